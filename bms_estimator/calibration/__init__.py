@@ -1,0 +1,1 @@
+"""From captures to cell models: relaxation test, OCV, series resistance, identification, validation."""

@@ -1,0 +1,1 @@
+"""Pure numerical kernels (numba): no I/O, no clock, no Python objects."""

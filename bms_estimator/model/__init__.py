@@ -1,0 +1,1 @@
+"""Typed values: samples, cells, settings, estimates."""

@@ -1,0 +1,34 @@
+"""One sample of a battery: what every source yields and the estimator takes.
+
+Samples travel in blocks, numpy structured arrays of dtype ``SAMPLE``: what one read of the serial
+descriptor brought, or some thousand rows of a file. A block of one is a sample.
+"""
+
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+SAMPLE = np.dtype(
+    [
+        ("time_s", "f8"),  # the stream's own clock; never decreasing in a good stream
+        ("current_a", "f8"),  # positive on discharge
+        ("voltage_v", "f8"),  # pack terminals
+        ("temperature_c", "f8"),  # NaN where there is no sensor
+        ("status", "u4"),  # bits of SampleStatus
+    ],
+    align=True,
+)
+
+SampleBlock = NDArray[np.void]
+"""Shape (n,), dtype ``SAMPLE``."""
+
+
+class SampleStatus(IntFlag):
+    """What the board says of a sample."""
+
+    VOLTAGE_SATURATED = 1
+    CURRENT_SATURATED = 2
+    OVERRUN = 4
+    RESET = 8
+    GAP = 16

@@ -1,0 +1,1 @@
+"""Reports: the thesis recomputed beside the printed page."""

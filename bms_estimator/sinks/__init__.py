@@ -1,0 +1,1 @@
+"""Where estimates go: MQTT, the console, CSV and Parquet files."""

@@ -1,0 +1,1 @@
+"""Where samples come from: serial boards, captures, tables, the virtual board."""

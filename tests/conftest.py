@@ -1,0 +1,15 @@
+"""Fixtures that every test may use."""
+
+from pathlib import Path
+
+import pytest
+
+SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the real captures, or a skip that says where it was looked for."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"real captures are absent: {SHARED_DATA} does not exist")
+    return SHARED_DATA
