@@ -1,0 +1,93 @@
+"""From typed settings to the kernels' records."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from bms_estimator.kernels.cell import OCV_POINTS, emf
+from bms_estimator.kernels.mittag_leffler import decay_table, series_coefficients
+from bms_estimator.kernels.nussbaum import Nussbaum
+from bms_estimator.kernels.state import OBSERVER_SETTINGS, PARAMETERS
+from bms_estimator.model.cell import CellModel, ChenMoraOcv
+from bms_estimator.model.settings import ObserverSettings
+
+SETTLED_STEPS = 2.0
+"""Width of the dead zone in steps of the converter: half a step of rounding, half of noise, and as much again."""
+LOCK_FRACTION = 0.02
+"""An error of this fraction of the nominal voltage is no tracking."""
+GAP_S = 5.0
+"""A step longer than this counts as a gap [s]."""
+IMPROVED = range(1, 13)
+"""Parameters that the improved method adapts (Algorithm 1); a13..a15 come from (4.2)."""
+
+
+def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Open-circuit voltage and its slope dOCV/dSOC [V] at ``OCV_POINTS`` evenly spaced SOCs 0..1."""
+    soc = np.linspace(0.0, 1.0, OCV_POINTS)
+    if isinstance(cell.ocv, ChenMoraOcv):
+        a = cell.a
+        slope = a[16] * a[17] * np.exp(-a[17] * soc) + a[19] - 2.0 * a[20] * soc + 3.0 * a[21] * soc**2
+        return np.array([emf(x, a) for x in soc]), slope
+    curve = PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v, extrapolate=True)
+    return curve(soc), curve.derivative()(soc)
+
+
+def observer_settings(
+    cell: CellModel, observer: ObserverSettings, voltage_resolution_v: float, initial_soc: float | None
+) -> NDArray[np.void]:
+    """The observer's settings record.
+
+    Args:
+        cell: The pack as one object.
+        observer: Its ``[observer]`` section.
+        voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
+        initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
+
+    Returns:
+        Shape (1,), dtype ``OBSERVER_SETTINGS``.
+    """
+    record = np.zeros(1, dtype=OBSERVER_SETTINGS)
+    p = record[0]
+    p["capacity_as"] = cell.cell.capacity_ah * 3600.0
+    p["ocv_v"], p["ocv_slope_v"] = ocv_grid(cell)
+    _adaptation(p, cell, observer)
+    p["output_r_s"] = 0.0 if observer.law == "improved" else 1.0
+    p["nussbaum"] = Nussbaum[observer.nussbaum.replace("-", "_").upper()]
+    p["alpha"] = observer.alpha
+    p["gain_scale"] = observer.lambda_ ** (1.0 / observer.alpha)
+    p["ml_series"] = series_coefficients(observer.alpha)
+    p["ml_decay"], p["ml_decay_slope"] = decay_table(observer.alpha)
+    p["k0"] = observer.k0
+    p["gain_limit"] = observer.gain_limit
+    p["rearm_gain"] = -np.inf if observer.rearm_gain is None else observer.rearm_gain
+    dead_zone_v = SETTLED_STEPS * voltage_resolution_v if observer.dead_zone_v is None else observer.dead_zone_v
+    p["dead_zone_v"] = dead_zone_v
+    p["epsilon_v"] = observer.epsilon_v or 2.0 * max(dead_zone_v, voltage_resolution_v)
+    p["lock_error_v"] = observer.lock_error_v or max(
+        LOCK_FRACTION * cell.cell.nominal_voltage_v, 10.0 * voltage_resolution_v
+    )
+    p["lock_time_s"] = observer.lock_time_s
+    p["margin_guard"] = observer.margin_guard
+    p["soc_initial"] = np.nan if initial_soc is None else initial_soc
+    p["voltage_min_v"] = cell.cell.voltage_min_v
+    p["voltage_max_v"] = cell.cell.voltage_max_v
+    p["current_max_a"] = cell.cell.current_max_a
+    p["gap_s"] = GAP_S
+    return record
+
+
+def _adaptation(p: np.void, cell: CellModel, observer: ObserverSettings) -> None:
+    """All laws as one, a' = drive e^2 + rate (target - a): (3.16), (3.17), (3.18)."""
+    a = cell.a
+    initial, target, rate, drive = (np.zeros(PARAMETERS) for _ in range(4))
+    initial[1:] = target[1:] = a[1:PARAMETERS]
+    adapted = IMPROVED if observer.law == "improved" else range(1, PARAMETERS)
+    for i in adapted:
+        drive[i] = 1.0
+        if observer.law in ("improved", "scheme-3"):  # (3.18)
+            bounds = cell.bounds(i)
+            target[i], rate[i] = bounds.limit, bounds.rate
+            initial[i] = bounds.limit if bounds.initial is None else bounds.initial
+        elif observer.law == "scheme-2" and a[i] <= observer.scheme_2_epsilon:  # (3.17), i in q
+            rate[i] = observer.scheme_2_lambda
+    p["a_initial"], p["target"], p["rate"], p["drive"] = initial, target, rate, drive

@@ -1,0 +1,158 @@
+"""The cell of Chen and Mora: its elements over SOC and its exact response to a held current.
+
+Parameters stand at their own index: ``a[1]`` is a1, ``a[0]`` is unused. Voltages in V, currents in A
+(positive on discharge), resistances in ohm, capacitances in F, SOC 0..1.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+OCV_POINTS = 401
+"""Nodes of the OCV grid, evenly spaced over SOC 0..1."""
+
+
+@njit(cache=True)
+def r_ts(soc, a):
+    """Short-term resistance R_ts(SOC) [ohm], (2.5)."""
+    return a[1] * math.exp(-a[2] * soc) + a[3]  # (2.5)
+
+
+@njit(cache=True)
+def r_tl(soc, a):
+    """Long-term resistance R_tl(SOC) [ohm], (2.6)."""
+    return a[4] * math.exp(-a[5] * soc) + a[6]  # (2.6)
+
+
+@njit(cache=True)
+def c_ts(soc, a):
+    """Short-term capacitance C_ts(SOC) [F], (2.7); negative below delta1."""
+    return -a[7] * math.exp(-a[8] * soc) + a[9]  # (2.7)
+
+
+@njit(cache=True)
+def c_tl(soc, a):
+    """Long-term capacitance C_tl(SOC) [F], (2.8); negative below delta2."""
+    return -a[10] * math.exp(-a[11] * soc) + a[12]  # (2.8)
+
+
+@njit(cache=True)
+def r_s(soc, a):
+    """Series resistance R_s(SOC) [ohm], (2.9)."""
+    return a[13] * math.exp(-a[14] * soc) + a[15]  # (2.9)
+
+
+@njit(cache=True)
+def emf(soc, a):
+    """Open-circuit EMF E_o(SOC) [V], (2.10)."""
+    return -a[16] * math.exp(-a[17] * soc) + a[18] + a[19] * soc - a[20] * soc**2 + a[21] * soc**3  # (2.10)
+
+
+@njit(cache=True)
+def ocv(soc, ocv_v, ocv_slope_v):
+    """Open-circuit voltage [V] at ``soc`` from a grid of values and slopes (cubic Hermite).
+
+    Beyond 0..1 the end slope goes on, so that a drifting SOC still meets a finite, increasing curve.
+
+    Args:
+        soc: State of charge.
+        ocv_v: Voltage at ``OCV_POINTS`` evenly spaced SOCs [V].
+        ocv_slope_v: dOCV/dSOC at the same SOCs [V].
+    """
+    last = ocv_v.shape[0] - 1
+    if soc <= 0.0:
+        return ocv_v[0] + soc * ocv_slope_v[0]
+    if soc >= 1.0:
+        return ocv_v[last] + (soc - 1.0) * ocv_slope_v[last]
+    position = soc * last
+    i = min(int(position), last - 1)
+    t = position - i
+    step = 1.0 / last
+    w = t * t * (3.0 - 2.0 * t)
+    bend = t * (1.0 - t) * step
+    return ocv_v[i] + w * (ocv_v[i + 1] - ocv_v[i]) + bend * ((1.0 - t) * ocv_slope_v[i] - t * ocv_slope_v[i + 1])
+
+
+@njit(cache=True)
+def soc_from_ocv(voltage_v, ocv_v, ocv_slope_v):
+    """SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of the grid, thesis 7.1.
+
+    Bisection: right for every increasing curve, and the nearest end outside its range.
+    """
+    low, high = 0.0, 1.0
+    if voltage_v <= ocv_v[0]:
+        return 0.0
+    if voltage_v >= ocv_v[ocv_v.shape[0] - 1]:
+        return 1.0
+    for _ in range(48):
+        middle = 0.5 * (low + high)
+        if ocv(middle, ocv_v, ocv_slope_v) < voltage_v:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+@njit(cache=True)
+def overpotential_step(v_rc, current_a, r_ohm, tau_s, dt_s):
+    """RC branch voltage [V] after ``dt_s`` under constant current, (2.2)-(2.3) solved exactly."""
+    decay = math.exp(-dt_s / tau_s)
+    return v_rc * decay + current_a * r_ohm * (1.0 - decay)
+
+
+@njit(cache=True)
+def cell_step(x, current_a, dt_s, capacity_as, a):
+    """State x = (soc, v_ts, v_tl) after ``dt_s`` under constant current, (2.1)-(2.3).
+
+    The elements are held at the SOC of mid-step, which makes the step second order in ``dt_s``.
+
+    Args:
+        x: SOC (0..1), v_ts [V], v_tl [V].
+        current_a: Discharge current [A], held over the step.
+        dt_s: Step [s].
+        capacity_as: Capacity C_c [A s].
+        a: a1..a21 at index 1..21.
+    """
+    soc, v_ts, v_tl = x
+    drop = current_a * dt_s / capacity_as
+    middle = soc - 0.5 * drop
+    ohm_ts = r_ts(middle, a)
+    ohm_tl = r_tl(middle, a)
+    return (
+        soc - drop,  # (2.1)
+        overpotential_step(v_ts, current_a, ohm_ts, ohm_ts * c_ts(middle, a), dt_s),  # (2.2)
+        overpotential_step(v_tl, current_a, ohm_tl, ohm_tl * c_tl(middle, a), dt_s),  # (2.3)
+    )
+
+
+@njit(cache=True)
+def terminal_voltage(x, current_a, a):
+    """Terminal voltage y [V] of state x under ``current_a``, (2.4)."""
+    soc, v_ts, v_tl = x
+    return emf(soc, a) - v_ts - v_tl - current_a * r_s(soc, a)  # (2.4)
+
+
+@njit(cache=True)
+def simulate_cell(x, time_s, current_a, capacity_as, a):
+    """Terminal voltage [V] and SOC at every ``time_s`` under a current held between samples, (2.1)-(2.4).
+
+    Args:
+        x: State at the first sample: SOC (0..1), v_ts [V], v_tl [V].
+        time_s: Shape (n,), increasing [s].
+        current_a: Shape (n,), discharge positive [A]; ``current_a[j]`` holds from ``time_s[j]`` on.
+        capacity_as: Capacity C_c [A s].
+        a: a1..a21 at index 1..21.
+
+    Returns:
+        Two arrays of shape (n,): terminal voltage [V] and SOC (0..1).
+    """
+    n = time_s.shape[0]
+    voltage_v = np.empty(n)
+    soc = np.empty(n)
+    for j in range(n):
+        if j > 0:
+            x = cell_step(x, current_a[j - 1], time_s[j] - time_s[j - 1], capacity_as, a)
+        soc[j] = x[0]
+        voltage_v[j] = terminal_voltage(x, current_a[j], a)
+    return voltage_v, soc

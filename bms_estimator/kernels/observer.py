@@ -1,0 +1,167 @@
+"""The high-gain adaptive observer, Algorithm 1: one sample in, one record updated.
+
+Over a sample y, i, N and a_i are held. Then (3.18) is a first-order lag, and (3.2)-(3.3) with
+u = -N e is linear with a symmetric 2x2 matrix: both are solved exactly, so the step is stable for every
+N >= 0 and every step length. ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+"""
+
+import math
+
+from numba import njit
+
+from bms_estimator.kernels.cell import c_tl, c_ts, ocv, r_s, r_tl, r_ts, soc_from_ocv
+from bms_estimator.kernels.margins import delta
+from bms_estimator.kernels.nussbaum import nussbaum_gain
+
+SMALLEST_LOOP = 0.1
+"""Least 1 + N R_s the algebraic loop of (3.14) is closed with; below it N has turned the loop's sign."""
+
+
+@njit(cache=True)
+def start(s, p, time_s, current_a, voltage_v):
+    """Initial conditions of Algorithm 1 at the first sample."""
+    s.time_s = time_s
+    s.current_a = current_a
+    for i in range(1, 16):
+        s.a[i] = p.a_initial[i]
+        s.target[i] = p.target[i]
+    s.soc = p.soc_initial
+    if math.isnan(s.soc):
+        ohmic = current_a * r_s(1.0, s.a)
+        s.soc = soc_from_ocv(voltage_v + ohmic, p.ocv_v, p.ocv_slope_v)
+    s.k = p.k0
+    s.gain = nussbaum_gain(s.k, p)
+    s.lock = 1
+    s.adapting = 1
+    s.started = 1
+    s.voltage_estimate_v = ocv(s.soc, p.ocv_v, p.ocv_slope_v)  # (4.1), x2 = x3 = 0
+    s.innovation_v = voltage_v - s.voltage_estimate_v
+    update_margins(s)
+
+
+@njit(cache=True)
+def observer_step(s, p, dt_s, current_a, voltage_v):
+    """Advance the observer by one sample: Algorithm 1, lines 2 to 7."""
+    charge_as = 0.5 * (s.current_a + current_a) * dt_s
+    s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)  # (3.1)
+    s.current_a = current_a
+    e_o = ocv(s.soc, p.ocv_v, p.ocv_slope_v)
+
+    floor = max(s.delta_1, s.delta_2) + p.margin_guard
+    s.adapting = 1 if s.soc > floor else 0
+    soc = max(s.soc, floor)  # E14: below it a capacitance may be negative
+
+    ohm_s = p.output_r_s * r_s(soc, s.a) if p.output_r_s > 0.0 else 0.0
+    loop = max(1.0 + s.gain * ohm_s, SMALLEST_LOOP)
+    e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop  # (3.15) with (3.14) or (4.1)
+    s.innovation_v = e
+
+    if s.adapting:
+        adapt(s, p, dt_s, e * e)
+        update_margins(s)
+
+    ohm_ts, ohm_tl = r_ts(soc, s.a), r_tl(soc, s.a)
+    rate_e = states_step(s, s.gain / loop, voltage_v - e_o, ohm_ts * c_ts(soc, s.a), ohm_tl * c_tl(soc, s.a), dt_s)
+
+    excess = max(abs(e) - p.dead_zone_v, 0.0)
+    if excess > 0.0:
+        s.k += excess * excess * integral_of_exponential(2.0 * rate_e, dt_s)  # (3.13) with the dead zone of E2
+        s.gain = nussbaum_gain(s.k, p)
+    s.voltage_estimate_v = e_o - s.v_ts - s.v_tl  # (4.1)
+    if p.output_r_s > 0.0:
+        s.voltage_estimate_v = voltage_v - (voltage_v - s.voltage_estimate_v) / loop  # (3.14), u = -N e
+    watch_lock(s, p, dt_s, voltage_v, e_o)
+
+
+@njit(cache=True)
+def adapt(s, p, dt_s, e_squared):
+    """Adaptation laws (3.16)-(3.18), exact for held e: a' = drive e^2 + rate (target - a)."""
+    if dt_s != s.decay_dt_s:
+        s.decay_dt_s = dt_s
+        for i in range(1, 16):
+            s.decay[i] = math.exp(-p.rate[i] * dt_s)
+            s.settle[i] = integral_of_exponential(-p.rate[i], dt_s)
+    for i in range(1, 16):
+        s.a[i] = s.target[i] + (s.a[i] - s.target[i]) * s.decay[i] + p.drive[i] * e_squared * s.settle[i]
+
+
+@njit(cache=True)
+def update_margins(s):
+    """delta1 (2.11) and delta2 (2.12) of the present parameters."""
+    s.delta_1 = delta(s.a[8], s.a[9], s.a[7])
+    s.delta_2 = delta(s.a[11], s.a[12], s.a[10])
+
+
+@njit(cache=True)
+def states_step(s, gain, drop_v, tau_ts, tau_tl, dt_s):
+    """x2, x3 after ``dt_s``: (3.2)-(3.3) with u = -gain (drop_v + x2 + x3), gain and inputs held, exactly.
+
+    The matrix is [[-1/tau_ts - gain, -gain], [-gain, -1/tau_tl - gain]]. Returns the eigenvalue that the
+    output error e follows [1/s].
+    """
+    mean = -gain - 0.5 * (1.0 / tau_ts + 1.0 / tau_tl)
+    half = 0.5 * (1.0 / tau_tl - 1.0 / tau_ts)
+    q = max(math.sqrt(half * half + gain * gain), 1e-300)
+    low, high = mean - q, mean + q
+    phi_low = integral_of_exponential(low, dt_s)
+    phi_high = integral_of_exponential(high, dt_s)
+    decay_low = 1.0 + low * phi_low
+    decay_high = 1.0 + high * phi_high
+    along, across = 0.5 * (decay_high + decay_low), 0.5 * (decay_high - decay_low) / q
+    phi_along, phi_across = 0.5 * (phi_high + phi_low), 0.5 * (phi_high - phi_low) / q
+    u = -gain * drop_v
+    v_ts, v_tl = s.v_ts, s.v_tl
+    s.v_ts = along * v_ts + across * (half * v_ts - gain * v_tl) + u * (phi_along + phi_across * (half - gain))
+    s.v_tl = along * v_tl + across * (-half * v_tl - gain * v_ts) + u * (phi_along + phi_across * (-half - gain))
+    return low if gain >= 0.0 else high
+
+
+@njit(cache=True)
+def integral_of_exponential(rate, dt_s):
+    """Integral of e^(rate t) over 0..dt_s [s]."""
+    x = rate * dt_s
+    if abs(x) < 1e-8:
+        return dt_s * (1.0 + 0.5 * x)
+    return math.expm1(x) / rate
+
+
+@njit(cache=True)
+def watch_lock(s, p, dt_s, voltage_v, e_o):
+    """Loss of lock (E2): detected by an error that stays, or by numbers that are none; then recovered from.
+
+    In lock, a gain that falls below ``rearm_gain`` starts again from k0 before its sign turns.
+    """
+    finite = math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and math.isfinite(s.k) and math.isfinite(s.a[1])
+    beyond = not abs(s.innovation_v) <= p.lock_error_v
+    if beyond == (s.lock == 1):
+        # a single sample after a long gap must not decide: at most a fifth of the time counts per sample
+        s.unlocked_s += min(dt_s, 0.2 * p.lock_time_s)
+    else:
+        s.unlocked_s = 0.0
+    if not finite or (s.lock == 1 and s.unlocked_s >= p.lock_time_s):
+        s.lock = 0
+        s.lock_losses += 1
+        recover(s, p, voltage_v, e_o)
+    elif s.lock == 0 and s.unlocked_s >= p.lock_time_s:
+        s.lock = 1
+        s.unlocked_s = 0.0
+    elif s.lock == 1 and s.gain < p.rearm_gain and not beyond:
+        s.k = p.k0
+        s.gain = nussbaum_gain(s.k, p)
+        s.gain_rearms += 1
+
+
+@njit(cache=True)
+def recover(s, p, voltage_v, e_o):
+    """Start again from the measurement: e = 0, k = k0, parameters at their limit."""
+    s.k = p.k0
+    s.gain = nussbaum_gain(s.k, p)
+    s.v_ts = 0.5 * (e_o - voltage_v)
+    s.v_tl = s.v_ts
+    for i in range(1, 16):
+        if p.rate[i] > 0.0:
+            s.a[i] = s.target[i]
+        elif not math.isfinite(s.a[i]):
+            s.a[i] = p.a_initial[i]
+    s.unlocked_s = 0.0
+    update_margins(s)

@@ -1,0 +1,233 @@
+"""The cell model: what ``cell.toml`` holds, and its a1..a21.
+
+The values describe ``series_count`` cells in series as one two-terminal object; ``CellModel.pack``
+scales them to packs of such objects in series and parallel.
+"""
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.toml_file import Strict, read_toml
+
+Positive = Annotated[float, Field(gt=0)]
+
+ELEMENTS = {
+    "r_ts": (1, "amplitude_ohm", "offset_ohm"),  # (2.5)
+    "r_tl": (4, "amplitude_ohm", "offset_ohm"),  # (2.6)
+    "c_ts": (7, "amplitude_farad", "offset_farad"),  # (2.7)
+    "c_tl": (10, "amplitude_farad", "offset_farad"),  # (2.8)
+    "r_s": (13, "amplitude_ohm", "offset_ohm"),  # (2.9)
+}
+"""Element -> index of its first parameter, key of its amplitude, key of its offset."""
+
+
+class Resistance(Strict):
+    """R(SOC) = amplitude e^(-exponent SOC) + offset: (2.5), (2.6), (2.9)."""
+
+    amplitude_ohm: Positive
+    exponent: Positive
+    offset_ohm: Positive
+
+    @property
+    def a(self) -> tuple[float, float, float]:
+        """The three parameters in the order of the thesis."""
+        return self.amplitude_ohm, self.exponent, self.offset_ohm
+
+
+class Capacitance(Strict):
+    """C(SOC) = -amplitude e^(-exponent SOC) + offset: (2.7), (2.8)."""
+
+    amplitude_farad: Positive
+    exponent: Positive
+    offset_farad: Positive
+
+    @property
+    def a(self) -> tuple[float, float, float]:
+        """The three parameters in the order of the thesis."""
+        return self.amplitude_farad, self.exponent, self.offset_farad
+
+
+class ChenMoraOcv(Strict):
+    """E_o(SOC) of (2.10): -a16 e^(-a17 SOC) + a18 + a19 SOC - a20 SOC^2 + a21 SOC^3."""
+
+    form: Literal["chen-mora"] = "chen-mora"
+    amplitude_v: Positive = Field(description="a16")
+    exponent: Positive = Field(description="a17")
+    constant_v: float = Field(description="a18")
+    linear_v: float = Field(description="a19")
+    quadratic_v: float = Field(description="a20")
+    cubic_v: float = Field(description="a21")
+
+    @property
+    def a(self) -> tuple[float, ...]:
+        """a16..a21."""
+        return self.amplitude_v, self.exponent, self.constant_v, self.linear_v, self.quadratic_v, self.cubic_v
+
+
+class TableOcv(Strict):
+    """E_o(SOC) through measured points, monotone between them (PCHIP)."""
+
+    form: Literal["table"]
+    soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=4, description="increasing, from 0 to 1")
+    ocv_v: tuple[Positive, ...] = Field(min_length=4, description="increasing, one for each SOC")
+
+    @model_validator(mode="after")
+    def _increasing(self) -> Self:
+        if len(self.soc) != len(self.ocv_v):
+            raise ValueError(f"{len(self.soc)} SOCs but {len(self.ocv_v)} voltages: give one voltage for each SOC")
+        for name, values in (("soc", self.soc), ("ocv_v", self.ocv_v)):
+            steps = np.diff(values)
+            if not (steps > 0).all():
+                i = int(np.argmax(steps <= 0))
+                raise ValueError(f"{name} must increase, but {values[i + 1]} follows {values[i]} at point {i + 2}")
+        return self
+
+
+class Bounds(Strict):
+    """What (3.18) needs of one parameter: its bounds, the confidence in each, where it starts."""
+
+    upper: Positive = Field(description="a_iu")
+    lower: Positive = Field(description="a_il")
+    weight_upper: Annotated[float, Field(ge=0)] = Field(description="lambda_x [1/s]")
+    weight_lower: Annotated[float, Field(ge=0)] = Field(description="lambda_y [1/s]")
+    initial: Positive | None = Field(default=None, description="a_i(t0); the limit of Lemma 4.1.3 when left out")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.lower > self.upper:
+            raise ValueError(f"lower = {self.lower} is above upper = {self.upper}")
+        if self.weight_upper + self.weight_lower <= 0:
+            raise ValueError("weight_upper + weight_lower must be above 0")
+        return self
+
+    @property
+    def rate(self) -> float:
+        """How fast the parameter goes to its limit, lambda_x + lambda_y [1/s]."""
+        return self.weight_upper + self.weight_lower
+
+    @property
+    def limit(self) -> float:
+        """Where the parameter goes, whatever the data say: Lemma 4.1.3."""
+        return (self.weight_upper * self.upper + self.weight_lower * self.lower) / self.rate
+
+
+class Cell(Strict):
+    """What the cell is."""
+
+    name: str
+    description: str = ""
+    capacity_ah: Positive = Field(description="rated capacity in ampere-hours")
+    series_count: Annotated[int, Field(ge=1)] = Field(default=1, description="cells in series that the values describe")
+    nominal_voltage_v: Positive
+    voltage_min_v: Positive = Field(description="a sample below is a glitch")
+    voltage_max_v: Positive = Field(description="a sample above is a glitch")
+    current_max_a: Positive = Field(description="a sample of larger magnitude is a glitch")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.voltage_min_v < self.nominal_voltage_v < self.voltage_max_v:
+            raise ValueError(
+                f"voltage_min_v = {self.voltage_min_v}, nominal_voltage_v = {self.nominal_voltage_v}, "
+                f"voltage_max_v = {self.voltage_max_v}: must increase in this order"
+            )
+        return self
+
+
+class CellModel(Strict):
+    """A cell file: the cell, its elements (2.5)-(2.9), its OCV, and the bounds of the adaptation law."""
+
+    cell: Cell
+    r_ts: Resistance
+    r_tl: Resistance
+    c_ts: Capacitance
+    c_tl: Capacitance
+    r_s: Resistance
+    ocv: Annotated[ChenMoraOcv | TableOcv, Field(discriminator="form")]
+    adaptation: dict[str, Bounds] = Field(default_factory=dict, description="bounds by parameter, keys a1 to a15")
+
+    @model_validator(mode="after")
+    def _known_parameters(self) -> Self:
+        known = {f"a{i}" for i in range(1, 16)}
+        for name in self.adaptation:
+            if name not in known:
+                raise ValueError(f"adaptation.{name}: no such parameter; a1 to a15 adapt")
+        return self
+
+    @property
+    def a(self) -> NDArray[np.float64]:
+        """a1..a15 at index 1..15, and a16..a21 when the OCV has the form (2.10), else NaN. Shape (22,)."""
+        ocv = self.ocv.a if isinstance(self.ocv, ChenMoraOcv) else (np.nan,) * 6
+        return np.array([np.nan, *self.r_ts.a, *self.r_tl.a, *self.c_ts.a, *self.c_tl.a, *self.r_s.a, *ocv])
+
+    def bounds(self, index: int) -> Bounds:
+        """Bounds of a_index: the configured ones, or half to one and a half times the model's value."""
+        configured = self.adaptation.get(f"a{index}")
+        if configured is not None:
+            return configured
+        value = float(self.a[index])
+        weight = 50.0
+        if index in (9, 12) and self.a[index - 2] > value:
+            # Lemma 4.1.1: a9 (a12) must settle faster than a7 (a10), but not by more than their ratio allows
+            weight *= float(np.sqrt(self.a[index - 2] / value))
+        return Bounds(upper=1.5 * value, lower=0.5 * value, weight_upper=weight, weight_lower=weight)
+
+    def pack(self, series: int, parallel: int) -> "CellModel":
+        """The model of ``series`` x ``parallel`` of these: voltages, resistances, capacitances and capacity scaled."""
+        if series == parallel == 1:
+            return self
+        return _scaled(self, series, parallel)
+
+
+def _scaled(model: CellModel, series: int, parallel: int) -> CellModel:
+    ohm, farad = series / parallel, parallel / series
+
+    def times(part: Strict, factor: dict[str, float]) -> dict[str, object]:
+        table = part.model_dump()
+        for key, value in table.items():
+            unit = key.rsplit("_", 1)[-1]
+            if unit in factor:
+                table[key] = (
+                    tuple(v * factor[unit] for v in value) if isinstance(value, tuple) else value * factor[unit]
+                )
+        return table
+
+    factor = {"ohm": ohm, "farad": farad, "v": float(series), "a": float(parallel), "ah": float(parallel)}
+    elements = {name: times(getattr(model, name), factor) for name in ELEMENTS}
+    adaptation = {}
+    for name, bounds in model.adaptation.items():
+        element, place = divmod(int(name[1:]) - 1, 3)
+        scale = 1.0 if place == 1 else farad if element in (2, 3) else ohm
+        table = bounds.model_dump()
+        adaptation[name] = table | {k: table[k] * scale for k in ("upper", "lower", "initial") if table[k] is not None}
+    cell = times(model.cell, factor) | {"series_count": model.cell.series_count * series}
+    return CellModel.model_validate(
+        {"cell": cell, "ocv": times(model.ocv, factor), "adaptation": adaptation, **elements}
+    )
+
+
+def shipped_cells() -> list[str]:
+    """Names of the cell files that come with the package."""
+    folder = resources.files("bms_estimator.model") / "cells"
+    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def load_cell(name_or_path: str | Path) -> CellModel:
+    """A shipped cell by name, or a cell file by path.
+
+    Raises:
+        UserError: No such cell or file, or a value in it that is not allowed.
+    """
+    text = str(name_or_path)
+    if text in shipped_cells():
+        with resources.as_file(resources.files("bms_estimator.model") / "cells" / f"{text}.toml") as path:
+            return read_toml(path, CellModel)
+    path = Path(text)
+    if not path.exists():
+        raise UserError(f"{text}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())})")
+    return read_toml(path, CellModel)

@@ -1,0 +1,121 @@
+"""The settings of one pack: what ``pack.toml`` holds. Values are SI, the unit stands in the key."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from bms_estimator.model.toml_file import Strict, read_toml
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+DeviceName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+
+
+class PackSettings(Strict):
+    """Which cells, how many, and where to begin."""
+
+    name: DeviceName = Field(default="pack", description="device in topic names: letters, digits, _ and -")
+    cell: str = Field(default="ncr18650", description="a shipped cell's name or the path of a cell file")
+    series: Annotated[int, Field(ge=1)] = Field(default=1, description="cell-file objects in series")
+    parallel: Annotated[int, Field(ge=1)] = Field(default=1, description="cell-file objects in parallel")
+    initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
+
+
+class SensorSettings(Strict):
+    """The board, what it resolves, and its sign of current."""
+
+    port: str = Field(
+        default="auto", description="device path, best under /dev/serial/by-id; auto: the only board found"
+    )
+    protocol: Literal["binary", "text"] = Field(default="binary", description="frames of the firmware, or text lines")
+    baud: Annotated[int, Field(ge=1200)] = Field(default=500_000)
+    sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
+    current_sign: Literal["discharge_positive", "charge_positive"] = Field(
+        default="discharge_positive", description="what the board calls positive; inside, discharge is"
+    )
+    voltage_resolution_v: Positive = Field(default=25.0 / 1024, description="one step of the voltage converter")
+    current_resolution_a: Positive = Field(default=0.05, description="one step of the current converter")
+
+
+class ObserverSettings(Strict):
+    """The adaptive observer, Algorithm 1."""
+
+    law: Literal["improved", "scheme-1", "scheme-2", "scheme-3"] = Field(
+        default="improved", description="improved: (3.18) with output (4.1); scheme-1..3: (3.16)..(3.18) with (3.14)"
+    )
+    nussbaum: Literal["mittag-leffler", "k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"] = "mittag-leffler"
+    alpha: Annotated[float, Field(gt=2, le=3)] = Field(default=2.5, description="a of (3.10), in (2, 3]")
+    lambda_: Positive = Field(default=1.0, alias="lambda", description="lambda of (3.10)")
+    k0: NotNegative = Field(default=0.0, description="k(t0) of (3.13)")
+    dead_zone_v: NotNegative | None = Field(
+        default=None,
+        description="errors below do not raise k; from the sensor's resolution when left out; 0: (3.13) as printed",
+    )
+    epsilon_v: Positive | None = Field(
+        default=None, description="eps2 of Algorithm 1: below it the error has converged"
+    )
+    gain_limit: Positive = Field(default=1e3, description="clamp of |N|")
+    rearm_gain: float | None = Field(
+        default=0.5,
+        description="below this N, in lock, k starts again; none (omit with law = scheme-N): the printed law",
+    )
+    lock_error_v: Positive | None = Field(
+        default=None, description="an error beyond it for lock_time_s is a loss of lock"
+    )
+    lock_time_s: Positive = 10.0
+    margin_guard: Fraction = Field(default=0.005, description="adaptation stops this far above max(delta1, delta2)")
+    scheme_2_lambda: Positive = Field(default=100.0, description="lambda_i of (3.17)")
+    scheme_2_epsilon: Positive = Field(default=0.35, description="parameters up to this value are penalised, (3.17)")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_rearm(cls, table: object) -> object:
+        """``rearm_gain = "never"`` in a file, since TOML has no null."""
+        if isinstance(table, dict) and table.get("rearm_gain") == "never":
+            return table | {"rearm_gain": None}
+        return table
+
+
+class MqttSettings(Strict):
+    """The broker and how often to publish."""
+
+    url: str = Field(
+        default="mqtt://localhost:1883",
+        pattern=r"^mqtts?://[^/]+$",
+        description="mqtt://host:port or mqtts://host:port for TLS",
+    )
+    username: str | None = None
+    password_file: Path | None = Field(default=None, description="file that holds the password, read at start")
+    ca_file: Path | None = Field(default=None, description="certificate authority for mqtts, else the system's")
+    base_topic: Annotated[str, Field(pattern=r"^[^+#\s]+$")] = "bms"
+    publish_rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="of the state topic")
+
+
+class StateSettings(Strict):
+    """What outlives a restart."""
+
+    folder: Path | None = Field(
+        default=None, description="where checkpoints go; systemd's StateDirectory when left out"
+    )
+    checkpoint_s: Positive = 60.0
+
+
+class Settings(Strict):
+    """One pack's settings file."""
+
+    pack: PackSettings = PackSettings()
+    sensor: SensorSettings = SensorSettings()
+    observer: ObserverSettings = ObserverSettings()
+    mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
+    state: StateSettings = StateSettings()
+
+
+def load_settings(path: Path) -> Settings:
+    """Read a pack's settings.
+
+    Raises:
+        UserError: As ``read_toml``.
+    """
+    return read_toml(path, Settings)

@@ -1,0 +1,63 @@
+"""Reading a TOML file into a pydantic model, with errors that name file, key, value and what is allowed."""
+
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from bms_estimator.model.errors import UserError
+
+
+class Strict(BaseModel):
+    """Base of all configured values: unknown keys are errors, values do not change after load."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+T = TypeVar("T", bound=BaseModel)
+
+
+def read_toml(path: Path, model: type[T]) -> T:
+    """Load and check a TOML file.
+
+    Raises:
+        UserError: File missing, not TOML, or a value not allowed; one line per wrong key.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not valid TOML: {error}") from None
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        raise UserError("\n".join(_line(path, model, detail) for detail in error.errors())) from None
+
+
+def _line(path: Path, model: type[BaseModel], detail: Any) -> str:
+    """One wrong key: ``pack.toml: cell.capacity_ah = -6.6: must be above 0 (rated capacity ...)``."""
+    keys = [str(key) for key in detail["loc"]]
+    where = ".".join(keys)
+    described = _description(model, keys)
+    hint = f" ({described})" if described else ""
+    if detail["type"] == "missing":
+        return f"{path}: {where}: missing{hint}"
+    if detail["type"] == "extra_forbidden":
+        return f"{path}: {where}: unknown key"
+    shown = "" if isinstance(detail["input"], dict) else f" = {detail['input']!r}"
+    return f"{path}: {where}{shown}: {detail['msg'].removeprefix('Value error, ')}{hint}"
+
+
+def _description(model: type[BaseModel], keys: list[str]) -> str:
+    """What the key means, from the field's description; empty where the path leaves the models."""
+    described = ""
+    current: Any = model
+    for key in keys:
+        field = getattr(current, "model_fields", {}).get(key)
+        if field is None:
+            return described if key == keys[-1] and not described else ""
+        described = field.description or ""
+        current = field.annotation
+    return described
