@@ -8,49 +8,54 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+State = tuple[float, float, float]
+"""SOC (0..1), v_ts [V], v_tl [V]."""
 
 OCV_POINTS = 401
 """Nodes of the OCV grid, evenly spaced over SOC 0..1."""
 
 
 @njit(cache=True)
-def r_ts(soc, a):
+def r_ts(soc: float, a: Floats) -> float:
     """Short-term resistance R_ts(SOC) [ohm], (2.5)."""
     return a[1] * math.exp(-a[2] * soc) + a[3]  # (2.5)
 
 
 @njit(cache=True)
-def r_tl(soc, a):
+def r_tl(soc: float, a: Floats) -> float:
     """Long-term resistance R_tl(SOC) [ohm], (2.6)."""
     return a[4] * math.exp(-a[5] * soc) + a[6]  # (2.6)
 
 
 @njit(cache=True)
-def c_ts(soc, a):
+def c_ts(soc: float, a: Floats) -> float:
     """Short-term capacitance C_ts(SOC) [F], (2.7); negative below delta1."""
     return -a[7] * math.exp(-a[8] * soc) + a[9]  # (2.7)
 
 
 @njit(cache=True)
-def c_tl(soc, a):
+def c_tl(soc: float, a: Floats) -> float:
     """Long-term capacitance C_tl(SOC) [F], (2.8); negative below delta2."""
     return -a[10] * math.exp(-a[11] * soc) + a[12]  # (2.8)
 
 
 @njit(cache=True)
-def r_s(soc, a):
+def r_s(soc: float, a: Floats) -> float:
     """Series resistance R_s(SOC) [ohm], (2.9)."""
     return a[13] * math.exp(-a[14] * soc) + a[15]  # (2.9)
 
 
 @njit(cache=True)
-def emf(soc, a):
+def emf(soc: float, a: Floats) -> float:
     """Open-circuit EMF E_o(SOC) [V], (2.10)."""
     return -a[16] * math.exp(-a[17] * soc) + a[18] + a[19] * soc - a[20] * soc**2 + a[21] * soc**3  # (2.10)
 
 
 @njit(cache=True)
-def ocv(soc, ocv_v, ocv_slope_v):
+def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
     """Open-circuit voltage [V] at ``soc`` from a grid of values and slopes (cubic Hermite).
 
     Beyond 0..1 the end slope goes on, so that a drifting SOC still meets a finite, increasing curve.
@@ -75,7 +80,7 @@ def ocv(soc, ocv_v, ocv_slope_v):
 
 
 @njit(cache=True)
-def soc_from_ocv(voltage_v, ocv_v, ocv_slope_v):
+def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
     """SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of the grid, thesis 7.1.
 
     Bisection: right for every increasing curve, and the nearest end outside its range.
@@ -95,14 +100,14 @@ def soc_from_ocv(voltage_v, ocv_v, ocv_slope_v):
 
 
 @njit(cache=True)
-def overpotential_step(v_rc, current_a, r_ohm, tau_s, dt_s):
+def overpotential_step(v_rc: float, current_a: float, r_ohm: float, tau_s: float, dt_s: float) -> float:
     """RC branch voltage [V] after ``dt_s`` under constant current, (2.2)-(2.3) solved exactly."""
     decay = math.exp(-dt_s / tau_s)
     return v_rc * decay + current_a * r_ohm * (1.0 - decay)
 
 
 @njit(cache=True)
-def cell_step(x, current_a, dt_s, capacity_as, a):
+def cell_step(x: State, current_a: float, dt_s: float, capacity_as: float, a: Floats) -> State:
     """State x = (soc, v_ts, v_tl) after ``dt_s`` under constant current, (2.1)-(2.3).
 
     The elements are held at the SOC of mid-step, which makes the step second order in ``dt_s``.
@@ -127,14 +132,14 @@ def cell_step(x, current_a, dt_s, capacity_as, a):
 
 
 @njit(cache=True)
-def terminal_voltage(x, current_a, a):
+def terminal_voltage(x: State, current_a: float, a: Floats) -> float:
     """Terminal voltage y [V] of state x under ``current_a``, (2.4)."""
     soc, v_ts, v_tl = x
     return emf(soc, a) - v_ts - v_tl - current_a * r_s(soc, a)  # (2.4)
 
 
 @njit(cache=True)
-def simulate_cell(x, time_s, current_a, capacity_as, a):
+def simulate_cell(x: State, time_s: Floats, current_a: Floats, capacity_as: float, a: Floats) -> tuple[Floats, Floats]:
     """Terminal voltage [V] and SOC at every ``time_s`` under a current held between samples, (2.1)-(2.4).
 
     Args:

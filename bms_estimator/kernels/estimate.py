@@ -3,9 +3,14 @@
 import math
 from enum import IntEnum
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from bms_estimator.kernels.observer import observer_step, start
+from bms_estimator.kernels.state import Record
+
+Records = NDArray[np.void]
 
 
 class Verdict(IntEnum):
@@ -27,7 +32,7 @@ _VOLTAGE_SATURATED_BIT = 1  # SampleStatus.VOLTAGE_SATURATED
 
 
 @njit(cache=True)
-def judge(s, p, time_s, current_a, voltage_v, status):
+def judge(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
     """Whether a sample can be used; counts those that cannot by their kind."""
     if not (math.isfinite(time_s) and math.isfinite(current_a) and math.isfinite(voltage_v)):
         s.dropped_not_finite += 1
@@ -45,7 +50,7 @@ def judge(s, p, time_s, current_a, voltage_v, status):
 
 
 @njit(cache=True)
-def step(state, settings, time_s, current_a, voltage_v, status):
+def step(state: Records, settings: Records, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
     """Take one sample.
 
     Args:
@@ -80,7 +85,7 @@ def step(state, settings, time_s, current_a, voltage_v, status):
 
 
 @njit(cache=True)
-def run(state, settings, samples, trace):
+def run(state: Records, settings: Records, samples: Records, trace: Records) -> int:
     """Take a block of samples: ``step`` for each, a row of ``trace`` for each accepted one.
 
     Args:
@@ -102,7 +107,7 @@ def run(state, settings, samples, trace):
 
 
 @njit(cache=True)
-def write_row(row, s, p, x):
+def write_row(row: Record, s: Record, p: Record, x: Record) -> None:
     """What there is to say of an accepted sample ``x``."""
     row.time_s = x.time_s
     row.voltage_v = x.voltage_v

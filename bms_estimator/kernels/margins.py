@@ -6,7 +6,7 @@ from numba import njit
 
 
 @njit(cache=True)
-def delta(exponent, offset, amplitude):
+def delta(exponent: float, offset: float, amplitude: float) -> float:
     """SOC below which a capacitance -amplitude e^(-exponent SOC) + offset is negative: (2.11), (2.12).
 
     delta1 = delta(a8, a9, a7), delta2 = delta(a11, a12, a10). Negative when the capacitance is
@@ -16,6 +16,6 @@ def delta(exponent, offset, amplitude):
 
 
 @njit(cache=True)
-def crossing(soc, offset, amplitude):
+def crossing(soc: float, offset: float, amplitude: float) -> float:
     """The bound that a8 (a11) must exceed at ``soc``: right side of the condition in Lemma 4.1.1, Fig. 19."""
     return -math.log(offset / amplitude) / soc

@@ -20,7 +20,8 @@ import math
 import numpy as np
 from numba import njit
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
+
+from bms_estimator.kernels.cell import Floats
 
 SERIES_TERMS = 24
 SERIES_LIMIT = 2.0
@@ -31,13 +32,13 @@ TABLE_POINTS = 1025
 _W_END = 1.0 / (1.0 + SERIES_LIMIT)
 
 
-def series_coefficients(alpha: float) -> NDArray[np.float64]:
+def series_coefficients(alpha: float) -> Floats:
     """Coefficients (-1)^k / Gamma(alpha k + 1) of the series (3.11) in r^alpha. Shape (SERIES_TERMS,)."""
     k = np.arange(SERIES_TERMS)
     return np.array([(-1.0) ** j * math.exp(-math.lgamma(alpha * j + 1.0)) for j in k])
 
 
-def decay_table(alpha: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def decay_table(alpha: float) -> tuple[Floats, Floats]:
     """G_alpha and its derivative by w at ``TABLE_POINTS`` nodes of w = 1/(1 + r) in [0, 1/3].
 
     Raises:
@@ -57,7 +58,7 @@ def decay_table(alpha: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     return value, slope
 
 
-def _mean_of_exponentials(alpha: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _mean_of_exponentials(alpha: float) -> tuple[Floats, Floats]:
     """Nodes s and weights of G = sum(weight * exp(-r s)): Gauss-Legendre in theta, graded to both ends."""
     c, sine = math.cos(math.pi * alpha), abs(math.sin(math.pi * alpha))
     # theta runs from atan2(c, sine) (s = 0) to pi/2 (s = inf); z = s^alpha on a logarithmic scale has
@@ -84,7 +85,7 @@ def _mean_of_exponentials(alpha: float) -> tuple[NDArray[np.float64], NDArray[np
 
 
 @njit(cache=True)
-def mittag_leffler(r, alpha, series, decay_value, decay_slope):
+def mittag_leffler(r: float, alpha: float, series: Floats, decay_value: Floats, decay_slope: Floats) -> float:
     """E_alpha(-r^alpha) for r >= 0, to 1e-10 of its envelope.
 
     Args:
@@ -106,7 +107,7 @@ def mittag_leffler(r, alpha, series, decay_value, decay_slope):
 
 
 @njit(cache=True)
-def _decay(r, value, slope):
+def _decay(r: float, value: Floats, slope: Floats) -> float:
     """G_alpha(r) from its table over w = 1/(1 + r), cubic Hermite."""
     step = _W_END / (TABLE_POINTS - 1)
     position = 1.0 / (1.0 + r) / step

@@ -6,6 +6,7 @@ from enum import IntEnum
 from numba import njit
 
 from bms_estimator.kernels.mittag_leffler import mittag_leffler
+from bms_estimator.kernels.state import Record
 
 
 class Nussbaum(IntEnum):
@@ -23,7 +24,7 @@ _LN_COS_SQRT_LN = int(Nussbaum.LN_COS_SQRT_LN)
 
 
 @njit(cache=True)
-def nussbaum_gain(k, p):
+def nussbaum_gain(k: float, p: Record) -> float:
     """N(k), clamped to +-``gain_limit``.
 
     Args:

@@ -12,13 +12,14 @@ from numba import njit
 from bms_estimator.kernels.cell import c_tl, c_ts, ocv, r_s, r_tl, r_ts, soc_from_ocv
 from bms_estimator.kernels.margins import delta
 from bms_estimator.kernels.nussbaum import nussbaum_gain
+from bms_estimator.kernels.state import Record
 
 SMALLEST_LOOP = 0.1
 """Least 1 + N R_s the algebraic loop of (3.14) is closed with; below it N has turned the loop's sign."""
 
 
 @njit(cache=True)
-def start(s, p, time_s, current_a, voltage_v):
+def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float) -> None:
     """Initial conditions of Algorithm 1 at the first sample."""
     s.time_s = time_s
     s.current_a = current_a
@@ -40,7 +41,7 @@ def start(s, p, time_s, current_a, voltage_v):
 
 
 @njit(cache=True)
-def observer_step(s, p, dt_s, current_a, voltage_v):
+def observer_step(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
     """Advance the observer by one sample: Algorithm 1, lines 2 to 7."""
     charge_as = 0.5 * (s.current_a + current_a) * dt_s
     s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)  # (3.1)
@@ -74,7 +75,7 @@ def observer_step(s, p, dt_s, current_a, voltage_v):
 
 
 @njit(cache=True)
-def adapt(s, p, dt_s, e_squared):
+def adapt(s: Record, p: Record, dt_s: float, e_squared: float) -> None:
     """Adaptation laws (3.16)-(3.18), exact for held e: a' = drive e^2 + rate (target - a)."""
     if dt_s != s.decay_dt_s:
         s.decay_dt_s = dt_s
@@ -86,14 +87,14 @@ def adapt(s, p, dt_s, e_squared):
 
 
 @njit(cache=True)
-def update_margins(s):
+def update_margins(s: Record) -> None:
     """delta1 (2.11) and delta2 (2.12) of the present parameters."""
     s.delta_1 = delta(s.a[8], s.a[9], s.a[7])
     s.delta_2 = delta(s.a[11], s.a[12], s.a[10])
 
 
 @njit(cache=True)
-def states_step(s, gain, drop_v, tau_ts, tau_tl, dt_s):
+def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: float, dt_s: float) -> float:
     """x2, x3 after ``dt_s``: (3.2)-(3.3) with u = -gain (drop_v + x2 + x3), gain and inputs held, exactly.
 
     The matrix is [[-1/tau_ts - gain, -gain], [-gain, -1/tau_tl - gain]]. Returns the eigenvalue that the
@@ -117,7 +118,7 @@ def states_step(s, gain, drop_v, tau_ts, tau_tl, dt_s):
 
 
 @njit(cache=True)
-def integral_of_exponential(rate, dt_s):
+def integral_of_exponential(rate: float, dt_s: float) -> float:
     """Integral of e^(rate t) over 0..dt_s [s]."""
     x = rate * dt_s
     if abs(x) < 1e-8:
@@ -126,7 +127,7 @@ def integral_of_exponential(rate, dt_s):
 
 
 @njit(cache=True)
-def watch_lock(s, p, dt_s, voltage_v, e_o):
+def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) -> None:
     """Loss of lock (E2): detected by an error that stays, or by numbers that are none; then recovered from.
 
     In lock, a gain that falls below ``rearm_gain`` starts again from k0 before its sign turns.
@@ -152,7 +153,7 @@ def watch_lock(s, p, dt_s, voltage_v, e_o):
 
 
 @njit(cache=True)
-def recover(s, p, voltage_v, e_o):
+def recover(s: Record, p: Record, voltage_v: float, e_o: float) -> None:
     """Start again from the measurement: e = 0, k = k0, parameters at their limit."""
     s.k = p.k0
     s.gain = nussbaum_gain(s.k, p)
