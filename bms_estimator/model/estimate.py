@@ -1,0 +1,105 @@
+"""What leaves the service: the estimate, the parameters, health and info of one pack.
+
+Every number that can be missing is ``None`` and never NaN: the payloads are JSON. The field descriptions
+are published as JSON schema.
+"""
+
+from typing import Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Report(BaseModel):
+    """Base of all published values."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Estimate(Report):
+    """Topic ``state``: one publish window. V, I, P and temperature are means over the window, the rest is its last sample."""
+
+    time: str = Field(description="arrival of the window's last sample, ISO 8601, UTC")
+    publish_time: str = Field(description="when this message was made, ISO 8601, UTC")
+    board_time_s: float = Field(description="the stream's own clock at the last sample [s]")
+    voltage_v: float = Field(description="pack terminal voltage [V], mean")
+    current_a: float = Field(description="current [A], positive on discharge, mean")
+    power_w: float = Field(description="voltage times current [W], positive on discharge, mean of the products")
+    temperature_c: float | None = Field(description="temperature [C], mean; null without a sensor")
+    soc: float = Field(description="state of charge, 0..1")
+    soc_percent: float = Field(description="state of charge [%]")
+    voltage_estimate_v: float | None = Field(description="the observer's terminal voltage [V]")
+    innovation_v: float | None = Field(description="measured less predicted voltage before the correction [V]")
+    delta_1: float | None = Field(description="SOC below which C_ts is negative (2.11)")
+    delta_2: float | None = Field(description="SOC below which C_tl is negative (2.12)")
+    stability_margin: float | None = Field(description="soc - max(delta_1, delta_2)")
+    adaptive_gain_k: float | None = Field(description="k of (3.13) [V^2 s]")
+    nussbaum_gain: float | None = Field(description="N(k) of (3.12)")
+    converged: bool = Field(description="|innovation_v| is below eps2 of Algorithm 1")
+    lock: bool = Field(description="the observer tracks the measured voltage")
+    frames_received: int = Field(description="valid frames since start")
+    frames_lost: int = Field(description="frames missing from the sequence since start")
+    crc_errors: int = Field(description="frames with a wrong checksum since start")
+    sample_rate_hz: float | None = Field(description="samples per second of the stream's clock in the window [Hz]")
+
+
+class Parameter(Report):
+    """One parameter with what is known of it."""
+
+    value: float | None = Field(description="in the unit of its name; a1..a21 in SI as in the thesis")
+    std: float | None = Field(description="standard deviation, same unit; null when unknown")
+    valid: bool = Field(description="the value rests on data or configuration that may be relied on")
+    source: Literal["configured", "identified"]
+    since: str | None = Field(default=None, description="valid since, ISO 8601, UTC")
+    reason: str | None = Field(default=None, description="why not valid, with the numbers")
+
+
+class ParameterReport(Report):
+    """Topic ``parameters``: a1..a21 and the elements at the present SOC."""
+
+    publish_time: str = Field(description="when this message was made, ISO 8601, UTC")
+    soc: float | None = Field(description="state of charge the elements belong to, 0..1")
+    a: dict[str, Parameter] = Field(description="a1..a21 of (2.5)-(2.10)")
+    elements: dict[str, Parameter] = Field(description="r_s_ohm, r_ts_ohm, c_ts_farad, r_tl_ohm, c_tl_farad, e_o_v")
+
+
+class Health(Report):
+    """Topic ``health``, retained: how the service and the line are."""
+
+    publish_time: str = Field(description="when this message was made, ISO 8601, UTC")
+    uptime_s: float = Field(description="since the service started [s]")
+    rss_mib: float | None = Field(description="resident memory [MiB]")
+    restarts: int = Field(description="starts that found a checkpoint of an earlier run")
+    reconnects: int = Field(description="times the source was opened again")
+    sensor_online: bool = Field(description="a valid frame came within 3 publish periods")
+    sensor_message: str | None = Field(description="why the sensor is not online; null when it is")
+    line: dict[str, int] = Field(description="frames and faults of the line by kind, since start")
+    samples: dict[str, int] = Field(description="samples accepted and dropped by kind, since start")
+    lock_losses: int = Field(description="times the observer lost track")
+    gain_rearms: int = Field(description="times k was started again before the gain turned")
+    publish_drops: int = Field(description="messages replaced before a sink could take them")
+    checkpoint: str = Field(description="what became of the last checkpoint")
+
+
+class Info(Report):
+    """Topic ``info``, retained: what this is."""
+
+    device: str
+    version: str = Field(description="of bms_estimator")
+    started: str = Field(description="ISO 8601, UTC")
+    cell: str
+    capacity_ah: float
+    series_count: int
+    nominal_voltage_v: float
+    observer: str = Field(description="adaptation law and gain")
+    publish_rate_hz: float
+    board: dict[str, str] = Field(description="what the board said of itself; empty until it did")
+
+
+class Snapshot(NamedTuple):
+    """All that a sink may want at one publish time."""
+
+    estimate: Estimate | None
+    """None when no sample came in this window."""
+    parameters: ParameterReport
+    health: Health
+    info: Info
