@@ -128,25 +128,29 @@ def integral_of_exponential(rate: float, dt_s: float) -> float:
 
 @njit(cache=True)
 def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) -> None:
-    """Loss of lock (E2): detected by an error that stays, or by numbers that are none; then recovered from.
+    """Loss of lock (E2), detected and recovered from.
 
+    Lost is lock when the error stays beyond ``lock_error_v`` for ``lock_time_s``, or gets there under a gain whose
+    sign has turned, or when the gain overflows. It is back when the error has been within for ``lock_time_s``.
     In lock, a gain that falls below ``rearm_gain`` starts again from k0 before its sign turns.
     """
-    finite = math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and math.isfinite(s.k) and math.isfinite(s.a[1])
     beyond = not abs(s.innovation_v) <= p.lock_error_v
     if beyond == (s.lock == 1):
         # a single sample after a long gap must not decide: at most a fifth of the time counts per sample
         s.unlocked_s += min(dt_s, 0.2 * p.lock_time_s)
     else:
         s.unlocked_s = 0.0
-    if not finite or (s.lock == 1 and s.unlocked_s >= p.lock_time_s):
+    turned = beyond and s.gain <= 0.0
+    overflow = not (math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and abs(s.gain) < p.gain_limit)
+    expired = s.unlocked_s >= p.lock_time_s
+    if turned or overflow or (expired and s.lock == 1):
         s.lock = 0
         s.lock_losses += 1
         recover(s, p, voltage_v, e_o)
-    elif s.lock == 0 and s.unlocked_s >= p.lock_time_s:
+    elif expired:
         s.lock = 1
         s.unlocked_s = 0.0
-    elif s.lock == 1 and s.gain < p.rearm_gain and not beyond:
+    elif s.gain < p.rearm_gain and not beyond:
         s.k = p.k0
         s.gain = nussbaum_gain(s.k, p)
         s.gain_rearms += 1
@@ -160,9 +164,7 @@ def recover(s: Record, p: Record, voltage_v: float, e_o: float) -> None:
     s.v_ts = 0.5 * (e_o - voltage_v)
     s.v_tl = s.v_ts
     for i in range(1, 16):
-        if p.rate[i] > 0.0:
-            s.a[i] = s.target[i]
-        elif not math.isfinite(s.a[i]):
-            s.a[i] = p.a_initial[i]
+        s.a[i] = s.target[i]
+    s.voltage_estimate_v = voltage_v
     s.unlocked_s = 0.0
     update_margins(s)

@@ -1,0 +1,112 @@
+"""One object, two ways in, the same bits out; and what it does with bad samples."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.lemma import failed, lemma_conditions
+from bms_estimator.kernels.estimate import Verdict
+from bms_estimator.model.cell import load_cell, shipped_cells
+from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
+
+
+def noisy_load(n: int = 5000) -> SampleBlock:
+    rng = np.random.default_rng(7)
+    samples = np.zeros(n, dtype=SAMPLE)
+    samples["time_s"] = np.cumsum(rng.choice([0.01, 0.02, 1.0, 7.0], n))
+    samples["current_a"] = rng.normal(0.5, 1.0, n)
+    samples["voltage_v"] = 3.8 + rng.normal(0.0, 0.05, n)
+    samples["voltage_v"][rng.integers(0, n, 20)] = np.nan
+    samples["voltage_v"][rng.integers(0, n, 20)] = 0.0
+    samples["temperature_c"] = np.nan
+    return samples
+
+
+def test_step_and_run_are_bit_identical_whatever_the_blocks() -> None:
+    samples = noisy_load()
+    whole, stepped, pieces = (Estimator(load_cell("ncr18650"), initial_soc=0.8) for _ in range(3))
+    whole.run(samples)
+    for x in samples:
+        stepped.step(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), int(x["status"]))
+    for part in np.array_split(samples, 37):
+        pieces.run(part)
+    assert whole.state.tobytes() == stepped.state.tobytes() == pieces.state.tobytes()
+
+
+def test_saved_state_goes_on_where_it_was() -> None:
+    samples = noisy_load()
+    straight = Estimator(load_cell("ncr18650"), initial_soc=0.8)
+    straight.run(samples)
+    first = Estimator(load_cell("ncr18650"), initial_soc=0.8)
+    first.run(samples[:2000])
+    second = Estimator(load_cell("ncr18650"))
+    second.state[:] = first.state
+    second.run(samples[2000:])
+    assert straight.state.tobytes() == second.state.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("time_s", "current_a", "voltage_v", "status", "verdict", "counter"),
+    [
+        (2.0, 0.1, float("nan"), 0, Verdict.NOT_FINITE, "dropped_not_finite"),
+        (2.0, float("inf"), 3.7, 0, Verdict.NOT_FINITE, "dropped_not_finite"),
+        (float("nan"), 0.1, 3.7, 0, Verdict.NOT_FINITE, "dropped_not_finite"),
+        (2.0, 0.1, 0.0, 0, Verdict.OUT_OF_RANGE, "dropped_range"),
+        (2.0, 400.0, 3.7, 0, Verdict.OUT_OF_RANGE, "dropped_range"),
+        (1.0, 0.1, 3.7, 0, Verdict.REPEATED, "dropped_repeated"),
+        (2.0, 0.1, 3.7, SampleStatus.VOLTAGE_SATURATED, Verdict.SATURATED, "dropped_saturated"),
+    ],
+)
+def test_a_bad_sample_is_dropped_counted_and_changes_nothing_else(
+    time_s: float, current_a: float, voltage_v: float, status: int, verdict: Verdict, counter: str
+) -> None:
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    estimator.step(0.0, 0.1, 3.7)
+    estimator.step(1.0, 0.1, 3.7)
+    before = estimator.state.copy()
+    assert estimator.step(time_s, current_a, voltage_v, int(status)) is verdict
+    before[counter] += 1
+    assert before.tobytes() == estimator.state.tobytes()
+
+
+def test_a_clock_set_back_is_counted_and_costs_one_step_only() -> None:
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    for time_s in (0.0, 1.0, 2.0, -500.0, -499.0):
+        assert estimator.step(time_s, 3.0, 3.7) is Verdict.ACCEPTED
+    assert estimator.state["time_steps_back"][0] == 1
+    assert estimator.state["soc"][0] == pytest.approx(0.5 - 3.0 * 3.0 / (3.0 * 3600))
+
+
+def test_charge_flows_on_over_a_gap() -> None:
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    estimator.step(0.0, 1.0, 3.7)
+    estimator.step(10.0, 1.0, 3.7)
+    assert estimator.state["gaps"][0] == 1
+    assert estimator.state["soc"][0] == pytest.approx(0.5 - 10.0 / (3.0 * 3600))
+
+
+def test_soc_starts_from_the_open_circuit_voltage_when_not_given() -> None:
+    cell = load_cell("chen_mora")
+    estimator = Estimator(cell)
+    estimator.step(0.0, 0.0, 3.85)
+    soc = float(estimator.state["soc"][0])
+    a = cell.a
+    assert -a[16] * np.exp(-a[17] * soc) + a[18] + a[19] * soc - a[20] * soc**2 + a[21] * soc**3 == pytest.approx(3.85)
+
+
+@pytest.mark.parametrize("name", shipped_cells())
+def test_shipped_cells_load_and_step(name: str) -> None:
+    cell = load_cell(name)
+    assert Estimator(cell).step(0.0, 0.0, cell.cell.nominal_voltage_v) is Verdict.ACCEPTED
+
+
+def test_printed_settings_of_table_5_fail_condition_1_of_the_lemma() -> None:
+    """E6: P9.l9 = 89000 is not below P7.l7 = 87500."""
+    cell = load_cell("chen_mora")
+    assert [(c.name, c.left, c.right) for c in failed(cell)] == [("1: P9.l9 < P7.l7", 89000.0, 87500.0)]
+    assert sum(c.holds for c in lemma_conditions(cell)) == 5
+
+
+def test_default_bounds_meet_the_lemma() -> None:
+    cell = load_cell("chen_mora").model_copy(update={"adaptation": {}})
+    assert failed(cell) == []
