@@ -166,16 +166,16 @@ class CellModel(Strict):
         return np.array([np.nan, *self.r_ts.a, *self.r_tl.a, *self.c_ts.a, *self.c_tl.a, *self.r_s.a, *ocv])
 
     def bounds(self, index: int) -> Bounds:
-        """Bounds of a_index: the configured ones, or half to one and a half times the model's value."""
+        """Bounds of a_index: the configured ones, or a quarter to four times the model's value, with that as limit."""
         configured = self.adaptation.get(f"a{index}")
         if configured is not None:
             return configured
         value = float(self.a[index])
-        weight = 50.0
+        rate = 100.0
         if index in (9, 12) and self.a[index - 2] > value:
             # Lemma 4.1.1: a9 (a12) must settle faster than a7 (a10), but not by more than their ratio allows
-            weight *= float(np.sqrt(self.a[index - 2] / value))
-        return Bounds(upper=1.5 * value, lower=0.5 * value, weight_upper=weight, weight_lower=weight)
+            rate *= float(np.sqrt(self.a[index - 2] / value))
+        return Bounds(upper=4.0 * value, lower=0.25 * value, weight_upper=0.2 * rate, weight_lower=0.8 * rate)
 
     def pack(self, series: int, parallel: int) -> "CellModel":
         """The model of ``series`` x ``parallel`` of these: voltages, resistances, capacitances and capacity scaled."""

@@ -1,0 +1,190 @@
+"""What the identifier has learned of each element over SOC, and the thesis's functions fitted to it.
+
+The identifier knows the elements where the cell is now. A map keeps, for each SOC bin, the information-weighted mean
+of what it knew there. (2.5)-(2.9) are fitted to the map: one nonlinear exponent, searched; amplitude and offset, linear.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from bms_estimator.kernels.cell import Floats
+from bms_estimator.kernels.state import PARAMETERS, Record
+
+BINS = 25
+"""Bins of equal width over SOC 0..1."""
+ELEMENTS = 5
+"""In the order of their parameters: R_ts (a1..a3), R_tl (a4..a6), C_ts (a7..a9), C_tl (a10..a12), R_s (a13..a15)."""
+LEARNED_VARIANCE = 0.3**2
+"""A logarithm known worse than this (30 %) adds nothing to the map."""
+MODEL_ERROR = 0.02
+"""An element is no closer to (2.5)-(2.9) than this, relative."""
+PRIOR_ERROR = 0.7
+"""How far the configured function may be off in a bin that was never visited, relative."""
+EXPONENT_MIN, EXPONENT_MAX = 0.5, 300.0
+SEARCH_POINTS = 24
+REFINEMENTS = 12
+
+ELEMENT_MAP = np.dtype(
+    [
+        ("weight", "f8", (ELEMENTS, BINS)),  # sum of dt / variance [s]
+        ("moment", "f8", (ELEMENTS, BINS)),  # sum of dt ln(value) / variance
+        ("soc_moment", "f8", (ELEMENTS, BINS)),  # sum of dt soc / variance
+        ("dwell_s", "f8", (ELEMENTS, BINS)),  # sum of dt
+    ],
+    align=True,
+)
+
+ELEMENT_FIT = np.dtype(
+    [
+        ("a", "f8", PARAMETERS),  # a1..a15 at their own index
+        ("std", "f8", PARAMETERS),  # standard errors, NaN where nothing was learned
+        ("bins", "i8", ELEMENTS),  # bins that the element was seen in
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def learn(m: Record, element: int, soc: float, ln_value: float, variance: float, dt_s: float) -> None:
+    """Add what is known of one element at ``soc`` to its bin: ln of its value and the variance of that."""
+    if not 0.0 < variance < LEARNED_VARIANCE:
+        return
+    b = min(max(int(soc * BINS), 0), BINS - 1)
+    m.weight[element, b] += dt_s / variance
+    m.moment[element, b] += ln_value * dt_s / variance
+    m.soc_moment[element, b] += soc * dt_s / variance
+    m.dwell_s[element, b] += dt_s
+
+
+@njit(cache=True)
+def age(m: Record, factor: float) -> None:
+    """Let the map forget: what it knows counts ``factor`` times as much from now on."""
+    for e in range(ELEMENTS):
+        for b in range(BINS):
+            m.weight[e, b] *= factor
+            m.moment[e, b] *= factor
+            m.soc_moment[e, b] *= factor
+            m.dwell_s[e, b] *= factor
+
+
+@njit(cache=True)
+def fit_map(m: Record, prior: Floats, fit: Record) -> None:
+    """Fit (2.5)-(2.9) to the map.
+
+    Args:
+        m: Record of ELEMENT_MAP.
+        prior: Configured a1..a15 at index 1..15: stands in, weakly, where the map is empty.
+        fit: Record of ELEMENT_FIT, written.
+    """
+    x = np.empty(BINS)
+    y = np.empty(BINS)
+    w = np.empty(BINS)
+    for e in range(ELEMENTS):
+        base = 3 * e + 1
+        sign = -1.0 if e in (2, 3) else 1.0  # capacitances rise with SOC: (2.7), (2.8)
+        fit.bins[e] = _observations(m, e, prior, base, sign, x, y, w)
+        exponent = _best_exponent(prior[base + 1], sign, x, y, w)
+        amplitude, offset, _ = _linear_part(exponent, sign, x, y, w)
+        fit.a[base], fit.a[base + 1], fit.a[base + 2] = amplitude, exponent, offset
+        _standard_errors(fit, base, sign, x, w)
+        if fit.bins[e] == 0:
+            for i in range(base, base + 3):
+                fit.a[i] = prior[i]
+                fit.std[i] = math.nan
+
+
+@njit(cache=True)
+def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: Floats, y: Floats, w: Floats) -> int:
+    """SOC, value and weight of the element in each bin; returns how many bins were visited."""
+    visited = 0
+    for b in range(BINS):
+        x[b] = (b + 0.5) / BINS
+        if m.weight[e, b] > 0.0:
+            x[b] = m.soc_moment[e, b] / m.weight[e, b]
+        configured = max(
+            prior[base + 2] + sign * prior[base] * math.exp(-prior[base + 1] * x[b]), 0.05 * prior[base + 2]
+        )
+        y[b] = configured
+        w[b] = 1.0 / (PRIOR_ERROR * configured) ** 2
+        if m.weight[e, b] > 0.0:
+            visited += 1
+            y[b] = math.exp(m.moment[e, b] / m.weight[e, b])
+            # samples of one pass are no independent witnesses: the mean variance stands, not the variance of the mean
+            variance = m.dwell_s[e, b] / m.weight[e, b] + MODEL_ERROR**2
+            w[b] = 1.0 / (variance * y[b] * y[b])
+    return visited
+
+
+@njit(cache=True)
+def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -> float:
+    """The exponent of least cost: a logarithmic search, then golden sections around its best point."""
+    ratio = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
+    best, least = math.log(start), _linear_part(start, sign, x, y, w)[2]
+    for j in range(SEARCH_POINTS):
+        candidate = math.log(EXPONENT_MIN) + ratio * j
+        cost = _linear_part(math.exp(candidate), sign, x, y, w)[2]
+        if cost < least:
+            best, least = candidate, cost
+    low, high = best - ratio, best + ratio
+    golden = 0.5 * (math.sqrt(5.0) - 1.0)
+    left, right = high - golden * (high - low), low + golden * (high - low)
+    cost_left = _linear_part(math.exp(left), sign, x, y, w)[2]
+    cost_right = _linear_part(math.exp(right), sign, x, y, w)[2]
+    for _ in range(REFINEMENTS):
+        if cost_left < cost_right:
+            high, right, cost_right = right, left, cost_left
+            left = high - golden * (high - low)
+            cost_left = _linear_part(math.exp(left), sign, x, y, w)[2]
+        else:
+            low, left, cost_left = left, right, cost_right
+            right = low + golden * (high - low)
+            cost_right = _linear_part(math.exp(right), sign, x, y, w)[2]
+    return math.exp(0.5 * (low + high))
+
+
+@njit(cache=True)
+def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) -> tuple[float, float, float]:
+    """Amplitude and offset, both positive, of least weighted squares for this exponent; and the cost."""
+    sw = sg = sgg = sy = sgy = 0.0
+    for b in range(BINS):
+        g = sign * math.exp(-exponent * x[b])
+        sw += w[b]
+        sg += w[b] * g
+        sgg += w[b] * g * g
+        sy += w[b] * y[b]
+        sgy += w[b] * g * y[b]
+    det = sw * sgg - sg * sg
+    offset = sy / sw
+    amplitude = 1e-3 * offset
+    if det > 1e-12 * sw * sgg:
+        free = (sw * sgy - sg * sy) / det
+        amplitude = max(amplitude, free)
+    offset = max((sy - sg * amplitude) / sw, 1e-3 * offset)
+    cost = 0.0
+    for b in range(BINS):
+        r = offset + amplitude * sign * math.exp(-exponent * x[b]) - y[b]
+        cost += w[b] * r * r
+    return amplitude, offset, cost
+
+
+@njit(cache=True)
+def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats) -> None:
+    """Square roots of the diagonal of (J' W J)^-1."""
+    amplitude, exponent = fit.a[base], fit.a[base + 1]
+    h = np.zeros((3, 3))
+    j = np.empty(3)
+    for b in range(BINS):
+        j[0] = sign * math.exp(-exponent * x[b])
+        j[1] = -x[b] * amplitude * j[0]
+        j[2] = 1.0
+        for p in range(3):
+            for q in range(3):
+                h[p, q] += w[b] * j[p] * j[q]
+    for p in range(3):  # a parameter that the map says nothing of is known to a factor e^3, not less
+        value = fit.a[base + p]
+        h[p, p] += 1.0 / (3.0 * value) ** 2
+    inverse = np.linalg.inv(h)
+    for p in range(3):
+        fit.std[base + p] = math.sqrt(max(inverse[p, p], 0.0))
