@@ -1,17 +1,40 @@
 """The live loop: source -> estimator -> window -> sinks."""
 
 import asyncio
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
+from bms_estimator.service.checkpoint import CheckpointFile, resume
+from bms_estimator.service.clock import Clock
+from bms_estimator.service.notify import Notifier
+from bms_estimator.service.publisher import Publisher
+from bms_estimator.service.requests import Requests, number
 from bms_estimator.service.source import Source
 from bms_estimator.sinks import Sink
 
+log = structlog.get_logger(__name__)
+
 
 async def run_live(
-    settings: Settings, cell: CellModel, *, source: Source, sinks: Sequence[Sink], stop: asyncio.Event
+    settings: Settings,
+    cell: CellModel,
+    *,
+    source: Source,
+    sinks: Sequence[Sink],
+    stop: asyncio.Event,
+    checkpoint: CheckpointFile | None = None,
+    requests: Requests | None = None,
+    notifier: Notifier | None = None,
+    clock: Clock | None = None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
 
@@ -21,8 +44,137 @@ async def run_live(
         source: Where samples come from; opened and closed here.
         sinks: Where snapshots go; opened and closed here.
         stop: Set to end cleanly.
+        checkpoint: Where the state outlives a restart; None: it does not.
+        requests: Where this loop offers what it can answer.
+        notifier: Who hears that the loop is ready and alive.
+        clock: The clocks.
 
     Returns:
         The estimator as the last sample left it.
     """
-    raise NotImplementedError
+    notifier, clock = notifier or Notifier(), clock or Clock()
+    estimator = new_estimator(settings, cell)
+    restarts, restored = _restore(estimator, checkpoint, cell)
+    publisher = Publisher(
+        settings,
+        cell,
+        estimator,
+        source=source,
+        sinks=sinks,
+        clock=clock,
+        restarts=restarts,
+        checkpoint=restored,
+    )
+    _offer(requests or Requests(), estimator, publisher)
+    async with contextlib.AsyncExitStack() as stack:
+        for sink in sinks:
+            await stack.enter_async_context(sink)
+        await stack.enter_async_context(source)
+        notifier.send("READY=1", f"STATUS=estimating {settings.pack.name}")
+        tasks = [_estimate(source, estimator, publisher), _keep_alive(publisher, notifier)]
+        if checkpoint:
+            tasks.append(_save_often(checkpoint, estimator, publisher, settings.state.checkpoint_s, restarts))
+        await _until_first_ends([*tasks, stop.wait()])
+        notifier.send("STOPPING=1")
+        publisher.publish()
+    if checkpoint:
+        await _save(checkpoint, estimator, publisher, restarts)
+    return estimator
+
+
+def new_estimator(settings: Settings, cell: CellModel) -> Estimator:
+    """The estimator of a pack, its kernels loaded: nothing compiles once samples come."""
+
+    def make() -> Estimator:
+        return Estimator(
+            cell,
+            settings.observer,
+            voltage_resolution_v=settings.sensor.voltage_resolution_v,
+            initial_soc=settings.pack.initial_soc,
+        )
+
+    make().run(np.zeros(1, dtype=SAMPLE))
+    return make()
+
+
+async def _estimate(source: Source, estimator: Estimator, publisher: Publisher) -> None:
+    async for block in source:
+        publisher.add(estimator.run(block))
+        await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
+
+
+async def _keep_alive(publisher: Publisher, notifier: Notifier) -> None:
+    """Publish that nothing comes, and pat the watchdog."""
+    longest_s = notifier.watchdog_s / 3.0 or publisher.period_s
+    while True:
+        notifier.send("WATCHDOG=1")
+        await asyncio.sleep(min(max(publisher.wait_s, 0.01), longest_s))
+        if publisher.wait_s == 0.0:
+            publisher.publish()
+
+
+async def _until_first_ends(coroutines: Sequence[Any]) -> None:
+    """Run all until one ends, end the others, raise what one raised."""
+    tasks = [asyncio.ensure_future(coroutine) for coroutine in coroutines]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+    for result in results:
+        if isinstance(result, Exception):
+            raise result
+
+
+def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, cell: CellModel) -> tuple[int, str]:
+    """Go on from the checkpoint where there is a good one. Returns how many starts found one, and what was done."""
+    if checkpoint is None:
+        return 0, "off"
+    found = checkpoint.load(cell)
+    if found.state is not None:
+        resume(estimator, found.state)
+    log.info("checkpoint", file=str(checkpoint.path), outcome=found.reason)
+    return found.restarts, found.reason
+
+
+async def _save_often(
+    checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, every_s: float, restarts: int
+) -> None:
+    while True:
+        await asyncio.sleep(every_s)
+        await _save(checkpoint, estimator, publisher, restarts)
+
+
+async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, restarts: int) -> None:
+    """Save what samples have taught; writing waits for the disk in a thread."""
+    state = estimator.state.copy()
+    if not (state["started"][0] and state["samples"][0]):
+        return
+    try:
+        await asyncio.to_thread(checkpoint.save, state, restarts)
+        publisher.checkpoint = "saved"
+    except OSError as error:
+        publisher.checkpoint = f"cannot be saved: {error}"
+        log.warning("checkpoint cannot be saved", file=str(checkpoint.path), error=str(error))
+
+
+def _offer(requests: Requests, estimator: Estimator, publisher: Publisher) -> None:
+    """Offer the requests that need the loop."""
+
+    def state(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        return {"estimate": publisher.latest.model_dump() if publisher.latest else None}
+
+    def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        soc = number(arguments, "soc", 0.0, 1.0)
+        if not estimator.state["started"][0]:
+            raise UserError("no sample has been taken yet")
+        before = float(estimator.state["soc"][0])
+        estimator.state["soc"] = soc
+        log.info("SOC set on request", before=before, soc=soc)
+        return {"soc": soc, "before": before}
+
+    requests.offer("state", state)
+    requests.offer("parameters", lambda _: publisher.snapshot.parameters.model_dump())
+    requests.offer("health", lambda _: publisher.snapshot.health.model_dump())
+    requests.offer("set_soc", set_soc)

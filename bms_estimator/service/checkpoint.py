@@ -1,0 +1,145 @@
+"""Checkpoints: the estimator's state on disk, taken up again only when it belongs to the same pack and is sane."""
+
+import hashlib
+import io
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.state import OBSERVER_STATE
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.settings import Settings
+
+FORMAT = 1
+"""Raise it to make all older checkpoints invalid."""
+LONGEST_FILE = 1 << 20
+"""A checkpoint has some kilobytes; a longer file is none [bytes]."""
+
+_DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
+COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
+"""Fields of the state that count since start."""
+
+
+def pack_identity(settings: Settings, cell: CellModel) -> str:
+    """Hash of all that gives the state its meaning: the pack, its cell, its sensor, the observer, the record's layout."""
+    digest = hashlib.sha256()
+    sensor = settings.sensor.model_dump_json(include={"current_sign", "voltage_resolution_v", "current_resolution_a"})
+    parts = (cell.model_dump_json(), settings.pack.model_dump_json(), sensor, settings.observer.model_dump_json())
+    for part in (*parts, str(OBSERVER_STATE.descr)):
+        digest.update(part.encode() + b"\0")
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What a checkpoint file held."""
+
+    state: NDArray[np.void] | None
+    """Shape (1,), dtype OBSERVER_STATE; None when it was refused."""
+    restarts: int
+    """Starts that found a checkpoint, this one included."""
+    reason: str
+    """What was taken up, or why not."""
+
+
+class CheckpointFile:
+    """One pack's checkpoint.
+
+    Args:
+        path: The file; its folder must exist.
+        identity: ``pack_identity``.
+    """
+
+    def __init__(self, path: Path, identity: str) -> None:
+        self.path = path
+        self._identity = identity
+
+    def save(self, state: NDArray[np.void], restarts: int) -> None:
+        """Write atomically: after a power cut there is the old file or the new one.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        content = io.BytesIO()
+        np.savez(content, format=FORMAT, identity=self._identity, restarts=restarts, state=state)
+        new = self.path.with_suffix(".new")
+        with new.open("wb") as file:
+            file.write(content.getvalue())
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(self.path)
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+    def load(self, cell: CellModel) -> Restored:
+        """Read and check; what is wrong is a reason, not an exception."""
+        try:
+            if self.path.stat().st_size > LONGEST_FILE:
+                raise _RefusedError("file too long")
+            with np.load(io.BytesIO(self.path.read_bytes()), allow_pickle=False) as file:
+                return self._checked(file, cell)
+        except FileNotFoundError:
+            return Restored(None, 0, "none found")
+        except _RefusedError as error:
+            return Restored(None, 0, f"refused: {error}")
+        except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
+            return Restored(None, 0, f"refused: unreadable ({type(error).__name__}: {error})")
+
+    def _checked(self, file: Mapping[str, np.ndarray], cell: CellModel) -> Restored:
+        if int(file["format"]) != FORMAT:
+            raise _RefusedError(f"format {int(file['format'])}, this version reads {FORMAT}")
+        if str(file["identity"]) != self._identity:
+            raise _RefusedError("it belongs to another pack, cell or setting")
+        state, restarts = file["state"], int(file["restarts"]) + 1
+        insane = _insane(state, cell)
+        if insane:
+            return Restored(None, restarts, f"refused: {insane}")
+        return Restored(state, restarts, f"restored: SOC {float(state['soc'][0]):.4f}")
+
+
+class _RefusedError(Exception):
+    """Why a checkpoint is not taken up."""
+
+
+def _insane(state: NDArray[np.void], cell: CellModel) -> str:
+    """Why a state cannot be used; empty when it can."""
+    if state.dtype != OBSERVER_STATE or state.shape != (1,):
+        return f"state has dtype of {state.dtype.itemsize} bytes and shape {state.shape}"
+    for name in OBSERVER_STATE.names or ():
+        if not np.isfinite(state[name]).all():
+            return f"{name} is not finite"
+    s = state[0]
+    if not s["started"]:
+        return "no sample was taken"
+    ranges = {
+        "soc": (0.0, 1.0),
+        "v_ts": (-cell.cell.voltage_max_v, cell.cell.voltage_max_v),
+        "v_tl": (-cell.cell.voltage_max_v, cell.cell.voltage_max_v),
+        "k": (0.0, np.inf),
+    }
+    for name, (low, high) in ranges.items():
+        if not low <= s[name] <= high:
+            return f"{name} = {s[name]} is outside {low}..{high}"
+    if not (s["a"][1:16] > 0.0).all():
+        return "a parameter a1..a15 is not positive"
+    return ""
+
+
+def resume(estimator: Estimator, state: NDArray[np.void]) -> None:
+    """Go on from a checkpoint's state.
+
+    The board's clock has started anew and nobody knows what flowed meanwhile: time begins with the next sample,
+    which the estimator takes as a clock set back. The counters count from this start.
+    """
+    estimator.state[...] = state
+    estimator.state["time_s"] = np.inf
+    for name in COUNTERS:
+        estimator.state[name] = 0

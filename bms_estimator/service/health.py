@@ -1,0 +1,65 @@
+"""How the service and the line are: topic ``health``."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from bms_estimator.model.estimate import Health
+from bms_estimator.service.clock import iso_utc
+
+_PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
+_SAMPLE_COUNTERS = ("samples", "gaps", "time_steps_back")
+
+
+def resident_mib() -> float | None:
+    """Resident memory of this process [MiB]; None where the system does not say."""
+    try:
+        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * _PAGE_MIB
+    except OSError:
+        return None
+
+
+def sample_counters(state: np.void) -> dict[str, int]:
+    """Samples accepted and dropped by kind, of a record of OBSERVER_STATE."""
+    names = [name for name in state.dtype.names or () if name.startswith("dropped_") or name in _SAMPLE_COUNTERS]
+    return {name: int(state[name]) for name in names}
+
+
+def health_report(
+    state: np.void,
+    line: Mapping[str, int],
+    *,
+    now_s: float,
+    uptime_s: float,
+    restarts: int,
+    checkpoint: str,
+    sensor_message: str | None,
+) -> Health:
+    """Topic ``health``.
+
+    Args:
+        state: Record of OBSERVER_STATE.
+        line: The source's counters.
+        now_s: Wall clock [s since 1970].
+        uptime_s: Since the service started [s].
+        restarts: Starts that found a checkpoint.
+        checkpoint: What became of the last checkpoint.
+        sensor_message: Why values are not fresh; None when they are.
+    """
+    return Health(
+        publish_time=iso_utc(now_s),
+        uptime_s=uptime_s,
+        rss_mib=resident_mib(),
+        restarts=restarts,
+        reconnects=line.get("reconnects", 0),
+        sensor_online=sensor_message is None,
+        sensor_message=sensor_message,
+        line={name: int(count) for name, count in line.items() if name != "reconnects"},
+        samples=sample_counters(state),
+        lock_losses=int(state["lock_losses"]),
+        gain_rearms=int(state["gain_rearms"]),
+        publish_drops=0,
+        checkpoint=checkpoint,
+    )

@@ -1,0 +1,137 @@
+"""Snapshots at the publish rate: from window, estimator and source to all sinks."""
+
+import math
+from collections.abc import Sequence
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.estimate import Estimate, Health, Info, Snapshot
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.clock import Clock
+from bms_estimator.service.health import health_report, sample_counters
+from bms_estimator.service.report import estimate_report, info_report, parameter_report, publish_rate_hz
+from bms_estimator.service.source import Source
+from bms_estimator.service.window import Window
+from bms_estimator.sinks import Sink
+
+SLOW_S = 1.0
+"""Parameters and info move slowly: they are made no more often than this [s]."""
+HEALTH_S = 5.0
+"""Health is retained and must not wear out the broker's disk [s]."""
+FRESH_PERIODS = 3
+"""Values are stale when no sample was accepted for so many publish periods."""
+
+
+class Publisher:
+    """Makes a snapshot when one is due and gives it to the sinks.
+
+    Args:
+        settings: The pack's settings.
+        cell: The pack as one object.
+        estimator: Read only.
+        source: Its counters, message and board are read.
+        sinks: Where snapshots go.
+        clock: The clocks.
+        restarts: Starts that found a checkpoint.
+        checkpoint: What became of the checkpoint at start.
+
+    Attributes:
+        checkpoint: What became of the last checkpoint.
+        latest: The last estimate that there was.
+        snapshot: The last snapshot.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        cell: CellModel,
+        estimator: Estimator,
+        *,
+        source: Source,
+        sinks: Sequence[Sink],
+        clock: Clock,
+        restarts: int = 0,
+        checkpoint: str = "off",
+    ) -> None:
+        self._settings, self._cell, self._estimator = settings, cell, estimator
+        self._source, self._sinks, self._clock = source, sinks, clock
+        self._restarts = restarts
+        self.checkpoint = checkpoint
+        self.period_s = 1.0 / publish_rate_hz(settings)
+        self._window = Window()
+        self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
+        self._due_s = self._started_s
+        self._sample_s = -math.inf  # monotonic, of the last accepted sample
+        self.latest: Estimate | None = None
+        self.snapshot = self._first_snapshot()
+
+    @property
+    def wait_s(self) -> float:
+        """Until a snapshot is overdue, which tells that no samples come [s]."""
+        return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
+
+    def add(self, trace: TraceBlock) -> None:
+        """Take what the estimator made of a block; publish when it is time."""
+        now_s = self._clock.monotonic()
+        if trace.size:
+            self._window.add(trace, self._clock.wall())
+            self._sample_s = now_s
+        if now_s >= self._due_s:
+            self.publish()
+
+    def publish(self) -> None:
+        """Publish now."""
+        now_s = self._clock.monotonic()
+        self._due_s += self.period_s
+        if self._due_s <= now_s:  # behind: do not catch up
+            self._due_s = now_s + self.period_s
+        self.snapshot = self._next_snapshot(now_s)
+        self.latest = self.snapshot.estimate or self.latest
+        for sink in self._sinks:
+            sink.publish(self.snapshot)
+
+    def _first_snapshot(self) -> Snapshot:
+        now_s = self._slow_s = self._health_s = self._started_s
+        parameters = parameter_report(self._estimator, self._started_wall_s)
+        return Snapshot(None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info())
+
+    def _next_snapshot(self, now_s: float) -> Snapshot:
+        """The estimate of this window; of the rest, what is old enough to be made anew."""
+        _, parameters, health, info = self.snapshot
+        summary, wall_s = self._window.take(), self._clock.wall()
+        estimate = estimate_report(summary, self._source.counters, wall_s) if summary else None
+        if now_s - self._slow_s >= SLOW_S:
+            self._slow_s = now_s
+            parameters, info = parameter_report(self._estimator, wall_s), self._info()
+        message = self._sensor_message(now_s)
+        if now_s - self._health_s >= HEALTH_S or health.sensor_online != (message is None):
+            self._health_s = now_s
+            health = self._health(now_s, message)
+        return Snapshot(estimate, parameters, health, info)
+
+    def _health(self, now_s: float, message: str | None) -> Health:
+        return health_report(
+            self._estimator.state[0],
+            self._source.counters,
+            now_s=self._clock.wall(),
+            uptime_s=now_s - self._started_s,
+            restarts=self._restarts,
+            checkpoint=self.checkpoint,
+            sensor_message=message,
+        )
+
+    def _info(self) -> Info:
+        return info_report(self._settings, self._cell, self._source.board, self._started_wall_s)
+
+    def _sensor_message(self, now_s: float) -> str | None:
+        """Why values are not fresh, None when they are."""
+        silent_s = now_s - self._sample_s
+        if silent_s <= FRESH_PERIODS * self.period_s:
+            return None
+        if self._source.message:
+            return self._source.message
+        if math.isinf(silent_s):
+            silent_s = now_s - self._started_s
+        dropped = {k: n for k, n in sample_counters(self._estimator.state[0]).items() if k.startswith("dropped_") and n}
+        return f"no usable sample for {silent_s:.1f} s; dropped so far: {dropped or 'none'}"

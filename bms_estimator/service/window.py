@@ -1,0 +1,91 @@
+"""The publish window: sums over the samples since the last publication."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bms_estimator.estimator.estimator import TraceBlock
+
+
+@dataclass(frozen=True)
+class WindowSummary:
+    """Means over one window and its last row.
+
+    Attributes:
+        arrival_s: Wall clock at the arrival of the last block [s since 1970].
+        samples: How many.
+        voltage_v: Mean [V].
+        current_a: Mean [A], positive on discharge.
+        power_w: Mean of voltage times current [W].
+        temperature_c: Mean [C], NaN without a sensor.
+        sample_rate_hz: On the stream's clock [Hz], NaN when it cannot be told.
+        last: Row of dtype TRACE.
+    """
+
+    arrival_s: float
+    samples: int
+    voltage_v: float
+    current_a: float
+    power_w: float
+    temperature_c: float
+    sample_rate_hz: float
+    last: np.void
+
+
+class Window:
+    """Gathers trace blocks until they are taken."""
+
+    def __init__(self) -> None:
+        self._before_s = math.nan  # stream clock at the end of the window before
+        self._clear()
+
+    def _clear(self) -> None:
+        self._samples = self._temperatures = 0
+        self._voltage = self._current = self._power = self._temperature = 0.0
+        self._first_s = math.nan
+        self._last: np.void | None = None
+        self._arrival_s = math.nan
+
+    def add(self, trace: TraceBlock, arrival_s: float) -> None:
+        """Take what the estimator made of one block.
+
+        Args:
+            trace: Shape (n,), dtype TRACE; n may be 0.
+            arrival_s: Wall clock [s since 1970].
+        """
+        if trace.size == 0:
+            return
+        if self._samples == 0:
+            self._first_s = float(trace["time_s"][0])
+        voltage, current, temperature = trace["voltage_v"], trace["current_a"], trace["temperature_c"]
+        self._samples += trace.size
+        self._voltage += float(voltage.sum())
+        self._current += float(current.sum())
+        self._power += float(voltage @ current)
+        known = temperature[np.isfinite(temperature)]
+        self._temperatures += known.size
+        self._temperature += float(known.sum())
+        self._last = trace[-1].copy()
+        self._arrival_s = arrival_s
+
+    def take(self) -> WindowSummary | None:
+        """Summary of all since the last call, None when nothing came."""
+        if self._last is None:
+            return None
+        n, last_s = self._samples, float(self._last["time_s"])
+        steps, begin_s = (n, self._before_s) if math.isfinite(self._before_s) else (n - 1, self._first_s)
+        span_s = last_s - begin_s
+        summary = WindowSummary(
+            arrival_s=self._arrival_s,
+            samples=n,
+            voltage_v=self._voltage / n,
+            current_a=self._current / n,
+            power_w=self._power / n,
+            temperature_c=self._temperature / self._temperatures if self._temperatures else math.nan,
+            sample_rate_hz=steps / span_s if span_s > 0.0 else math.nan,
+            last=self._last,
+        )
+        self._before_s = last_s
+        self._clear()
+        return summary
