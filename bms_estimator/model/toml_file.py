@@ -2,7 +2,7 @@
 
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -51,13 +51,18 @@ def _line(path: Path, model: type[BaseModel], detail: Any) -> str:
 
 
 def _description(model: type[BaseModel], keys: list[str]) -> str:
-    """What the key means, from the field's description; empty where the path leaves the models."""
-    described = ""
-    current: Any = model
+    """What the last key means, from its field's description; empty where it has none."""
+    described, current = "", [model]
     for key in keys:
-        field = getattr(current, "model_fields", {}).get(key)
-        if field is None:
-            return described if key == keys[-1] and not described else ""
-        described = field.description or ""
-        current = field.annotation
+        fields = [m.model_fields[key] for m in current if key in m.model_fields]
+        described = fields[0].description or "" if fields else ""
+        if fields:
+            current = _models(fields[0].annotation)
     return described
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """The models within an annotation: itself, or the members of a union."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models(part)]
