@@ -1,0 +1,288 @@
+"""Voltage relaxation test (5.2.1): from a capture of loads and rests to points of the open-circuit voltage.
+
+A cell discharged in steps with a rest after each shows its open-circuit voltage at the end of every rest, as far as it
+has relaxed by then. What is left is extrapolated with an exponential; how far that can be trusted is part of the point.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+
+Floats = NDArray[np.float64]
+
+GLITCH_FRACTION = 0.5
+"""A voltage off the median by more than this fraction is a fault of the instrument: no Li-ion cell swings so far."""
+REST_CURRENT_C = 0.01
+"""Below this C-rate a cell rests [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
+BLIP_CHARGE = 2e-5
+"""Charge, in capacities, below which a current within a rest is a glitch of the sensor, not a load."""
+SHORTEST_REST_S = 30.0
+"""A shorter rest shows the ohmic step and not the relaxation [s]."""
+LARGEST_STD_V = 0.02
+"""A rest whose extrapolation is less certain than this, per cell in series, gives no point [V]."""
+LATE_FROM = 0.5
+"""The extrapolation fits this latter part of a rest: the fast branch is over there."""
+SHORTEST_TAU, LONGEST_TAU, TAU_GRID = 0.05, 0.7, 40
+"""Time constants tried, in rests. A slower one cannot be told from a drift and extrapolates wildly."""
+FORM_ERROR = 0.6
+"""Part of the extrapolated voltage that is its standard deviation: relaxation is no pure exponential. Half-hour rests of
+a NCR18650 cut to a quarter of an hour miss their end by 2.7 mV RMS so extrapolated, and by 4.7 mV when not."""
+LEAST_POINTS = 6
+"""As many as (2.10) has parameters."""
+CHARGING_AH = 0.005
+"""Charge taken in, in capacities, from which a capture is no relaxation test by discharge."""
+SOC_SLACK = 0.03
+"""How far SOC may leave 0..1 before the capacity is called wrong: cells of one type differ by as much."""
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A rest of a relaxation test.
+
+    Attributes:
+        start_s: Time of its first sample on the capture's clock [s].
+        duration_s: How long it lasted [s].
+        soc: State of charge 0..1 by coulomb counting.
+        voltage_v: Voltage at its end [V].
+        ocv_v: Voltage after an infinite rest, by exponential extrapolation [V].
+        std_v: Standard deviation of ``ocv_v`` [V].
+        tau_s: Time constant of the exponential [s].
+    """
+
+    start_s: float
+    duration_s: float
+    soc: float
+    voltage_v: float
+    ocv_v: float
+    std_v: float
+    tau_s: float
+
+    @property
+    def remaining_v(self) -> float:
+        """What was left to relax at the end of the rest [V]."""
+        return self.ocv_v - self.voltage_v
+
+
+@dataclass(frozen=True)
+class RelaxationTest:
+    """What a capture says of the open-circuit voltage.
+
+    Attributes:
+        name: Where it came from.
+        rests: In the order of time, those good for a point only.
+        rejected: Why other rests gave no point, one line each.
+        glitches: Samples dropped as faults of the instrument.
+        start_soc: SOC at the first sample.
+        end_soc: SOC at the last sample.
+        mean_load_a: Mean current of the loads [A].
+    """
+
+    name: str
+    rests: tuple[Rest, ...]
+    rejected: tuple[str, ...]
+    glitches: int
+    start_soc: float
+    end_soc: float
+    mean_load_a: float
+
+    @property
+    def soc(self) -> Floats:
+        """SOC of the points, 0..1."""
+        return np.array([rest.soc for rest in self.rests])
+
+    @property
+    def ocv_v(self) -> Floats:
+        """Open-circuit voltage of the points [V]."""
+        return np.array([rest.ocv_v for rest in self.rests])
+
+    @property
+    def std_v(self) -> Floats:
+        """Standard deviation of the points [V]."""
+        return np.array([rest.std_v for rest in self.rests])
+
+
+def without_glitches(samples: SampleBlock) -> SampleBlock:
+    """Samples that can be true: finite, time going on, voltage within half of the median.
+
+    Raises:
+        UserError: Nothing is left.
+    """
+    finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
+    good = samples[finite]
+    if good.size == 0:
+        raise UserError(f"none of {samples.size} samples has finite time, current and voltage")
+    middle = float(np.median(good["voltage_v"]))
+    good = good[np.abs(good["voltage_v"] - middle) <= GLITCH_FRACTION * abs(middle)]
+    latest = np.maximum.accumulate(good["time_s"])
+    later = np.r_[True, good["time_s"][1:] > latest[:-1]]
+    return good[later]
+
+
+def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:
+    """SOC at every sample by coulomb counting, (2.1): 1 - Ah/Q from full.
+
+    A current holds until the next sample. Shape (n,), not limited to 0..1.
+    """
+    step_s = np.diff(samples["time_s"])
+    charge_ah = np.r_[0.0, np.cumsum(samples["current_a"][:-1] * step_s)] / 3600.0
+    return np.asarray(initial_soc - charge_ah / capacity_ah, dtype=np.float64)
+
+
+def relaxation_test(
+    samples: SampleBlock,
+    capacity_ah: float,
+    *,
+    initial_soc: float = 1.0,
+    series_count: int = 1,
+    name: str = "capture",
+) -> RelaxationTest:
+    """Points of the open-circuit voltage from a capture of loads and rests.
+
+    Args:
+        samples: Dtype ``SAMPLE``, raw: glitches are dropped here.
+        capacity_ah: Capacity that SOC is counted against [Ah].
+        initial_soc: SOC at the first sample, 0..1.
+        series_count: Cells in series, for limits that are given per cell.
+        name: What to call the capture in messages.
+
+    Raises:
+        UserError: No relaxation test: no rests, too short ones, charging inside, wrong sign or capacity.
+    """
+    good = without_glitches(samples)
+    soc = soc_by_counting(good, capacity_ah, initial_soc)
+    _check_charge(name, good, soc, capacity_ah)
+    resting = _resting(good, capacity_ah)
+    rests, rejected = [], []
+    for first, last in _runs(resting):
+        duration_s = float(good["time_s"][last - 1] - good["time_s"][first])
+        if duration_s < SHORTEST_REST_S:
+            rejected.append(
+                f"rest at {good['time_s'][first]:.0f} s: {duration_s:.0f} s long, shorter than {SHORTEST_REST_S:.0f} s"
+            )
+            continue
+        rest = _relaxed(good[first:last], float(soc[last - 1]))
+        if rest.std_v > LARGEST_STD_V * series_count:
+            rejected.append(
+                f"rest at {rest.start_s:.0f} s: {duration_s:.0f} s is too short, its end voltage {rest.voltage_v:.4f} V "
+                f"extrapolates to {rest.ocv_v:.4f} +- {rest.std_v:.4f} V"
+            )
+            continue
+        rests.append(rest)
+    _check_rests(name, good, rests, rejected, resting)
+    return RelaxationTest(
+        name=name,
+        rests=tuple(rests),
+        rejected=tuple(rejected),
+        glitches=samples.size - good.size,
+        start_soc=initial_soc,
+        end_soc=float(soc[-1]),
+        mean_load_a=float(good["current_a"][~resting].mean()),
+    )
+
+
+def _check_charge(name: str, good: SampleBlock, soc: Floats, capacity_ah: float) -> None:
+    """Sign of the current, charging inside, capacity."""
+    given = -np.minimum(np.diff(soc), 0.0).sum()
+    taken = np.maximum(np.diff(soc), 0.0).sum()
+    if taken > max(given, CHARGING_AH):
+        raise UserError(
+            f"{name}: current has the wrong sign or the capture charges: {given * capacity_ah:.3f} Ah out, "
+            f"{taken * capacity_ah:.3f} Ah in while the voltage went from {good['voltage_v'][0]:.3f} to "
+            f"{good['voltage_v'][-1]:.3f} V; discharge must be positive"
+        )
+    if taken > CHARGING_AH:
+        start_s = good["time_s"][int(np.argmax(np.diff(soc) > 0.0))]
+        raise UserError(
+            f"{name}: charges inside, {taken * capacity_ah:.3f} Ah from {start_s:.0f} s on: "
+            "a relaxation test by discharge has none; cut the capture there"
+        )
+    low, high = float(soc.min()), float(soc.max())
+    if low < -SOC_SLACK or high > 1.0 + SOC_SLACK:
+        raise UserError(
+            f"{name}: SOC runs from {soc[0]:.3f} to {low:.3f}, outside 0..1: {given * capacity_ah:.3f} Ah were drawn, "
+            f"more than a capacity of {capacity_ah:g} Ah holds; give the right capacity or initial SOC"
+        )
+
+
+def _resting(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
+    """Which samples belong to a rest; blips of the current sensor do not end one."""
+    resting = np.abs(good["current_a"]) < REST_CURRENT_C * capacity_ah
+    time_s = good["time_s"]
+    for first, last in _runs(~resting):
+        until_s = time_s[min(last, good.size - 1)]
+        charge_ah = abs(float(good["current_a"][first:last].mean())) * (until_s - time_s[first]) / 3600.0
+        if charge_ah < BLIP_CHARGE * capacity_ah:
+            resting[first:last] = True
+    return resting
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Stretches where ``mask`` holds, each as first and one past its last index."""
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _relaxed(rest: SampleBlock, soc: float) -> Rest:
+    """The rest's end, extrapolated to infinite time by an exponential through its latter half."""
+    time_s = rest["time_s"] - rest["time_s"][0]
+    duration_s = float(time_s[-1])
+    late = time_s >= LATE_FROM * duration_s
+    ocv_v, tau_s, spread_v = _extrapolate(time_s[late], rest["voltage_v"][late], duration_s)
+    voltage_v = float(rest["voltage_v"][time_s >= 0.98 * duration_s].mean())
+    return Rest(
+        start_s=float(rest["time_s"][0]),
+        duration_s=duration_s,
+        soc=soc,
+        voltage_v=voltage_v,
+        ocv_v=ocv_v,
+        std_v=float(np.hypot(spread_v, FORM_ERROR * (ocv_v - voltage_v))),
+        tau_s=tau_s,
+    )
+
+
+def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[float, float, float]:
+    """Fit v = v_inf + b e^(-t/tau): v_inf [V], tau [s], standard deviation of v_inf [V].
+
+    For each tau, v_inf and b are linear least squares; tau is searched on a grid.
+    """
+    elapsed = time_s - time_s[0]
+    taus = np.geomspace(SHORTEST_TAU * duration_s, LONGEST_TAU * duration_s, TAU_GRID)
+    fits = [_with_tau(elapsed, voltage_v, tau) for tau in taus]
+    best = int(np.argmin([squares for _, _, squares in fits]))
+    (v_inf, b), basis, squares = fits[best]
+    tau_s = float(taus[best])
+    jacobian = np.column_stack([basis, b * elapsed / tau_s * basis[:, 1]])  # by v_inf, b, ln tau
+    variance = squares / max(elapsed.size - 3, 1)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
+    return float(v_inf), tau_s, float(np.sqrt(max(covariance[0, 0], 0.0)))
+
+
+def _with_tau(elapsed: Floats, voltage_v: Floats, tau_s: float) -> tuple[Floats, Floats, float]:
+    """Coefficients, basis and squared residual of the exponential with a given ``tau_s``."""
+    basis = np.column_stack([np.ones_like(elapsed), np.exp(-elapsed / tau_s)])
+    coefficients = np.linalg.lstsq(basis, voltage_v, rcond=None)[0]
+    residual = voltage_v - basis @ coefficients
+    return coefficients, basis, float(residual @ residual)
+
+
+def _check_rests(
+    name: str, good: SampleBlock, rests: list[Rest], rejected: list[str], resting: NDArray[np.bool_]
+) -> None:
+    """Enough rests, good enough."""
+    hours = (good["time_s"][-1] - good["time_s"][0]) / 3600.0
+    if not resting.any():
+        least = float(np.abs(good["current_a"]).min())
+        raise UserError(
+            f"{name}: no rests in {hours:.2f} h: the current never falls below {least:.3f} A; "
+            "a relaxation test discharges in steps with a rest after each"
+        )
+    if len(rests) < LEAST_POINTS:
+        reasons = "".join(f"\n  {line}" for line in rejected[:8])
+        raise UserError(
+            f"{name}: {len(rests)} usable rests, at least {LEAST_POINTS} are needed; {len(rejected)} others were "
+            f"too short or too far from relaxed{':' if reasons else ''}{reasons}"
+        )
