@@ -1,0 +1,47 @@
+# Without a target: what there is to do.
+
+VENV    := .venv
+BIN     := $(VENV)/bin
+PYTHON  ?= python3
+READY   := $(VENV)/.ready
+ARGS    ?=
+
+# What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd
+
+.DEFAULT_GOAL := help
+.PHONY: help venv apt check test demo benchmark firmware lock
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+venv: $(READY) ## the environment in .venv, from the hash-locked list
+
+$(READY): requirements.lock pyproject.toml
+	@.ci/venv "$(PYTHON)" "$(VENV)"
+	@touch $@
+
+apt: ## the Debian packages of the tests: installs what is missing when allowed, else names it
+	@.ci/apt $(APT)
+
+check: venv ## style and types, in seconds
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+test: apt check firmware ## all there is to check: packages, style, types, firmware, pytest
+	$(BIN)/pytest $(ARGS)
+
+demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
+	@if .ci/can-simulate; then $(MAKE) --no-print-directory --silent firmware || echo "the firmware does not build here: the Python board serves"; fi
+	@$(BIN)/bms-estimator demo $(ARGS)
+
+benchmark: venv ## the table of measured times, rates and memory
+	@$(BIN)/python tests/benchmarks $(ARGS)
+
+firmware: ## the board's firmware and its simulator, where the compilers are installed
+	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
+	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
+
+lock: ## write requirements.lock anew after a change of dependencies (needs uv)
+	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --no-annotate --universal pyproject.toml -o requirements.lock
