@@ -82,9 +82,7 @@ class CheckpointFile:
     def load(self, cell: CellModel) -> Restored:
         """Read and check; what is wrong is a reason, not an exception."""
         try:
-            if self.path.stat().st_size > LONGEST_FILE:
-                raise _RefusedError("file too long")
-            with np.load(io.BytesIO(self.path.read_bytes()), allow_pickle=False) as file:
+            with np.load(io.BytesIO(self._read()), allow_pickle=False) as file:
                 return self._checked(file, cell)
         except FileNotFoundError:
             return Restored(None, 0, "none found")
@@ -92,6 +90,11 @@ class CheckpointFile:
             return Restored(None, 0, f"refused: {error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
             return Restored(None, 0, f"refused: unreadable ({type(error).__name__}: {error})")
+
+    def _read(self) -> bytes:
+        if self.path.stat().st_size > LONGEST_FILE:
+            raise _RefusedError("file too long")
+        return self.path.read_bytes()
 
     def _checked(self, file: Mapping[str, np.ndarray], cell: CellModel) -> Restored:
         if int(file["format"]) != FORMAT:

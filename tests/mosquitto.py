@@ -1,0 +1,138 @@
+"""A real Mosquitto on a free port of the loopback, and a listener that remembers what it heard."""
+
+import asyncio
+import getpass
+import json
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import aiomqtt
+import pytest
+
+MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
+LONG_S = 20.0
+"""Anything that takes longer will not come."""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Broker:
+    """Mosquitto; can be stopped and started again on its port, forgetting what it retained."""
+
+    def __init__(self, folder: Path, extra: str = "allow_anonymous true") -> None:
+        self.port = free_port()
+        self._config = folder / "mosquitto.conf"
+        self._config.write_text(
+            f"listener {self.port} 127.0.0.1\nuser {getpass.getuser()}\npersistence false\n{extra}\n"
+        )
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def url(self) -> str:
+        return f"mqtt://127.0.0.1:{self.port}"
+
+    def start(self) -> Self:
+        assert MOSQUITTO
+        self._process = subprocess.Popen(
+            [MOSQUITTO, "-c", str(self._config)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        deadline = time.monotonic() + LONG_S
+        while time.monotonic() < deadline and self._process.poll() is None:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return self
+            time.sleep(0.02)
+        raise AssertionError("mosquitto did not start")
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait(LONG_S)
+            self._process = None
+
+
+def _running(folder: Path) -> Iterator[Broker]:
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    broker = Broker(folder).start()
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    yield from _running(tmp_path)
+
+
+class Listener:
+    """Subscribes to everything; keeps the messages in order.
+
+    Attributes:
+        messages: (topic, payload, retain flag as delivered).
+    """
+
+    def __init__(self, broker: Broker, topic: str = "#", **options: Any) -> None:
+        self._client = aiomqtt.Client("127.0.0.1", broker.port, **options)
+        self._topic = topic
+        self.messages: list[tuple[str, bytes, bool]] = []
+        self._news = asyncio.Event()
+
+    async def __aenter__(self) -> Self:
+        await self._client.__aenter__()
+        await self._client.subscribe(self._topic, qos=1)
+        self._task = asyncio.create_task(self._listen())
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        await self._client.__aexit__(None, None, None)
+
+    async def _listen(self) -> None:
+        async for message in self._client.messages:
+            payload = message.payload if isinstance(message.payload, bytes) else b""
+            self.messages.append((message.topic.value, payload, bool(message.retain)))
+            self._news.set()
+
+    async def publish(self, topic: str, payload: bytes | str = b"", **options: Any) -> None:
+        await self._client.publish(topic, payload, **options)
+
+    def all(self, topic: str) -> list[bytes]:
+        return [payload for name, payload, _ in self.messages if name == topic]
+
+    async def wait(self, topic: str, wanted: Callable[[bytes], bool] = lambda _: True, skip: int = 0) -> bytes:
+        """The first message on ``topic`` that is wanted, of those after the first ``skip`` of all messages."""
+        deadline = time.monotonic() + LONG_S
+        while time.monotonic() < deadline:
+            self._news.clear()
+            for name, payload, _ in self.messages[skip:]:
+                if name == topic and wanted(payload):
+                    return payload
+            try:
+                async with asyncio.timeout(max(deadline - time.monotonic(), 0.0)):
+                    await self._news.wait()
+            except TimeoutError:
+                break
+        seen = {name: payload[:300] for name, payload, _ in self.messages}
+        raise AssertionError(f"{topic} did not bring what was wanted; last on each topic: {seen}")
+
+    async def wait_json(self, topic: str, wanted: Callable[[Any], bool] = lambda _: True, skip: int = 0) -> Any:
+        """As ``wait``, decoded; a NaN in the payload is a failure."""
+
+        def nan(token: str) -> None:
+            raise AssertionError(f"{topic} holds {token}")
+
+        decoded = await self.wait(topic, lambda p: bool(p) and wanted(json.loads(p, parse_constant=nan)), skip)
+        return json.loads(decoded)

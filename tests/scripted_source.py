@@ -1,0 +1,41 @@
+"""A source that yields what a test puts into it."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+
+
+class ScriptedSource:
+    """Blocks from a queue; ``finish`` ends it."""
+
+    def __init__(self) -> None:
+        self.counters: dict[str, int] = {"frames_received": 0, "frames_lost": 0, "crc_errors": 0, "reconnects": 0}
+        self.message: str | None = None
+        self.board: dict[str, str] = {}
+        self._queue: asyncio.Queue[SampleBlock | None] = asyncio.Queue()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+        while (block := await self._queue.get()) is not None:
+            self.counters["frames_received"] += block.size
+            yield block
+
+    def give(self, *rows: tuple[float, float, float] | tuple[float, float, float, float, int]) -> None:
+        """Rows of (time_s, current_a, voltage_v[, temperature_c, status])."""
+        padded = [row if len(row) == 5 else (*row, np.nan, 0) for row in rows]
+        self._queue.put_nowait(np.array(padded, dtype=SAMPLE))
+
+    def finish(self) -> None:
+        self._queue.put_nowait(None)
