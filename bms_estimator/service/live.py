@@ -76,7 +76,7 @@ async def run_live(
             tasks.append(_save_often(checkpoint, estimator, publisher, settings.state.checkpoint_s, restarts))
         await _until_first_ends([*tasks, stop.wait()])
         notifier.send("STOPPING=1")
-        publisher.publish()
+        publisher.publish_last()
     if checkpoint:
         await _save(checkpoint, estimator, publisher, restarts)
     return estimator

@@ -16,9 +16,7 @@ from bms_estimator.service.window import Window
 from bms_estimator.sinks import Sink
 
 SLOW_S = 1.0
-"""Parameters and info move slowly: they are made no more often than this [s]."""
-HEALTH_S = 5.0
-"""Health is retained and must not wear out the broker's disk [s]."""
+"""Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
 FRESH_PERIODS = 3
 """Values are stale when no sample was accepted for so many publish periods."""
 
@@ -91,8 +89,13 @@ class Publisher:
         for sink in self._sinks:
             sink.publish(self.snapshot)
 
+    def publish_last(self) -> None:
+        """Publish the end, all of it made anew."""
+        self._slow_s = -math.inf
+        self.publish()
+
     def _first_snapshot(self) -> Snapshot:
-        now_s = self._slow_s = self._health_s = self._started_s
+        now_s = self._slow_s = self._started_s
         parameters = parameter_report(self._estimator, self._started_wall_s)
         return Snapshot(None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info())
 
@@ -101,12 +104,12 @@ class Publisher:
         _, parameters, health, info = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
         estimate = estimate_report(summary, self._source.counters, wall_s) if summary else None
-        if now_s - self._slow_s >= SLOW_S:
+        message = self._sensor_message(now_s)
+        old = now_s - self._slow_s >= SLOW_S
+        if old:
             self._slow_s = now_s
             parameters, info = parameter_report(self._estimator, wall_s), self._info()
-        message = self._sensor_message(now_s)
-        if now_s - self._health_s >= HEALTH_S or health.sensor_online != (message is None):
-            self._health_s = now_s
+        if old or health.sensor_online != (message is None):
             health = self._health(now_s, message)
         return Snapshot(estimate, parameters, health, info)
 

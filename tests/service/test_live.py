@@ -1,0 +1,327 @@
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.estimate import Estimate, Snapshot
+from bms_estimator.model.sample import SAMPLE, SampleStatus
+from bms_estimator.model.settings import MqttSettings, PackSettings, Settings
+from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
+from bms_estimator.service.clock import Clock
+from bms_estimator.service.live import run_live
+from bms_estimator.service.notify import Notifier
+from bms_estimator.service.requests import Requests
+from tests.scripted_source import ScriptedSource
+
+CELL = load_cell("chen_mora")
+SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), mqtt=MqttSettings(publish_rate_hz=10.0))
+LONG_S = 20.0
+
+
+@dataclass
+class Collector:
+    """A sink that keeps what it gets."""
+
+    snapshots: list[Snapshot] = field(default_factory=list)
+
+    def publish(self, snapshot: Snapshot) -> None:
+        self.snapshots.append(snapshot)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+    async def until(self, wanted: Callable[[Snapshot], bool]) -> Snapshot:
+        async with asyncio.timeout(LONG_S):
+            while not any(wanted(s) for s in self.snapshots):  # noqa: ASYNC110 - the predicate is the test's
+                await asyncio.sleep(0.01)
+        return next(s for s in self.snapshots if wanted(s))
+
+
+@dataclass
+class Run:
+    source: ScriptedSource
+    sink: Collector
+    requests: Requests
+    task: asyncio.Task[Estimator]
+    stop: asyncio.Event
+
+    async def end(self) -> Estimator:
+        self.source.finish()
+        return await asyncio.wait_for(self.task, LONG_S)
+
+
+@asynccontextmanager
+async def running(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
+    source, sink, requests, stop = ScriptedSource(), Collector(), Requests(), asyncio.Event()
+    task = asyncio.create_task(
+        run_live(settings, cell, source=source, sinks=[sink], stop=stop, requests=requests, **options)
+    )
+    try:
+        yield Run(source, sink, requests, task, stop)
+    finally:
+        stop.set()
+        await asyncio.wait_for(task, LONG_S)
+
+
+def estimates(sink: Collector) -> list[Estimate]:
+    return [s.estimate for s in sink.snapshots if s.estimate]
+
+
+async def test_voltage_current_and_power_are_means_of_the_publish_window() -> None:
+    async with running() as run:
+        run.source.give(*((0.01 * i, float(i % 2), 3.8 + 0.1 * (i % 2)) for i in range(100)))
+        await run.end()
+    (window,) = estimates(run.sink)
+    assert window.voltage_v == pytest.approx(3.85)
+    assert window.current_a == pytest.approx(0.5)
+    assert window.power_w == pytest.approx(3.9 / 2)  # the mean of products, not the product of means
+    assert window.sample_rate_hz == pytest.approx(100.0)
+    assert window.frames_received == 100
+
+
+async def test_a_run_in_blocks_leaves_the_state_of_single_steps() -> None:
+    rng = np.random.default_rng(3)
+    rows = [(0.01 * i, float(rng.normal(0.1, 0.05)), float(rng.normal(3.8, 0.01))) for i in range(500)]
+    async with running() as run:
+        for i in range(0, 500, 7):
+            run.source.give(*rows[i : i + 7])
+        live = await run.end()
+    alone = Estimator(
+        CELL, SETTINGS.observer, voltage_resolution_v=SETTINGS.sensor.voltage_resolution_v, initial_soc=0.5
+    )
+    for row in rows:
+        alone.step(*row)
+    assert live.state.tobytes() == alone.state.tobytes()
+
+
+async def test_samples_that_cannot_be_used_are_dropped_counted_and_published() -> None:
+    async with running() as run:
+        run.source.give((0.0, 0.1, 3.8))
+        run.source.give(
+            (0.1, np.nan, 3.8),
+            (0.2, 0.1, np.inf),
+            (0.3, 0.1, 0.0),  # a glitch
+            (0.4, 400.0, 3.8),
+            (0.5, 0.1, 3.8, np.nan, int(SampleStatus.VOLTAGE_SATURATED)),
+            (0.6, 0.1, 3.8),
+            (0.6, 0.1, 3.8),
+            (20.0, 0.1, 3.8, np.nan, int(SampleStatus.GAP)),
+        )
+        await run.sink.until(lambda s: s.health.samples["gaps"] == 1)
+        await run.end()
+    counted = run.sink.snapshots[-1].health.samples
+    assert counted == {
+        "samples": 3,
+        "dropped_not_finite": 2,
+        "dropped_range": 2,
+        "dropped_repeated": 1,
+        "dropped_saturated": 1,
+        "time_steps_back": 0,
+        "gaps": 1,
+    }
+    for snapshot in run.sink.snapshots:
+        for part in snapshot:
+            assert part is None or "NaN" not in part.model_dump_json()
+
+
+async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> None:
+    async with running() as run:
+        run.source.give((0.0, 0.1, 3.8))
+        await run.sink.until(lambda s: s.health.sensor_online)
+        silent = await run.sink.until(lambda s: s.health.samples["samples"] == 1 and not s.health.sensor_online)
+        assert silent.estimate is None
+        assert "no usable sample" in (silent.health.sensor_message or "")
+        seen = len(run.sink.snapshots)
+        run.source.give((1.0, 0.1, 3.8))
+        await run.sink.until(lambda s: run.sink.snapshots.index(s) >= seen and s.health.sensor_online)
+
+
+async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> None:
+    async with running() as run:
+        for i in range(60):
+            run.source.give((0.01 * i, 0.1, 0.0))
+            await asyncio.sleep(0.01)
+        await run.end()
+    health = run.sink.snapshots[-1].health
+    assert not health.sensor_online
+    assert "dropped_range" in (health.sensor_message or "")
+
+
+async def test_the_source_says_why_nothing_comes() -> None:
+    async with running() as run:
+        run.source.message = "waiting for /dev/ttyUSB0: it does not exist"
+        said = await run.sink.until(lambda s: s.health.sensor_message == run.source.message)
+    assert said.estimate is None
+
+
+async def test_a_step_of_the_wall_clock_changes_time_stamps_only() -> None:
+    offset = 0.0
+
+    def wall() -> float:
+        return 1_700_000_000.0 + offset
+
+    async with running(clock=Clock(wall=wall)) as run:
+        run.source.give((0.0, 0.1, 3.8))
+        await run.sink.until(lambda s: s.estimate is not None)
+        offset = -7200.0
+        seen = len(run.sink.snapshots)
+        run.source.give((0.1, 0.1, 3.8))
+        after = await run.sink.until(lambda s: run.sink.snapshots.index(s) >= seen and s.estimate is not None)
+        state = await run.end()
+    assert after.estimate
+    assert after.estimate.publish_time.startswith("2023-11-14T20:13:20")
+    assert after.health.sensor_online
+    assert state.state["time_steps_back"][0] == 0
+
+
+async def test_requests_reach_the_running_estimator() -> None:
+    async with running() as run:
+        await run.sink.until(lambda _: True)
+        with pytest.raises(UserError, match="no sample"):
+            run.requests.answer("set_soc", {"soc": 0.8})
+        run.source.give((0.0, 0.1, 3.8))
+        await run.sink.until(lambda s: s.estimate is not None)
+        assert run.requests.answer("set_soc", {"soc": 0.8})["before"] == pytest.approx(0.5)
+        for wrong in ({}, {"soc": 1.5}, {"soc": "0.5"}, {"soc": True}, {"soc": float("nan")}):
+            with pytest.raises(UserError, match=r"soc = .*must be a number from 0 to 1"):
+                run.requests.answer("set_soc", wrong)
+        with pytest.raises(UserError, match=r"health, parameters, set_soc, state"):
+            run.requests.answer("reboot", {})
+        assert run.requests.answer("state", {})["estimate"]["soc"] == pytest.approx(0.5)
+        assert set(run.requests.answer("parameters", {})["a"]) == {f"a{i}" for i in range(1, 22)}
+        assert run.requests.answer("health", {})["samples"]["samples"] == 1
+        state = await run.end()
+    assert state.state["soc"][0] == 0.8
+
+
+async def test_a_parameter_says_where_it_comes_from_and_a_negative_capacitance_why_it_is_missing() -> None:
+    nearly_empty = SETTINGS.model_copy(update={"pack": PackSettings(initial_soc=0.001)})
+    async with running(nearly_empty) as run:
+        run.source.give((0.0, 0.0, 3.0))
+        run.source.finish()
+        await run.task
+        parameters = run.sink.snapshots[-1].parameters
+    assert parameters.a["a16"].value == CELL.a[16]
+    assert (parameters.a["a1"].source, parameters.a["a1"].std, parameters.a["a1"].valid) == ("configured", None, False)
+    missing = parameters.elements["c_ts_farad"]
+    assert missing.value is None
+    assert "is not above delta_1" in (missing.reason or "")
+
+
+def checkpoint(path: Path, settings: Settings = SETTINGS, cell: CellModel = CELL) -> CheckpointFile:
+    return CheckpointFile(path, pack_identity(settings, cell))
+
+
+async def test_a_restart_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
+    file = tmp_path / "pack.npz"
+    async with running(checkpoint=checkpoint(file)) as run:
+        run.source.give(*((float(i), 0.275, 3.8) for i in range(361)))  # a tenth of the capacity
+        first = await run.end()
+    assert first.state["soc"][0] == pytest.approx(0.4)
+    async with running(checkpoint=checkpoint(file)) as run:
+        run.source.give((5.0, 0.275, 3.8), (6.0, 0.275, 3.8))  # the board's clock has started anew
+        second = await run.end()
+    assert second.state["soc"][0] == pytest.approx(0.4 - 1.0 / 3600.0, abs=1e-9)
+    assert second.state["samples"][0] == 2
+    health = run.sink.snapshots[-1].health
+    assert health.restarts == 1
+    assert health.checkpoint == "restored: SOC 0.4000"
+
+
+@pytest.mark.parametrize("damage", ["other pack", "other cell", "nan", "range", "truncated", "garbage", "format"])
+async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason(
+    tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "pack.npz"
+    estimator = Estimator(CELL, initial_soc=0.3)
+    estimator.step(0.0, 0.1, 3.8)
+    settings, cell = SETTINGS, CELL
+    reason = "refused: it belongs to another pack"
+    if damage == "nan":
+        estimator.state["a"][0][3], reason = np.nan, "refused: a is not finite"
+    if damage == "range":
+        estimator.state["soc"], reason = 1.7, r"refused: soc = 1.7 is outside 0.0..1.0"
+    checkpoint(file).save(estimator.state, restarts=0)
+    if damage == "other pack":
+        settings = SETTINGS.model_copy(update={"pack": PackSettings(name="other", initial_soc=0.5)})
+    if damage == "other cell":
+        cell = CELL.pack(2, 1)
+    if damage in ("truncated", "garbage"):
+        content = file.read_bytes()[:500] if damage == "truncated" else bytes(range(256)) * 8
+        file.write_bytes(content)
+        reason = "refused: unreadable"
+    if damage == "format":
+        monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", 2)
+        reason = "refused: format 1, this version reads 2"
+    async with running(settings, cell, checkpoint=checkpoint(file, settings, cell)) as run:
+        snapshot = await run.sink.until(lambda _: True)
+        run.source.give((0.0, 0.0, 3.8 * cell.cell.series_count))
+        estimator = await run.end()
+    assert snapshot.health.checkpoint.startswith(reason)
+    assert estimator.state["soc"][0] == 0.5
+
+
+async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes_on(tmp_path: Path) -> None:
+    often = SETTINGS.model_copy(update={"state": SETTINGS.state.model_copy(update={"checkpoint_s": 0.02})})
+    async with running(often, checkpoint=checkpoint(tmp_path / "absent" / "pack.npz")) as run:
+        run.source.give((0.0, 0.1, 3.8))
+        await asyncio.sleep(0.1)
+        run.source.give((1.0, 0.1, 3.8))
+        state = await run.end()
+    assert state.state["samples"][0] == 2
+
+
+async def test_systemd_hears_ready_watchdog_and_stopping(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.setblocking(False)
+        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
+        async with running(notifier=Notifier(environment)) as run:
+            await asyncio.sleep(0.5)
+            await run.end()
+        heard = []
+        while True:
+            try:
+                heard.append(systemd.recv(4096).decode())
+            except BlockingIOError:
+                break
+    assert heard[0].startswith("READY=1\nSTATUS=")
+    assert heard.count("WATCHDOG=1") >= 3
+    assert heard[-1] == "STOPPING=1"
+
+
+async def test_a_source_that_never_waits_does_not_starve_the_sinks() -> None:
+    class Endless(ScriptedSource):
+        async def __aiter__(self) -> AsyncIterator[Any]:
+            block = np.zeros(10, dtype=SAMPLE)
+            block["voltage_v"] = 3.8
+            while True:
+                block["time_s"] = block["time_s"][-1] + 0.01 * np.arange(1, 11)
+                yield block
+
+    stop, sink = asyncio.Event(), Collector()
+    asyncio.get_running_loop().call_later(0.5, stop.set)
+    await asyncio.wait_for(run_live(SETTINGS, CELL, source=Endless(), sinks=[sink], stop=stop), LONG_S)
+    assert len(estimates(sink)) >= 3
+
+
+async def test_a_fault_of_the_source_is_raised_not_swallowed() -> None:
+    class Broken(ScriptedSource):
+        async def __aiter__(self) -> AsyncIterator[Any]:
+            raise ZeroDivisionError
+            yield
+
+    with pytest.raises(ZeroDivisionError):
+        await run_live(SETTINGS, CELL, source=Broken(), sinks=[], stop=asyncio.Event())
