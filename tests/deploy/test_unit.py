@@ -1,0 +1,49 @@
+"""The systemd unit, judged by systemd."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+HIGHEST_EXPOSURE = 2.5
+
+
+@pytest.fixture
+def unit(deploy, tmp_path) -> Path:
+    """The unit with a program that exists here."""
+    text = (deploy / "bms-estimator.service").read_text()
+    text, changed = re.subn(r"(?m)^ExecStart=\S+", f"ExecStart={sys.executable}", text)
+    assert changed == 1
+    path = tmp_path / "bms-estimator.service"
+    path.write_text(text)
+    return path
+
+
+def verify(systemd_analyze: str, unit: Path) -> str:
+    """What systemd finds wrong. Its exit code is 0 for unknown keys, so only its words count."""
+    return subprocess.run([systemd_analyze, "verify", unit], capture_output=True, text=True, check=False).stderr
+
+
+def test_systemd_finds_nothing_wrong_in_the_unit(program, unit):
+    assert verify(program("systemd-analyze", "systemd"), unit) == ""
+
+
+def test_systemd_would_find_a_misspelled_key(program, unit):
+    unit.write_text(unit.read_text().replace("ProtectHome=", "ProtectHomes="))
+    assert "ProtectHomes" in verify(program("systemd-analyze", "systemd"), unit)
+
+
+def test_exposure_is_at_most_2_5(program, unit):
+    command = [program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", text)
+    assert found, text
+    assert float(found[1]) <= HIGHEST_EXPOSURE
+
+
+def test_machine_code_may_be_made_at_run_time(deploy):
+    """Import numba fails under MemoryDenyWriteExecute, so it must never be switched on."""
+    keys = [line.split("=")[0] for line in (deploy / "bms-estimator.service").read_text().splitlines()]
+    assert "MemoryDenyWriteExecute" not in keys
