@@ -31,6 +31,10 @@ SHORTEST_TAU, LONGEST_TAU, TAU_GRID = 0.05, 0.7, 40
 FORM_ERROR = 0.6
 """Part of the extrapolated voltage that is its standard deviation: relaxation is no pure exponential. Half-hour rests of
 a NCR18650 cut to a quarter of an hour miss their end by 2.7 mV RMS so extrapolated, and by 4.7 mV when not."""
+LEAST_STD_V = 5e-4
+"""No point is better known: half a step of the usual converter, and temperature [V]."""
+NEAR_FULL, NEAR_EMPTY = 0.995, 0.02
+"""SOC from which a first sample counts as full, below which a last one counts as empty."""
 LEAST_POINTS = 6
 """As many as (2.10) has parameters."""
 CHARGING_AH = 0.005
@@ -79,6 +83,9 @@ class RelaxationTest:
         start_soc: SOC at the first sample.
         end_soc: SOC at the last sample.
         mean_load_a: Mean current of the loads [A].
+        empty_v: Open-circuit voltage at SOC 0 [V]: where the last load ended, plus what the load before it hid from the
+            rest after it. NaN when the capture ends above SOC 0.02.
+        full_v: Open-circuit voltage at SOC 1 [V]: the first sample's, when it is at rest and full; else NaN.
     """
 
     name: str
@@ -88,6 +95,8 @@ class RelaxationTest:
     start_soc: float
     end_soc: float
     mean_load_a: float
+    empty_v: float
+    full_v: float
 
     @property
     def soc(self) -> Floats:
@@ -119,7 +128,8 @@ def without_glitches(samples: SampleBlock) -> SampleBlock:
     good = good[np.abs(good["voltage_v"] - middle) <= GLITCH_FRACTION * abs(middle)]
     latest = np.maximum.accumulate(good["time_s"])
     later = np.r_[True, good["time_s"][1:] > latest[:-1]]
-    return good[later]
+    kept: SampleBlock = good[later]
+    return kept
 
 
 def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:
@@ -181,7 +191,18 @@ def relaxation_test(
         start_soc=initial_soc,
         end_soc=float(soc[-1]),
         mean_load_a=float(good["current_a"][~resting].mean()),
+        empty_v=_empty_v(good, soc, resting, rests),
+        full_v=float(good["voltage_v"][0]) if resting[0] and initial_soc > NEAR_FULL else float("nan"),
     )
+
+
+def _empty_v(good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], rests: list[Rest]) -> float:
+    """Open-circuit voltage at the end of a capture that ends empty and under load [V], else NaN."""
+    if resting[-1] or abs(soc[-1]) > NEAR_EMPTY or not rests:
+        return float("nan")
+    first = int(np.searchsorted(good["time_s"], rests[-1].start_s))
+    hidden_v = rests[-1].ocv_v - float(good["voltage_v"][first - 1])
+    return min(float(good["voltage_v"][-1]) + hidden_v, rests[-1].ocv_v)
 
 
 def _check_charge(name: str, good: SampleBlock, soc: Floats, capacity_ah: float) -> None:
@@ -210,7 +231,7 @@ def _check_charge(name: str, good: SampleBlock, soc: Floats, capacity_ah: float)
 
 def _resting(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     """Which samples belong to a rest; blips of the current sensor do not end one."""
-    resting = np.abs(good["current_a"]) < REST_CURRENT_C * capacity_ah
+    resting: NDArray[np.bool_] = np.abs(good["current_a"]) < REST_CURRENT_C * capacity_ah
     time_s = good["time_s"]
     for first, last in _runs(~resting):
         until_s = time_s[min(last, good.size - 1)]
@@ -239,7 +260,7 @@ def _relaxed(rest: SampleBlock, soc: float) -> Rest:
         soc=soc,
         voltage_v=voltage_v,
         ocv_v=ocv_v,
-        std_v=float(np.hypot(spread_v, FORM_ERROR * (ocv_v - voltage_v))),
+        std_v=float(np.sqrt(spread_v**2 + (FORM_ERROR * (ocv_v - voltage_v)) ** 2 + LEAST_STD_V**2)),
         tau_s=tau_s,
     )
 
