@@ -1,0 +1,20 @@
+"""All benchmarks in one table: ``make benchmark``, or ``make benchmark ARGS="kernel start"`` for some."""
+
+import sys
+from itertools import chain
+
+import kernel
+from table import show
+
+GROUPS = {"kernel": kernel.rows}
+
+
+def main() -> None:
+    names = sys.argv[1:] or list(GROUPS)
+    unknown = [name for name in names if name not in GROUPS]
+    if unknown:
+        sys.exit(f"no such benchmark: {', '.join(unknown)}; there are {', '.join(GROUPS)}")
+    show(chain.from_iterable(GROUPS[name]() for name in names))
+
+
+main()

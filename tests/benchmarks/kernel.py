@@ -1,0 +1,84 @@
+"""The observer's step alone: against C, and from Python."""
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from load import pulses
+from observer_in_c import ObserverInC
+from table import Row
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels import estimate as kernel
+from bms_estimator.kernels.state import TRACE
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SampleBlock
+
+BLOCK = 65_536
+ROUNDS = 10
+CALLS = 100_000
+
+
+def rows() -> Iterator[Row]:
+    """Kernel and C on the same block in turn, the best of all rounds for each; then calls from Python."""
+    block = pulses(BLOCK)
+    ours, theirs = kernel_and_c(block)
+    yield Row("observer step in run", "at most 300 ns", f"{ours:.0f} ns", ours <= 300.0)
+    yield Row("  the same in C, -O3 -march=native", "-", f"{theirs:.0f} ns", None)
+    yield Row("  ratio", "at most 1.5", f"{ours / theirs:.2f}", ours <= 1.5 * theirs)
+    call, bare = calls_from_python(block)
+    overhead = call - ours
+    yield Row("Estimator.step from Python", "-", f"{call / 1e3:.2f} us", None)
+    yield Row("  kernel's step from Python", "-", f"{bare / 1e3:.2f} us", None)
+    yield Row("  overhead over the kernel in run", "at most 2 us", f"{overhead / 1e3:.2f} us", overhead <= 2000.0)
+
+
+def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
+    """Time per sample of ``run`` and of its twin in C [ns]."""
+    estimator, twin = (Estimator(load_cell("chen_mora")) for _ in range(2))
+    trace = np.zeros(BLOCK, dtype=TRACE)
+    with tempfile.TemporaryDirectory() as folder:
+        in_c = ObserverInC(Path(folder))
+
+        def run_c() -> None:
+            in_c.run(twin.state, twin.settings, block, trace)
+
+        def run_kernel() -> None:
+            kernel.run(estimator.state, estimator.settings, block, trace)
+
+        run_kernel()
+        best = np.full(2, np.inf)
+        for _ in range(ROUNDS):
+            best = np.minimum(best, [elapsed_ns(run_kernel), elapsed_ns(run_c)])
+    return float(best[0]) / BLOCK, float(best[1]) / BLOCK
+
+
+def calls_from_python(block: SampleBlock) -> tuple[float, float]:
+    """Time of one ``Estimator.step``, and of the kernel's own ``step``, called sample by sample [ns]."""
+    estimator = Estimator(load_cell("chen_mora"))
+    state, settings = estimator.state, estimator.settings
+    samples = [(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), 0) for x in block[:CALLS]]
+
+    def step() -> None:
+        for sample in samples:
+            estimator.step(*sample)
+
+    def bare() -> None:
+        for sample in samples:
+            kernel.step(state, settings, *sample)
+
+    best = np.full(2, np.inf)
+    for _ in range(3):
+        for i, run in enumerate((step, bare)):
+            estimator.state["started"] = 0
+            best[i] = min(best[i], elapsed_ns(run))
+    return float(best[0]) / len(samples), float(best[1]) / len(samples)
+
+
+def elapsed_ns(run: Callable[[], None]) -> int:
+    """Processor time of a call [ns]: others on the machine do not count."""
+    start = time.thread_time_ns()
+    run()
+    return time.thread_time_ns() - start

@@ -1,0 +1,68 @@
+"""The observer's step in C: compiled from uas_step.c and called on the very records of the kernels."""
+
+import ctypes
+import subprocess
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.cell import OCV_POINTS
+from bms_estimator.kernels.mittag_leffler import SERIES_LIMIT, SERIES_TERMS, TABLE_POINTS
+from bms_estimator.kernels.state import OBSERVER_SETTINGS, OBSERVER_STATE, TRACE
+from bms_estimator.model.sample import SAMPLE
+
+Records = NDArray[np.void]
+
+SOURCE = Path(__file__).with_name("uas_step.c")
+COMPILER = ["cc", "-O3", "-march=native", "-std=gnu11", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared"]
+"""numba compiles for the very processor too."""
+C_TYPES = {"f8": "double", "i8": "int64_t", "u4": "uint32_t"}
+
+
+class ObserverInC:
+    """``run`` of the kernels, in C.
+
+    Args:
+        folder: Where the library is built.
+
+    Raises:
+        FileNotFoundError: There is no C compiler.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        (folder / "records.h").write_text(header())
+        library = folder / "uas_step.so"
+        subprocess.run([*COMPILER, "-I", folder, "-o", library, SOURCE, "-lm"], check=True)
+        self._run = ctypes.CDLL(str(library)).run
+        self._run.restype = ctypes.c_int64
+        self._run.argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_int64]
+
+    def run(self, state: Records, settings: Records, samples: Records, trace: Records) -> int:
+        """As ``kernels.estimate.run``."""
+        pointers = [array.ctypes.data for array in (state, settings, samples, trace)]
+        return int(self._run(*pointers, samples.size))
+
+
+def header() -> str:
+    """The record types as C structures: numpy aligned them as C does."""
+    constants = {
+        "OCV_POINTS": OCV_POINTS,
+        "SERIES_TERMS": SERIES_TERMS,
+        "SERIES_LIMIT": SERIES_LIMIT,
+        "TABLE_POINTS": TABLE_POINTS,
+    }
+    records = {"settings_t": OBSERVER_SETTINGS, "state_t": OBSERVER_STATE, "sample_t": SAMPLE, "trace_t": TRACE}
+    lines = [f"#define {name} {value}" for name, value in constants.items()]
+    return "\n".join(lines + [structure(name, record) for name, record in records.items()]) + "\n"
+
+
+def structure(name: str, record: "np.dtype[np.void]") -> str:
+    """One record type in C, and the compiler's oath that it has the same size."""
+    members = []
+    for field in record.names or ():
+        base, shape = record[field].subdtype or (record[field], ())
+        members.append(f"    {C_TYPES[base.str[1:]]} {field}{''.join(f'[{n}]' for n in shape)};")
+    body = "\n".join(members)
+    check = f'_Static_assert(sizeof({name}) == {record.itemsize}, "{name}");'
+    return f"typedef struct {{\n{body}\n}} {name};\n{check}"

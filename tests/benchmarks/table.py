@@ -1,0 +1,32 @@
+"""The table of what was to be reached and what was measured."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line: what, how good it has to be, how good it was, and whether that is enough (None: no target)."""
+
+    what: str
+    target: str
+    measured: str
+    met: bool | None
+
+
+def show(rows: Iterable[Row]) -> bool:
+    """Print the rows as they come. Returns whether all targets were met."""
+    table = Table(title="bms_estimator benchmarks")
+    for column in ("what", "target", "measured", "met"):
+        table.add_column(column)
+    all_met = True
+    with Live(table, console=Console(), auto_refresh=False) as live:
+        for row in rows:
+            table.add_row(row.what, row.target, row.measured, {None: "", True: "yes", False: "[red]no"}[row.met])
+            live.refresh()
+            all_met &= row.met is not False
+    return all_met

@@ -1,0 +1,38 @@
+"""The C yardstick measures the same work: it gives the kernel's numbers."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.state import TRACE
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.settings import ObserverSettings
+
+sys.path.insert(0, str(Path(__file__).parent))
+from load import pulses
+from observer_in_c import ObserverInC
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [ObserverSettings(), ObserverSettings(dead_zone_v=0.0), ObserverSettings(law="scheme-3", nussbaum="k2-cos")],
+    ids=["default", "as printed", "scheme 3"],
+)
+def test_c_and_kernel_agree(settings, tmp_path):
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler (apt install gcc)")
+    block = pulses(60_000)
+    block["voltage_v"][20_000:20_010] = np.nan
+    estimator, twin = (Estimator(load_cell("chen_mora"), settings) for _ in range(2))
+    expected = estimator.run(block)
+    trace = np.zeros(block.size, dtype=TRACE)
+    rows = ObserverInC(tmp_path).run(twin.state, twin.settings, block, trace)
+    assert rows == expected.size == block.size - 10
+    for name in ("soc", "voltage_estimate_v", "innovation_v", "nussbaum_gain", "k", "delta_1", "stability_margin"):
+        np.testing.assert_allclose(trace[name][:rows], expected[name], rtol=1e-9, atol=1e-12, err_msg=name)
+    assert np.array_equal(trace["lock"][:rows], expected["lock"])
+    assert twin.state["dropped_not_finite"][0] == 10

@@ -1,0 +1,297 @@
+/* One sample's way through the adaptive observer, the yardstick for the kernel that does the same:
+ * judge, Algorithm 1 with (3.12), (3.13), (3.18), (4.1), loss of lock, a row of trace.
+ * Line by line bms_estimator/kernels/{estimate,observer,nussbaum,mittag_leffler,margins,cell}.py;
+ * records.h is made from their record types. */
+
+#include <math.h>
+#include <stdint.h>
+
+#include "records.h"
+
+#define SMALLEST_LOOP 0.1
+#define VOLTAGE_SATURATED 1u
+
+enum verdict { ACCEPTED, NOT_FINITE, OUT_OF_RANGE, REPEATED, SATURATED };
+enum nussbaum { MITTAG_LEFFLER, K2_COS, K_COS_SQRT, LN_COS_SQRT_LN };
+
+static double element(double amplitude, double exponent, double offset, double soc) /* (2.5)-(2.9) */
+{
+    return amplitude * exp(-exponent * soc) + offset;
+}
+
+static double ocv(double soc, const settings_t *p)
+{
+    const int last = OCV_POINTS - 1;
+    const double *v = p->ocv_v, *slope = p->ocv_slope_v;
+    if (soc <= 0.0)
+        return v[0] + soc * slope[0];
+    if (soc >= 1.0)
+        return v[last] + (soc - 1.0) * slope[last];
+    double position = soc * last;
+    int i = (int)position < last - 1 ? (int)position : last - 1;
+    double t = position - i, step = 1.0 / last;
+    double w = t * t * (3.0 - 2.0 * t), bend = t * (1.0 - t) * step;
+    return v[i] + w * (v[i + 1] - v[i]) + bend * ((1.0 - t) * slope[i] - t * slope[i + 1]);
+}
+
+static double soc_from_ocv(double voltage_v, const settings_t *p)
+{
+    double low = 0.0, high = 1.0;
+    if (voltage_v <= p->ocv_v[0])
+        return 0.0;
+    if (voltage_v >= p->ocv_v[OCV_POINTS - 1])
+        return 1.0;
+    for (int n = 0; n < 48; n++) {
+        double middle = 0.5 * (low + high);
+        if (ocv(middle, p) < voltage_v)
+            low = middle;
+        else
+            high = middle;
+    }
+    return 0.5 * (low + high);
+}
+
+static double delta(double exponent, double offset, double amplitude) /* (2.11), (2.12) */
+{
+    return -log(offset / amplitude) / exponent;
+}
+
+static void update_margins(state_t *s)
+{
+    s->delta_1 = delta(s->a[8], s->a[9], s->a[7]);
+    s->delta_2 = delta(s->a[11], s->a[12], s->a[10]);
+}
+
+static double mittag_leffler(double r, const settings_t *p)
+{
+    if (r <= SERIES_LIMIT) {
+        double z = pow(r, p->alpha), total = 0.0;
+        for (int j = SERIES_TERMS - 1; j >= 0; j--)
+            total = total * z + p->ml_series[j];
+        return total;
+    }
+    double angle = M_PI / p->alpha;
+    double wave = 2.0 / p->alpha * exp(r * cos(angle)) * cos(r * sin(angle));
+    double step = 1.0 / (1.0 + SERIES_LIMIT) / (TABLE_POINTS - 1);
+    double position = 1.0 / (1.0 + r) / step;
+    int i = (int)position < TABLE_POINTS - 2 ? (int)position : TABLE_POINTS - 2;
+    double t = position - i, w = t * t * (3.0 - 2.0 * t), bend = t * (1.0 - t) * step;
+    const double *v = p->ml_decay, *slope = p->ml_decay_slope;
+    return wave + v[i] + w * (v[i + 1] - v[i]) + bend * ((1.0 - t) * slope[i] - t * slope[i + 1]);
+}
+
+static double nussbaum_gain(double k, const settings_t *p)
+{
+    double gain, log_k;
+    switch (p->nussbaum) {
+    case K2_COS:
+        gain = k * k * cos(k);
+        break;
+    case K_COS_SQRT:
+        gain = k * cos(sqrt(fabs(k)));
+        break;
+    case LN_COS_SQRT_LN:
+        log_k = log(fmax(k, 1.0));
+        gain = log_k * cos(sqrt(log_k));
+        break;
+    default:
+        gain = mittag_leffler(p->gain_scale * k, p);
+    }
+    return fmin(fmax(gain, -p->gain_limit), p->gain_limit);
+}
+
+static double integral_of_exponential(double rate, double dt_s)
+{
+    double x = rate * dt_s;
+    return fabs(x) < 1e-8 ? dt_s * (1.0 + 0.5 * x) : expm1(x) / rate;
+}
+
+static void adapt(state_t *s, const settings_t *p, double dt_s, double e_squared) /* (3.16)-(3.18) */
+{
+    if (dt_s != s->decay_dt_s) {
+        s->decay_dt_s = dt_s;
+        for (int i = 1; i < 16; i++) {
+            s->decay[i] = exp(-p->rate[i] * dt_s);
+            s->settle[i] = integral_of_exponential(-p->rate[i], dt_s);
+        }
+    }
+    for (int i = 1; i < 16; i++)
+        s->a[i] = s->target[i] + (s->a[i] - s->target[i]) * s->decay[i] + p->drive[i] * e_squared * s->settle[i];
+}
+
+static double states_step(state_t *s, double gain, double drop_v, double tau_ts, double tau_tl, double dt_s)
+{
+    double mean = -gain - 0.5 * (1.0 / tau_ts + 1.0 / tau_tl);
+    double half = 0.5 * (1.0 / tau_tl - 1.0 / tau_ts);
+    double q = fmax(sqrt(half * half + gain * gain), 1e-300);
+    double low = mean - q, high = mean + q;
+    double phi_low = integral_of_exponential(low, dt_s), phi_high = integral_of_exponential(high, dt_s);
+    double decay_low = 1.0 + low * phi_low, decay_high = 1.0 + high * phi_high;
+    double along = 0.5 * (decay_high + decay_low), across = 0.5 * (decay_high - decay_low) / q;
+    double phi_along = 0.5 * (phi_high + phi_low), phi_across = 0.5 * (phi_high - phi_low) / q;
+    double u = -gain * drop_v, v_ts = s->v_ts, v_tl = s->v_tl;
+    s->v_ts = along * v_ts + across * (half * v_ts - gain * v_tl) + u * (phi_along + phi_across * (half - gain));
+    s->v_tl = along * v_tl + across * (-half * v_tl - gain * v_ts) + u * (phi_along + phi_across * (-half - gain));
+    return gain >= 0.0 ? low : high;
+}
+
+static void start(state_t *s, const settings_t *p, double time_s, double current_a, double voltage_v)
+{
+    s->time_s = time_s;
+    s->current_a = current_a;
+    for (int i = 1; i < 16; i++) {
+        s->a[i] = p->a_initial[i];
+        s->target[i] = p->target[i];
+    }
+    s->soc = p->soc_initial;
+    if (isnan(s->soc))
+        s->soc = soc_from_ocv(voltage_v + current_a * element(s->a[13], s->a[14], s->a[15], 1.0), p);
+    s->k = p->k0;
+    s->gain = nussbaum_gain(s->k, p);
+    s->lock = s->adapting = s->started = 1;
+    s->voltage_estimate_v = ocv(s->soc, p);
+    s->innovation_v = voltage_v - s->voltage_estimate_v;
+    update_margins(s);
+}
+
+static void recover(state_t *s, const settings_t *p, double voltage_v, double e_o)
+{
+    s->k = p->k0;
+    s->gain = nussbaum_gain(s->k, p);
+    s->v_ts = s->v_tl = 0.5 * (e_o - voltage_v);
+    for (int i = 1; i < 16; i++)
+        s->a[i] = s->target[i];
+    s->voltage_estimate_v = voltage_v;
+    s->unlocked_s = 0.0;
+    update_margins(s);
+}
+
+static void watch_lock(state_t *s, const settings_t *p, double dt_s, double voltage_v, double e_o)
+{
+    int beyond = !(fabs(s->innovation_v) <= p->lock_error_v);
+    s->unlocked_s = beyond == (s->lock == 1) ? s->unlocked_s + fmin(dt_s, 0.2 * p->lock_time_s) : 0.0;
+    int turned = beyond && s->gain <= 0.0;
+    int overflow = !(isfinite(s->v_ts) && isfinite(s->v_tl) && fabs(s->gain) < p->gain_limit);
+    int expired = s->unlocked_s >= p->lock_time_s;
+    if (turned || overflow || (expired && s->lock == 1)) {
+        s->lock = 0;
+        s->lock_losses++;
+        recover(s, p, voltage_v, e_o);
+    } else if (expired) {
+        s->lock = 1;
+        s->unlocked_s = 0.0;
+    } else if (s->gain < p->rearm_gain && !beyond) {
+        s->k = p->k0;
+        s->gain = nussbaum_gain(s->k, p);
+        s->gain_rearms++;
+    }
+}
+
+static void observer_step(state_t *s, const settings_t *p, double dt_s, double current_a, double voltage_v)
+{
+    double charge_as = 0.5 * (s->current_a + current_a) * dt_s;
+    s->soc = fmin(fmax(s->soc - charge_as / p->capacity_as, 0.0), 1.0); /* (3.1) */
+    s->current_a = current_a;
+    double e_o = ocv(s->soc, p);
+
+    double lowest = fmax(s->delta_1, s->delta_2) + p->margin_guard;
+    s->adapting = s->soc > lowest;
+    double soc = fmax(s->soc, lowest);
+
+    const double *a = s->a;
+    double ohm_s = p->output_r_s > 0.0 ? p->output_r_s * element(a[13], a[14], a[15], soc) : 0.0;
+    double loop = fmax(1.0 + s->gain * ohm_s, SMALLEST_LOOP);
+    double e = (voltage_v - e_o + s->v_ts + s->v_tl) / loop; /* (3.15) */
+    s->innovation_v = e;
+
+    if (s->adapting) {
+        adapt(s, p, dt_s, e * e);
+        update_margins(s);
+    }
+
+    double tau_ts = element(a[1], a[2], a[3], soc) * element(-a[7], a[8], a[9], soc);
+    double tau_tl = element(a[4], a[5], a[6], soc) * element(-a[10], a[11], a[12], soc);
+    double rate_e = states_step(s, s->gain / loop, voltage_v - e_o, tau_ts, tau_tl, dt_s);
+
+    double excess = fmax(fabs(e) - p->dead_zone_v, 0.0);
+    if (excess > 0.0) {
+        s->k += excess * excess * integral_of_exponential(2.0 * rate_e, dt_s); /* (3.13) */
+        s->gain = nussbaum_gain(s->k, p);
+    }
+    s->voltage_estimate_v = e_o - s->v_ts - s->v_tl; /* (4.1) */
+    if (p->output_r_s > 0.0)
+        s->voltage_estimate_v = voltage_v - (voltage_v - s->voltage_estimate_v) / loop; /* (3.14) */
+    watch_lock(s, p, dt_s, voltage_v, e_o);
+}
+
+static enum verdict judge(state_t *s, const settings_t *p, const sample_t *x)
+{
+    if (!(isfinite(x->time_s) && isfinite(x->current_a) && isfinite(x->voltage_v))) {
+        s->dropped_not_finite++;
+        return NOT_FINITE;
+    }
+    if (x->status & VOLTAGE_SATURATED) {
+        s->dropped_saturated++;
+        return SATURATED;
+    }
+    if (!(p->voltage_min_v <= x->voltage_v && x->voltage_v <= p->voltage_max_v &&
+          fabs(x->current_a) <= p->current_max_a)) {
+        s->dropped_range++;
+        return OUT_OF_RANGE;
+    }
+    if (s->started && x->time_s == s->time_s) {
+        s->dropped_repeated++;
+        return REPEATED;
+    }
+    return ACCEPTED;
+}
+
+static enum verdict step(state_t *s, const settings_t *p, const sample_t *x)
+{
+    enum verdict verdict = judge(s, p, x);
+    if (verdict != ACCEPTED)
+        return verdict;
+    s->samples++;
+    if (!s->started) {
+        start(s, p, x->time_s, x->current_a, x->voltage_v);
+        return verdict;
+    }
+    double dt_s = x->time_s - s->time_s;
+    s->time_s = x->time_s;
+    if (dt_s < 0.0) {
+        s->time_steps_back++;
+        s->current_a = x->current_a;
+        return verdict;
+    }
+    if (dt_s > p->gap_s)
+        s->gaps++;
+    observer_step(s, p, dt_s, x->current_a, x->voltage_v);
+    return verdict;
+}
+
+static void write_row(trace_t *row, const state_t *s, const settings_t *p, const sample_t *x)
+{
+    row->time_s = x->time_s;
+    row->voltage_v = x->voltage_v;
+    row->current_a = x->current_a;
+    row->temperature_c = x->temperature_c;
+    row->soc = s->soc;
+    row->voltage_estimate_v = s->voltage_estimate_v;
+    row->innovation_v = s->innovation_v;
+    row->nussbaum_gain = s->gain;
+    row->k = s->k;
+    row->delta_1 = s->delta_1;
+    row->delta_2 = s->delta_2;
+    row->stability_margin = s->soc - fmax(s->delta_1, s->delta_2);
+    row->lock = s->lock;
+    row->converged = fabs(s->innovation_v) < p->epsilon_v;
+}
+
+int64_t run(state_t *state, const settings_t *settings, const sample_t *samples, trace_t *trace, int64_t n)
+{
+    int64_t rows = 0;
+    for (int64_t j = 0; j < n; j++)
+        if (step(state, settings, samples + j) == ACCEPTED)
+            write_row(trace + rows++, state, settings, samples + j);
+    return rows;
+}
