@@ -1,0 +1,114 @@
+"""Parameters as a mean over the settled part of a run, (3.19), with t_int and t_unst found from the run."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+SETTLED_SHARE = 0.99
+"""Share of the samples after t_int whose error must be within the bound."""
+WINDOWS = 100
+"""The voltage's slope is taken over this part of the run."""
+KNEE_SLOPE = 5.0
+"""A voltage that falls this many times as fast as in the middle of the run, until its end, has passed its knee."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """From when to when (3.19) averages, and why there.
+
+    Attributes:
+        t_int_s: From here the error stays small [s].
+        t_unst_s: Here the battery becomes unstable [s].
+        start_reason: What set t_int.
+        end_reason: What set t_unst.
+    """
+
+    t_int_s: float
+    t_unst_s: float
+    start_reason: str
+    end_reason: str
+
+
+def settled(
+    time_s: Floats,
+    error_v: Floats,
+    voltage_v: Floats,
+    margin: Floats,
+    epsilon_v: float,
+    *,
+    t_int_s: float | None = None,
+    t_unst_s: float | None = None,
+) -> Settled:
+    """Find t_int and t_unst of (3.19).
+
+    t_unst: the margin SOC - max(delta1, delta2) reaches zero, or the voltage its knee, whichever is first.
+    t_int: from here to t_unst, 99 % of the errors are within ``epsilon_v``.
+
+    Args:
+        time_s: Shape (n,) [s].
+        error_v: e(t) (3.15) [V].
+        voltage_v: y(t) [V].
+        margin: SOC - max(delta1, delta2), less what is kept free of it.
+        epsilon_v: What counts as settled [V].
+        t_int_s: Given by the user instead [s].
+        t_unst_s: Given by the user instead [s].
+    """
+    end_s, end_reason = _unstable_from(time_s, voltage_v, margin) if t_unst_s is None else (t_unst_s, "given")
+    if t_int_s is not None:
+        return Settled(t_int_s, end_s, "given", end_reason)
+    inside = time_s <= end_s
+    beyond = np.abs(error_v[inside]) > epsilon_v
+    left = np.arange(beyond.size, 0, -1)
+    share = np.cumsum(beyond[::-1])[::-1] / left  # of the samples from here on
+    good = share <= 1.0 - SETTLED_SHARE
+    good &= ~beyond
+    if not good.any():
+        return Settled(
+            float(time_s[inside][-1]), end_s, f"the error never settles within {1e3 * epsilon_v:.2f} mV", end_reason
+        )
+    start_s = float(time_s[inside][int(np.argmax(good))])
+    return Settled(start_s, end_s, f"99 % of the errors from here on are within {1e3 * epsilon_v:.2f} mV", end_reason)
+
+
+def _unstable_from(time_s: Floats, voltage_v: Floats, margin: Floats) -> tuple[float, str]:
+    """When the battery becomes unstable [s], and what says so."""
+    candidates = [(float(time_s[-1]), "end of the run")]
+    if (margin <= 0.0).any():
+        candidates.append((float(time_s[int(np.argmax(margin <= 0.0))]), "SOC reached max(delta1, delta2)"))
+    knee_s = _knee(time_s, voltage_v)
+    if knee_s is not None:
+        candidates.append((knee_s, "knee of the voltage"))
+    return min(candidates, key=lambda candidate: candidate[0])
+
+
+def _knee(time_s: Floats, voltage_v: Floats) -> float | None:
+    """Where the voltage begins its last fall [s]; None when it does not."""
+    edges = np.linspace(0, time_s.size - 1, WINDOWS + 1).astype(int)
+    if np.unique(edges).size < edges.size:
+        return None
+    fall = -np.diff(voltage_v[edges]) / np.diff(time_s[edges])
+    usual = float(np.median(fall))
+    steep = fall > KNEE_SLOPE * usual
+    if usual <= 0.0 or not steep[-1]:
+        return None
+    gentle = np.flatnonzero(~steep)
+    first = int(gentle[-1]) + 1 if gentle.size else 0
+    return float(time_s[edges[first]])
+
+
+def averaged(time_s: Floats, a: Floats, window: Settled) -> Floats:
+    """The mean of a_i(t) over t_int..t_unst, (3.19).
+
+    Args:
+        time_s: Shape (n,) [s].
+        a: Shape (n, 16), a1..a15 at index 1..15.
+        window: t_int and t_unst.
+
+    Returns:
+        Shape (16,). The last values when no sample lies between t_int and t_unst.
+    """
+    inside = (time_s >= window.t_int_s) & (time_s <= window.t_unst_s)
+    return np.asarray(a[inside].mean(axis=0) if inside.any() else a[-1], dtype=np.float64)  # (3.19)

@@ -1,0 +1,126 @@
+"""Step 3: R_s from the model's other elements by (4.2), and a13..a15 fitted to it, from several currents.
+
+(4.2) is printed with the opposite sign: solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive.
+x2 and x3 are those of the model with frozen a1..a12: the observer's own settle so that (4.1) meets y, and leave nothing
+for R_s.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from bms_estimator.calibration.prediction import Prediction, open_circuit
+from bms_estimator.model.cell import CellModel, Resistance
+from bms_estimator.model.errors import UserError
+
+Floats = NDArray[np.float64]
+
+LEAST_CURRENT_C = 0.02
+"""Below this C-rate (4.2) divides noise by little [1/h]."""
+BIN = 0.01
+"""R_s is averaged over such steps of SOC."""
+EXPONENTS = np.geomspace(2.0, 200.0, 200)
+"""Exponents a14 tried."""
+LEAST_BINS = 5
+"""As many bins as a fit of three parameters should have."""
+
+
+@dataclass(frozen=True)
+class SeriesResistance:
+    """R_s over SOC.
+
+    Attributes:
+        soc: Centres of the bins that hold data, 0..1.
+        r_s_ohm: Mean of (4.2) in each bin [ohm].
+    """
+
+    soc: Floats
+    r_s_ohm: Floats
+
+
+@dataclass(frozen=True)
+class SeriesResistanceFit:
+    """a13..a15 of (2.9).
+
+    Attributes:
+        a: a13 [ohm], a14, a15 [ohm].
+        std: Their standard errors; NaN for one at its bound.
+        rms_ohm: Of the residual [ohm].
+    """
+
+    a: Floats
+    std: Floats
+    rms_ohm: float
+
+    def __call__(self, soc: Floats) -> Floats:
+        """R_s(SOC) [ohm], (2.9)."""
+        return np.asarray(self.a[0] * np.exp(-self.a[1] * soc) + self.a[2], dtype=np.float64)
+
+    @property
+    def element(self) -> Resistance:
+        """As the ``[r_s]`` section of a cell file, whose values must be above 0."""
+        a13, a14, a15 = (max(float(a), 1e-9) for a in self.a)
+        return Resistance(amplitude_ohm=a13, exponent=a14, offset_ohm=a15)
+
+
+def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
+    """R_s by (4.2) wherever current flows.
+
+    Args:
+        cell: Whose open-circuit voltage holds.
+        run: A capture with the x2 + x3 that frozen a1..a12 give under its current.
+
+    Raises:
+        UserError: No current flows.
+    """
+    flowing = np.abs(run.current_a) > LEAST_CURRENT_C * cell.cell.capacity_ah
+    if not flowing.any():
+        raise UserError(
+            f"R_s by (4.2) needs a current: none above {LEAST_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
+            f"{np.abs(run.current_a).max():.3f} A"
+        )
+    missing_v = open_circuit(cell, run.soc) - run.overpotential_v - run.voltage_v
+    r_s = missing_v[flowing] / run.current_a[flowing]  # (4.2), with the sign of (2.4)
+    bins = np.clip((run.soc[flowing] / BIN).astype(int), 0, round(1.0 / BIN) - 1)
+    count = np.bincount(bins)
+    used = np.flatnonzero(count)
+    return SeriesResistance(
+        soc=np.bincount(bins, run.soc[flowing])[used] / count[used], r_s_ohm=np.bincount(bins, r_s)[used] / count[used]
+    )
+
+
+def mean_of(curves: list[SeriesResistance]) -> SeriesResistance:
+    """The mean over several currents where at least one has data, as in Fig. 22 and 31."""
+    soc = (np.arange(round(1.0 / BIN)) + 0.5) * BIN
+    rows = [np.interp(soc, c.soc, c.r_s_ohm, left=np.nan, right=np.nan) for c in curves]
+    stacked = np.array(rows)
+    known = np.isfinite(stacked).any(axis=0)
+    return SeriesResistance(soc=soc[known], r_s_ohm=np.nanmean(stacked[:, known], axis=0))
+
+
+def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> SeriesResistanceFit:
+    """Fit (2.9): for each exponent a14 non-negative linear least squares, the best of them taken.
+
+    Raises:
+        UserError: Too few bins of SOC with data.
+    """
+    used = curve.soc >= lowest_soc
+    soc, r_s = curve.soc[used], curve.r_s_ohm[used]
+    if soc.size < LEAST_BINS:
+        raise UserError(f"R_s is known in {soc.size} steps of SOC, at least {LEAST_BINS} are needed for a13..a15")
+    fits = []
+    for exponent in EXPONENTS:
+        basis = np.column_stack([np.exp(-exponent * soc), np.ones_like(soc)])
+        values, norm = nnls(basis, r_s)
+        fits.append((float(norm), exponent, values))
+    norm, exponent, (a13, a15) = min(fits, key=lambda fit: fit[0])
+    a = np.array([a13, exponent, a15])
+    decay = np.exp(-exponent * soc)
+    jacobian = np.column_stack([decay, -a13 * soc * decay, np.ones_like(soc)])
+    free = np.array([a13 > 0.0, a13 > 0.0 and EXPONENTS[0] < exponent < EXPONENTS[-1], a15 > 0.0])
+    std = np.full(3, np.nan)
+    variance = norm**2 / max(soc.size - int(free.sum()), 1)
+    std[free] = np.sqrt(np.diag(np.linalg.pinv(jacobian[:, free].T @ jacobian[:, free])) * variance)
+    return SeriesResistanceFit(a=a, std=std, rms_ohm=norm / float(np.sqrt(soc.size)))
