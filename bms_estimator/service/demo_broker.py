@@ -1,0 +1,88 @@
+"""An MQTT broker inside the process, for the demo: nothing to install, loopback only.
+
+amqtt is right in what our topics need, retained messages and last wills; a subscription with a wildcard may also
+be handed retained messages that it does not match. No broker for a pack that matters: see docs/deploy.md.
+"""
+
+import errno
+import logging
+import socket
+from types import TracebackType
+from typing import Self
+
+from amqtt.broker import Broker
+from amqtt.contexts import BrokerConfig, ListenerConfig
+
+from bms_estimator.model.errors import UserError
+
+MQTT_PORT = 1883
+"""Where MQTT clients look when nobody tells them."""
+LOOPBACK = "127.0.0.1"
+ANONYMOUS = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
+
+
+class DemoBroker:
+    """A broker on loopback while the context lasts.
+
+    Args:
+        port: TCP port; None: 1883 when it is free, else any that is.
+
+    Raises:
+        UserError: The port asked for is taken.
+    """
+
+    def __init__(self, port: int | None = None) -> None:
+        self.port = _choose(port)
+        logging.getLogger("amqtt").setLevel(logging.CRITICAL)  # it logs whole stacks when a client goes without a word
+        listener = ListenerConfig(bind=f"{LOOPBACK}:{self.port}")
+        self._broker = Broker(BrokerConfig(listeners={"default": listener}, plugins=ANONYMOUS))
+
+    @property
+    def url(self) -> str:
+        """For ``mqtt.url``."""
+        return f"mqtt://{LOOPBACK}:{self.port}"
+
+    @property
+    def look_command(self) -> str:
+        """What shows all topics in a second terminal."""
+        port = "" if self.port == MQTT_PORT else f" -p {self.port}"
+        return f"mosquitto_sub{port} -t 'bms/#' -v"
+
+    async def __aenter__(self) -> Self:
+        """Start listening."""
+        await self._broker.start()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Part from all clients."""
+        await self._broker.shutdown()
+
+
+def _choose(port: int | None) -> int:
+    """The port to listen on: as asked, else 1883, else a free one."""
+    if port is not None:
+        if not _free(port):
+            raise UserError(f"port {port}: taken by another program; leave --port out to have a free one chosen")
+        return port
+    return MQTT_PORT if _free(MQTT_PORT) else _any_free()
+
+
+def _free(port: int) -> bool:
+    """Whether nobody listens on the port."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            if error.errno in (errno.EADDRINUSE, errno.EACCES):
+                return False
+            raise
+    return True
+
+
+def _any_free() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])

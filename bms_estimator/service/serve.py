@@ -1,0 +1,78 @@
+"""The service of one pack as ``bms-estimator run`` starts it: board, estimator, broker, checkpoint, signals."""
+
+import asyncio
+import os
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
+from bms_estimator.service.live import run_live
+from bms_estimator.service.requests import Requests
+from bms_estimator.sinks import Sink
+from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.sources.serial_board import SerialBoard, Tap
+
+
+async def serve(
+    settings: Settings,
+    cell: CellModel,
+    *,
+    sinks: Sequence[Sink] = (),
+    tap: Tap | None = None,
+    stop: asyncio.Event | None = None,
+) -> Estimator:
+    """Run until SIGINT or SIGTERM.
+
+    Args:
+        settings: The pack's settings; with ``[mqtt]`` a broker is served.
+        cell: The pack as one object (``CellModel.pack``).
+        sinks: Further sinks, such as the console.
+        tap: Gets all bytes of the board with their arrival times.
+        stop: Set by someone else to end as a signal does.
+
+    Returns:
+        The estimator as the last sample left it.
+
+    Raises:
+        UserError: A setting that cannot be used.
+    """
+    stop = stop or asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    requests = Requests()
+    board = SerialBoard(settings.sensor, tap=tap)
+    requests.offer("current_zero", lambda _: board.current_zero())
+    all_sinks = list(sinks)
+    if settings.mqtt is not None:
+        all_sinks.append(MqttSink(settings.mqtt, settings.pack.name, requests.answer))
+    return await run_live(
+        settings,
+        cell,
+        source=board,
+        sinks=all_sinks,
+        stop=stop,
+        checkpoint=_checkpoint(settings, cell),
+        requests=requests,
+    )
+
+
+def _checkpoint(settings: Settings, cell: CellModel) -> CheckpointFile | None:
+    """The pack's checkpoint in the folder of the settings, else in systemd's StateDirectory, else none.
+
+    Raises:
+        UserError: The folder cannot be made.
+    """
+    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    folder = settings.state.folder or (Path(given) if given else None)
+    if folder is None:
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"state.folder = {folder}: {error.strerror}") from None
+    return CheckpointFile(folder / f"{settings.pack.name}.npz", pack_identity(settings, cell))
