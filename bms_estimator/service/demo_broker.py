@@ -1,7 +1,6 @@
 """An MQTT broker inside the process, for the demo: nothing to install, loopback only.
 
-amqtt is right in what our topics need, retained messages and last wills; a subscription with a wildcard may also
-be handed retained messages that it does not match. No broker for a pack that matters: see docs/deploy.md.
+No broker for a pack that matters: it knows no passwords here, keeps nothing over a restart, and see ``_Broker``.
 """
 
 import errno
@@ -12,6 +11,7 @@ from typing import Self
 
 from amqtt.broker import Broker
 from amqtt.contexts import BrokerConfig, ListenerConfig
+from amqtt.session import Session
 
 from bms_estimator.model.errors import UserError
 
@@ -19,6 +19,17 @@ MQTT_PORT = 1883
 """Where MQTT clients look when nobody tells them."""
 LOOPBACK = "127.0.0.1"
 ANONYMOUS = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
+
+
+class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
+    """amqtt 0.12 hands a client that connects the retained messages of everyone's subscriptions: only its own are right."""
+
+    async def _publish_retained_messages_for_subscription(
+        self, subscription: tuple[str, int], session: Session
+    ) -> None:
+        topic_filter, _ = subscription
+        if any(subscriber is session for subscriber, _ in self._subscriptions.get(topic_filter, ())):
+            await super()._publish_retained_messages_for_subscription(subscription, session)
 
 
 class DemoBroker:
@@ -35,7 +46,7 @@ class DemoBroker:
         self.port = _choose(port)
         logging.getLogger("amqtt").setLevel(logging.CRITICAL)  # it logs whole stacks when a client goes without a word
         listener = ListenerConfig(bind=f"{LOOPBACK}:{self.port}")
-        self._broker = Broker(BrokerConfig(listeners={"default": listener}, plugins=ANONYMOUS))
+        self._broker = _Broker(BrokerConfig(listeners={"default": listener}, plugins=ANONYMOUS))
 
     @property
     def url(self) -> str:

@@ -1,0 +1,129 @@
+"""The demo's broker is right in what our topics need: retained messages and last wills."""
+
+import asyncio
+import json
+import shutil
+import socket
+import sys
+
+import aiomqtt
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.service.demo_broker import DemoBroker
+
+PATIENCE_S = 10.0
+RETAINED = ["bms/p/availability", "bms/p/sensor/availability", "bms/p/info", "homeassistant/device/p/config"]
+
+# A client with a last will that ends without a word once it is connected
+DIES = """
+import asyncio, os, sys, aiomqtt
+async def main():
+    will = aiomqtt.Will("bms/p/availability", b"offline", qos=1, retain=True)
+    async with aiomqtt.Client("127.0.0.1", int(sys.argv[1]), will=will) as client:
+        await client.publish("bms/p/availability", b"online", qos=1, retain=True)
+        sys.stdin.read()
+        os._exit(1)
+asyncio.run(main())
+"""
+
+
+@pytest.fixture
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+async def next_message(client: aiomqtt.Client) -> tuple[str, bytes, bool]:
+    async with asyncio.timeout(PATIENCE_S):
+        message = await anext(aiter(client.messages))
+    return message.topic.value, message.payload, message.retain
+
+
+async def all_retained(port: int, subscription: str) -> list[str]:
+    """Topics that come to a new client, until one it publishes itself afterwards."""
+    seen = []
+    last = subscription.replace("#", "last").replace("+", "last")
+    async with aiomqtt.Client("127.0.0.1", port) as client:
+        await client.subscribe(subscription, qos=1)
+        await client.publish(last, json.dumps("x"), qos=1)
+        while True:
+            topic, payload, retain = await next_message(client)
+            if not retain and payload == b'"x"':
+                return sorted(seen)
+            seen.append(topic)
+
+
+async def publish_all(client: aiomqtt.Client) -> None:
+    for topic in RETAINED:
+        await client.publish(topic, topic, qos=1, retain=True)
+
+
+@pytest.mark.parametrize(
+    ("subscription", "expected"),
+    [
+        ("bms/#", RETAINED[:3]),
+        ("homeassistant/#", RETAINED[3:]),
+        ("bms/+/availability", RETAINED[:1]),
+        ("bms/p/info", ["bms/p/info"]),
+        ("homeassistant/status", []),
+    ],
+)
+async def test_a_subscription_gets_the_retained_messages_it_matches_once(free_port, subscription, expected):
+    async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
+        await publish_all(service)
+        for other in ("bms/#", "homeassistant/#", "#"):  # others listen too
+            await service.subscribe(other)
+        assert await all_retained(free_port, subscription) == sorted(expected)
+
+
+async def test_an_empty_message_removes_a_retained_one(free_port):
+    async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
+        await publish_all(service)
+        await service.publish("bms/p/info", b"", qos=1, retain=True)
+        assert "bms/p/info" not in await all_retained(free_port, "bms/#")
+
+
+async def test_the_will_of_a_client_that_dies_comes_and_is_retained(free_port):
+    async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as watcher:
+        await watcher.subscribe("bms/p/availability", qos=1)
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", DIES, str(free_port), stdin=asyncio.subprocess.PIPE
+        )
+        assert await next_message(watcher) == ("bms/p/availability", b"online", False)
+        assert process.stdin
+        process.stdin.close()
+        assert await next_message(watcher) == ("bms/p/availability", b"offline", False)
+        await process.wait()
+        async with aiomqtt.Client("127.0.0.1", free_port) as late:
+            await late.subscribe("bms/p/availability", qos=1)
+            assert await next_message(late) == ("bms/p/availability", b"offline", True)
+
+
+async def test_the_will_of_a_client_that_says_goodbye_does_not_come(free_port):
+    async with DemoBroker(free_port):
+        will = aiomqtt.Will("bms/p/availability", b"offline", qos=1, retain=True)
+        async with aiomqtt.Client("127.0.0.1", free_port, will=will) as service:
+            await service.publish("bms/p/availability", b"online", qos=1, retain=True)
+        async with aiomqtt.Client("127.0.0.1", free_port) as late:
+            await late.subscribe("bms/p/availability", qos=1)
+            assert await next_message(late) == ("bms/p/availability", b"online", True)
+
+
+async def test_a_port_that_is_taken_is_said(free_port):
+    async with DemoBroker(free_port):
+        with pytest.raises(UserError, match=f"port {free_port}: taken"):
+            DemoBroker(free_port)
+        assert DemoBroker().port != free_port
+
+
+async def test_the_printed_command_shows_the_topics(free_port):
+    if shutil.which("mosquitto_sub") is None:
+        pytest.skip("mosquitto_sub is not installed (apt install mosquitto-clients)")
+    async with DemoBroker(free_port) as broker, aiomqtt.Client("127.0.0.1", free_port) as service:
+        await publish_all(service)
+        process = await asyncio.create_subprocess_shell(f"{broker.look_command} -C 3", stdout=asyncio.subprocess.PIPE)
+        async with asyncio.timeout(PATIENCE_S):
+            shown, _ = await process.communicate()
+        assert sorted(shown.decode().split()[::2]) == sorted(RETAINED[:3])
