@@ -126,7 +126,7 @@ def adaptive_run(
     error, parameters = np.array(error_v), np.array(a)
     epsilon_v = float(estimator.settings["epsilon_v"][0])
     margin = found["stability_margin"] - float(estimator.settings["margin_guard"][0])
-    window = settled(found["time_s"], error, found["voltage_v"], margin, epsilon_v, t_int_s=t_int_s, t_unst_s=t_unst_s)
+    window = settled(found["time_s"], error, found["voltage_v"], margin, parameters, epsilon_v, t_int_s=t_int_s, t_unst_s=t_unst_s)
     lock_losses = int(estimator.state["lock_losses"][0])
     return AdaptiveRun(
         time_s=found["time_s"],

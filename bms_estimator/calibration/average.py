@@ -9,6 +9,8 @@ Floats = NDArray[np.float64]
 
 SETTLED_SHARE = 0.99
 """Share of the samples after t_int whose error must be within the bound."""
+SETTLED_PARAMETER = 1e-3
+"""A parameter this near to its median, relatively, has settled."""
 WINDOWS = 100
 """The voltage's slope is taken over this part of the run."""
 KNEE_SLOPE = 5.0
@@ -37,6 +39,7 @@ def settled(
     error_v: Floats,
     voltage_v: Floats,
     margin: Floats,
+    a: Floats,
     epsilon_v: float,
     *,
     t_int_s: float | None = None,
@@ -45,13 +48,15 @@ def settled(
     """Find t_int and t_unst of (3.19).
 
     t_unst: the margin SOC - max(delta1, delta2) reaches zero, or the voltage its knee, whichever is first.
-    t_int: from here to t_unst, 99 % of the errors are within ``epsilon_v``.
+    t_int: from here to t_unst, 99 % of the errors are within ``epsilon_v``, and each a_i within 0.1 % of its
+    median: a mean from the first sample on would hold the way from a_i(t0) to there.
 
     Args:
         time_s: Shape (n,) [s].
         error_v: e(t) (3.15) [V].
         voltage_v: y(t) [V].
         margin: SOC - max(delta1, delta2), less what is kept free of it.
+        a: Shape (n, 16), a1..a15 at index 1..15.
         epsilon_v: What counts as settled [V].
         t_int_s: Given by the user instead [s].
         t_unst_s: Given by the user instead [s].
@@ -63,14 +68,25 @@ def settled(
     beyond = np.abs(error_v[inside]) > epsilon_v
     left = np.arange(beyond.size, 0, -1)
     share = np.cumsum(beyond[::-1])[::-1] / left  # of the samples from here on
-    good = share <= 1.0 - SETTLED_SHARE
-    good &= ~beyond
+    good = (share <= 1.0 - SETTLED_SHARE) & ~beyond
     if not good.any():
-        return Settled(
-            float(time_s[inside][-1]), end_s, f"the error never settles within {1e3 * epsilon_v:.2f} mV", end_reason
-        )
-    start_s = float(time_s[inside][int(np.argmax(good))])
-    return Settled(start_s, end_s, f"99 % of the errors from here on are within {1e3 * epsilon_v:.2f} mV", end_reason)
+        reason = f"the error never settles within {1e3 * epsilon_v:.2f} mV"
+        return Settled(float(time_s[inside][-1]), end_s, reason, end_reason)
+    error_from = int(np.argmax(good))
+    a_from = _settled_from(a[inside])
+    if a_from > error_from:
+        reason = f"every a_i is within {100 * SETTLED_PARAMETER:g} % of its median from here on"
+        return Settled(float(time_s[inside][a_from]), end_s, reason, end_reason)
+    reason = f"99 % of the errors from here on are within {1e3 * epsilon_v:.2f} mV"
+    return Settled(float(time_s[inside][error_from]), end_s, reason, end_reason)
+
+
+def _settled_from(a: Floats) -> int:
+    """Index from which on every parameter stays near its median of the latter half."""
+    usual = np.median(a[a.shape[0] // 2 :], axis=0)
+    off = (np.abs(a - usual) > SETTLED_PARAMETER * np.abs(usual)).any(axis=1)
+    last = np.flatnonzero(off)
+    return min(int(last[-1]) + 1, a.shape[0] - 1) if last.size else 0
 
 
 def _unstable_from(time_s: Floats, voltage_v: Floats, margin: Floats) -> tuple[float, str]:

@@ -1,0 +1,78 @@
+"""What a report is made of: tables and figures of the thesis, each with what became of it."""
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+
+class Verdict(Enum):
+    """What became of a table or figure."""
+
+    REPRODUCED = "reproduced"
+    CORRECTED = "reproduced after correction"
+    NOT = "cannot be reproduced"
+    GIVEN = "given"
+    """Input data, a diagram or a photograph: there is nothing to compute."""
+    ADDED = "added"
+    """Not in the thesis."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: printed beside recomputed.
+
+    Attributes:
+        key: "5" for Table 5 of the thesis.
+        title: Its caption.
+        columns: Headings.
+        rows: One list of cells for each row.
+        verdict: What became of it.
+        reason: Why it differs from print, or what the agreement rests on.
+    """
+
+    key: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    verdict: Verdict
+    reason: str
+
+    kind: str = field(default="Table", init=False)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure.
+
+    Attributes:
+        key: "19" for Figure 19 of the thesis.
+        title: Its caption.
+        svg: The plot, one ``<svg>`` element; empty for a diagram or photograph.
+        verdict: What became of it.
+        reason: What it shows, where it differs from print and why.
+    """
+
+    key: str
+    title: str
+    svg: str
+    verdict: Verdict
+    reason: str
+
+    kind: str = field(default="Figure", init=False)
+
+
+Item = Table | Figure
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number as tables show it: significant digits, no needless exponent."""
+    if value != value:  # NaN  # noqa: PLR0124
+        return "–"
+    text = f"{value:.{digits}g}"
+    if "e" in text and 1e-4 <= abs(value) < 1e7:
+        text = f"{value:.{max(digits - 1, 0)}f}" if abs(value) < 1 else f"{value:.0f}"
+    return text
+
+
+def percent(value: float, true: float) -> str:
+    """Error of ``value`` in percent of the true value (E7)."""
+    return number(100.0 * abs(value - true) / abs(true), 3)

@@ -1,0 +1,78 @@
+"""Plots as inline SVG (matplotlib)."""
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+INK = "#1d2733"
+FAINT = "#8a97a6"
+COLOURS = ("#1f5fa8", "#d1602b", "#2f8f5b", "#8a4fa3", "#b08a1e", "#4aa3b5")
+"""Told apart in print and by colour-blind eyes: blue, orange, green, violet, ochre, teal."""
+POINTS = 1200
+"""More points than this on a line are not seen in a plot of this width."""
+WIDTH_IN, ROW_IN = 8.0, 3.0
+
+STYLE: dict[str, Any] = {
+    "svg.fonttype": "path",
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6eaef",
+    "grid.linewidth": 0.7,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "lines.linewidth": 1.4,
+    "figure.constrained_layout.use": True,
+}
+
+
+def plot(draw: Callable[[Any], None], *, rows: int = 1, columns: int = 1, salt: str = "bms") -> str:
+    """One figure as an ``<svg>`` element.
+
+    Args:
+        draw: Is given the axes: one, or an array of rows x columns.
+        rows: Of axes.
+        columns: Of axes.
+        salt: Makes the ids of the SVG's parts its own, and the same at every run.
+    """
+    import matplotlib as mpl  # noqa: PLC0415  (an optional dependency)
+    from matplotlib.backends.backend_svg import FigureCanvasSVG  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    with mpl.rc_context(STYLE | {"axes.prop_cycle": mpl.cycler(color=COLOURS), "svg.hashsalt": salt}):
+        figure = Figure(figsize=(WIDTH_IN, 0.3 + ROW_IN * rows))
+        FigureCanvasSVG(figure)
+        draw(figure.subplots(rows, columns))
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def thin(x: Floats, *curves: Floats, points: int = POINTS) -> tuple[Floats, ...]:
+    """The same curves with fewer points; of each stretch its first, lowest and highest by the first curve are kept."""
+    if x.size <= points:
+        return (x, *curves)
+    y = curves[0]
+    edges = np.linspace(0, x.size, points // 3 + 1).astype(int)
+    kept = {x.size - 1}
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        part = y[first:last]
+        kept |= {int(first), int(first + np.argmin(part)), int(first + np.argmax(part))}
+    index = np.array(sorted(kept))
+    return (x[index], *(curve[index] for curve in curves))

@@ -1,0 +1,228 @@
+"""The experimental protocol of chapter 5 on captures: steps 1 to 3, validation, SOC by interpolation.
+
+The captures are real ones, or those of the simulated pack. Each result is made when it is first asked for.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.adaptive import AdaptiveRun, adaptive_run
+from bms_estimator.calibration.ocv import ChenMoraFit, TableFit, fit_chen_mora, fit_table, pooled
+from bms_estimator.calibration.prediction import Prediction, predict, static_elements
+from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, without_glitches
+from bms_estimator.calibration.series_resistance import (
+    SeriesResistance,
+    SeriesResistanceFit,
+    fit_series_resistance,
+    mean_of,
+    series_resistance,
+)
+from bms_estimator.calibration.soc_lookup import soc_by_interpolation
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import ObserverSettings
+
+Floats = NDArray[np.float64]
+
+LOWEST_SOC = 0.05
+"""Validation ends here: below, the elements and the open-circuit voltage run off (E14)."""
+STATIC_SOC = 0.5
+"""SOC at which the static model is frozen."""
+REST_SHARE = 0.05
+"""A capture that rests for a larger share of its time is one of steps."""
+STEADY = 0.15
+"""A current that varies by less than this of its mean is constant."""
+
+
+class Kind(Enum):
+    """What a capture serves for."""
+
+    RELAXATION = "voltage relaxation test"
+    CONSTANT = "constant load"
+    STEPS = "steps"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One experiment.
+
+    Attributes:
+        name: What to call it.
+        kind: What it serves for.
+        samples: Dtype ``SAMPLE``, raw.
+    """
+
+    name: str
+    kind: Kind
+    samples: SampleBlock
+
+
+def kind_of(samples: SampleBlock, capacity_ah: float) -> Kind:
+    """What a capture is good for, by its current."""
+    good = without_glitches(samples)
+    current_a = good["current_a"]
+    resting = np.abs(current_a) < 0.01 * capacity_ah
+    if resting.mean() < REST_SHARE:
+        loaded = current_a[~resting]
+        return Kind.CONSTANT if loaded.std() < STEADY * abs(loaded.mean()) else Kind.STEPS
+    loaded = current_a[~resting & (np.r_[0.0, np.abs(np.diff(current_a))] < 0.01 * capacity_ah)]
+    if loaded.size and loaded.std() < STEADY * abs(loaded.mean()):
+        return Kind.RELAXATION
+    return Kind.STEPS
+
+
+class Protocol:
+    """Chapter 5 on one pack.
+
+    Args:
+        cell: Its capacity, its limits and the bounds of (3.18); its elements and OCV are not used but estimated.
+        captures: At least one relaxation test and one constant load, discharging.
+        voltage_step_v: One step of the voltage converter [V].
+    """
+
+    def __init__(self, cell: CellModel, captures: Sequence[Capture], voltage_step_v: float) -> None:
+        self.cell = cell
+        self.voltage_step_v = voltage_step_v
+        self.captures = list(captures)
+        for kind in (Kind.RELAXATION, Kind.CONSTANT):
+            if not self.of(kind):
+                listed = ", ".join(f"{c.name} ({c.kind.value})" for c in self.captures)
+                raise UserError(f"the protocol needs a {kind.value}; given: {listed or 'nothing'}")
+
+    def of(self, *kinds: Kind) -> list[Capture]:
+        """The captures of given kinds."""
+        return [capture for capture in self.captures if capture.kind in kinds]
+
+    @property
+    def loads(self) -> list[Capture]:
+        """What validates: constant loads and steps; where there are no steps, the relaxation tests are."""
+        steps = self.of(Kind.STEPS) or self.of(Kind.RELAXATION)
+        return [*self.of(Kind.CONSTANT), *steps]
+
+    # Step 1 -----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def tests(self) -> list[RelaxationTest]:
+        """The voltage relaxation tests."""
+        return [
+            relaxation_test(
+                c.samples, self.cell.cell.capacity_ah, series_count=self.cell.cell.series_count, name=c.name
+            )
+            for c in self.of(Kind.RELAXATION)
+        ]
+
+    @cached_property
+    def single_fits(self) -> list[ChenMoraFit]:
+        """(2.10) fitted to each test, for (5.1)-(5.2)."""
+        return [fit_chen_mora(pooled([test])) for test in self.tests]
+
+    @cached_property
+    def joint_fit(self) -> ChenMoraFit:
+        """(2.10) fitted to all tests together."""
+        return fit_chen_mora(pooled(self.tests))
+
+    @cached_property
+    def table(self) -> TableFit:
+        """The monotone table through the points of all tests."""
+        return fit_table(pooled(self.tests))
+
+    @cached_property
+    def with_ocv(self) -> CellModel:
+        """The cell with the fitted (2.10)."""
+        return self.cell.model_copy(update={"ocv": self.joint_fit.ocv})
+
+    def initial_soc(self, capture: Capture) -> float:
+        """1 when the capture begins as full as the relaxation tests do, else from its first voltage at rest."""
+        first = without_glitches(capture.samples)[0]
+        full_v = float(self.table.ocv_v[-1])
+        if capture.kind is Kind.RELAXATION or abs(first["current_a"]) > 0.01 * self.cell.cell.capacity_ah:
+            return 1.0
+        if first["voltage_v"] > full_v - 0.004 * self.cell.cell.series_count:
+            return 1.0
+        grid = np.linspace(0.0, 1.0, 2001)
+        return float(np.interp(first["voltage_v"], self.table(grid), grid))
+
+    # Step 2 -----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def smallest(self) -> Capture:
+        """The constant load of the smallest current: Algorithm 1 asks for a very small one."""
+        return min(self.of(Kind.CONSTANT), key=lambda c: float(np.median(c.samples["current_a"])))
+
+    @cached_property
+    def adaptive(self) -> AdaptiveRun:
+        """Algorithm 1 on it."""
+        estimator = Estimator(
+            self.with_ocv,
+            ObserverSettings(),
+            voltage_resolution_v=self.voltage_step_v,
+            initial_soc=self.initial_soc(self.smallest),
+        )
+        return adaptive_run(estimator, without_glitches(self.smallest.samples))
+
+    # Step 3 -----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def r_s_curves(self) -> dict[str, SeriesResistance]:
+        """R_s by (4.2) for each constant load."""
+        return {
+            c.name: series_resistance(
+                self.with_ocv, self._predict(self.with_ocv, c, a=self.adaptive.average, lowest_soc=0.02)
+            )
+            for c in self.of(Kind.CONSTANT)
+        }
+
+    @cached_property
+    def r_s_mean(self) -> SeriesResistance:
+        """Their mean, as in Fig. 31."""
+        return mean_of(list(self.r_s_curves.values()))
+
+    @cached_property
+    def r_s_fit(self) -> SeriesResistanceFit:
+        """a13..a15."""
+        return fit_series_resistance(self.r_s_mean)
+
+    @cached_property
+    def a(self) -> Floats:
+        """a1..a15 as estimated, shape (16,)."""
+        a = self.adaptive.average.copy()
+        a[13:16] = self.r_s_fit.a
+        return a
+
+    @cached_property
+    def model(self) -> CellModel:
+        """The estimated model, R_s included."""
+        return self.with_ocv.model_copy(update={"r_s": self.r_s_fit.element})
+
+    # Validation -------------------------------------------------------------------------------------------------
+
+    def _predict(self, cell: CellModel, capture: Capture, *, a: Floats, lowest_soc: float = LOWEST_SOC) -> Prediction:
+        return predict(cell, capture.samples, self.initial_soc(capture), a=a, lowest_soc=lowest_soc)
+
+    @cached_property
+    def dynamic(self) -> dict[str, Prediction]:
+        """The estimated model, frozen, on every load (5.3)."""
+        return {c.name: self._predict(self.with_ocv, c, a=self.a) for c in self.loads}
+
+    @cached_property
+    def static(self) -> dict[str, Prediction]:
+        """The same with its elements frozen at one SOC (chapter 6)."""
+        frozen = static_elements(self.a, STATIC_SOC)
+        return {c.name: self._predict(self.with_ocv, c, a=frozen) for c in self.loads}
+
+    @cached_property
+    def largest(self) -> str:
+        """Name of the constant load of the largest current, the bulb of Fig. 41."""
+        return max(self.of(Kind.CONSTANT), key=lambda c: float(np.median(c.samples["current_a"]))).name
+
+    @cached_property
+    def interpolated(self) -> tuple[Floats, Floats]:
+        """SOC and E_o by 7.1 over the run of ``largest``."""
+        return soc_by_interpolation(self.model, self.dynamic[self.largest])

@@ -1,0 +1,97 @@
+"""What Theorem 4.1.2 claims, measured: do the products R_ts C_ts, R_tl C_tl converge to the truth?
+
+The theorem says so for a small current, whatever a1..a12 converge to. Here the observer runs at several currents and
+with several bounds on a cell whose truth is known.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.adaptive import adaptive_run
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import Bounds, CellModel
+from bms_estimator.reports.simulation import discharge, mean_error_percent, observer_settings, with_bounds
+
+Floats = NDArray[np.float64]
+
+C_RATES = (1.0, 0.1, 0.01)
+"""The smallest is a hundred hours from full to empty."""
+SAMPLES = 100_000
+"""In each run, from full to empty."""
+SETTLED_FROM_S = 60.0
+"""Tracking is judged from here on [s]."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One run.
+
+    Attributes:
+        bounds: Which.
+        c_rate: Current over capacity [1/h].
+        tracking_v: Largest |e| from ``SETTLED_FROM_S`` to t_unst [V].
+        error_percent: Mean error over SOC of R_ts C_ts and R_tl C_tl [%].
+        limit_percent: The same of the products at the Lemma 4.1.3 limits [%].
+    """
+
+    bounds: str
+    c_rate: float
+    tracking_v: float
+    error_percent: tuple[float, float]
+    limit_percent: tuple[float, float]
+
+
+PRODUCTS = ("R_ts C_ts", "R_tl C_tl")
+
+
+def bounds_sets(cell: CellModel) -> dict[str, dict[int, Bounds]]:
+    """Table 5's bounds, some with the truth as their limit, some with twice the resistances."""
+
+    def around(low: float, high: float) -> dict[int, Bounds]:
+        found = {}
+        for i in range(1, 13):
+            # offsets and amplitudes of the resistances only: the exponents and capacitances stay at the truth
+            scale = (low, high) if i in (1, 3, 4, 6) else (0.5, 1.5)
+            value = float(cell.a[i])
+            found[i] = Bounds(lower=scale[0] * value, upper=scale[1] * value, weight_upper=50.0, weight_lower=50.0)
+        return found
+
+    return {
+        "Table 5": {i: cell.bounds(i) for i in range(1, 13)},
+        "limit at the truth": around(0.5, 1.5),
+        "limit at twice the resistances": around(1.0, 3.0),
+    }
+
+
+def measure(cell: CellModel) -> list[Measured]:
+    """Every set of bounds at every current."""
+    found = []
+    for name, bounds in bounds_sets(cell).items():
+        bounded = with_bounds(cell, bounds)
+        limit = np.zeros(16)
+        for i, b in bounds.items():
+            limit[i] = b.limit
+        for c_rate in C_RATES:
+            found.append(_measure(bounded, name, c_rate, limit))
+    return found
+
+
+def _measure(cell: CellModel, name: str, c_rate: float, limit: Floats) -> Measured:
+    current_a = c_rate * cell.cell.capacity_ah
+    samples = discharge(cell, current_a, 3600.0 / c_rate / SAMPLES)
+    estimator = Estimator(cell, observer_settings("improved"), voltage_resolution_v=1e-6, initial_soc=1.0)
+    run = adaptive_run(estimator, samples)
+    judged = (run.time_s >= SETTLED_FROM_S) & (run.time_s <= run.window.t_unst_s)
+    return Measured(
+        bounds=name,
+        c_rate=c_rate,
+        tracking_v=float(np.abs(run.error_v[judged]).max()),
+        error_percent=_both(run.average, cell.a),
+        limit_percent=_both(limit, cell.a),
+    )
+
+
+def _both(a: Floats, true: Floats) -> tuple[float, float]:
+    return mean_error_percent(PRODUCTS[0], a, true), mean_error_percent(PRODUCTS[1], a, true)
