@@ -1,0 +1,112 @@
+"""``bms-estimator``: the table of commands, and what becomes of errors.
+
+A command's module is imported when the command runs: ``--help`` stays fast, and a missing optional package
+hurts only the command that needs it.
+"""
+
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from bms_estimator import __version__
+from bms_estimator.model.errors import UserError
+
+
+class Entry(NamedTuple):
+    """A command that has not been imported yet."""
+
+    target: str
+    """``module:name`` of a function or a ``Typer``."""
+    help: str
+
+
+COMMANDS = {
+    "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
+    "replay": Entry("bms_estimator.cli.replay:replay", "Estimate from a recorded capture or a table."),
+    "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),
+    "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
+    "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
+    "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
+    "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
+}
+
+EXTRAS = {"pyarrow": "parquet", "amqtt": "demo", "matplotlib": "report"}
+"""Optional package -> the extra that brings it."""
+
+
+class LazyGroup(TyperGroup):
+    """Lists commands from ``COMMANDS`` and imports the one that is called."""
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 - the signature is the base's
+        """Names of all commands, in the order in which one meets them."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
+        """Enough of a command to be listed."""
+        entry = COMMANDS.get(cmd_name)
+        return TyperCommand(cmd_name, help=entry.help) if entry else None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is called, imported."""
+        name, listed, rest = super().resolve_command(ctx, args)
+        return name, _import(name) if name in COMMANDS else listed, rest
+
+
+def _import(name: str) -> Any:
+    module, attribute = COMMANDS[name].target.split(":")
+    target = getattr(importlib.import_module(module), attribute)
+    if not isinstance(target, typer.Typer):
+        function, target = target, typer.Typer(add_completion=False)
+        target.command(name, help=COMMANDS[name].help if not function.__doc__ else None)(function)
+    command = typer.main.get_command(target)
+    command.name = name
+    return command
+
+
+app = typer.Typer(cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"bms-estimator {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    _version: bool = typer.Option(
+        False, "--version", callback=_print_version, is_eager=True, help="Show the version and end."
+    ),
+) -> None:
+    """Real-time estimator of a Li-ion battery: SOC, parameters and stability margins."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and end the process.
+
+    Exit codes: 0 done, 1 a fault of ours (with its traceback), 2 something a person can mend, 130 interrupted.
+
+    Args:
+        arguments: Without the program's name; None: the process's.
+    """
+    try:
+        app(None if arguments is None else list(arguments), prog_name="bms-estimator")
+    except UserError as error:
+        _end(str(error))
+    except ModuleNotFoundError as error:
+        package = (error.name or "").split(".")[0]
+        if package not in EXTRAS:
+            raise
+        _end(f"this needs {package}: pip install 'bms_estimator[{EXTRAS[package]}]'")
+    except KeyboardInterrupt:  # while a command was imported
+        sys.exit(130)
+
+
+def _end(message: str) -> None:
+    for line in message.splitlines():
+        sys.stderr.write(f"error: {line}\n")
+    sys.exit(2)

@@ -1,0 +1,135 @@
+"""``bms-estimator replay``: the estimator over a capture."""
+
+import asyncio
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack, contextmanager, nullcontext
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from bms_estimator.cli.pack import pack_or_cell, with_broker, with_pack
+from bms_estimator.cli.summary import Result, Summary
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.clock import Clock
+from bms_estimator.service.live import new_estimator
+from bms_estimator.service.publisher import Publisher
+from bms_estimator.service.requests import Requests
+from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.sinks.table import TableSink, table_sink
+from bms_estimator.sources.replay import Replay, open_replay
+
+
+def replay(
+    capture: Annotated[Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet", show_default=False)],
+    cell: Annotated[str | None, typer.Option(help="shipped cell's name or a cell file", show_default=False)] = None,
+    pack: Annotated[Path | None, typer.Option(help="settings of the pack, pack.toml", show_default=False)] = None,
+    soc: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="SOC at the first sample; else from the OCV")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="estimates sample by sample: .csv, .csv.gz, .parquet", show_default=False)
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    mqtt: Annotated[str | None, typer.Option(help="publish to this broker, mqtt://host:port")] = None,
+    speed: Annotated[
+        float | None, typer.Option(min=1e-3, help="times as fast as recorded; else as fast as it goes")
+    ] = None,
+) -> None:
+    """Estimate from a recorded capture or a table.
+
+    The same estimator as in live operation: a capture that ``record`` made gives the same estimates to the last bit.
+    """
+    settings, model = pack_or_cell(pack, cell)
+    if soc is not None:
+        settings = with_pack(settings, initial_soc=soc)
+    settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
+    if out is not None and out.exists() and out.samefile(capture):
+        raise UserError(f"--out {out}: is the capture itself")
+    source = open_replay(capture, settings.sensor, speed=speed)
+    result = asyncio.run(_replay(settings, model, source, table_sink(out) if out else None))
+    if as_json:
+        sys.stdout.write(json.dumps(asdict(result)) + "\n")
+    else:
+        Console().print(result_table(capture, result))
+
+
+async def _replay(settings: Settings, cell: CellModel, source: Replay, table: TableSink | None) -> Result:
+    """Source -> estimator -> table, summary, broker."""
+    estimator, summary = new_estimator(settings, cell), Summary()
+    async with AsyncExitStack() as stack:
+        publisher = await _publisher(stack, settings, cell, estimator, source)
+        stack.enter_context(table or nullcontext())
+        show = stack.enter_context(_progress(source))
+        started_s = time.perf_counter()
+        async for block in source:
+            trace = estimator.run(block)
+            summary.add(trace)
+            if table:
+                table.write(trace)
+            if publisher:
+                publisher.add(trace)
+                await asyncio.sleep(0)
+            show()
+        wall_s = time.perf_counter() - started_s
+        if publisher:
+            publisher.publish_last()
+    return summary.result(estimator.state[0], source.samples, wall_s)
+
+
+async def _publisher(
+    stack: AsyncExitStack, settings: Settings, cell: CellModel, estimator: Estimator, source: Replay
+) -> Publisher | None:
+    """Who publishes, when there is a broker."""
+    if settings.mqtt is None:
+        return None
+    sink = await stack.enter_async_context(MqttSink(settings.mqtt, settings.pack.name, Requests().answer))
+    return Publisher(settings, cell, estimator, source=source, sinks=[sink], clock=Clock())
+
+
+@contextmanager
+def _progress(source: Replay) -> Iterator[Callable[[], None]]:
+    """A bar on stderr where that is a terminal; the value is called after each block."""
+    console = Console(stderr=True)
+    columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[samples]:,} samples"), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        bar = progress.add_task("replay", total=1.0, samples=0)
+        yield lambda: progress.update(bar, completed=source.fraction, samples=source.samples)
+
+
+def result_table(capture: Path, result: Result) -> Table:
+    """The outcome for people."""
+    table = Table(title=capture.name, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
+    table.add_column(style="dim")
+    table.add_column(justify="right")
+    dropped = ", ".join(f"{count:,} {kind.replace('_', ' ')}" for kind, count in result.dropped.items() if count)
+    lock = f"[red]lost {result.lock_losses} times[/]" if result.lock_lost else "[green]kept[/]"
+    rows = {
+        "samples": f"{result.samples:,}",
+        "dropped": dropped or "none",
+        "duration": _text(result.duration_s, ",.1f", "s"),
+        "SOC": f"{_text(result.soc_initial, '.2%')} to {_text(result.soc_final, '.2%')}",
+        "innovation, RMS": _text(result.innovation_rms_v, ".3f", "mV", 1e3),
+        "voltage error, RMS": _text(result.voltage_rms_error_v, ".3f", "mV", 1e3),
+        "lock": lock,
+        "k at the end": _text(result.k_final, ".4g", "V²s"),
+        "speed": f"{_text(result.samples_per_s, ',.0f')} samples/s, {result.wall_s:.2f} s",
+    }
+    for name, value in rows.items():
+        table.add_row(name, value)
+    return table
+
+
+def _text(value: float | None, form: str, unit: str = "", scale: float = 1.0) -> str:
+    return "-" if value is None else f"{value * scale:{form}} {unit}".rstrip()

@@ -1,0 +1,94 @@
+"""What a replay came to: sums over the trace, then one object for people and programs."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.service.health import sample_counters
+from bms_estimator.service.report import finite
+
+
+@dataclass(frozen=True)
+class Result:
+    """The outcome of a replay; a number that there is none of is None."""
+
+    samples: int  # accepted
+    duration_s: float | None  # from the first to the last of them, on the capture's clock
+    soc_initial: float | None
+    soc_final: float | None
+    innovation_rms_v: float | None  # measured less predicted, before the correction
+    voltage_rms_error_v: float | None  # measured less estimated, after it
+    lock_lost: bool
+    lock_losses: int
+    k_final: float | None
+    gain_rearms: int
+    dropped: dict[str, int]
+    """Kind of fault -> samples that were not used."""
+    gaps: int
+    time_steps_back: int
+    samples_per_s: float | None  # read, whether used or not
+    wall_s: float
+
+
+class Summary:
+    """Sums over trace blocks."""
+
+    def __init__(self) -> None:
+        self._rows = 0
+        self._first: np.void | None = None
+        self._last: np.void | None = None
+        self._innovation = self._error = 0.0
+
+    def add(self, trace: NDArray[np.void]) -> None:
+        """Take a block of dtype TRACE."""
+        if trace.size == 0:
+            return
+        if self._first is None:
+            self._first = trace[0].copy()
+        self._last = trace[-1].copy()
+        self._rows += trace.size
+        error = trace["voltage_v"] - trace["voltage_estimate_v"]
+        self._innovation += float(trace["innovation_v"] @ trace["innovation_v"])
+        self._error += float(error @ error)
+
+    def result(self, state: np.void, read: int, wall_s: float) -> Result:
+        """The outcome.
+
+        Args:
+            state: Record of OBSERVER_STATE after the last sample.
+            read: How many samples the capture had.
+            wall_s: How long it took [s].
+        """
+        counters = sample_counters(state)
+        return Result(
+            samples=self._rows,
+            duration_s=_between(self._first, self._last),
+            soc_initial=_field(self._first, "soc"),
+            soc_final=_field(self._last, "soc"),
+            innovation_rms_v=self._rms(self._innovation),
+            voltage_rms_error_v=self._rms(self._error),
+            lock_lost=bool(state["lock_losses"]),
+            lock_losses=int(state["lock_losses"]),
+            k_final=finite(state["k"]),
+            gain_rearms=int(state["gain_rearms"]),
+            dropped={
+                name.removeprefix("dropped_"): count for name, count in counters.items() if name.startswith("dropped_")
+            },
+            gaps=counters["gaps"],
+            time_steps_back=counters["time_steps_back"],
+            samples_per_s=read / wall_s if wall_s > 0.0 else None,
+            wall_s=wall_s,
+        )
+
+    def _rms(self, squares: float) -> float | None:
+        return finite(math.sqrt(squares / self._rows)) if self._rows else None
+
+
+def _field(row: np.void | None, name: str) -> float | None:
+    return None if row is None else finite(row[name])
+
+
+def _between(first: np.void | None, last: np.void | None) -> float | None:
+    return None if first is None or last is None else finite(last["time_s"] - first["time_s"])

@@ -1,0 +1,170 @@
+"""Estimates sample by sample into CSV or Parquet, block after block: length does not cost memory.
+
+The columns are the trace's fields; every value can be read back to the last bit.
+"""
+
+import gzip
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Protocol, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.errors import UserError
+
+GZIP_LEVEL = 3
+"""A third of the time of level 9 for some percent more bytes."""
+
+
+class TableSink(Protocol):
+    """A file that grows by trace blocks. Entering opens it, replacing an older one; leaving completes it."""
+
+    def __enter__(self) -> Self:
+        """Open the file.
+
+        Raises:
+            UserError: It cannot be written.
+        """
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the file."""
+
+    def write(self, trace: NDArray[np.void]) -> None:
+        """Append a row for each of ``trace``, a structured array of one dtype for all calls."""
+
+
+class CsvSink:
+    """CSV, gzipped when the name ends in .gz. With pyarrow four times as fast as without.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._files = ExitStack()
+        self._file: IO[bytes] | None = None
+        self._lines = _csv_writer()
+        self._header_written = False
+
+    def __enter__(self) -> Self:
+        """Open the file."""
+        file = self._files.enter_context(_create(self._path))
+        if self._path.suffix.lower() == ".gz":
+            file = self._files.enter_context(
+                cast("IO[bytes]", gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=GZIP_LEVEL))
+            )
+        self._file = file
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the file."""
+        self._files.close()
+
+    def write(self, trace: NDArray[np.void]) -> None:
+        """Append rows."""
+        if self._file is None:
+            raise ValueError(f"{self._path} is not open")
+        if not self._header_written:
+            self._file.write((",".join(trace.dtype.names or ()) + "\n").encode())
+            self._header_written = True
+        if trace.size:
+            self._file.write(self._lines(trace))
+
+
+class ParquetSink:
+    """Parquet; needs pyarrow.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import pyarrow  # noqa: F401, ICN001, PLC0415 - optional: its absence must show before the work, not after
+
+        self._path = path
+        self._files = ExitStack()
+        self._file: IO[bytes] | None = None
+        self._writer: Any = None
+
+    def __enter__(self) -> Self:
+        """Open the file."""
+        self._file = self._files.enter_context(_create(self._path))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the file."""
+        self._files.close()
+
+    def write(self, trace: NDArray[np.void]) -> None:
+        """Append rows."""
+        from pyarrow import parquet  # noqa: PLC0415
+
+        batch = _arrow_batch(trace)
+        if self._writer is None:
+            self._writer = self._files.enter_context(parquet.ParquetWriter(self._file, batch.schema))
+        self._writer.write_batch(batch)
+
+
+WRITERS: dict[str, type[CsvSink | ParquetSink]] = {".csv": CsvSink, ".csv.gz": CsvSink, ".parquet": ParquetSink}
+"""End of a file's name -> who writes it."""
+
+
+def table_sink(path: Path) -> TableSink:
+    """Who writes ``path`` by the end of its name.
+
+    Raises:
+        UserError: Nobody does.
+    """
+    for suffix, writer in WRITERS.items():
+        if path.name.lower().endswith(suffix):
+            return writer(path)
+    raise UserError(f"{path}: the name must end in {', '.join(WRITERS)}")
+
+
+def _create(path: Path) -> IO[bytes]:
+    try:
+        return path.open("wb")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _csv_writer() -> Callable[[NDArray[np.void]], bytes]:
+    """The faster of the two that can be had."""
+    try:
+        import pyarrow  # noqa: F401, ICN001, PLC0415 - optional
+    except ModuleNotFoundError:
+        return _lines
+    return _lines_by_arrow
+
+
+def _lines(trace: NDArray[np.void]) -> bytes:
+    """Rows as CSV, floats with as many digits as tell them apart."""
+    columns = [map(repr, trace[name].tolist()) for name in trace.dtype.names or ()]
+    return ("\n".join(map(",".join, zip(*columns, strict=True))) + "\n").encode()
+
+
+def _lines_by_arrow(trace: NDArray[np.void]) -> bytes:
+    """As ``_lines``."""
+    import pyarrow as pa  # noqa: PLC0415 - optional
+    from pyarrow import csv  # noqa: PLC0415
+
+    buffer = pa.BufferOutputStream()
+    csv.write_csv(_arrow_batch(trace), buffer, csv.WriteOptions(include_header=False))
+    return bytes(memoryview(buffer.getvalue()))
+
+
+def _arrow_batch(trace: NDArray[np.void]) -> Any:
+    import pyarrow as pa  # noqa: PLC0415
+
+    names = list(trace.dtype.names or ())
+    return pa.record_batch([pa.array(np.ascontiguousarray(trace[name])) for name in names], names=names)

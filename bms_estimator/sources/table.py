@@ -1,0 +1,241 @@
+"""Captures as tables: CSV, gzipped CSV and Parquet, read in blocks so that length does not cost memory.
+
+Two spellings of the columns are known: ours, and that of the Battery Data Format, which counts charge positive.
+"""
+
+import csv
+import gzip
+import itertools
+import zlib
+from collections.abc import Iterator, Sequence
+from io import TextIOWrapper
+from pathlib import Path
+from typing import IO, NamedTuple, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+
+BLOCK_ROWS = 65_536
+
+
+class Dialect(NamedTuple):
+    """How a table calls the columns of ``SAMPLE``, and which sign it gives to discharge."""
+
+    time_s: str
+    current_a: str
+    voltage_v: str
+    temperature_c: str
+    discharge_sign: float
+
+
+DIALECTS = (
+    Dialect("time_s", "current_a", "voltage_v", "temperature_c", 1.0),
+    Dialect("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", -1.0),  # Battery Data Format
+)
+
+
+class Table(Protocol):
+    """A capture that is a table. Each iteration reads it from its start."""
+
+    @property
+    def fraction(self) -> float:
+        """How much has been read, 0..1."""
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Blocks of at most ``BLOCK_ROWS`` samples, dtype ``SAMPLE``, current positive on discharge.
+
+        Raises:
+            UserError: The file cannot be read; the message names file, line and column.
+        """
+
+
+class _Columns(NamedTuple):
+    """Where a table keeps what a sample needs."""
+
+    indices: tuple[int, ...]
+    """Of time, current, voltage, and temperature where there is one."""
+    names: tuple[str, ...]
+    discharge_sign: float
+
+
+class CsvTable:
+    """A CSV file, gzipped when its name ends in .gz; lines that start with # are comments.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._raw: IO[bytes] | None = None
+        self._size = 0
+
+    @property
+    def fraction(self) -> float:
+        """How much has been read, 0..1."""
+        if self._raw is None:
+            return 0.0
+        return 1.0 if self._raw.closed else self._raw.tell() / max(self._size, 1)
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Blocks of samples, as ``Table`` says."""
+        try:
+            with self._path.open("rb") as self._raw:
+                self._size = self._path.stat().st_size
+                packed = self._path.name.lower().endswith(".gz")
+                plain = cast("IO[bytes]", gzip.GzipFile(fileobj=self._raw)) if packed else self._raw
+                with TextIOWrapper(plain, encoding="utf-8-sig") as text:
+                    yield from self._blocks(text)
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise UserError(f"{self._path}: gzip data damaged or cut short: {error}") from None
+        except UnicodeDecodeError:
+            raise UserError(f"{self._path}: not a text file, though its name says CSV") from None
+        except OSError as error:
+            raise UserError(f"{self._path}: cannot be read: {error.strerror}") from None
+
+    def _blocks(self, text: TextIOWrapper) -> Iterator[SampleBlock]:
+        header, line = _header(self._path, text)
+        columns = _columns(self._path, header)
+        rows = 0
+        while lines := list(itertools.islice(text, BLOCK_ROWS)):
+            values = self._values(lines, line + 1, columns, len(header))
+            line += len(lines)
+            if len(values):
+                rows += len(values)
+                yield _block(values.T, columns)
+        if rows == 0:
+            raise UserError(f"{self._path}: no samples after the header in line {line}")
+
+    def _values(self, lines: Sequence[str], first_line: int, columns: _Columns, width: int) -> NDArray[np.float64]:
+        """The wanted columns of some lines, shape (rows, columns)."""
+        if not any(_is_data(line) for line in lines):
+            return np.empty((0, len(columns.indices)))
+        try:
+            return np.loadtxt(lines, delimiter=",", usecols=columns.indices, ndmin=2, quotechar='"')
+        except ValueError:  # an empty cell, or something to complain about with line and column
+            return self._values_one_by_one(lines, first_line, columns, width)
+
+    def _values_one_by_one(
+        self, lines: Sequence[str], first_line: int, columns: _Columns, width: int
+    ) -> NDArray[np.float64]:
+        rows = []
+        for number, line in enumerate(lines, first_line):
+            if not _is_data(line):
+                continue
+            cells = next(csv.reader([line]))
+            if len(cells) <= max(columns.indices):
+                raise UserError(f"{self._path}: line {number}: {len(cells)} values, but the header has {width} columns")
+            named = zip(columns.names, columns.indices, strict=True)
+            rows.append([self._number(cells[index], number, name) for name, index in named])
+        return np.array(rows)
+
+    def _number(self, cell: str, line: int, column: str) -> float:
+        """An empty cell is a missing value: NaN."""
+        try:
+            return float(cell) if cell.strip() else np.nan
+        except ValueError:
+            raise UserError(f"{self._path}: line {line}: {column} = {cell!r}: must be a number") from None
+
+
+class ParquetTable:
+    """A Parquet file; needs pyarrow.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.fraction = 0.0
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Blocks of samples, as ``Table`` says."""
+        import pyarrow as pa  # noqa: PLC0415 - optional
+        from pyarrow import parquet  # noqa: PLC0415
+
+        try:
+            with parquet.ParquetFile(self._path) as file:
+                columns = _columns(self._path, file.schema_arrow.names)
+                if file.metadata.num_rows == 0:
+                    raise UserError(f"{self._path}: no samples")
+                rows = 0
+                for batch in file.iter_batches(BLOCK_ROWS, columns=list(columns.names)):
+                    rows += batch.num_rows
+                    self.fraction = rows / file.metadata.num_rows
+                    values = [self._numbers(batch.column(name), name) for name in columns.names]
+                    yield _block(values, columns)
+        except pa.ArrowInvalid as error:
+            raise UserError(f"{self._path}: not a whole Parquet file: {error}") from None
+        except OSError as error:
+            raise UserError(f"{self._path}: cannot be read: {error.strerror or error}") from None
+
+    def _numbers(self, column: "pa.Array", name: str) -> NDArray[np.float64]:  # type: ignore[name-defined]  # noqa: F821
+        """As floats, NaN where null."""
+        import pyarrow as pa  # noqa: PLC0415
+
+        try:
+            return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
+            raise UserError(f"{self._path}: column {name} is {column.type}: must be numbers") from None
+
+
+READERS: dict[str, type[CsvTable | ParquetTable]] = {
+    ".csv": CsvTable,
+    ".csv.gz": CsvTable,
+    ".bdf": CsvTable,
+    ".bdf.gz": CsvTable,
+    ".parquet": ParquetTable,
+}
+"""End of a file's name -> who reads it."""
+
+
+def table_reader(path: Path) -> Table | None:
+    """Who reads ``path`` by the end of its name; None when it is no table."""
+    name = path.name.lower()
+    return next((reader(path) for suffix, reader in READERS.items() if name.endswith(suffix)), None)
+
+
+def _is_data(line: str) -> bool:
+    return bool(line.strip()) and not line.startswith("#")
+
+
+def _header(path: Path, text: TextIOWrapper) -> tuple[list[str], int]:
+    """Names in the first line that is not empty or a comment, and its number."""
+    for number, line in enumerate(iter(text.readline, ""), 1):
+        if _is_data(line):
+            return [name.strip() for name in next(csv.reader([line]))], number
+    raise UserError(f"{path}: empty: the first line must name the columns, {_wanted(DIALECTS[0])}")
+
+
+def _columns(path: Path, header: Sequence[str]) -> _Columns:
+    """Where the columns are.
+
+    Raises:
+        UserError: Some are missing; the message says which, and what there is.
+    """
+    dialect = max(DIALECTS, key=lambda d: sum(name in header for name in d[:3]))
+    missing = [name for name in dialect[:3] if name not in header]
+    if missing:
+        raise UserError(
+            f"{path}: no column {' nor '.join(missing)}; found {', '.join(header)}; "
+            f"needed: {_wanted(DIALECTS[0])}, or {_wanted(DIALECTS[1])} (Battery Data Format)"
+        )
+    names = tuple(name for name in dialect[:4] if name in header)
+    return _Columns(tuple(header.index(name) for name in names), names, dialect.discharge_sign)
+
+
+def _wanted(dialect: Dialect) -> str:
+    return f"{','.join(dialect[:3])}[,{dialect.temperature_c}]"
+
+
+def _block(values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns: _Columns) -> SampleBlock:
+    """Samples from columns of values in the order of ``columns``."""
+    block = np.zeros(len(values[0]), dtype=SAMPLE)
+    block["time_s"] = values[0]
+    block["current_a"] = columns.discharge_sign * values[1]
+    block["voltage_v"] = values[2]
+    block["temperature_c"] = values[3] if len(values) > 3 else np.nan
+    return block
