@@ -7,7 +7,7 @@ READY   := $(VENV)/.ready
 ARGS    ?=
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
-APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container
 
 .DEFAULT_GOAL := help
 .PHONY: help venv apt check test demo benchmark firmware lock
@@ -30,7 +30,7 @@ check: venv ## style and types, in seconds
 	$(BIN)/mypy
 
 test: apt check firmware ## all there is to check: packages, style, types, firmware, pytest
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/python -m pytest $(ARGS)
 
 demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory --silent firmware || echo "the firmware does not build here: the Python board serves"; fi

@@ -1,0 +1,52 @@
+"""The unit under a real systemd: hardened, kernels compiled, cached, started again, stopped."""
+
+import os
+import re
+
+import pytest
+
+from tests.deploy.boot import boot, make_root
+
+LONGEST_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> str:
+    """What the judge inside the container saw."""
+    systemd_nspawn = "/usr/bin/systemd-nspawn"
+    if not os.access(systemd_nspawn, os.X_OK):
+        pytest.skip("systemd-nspawn is not installed (apt install systemd-container)")
+    if os.geteuid() != 0:
+        pytest.skip("only root can boot a container")
+    root = tmp_path_factory.mktemp("boot") / "root"
+    make_root(root)
+    text = boot(root, systemd_nspawn, LONGEST_S)
+    if "ActiveState" not in text:
+        pytest.skip(f"no container boots on this machine: {text[-300:]}")
+    return text
+
+
+def test_the_service_runs(report):
+    assert "ActiveState=active\n" in report, report
+    assert "StatusText=estimating boot" in report
+    assert "NRestarts=0" in report
+
+
+def test_it_has_no_rights(report):
+    assert re.search(r"CapEff:\s+0{16}\n", report), report
+    assert re.search(r"NoNewPrivs:\s+1\n", report)
+    assert re.search(r"Seccomp:\s+2\n", report)
+    assert not re.search(r"Uid:\s+0\b", report)
+
+
+def test_kernels_are_compiled_into_the_cache_folder(report):
+    assert "cached estimate.run-" in report, report
+
+
+def test_it_says_that_the_board_is_missing(report):
+    assert "/dev/bms/absent" in report, report
+
+
+def test_it_stops_cleanly(report):
+    assert report.count("Result=success") == 2, report
+    assert "Traceback" not in report

@@ -1,0 +1,113 @@
+"""The service as systemd starts it: what it tells the notify socket, and its cache of kernels."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+PATIENCE_S = 60.0
+PACK = '[pack]\ncell = "chen_mora"\n[sensor]\nport = "/dev/bms/absent"\n'
+
+
+class Systemd:
+    """The service, with a notify socket and the directories that the unit gives it; homes are not there."""
+
+    def __init__(self, folder: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(folder / "notify"))
+        self._socket.settimeout(PATIENCE_S)
+        (folder / "pack.toml").write_text(PACK)
+        self.cache, self.state = folder / "cache", folder / "state"
+        environment = {
+            "PATH": os.environ["PATH"],
+            "HOME": "/proc/self/fdinfo",  # not even root can write there
+            "NOTIFY_SOCKET": str(folder / "notify"),
+            "WATCHDOG_USEC": "1500000",
+            "NUMBA_CACHE_DIR": str(self.cache),
+            "STATE_DIRECTORY": str(self.state),
+        }
+        self.process = subprocess.Popen(
+            [PROGRAM, "run", "--pack", folder / "pack.toml"],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def next_notice(self) -> str:
+        return self._socket.recv(4096).decode()
+
+    def until(self, notice: str) -> None:
+        """Wait until a notice comes; others may come before."""
+        deadline = time.monotonic() + PATIENCE_S
+        while notice not in self.next_notice().split("\n"):
+            assert time.monotonic() < deadline, f"{notice} did not come"
+
+    def stop(self) -> tuple[int, str]:
+        """End as systemd ends a service. Returns its exit code and what it logged."""
+        self.process.send_signal(signal.SIGTERM)
+        _, logged = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, logged
+
+    def close(self) -> None:
+        self._socket.close()
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate()
+
+
+@contextlib.contextmanager
+def start(folder: Path) -> Iterator[Systemd]:
+    folder.mkdir(exist_ok=True)
+    (folder / "notify").unlink(missing_ok=True)
+    systemd = Systemd(folder)
+    try:
+        yield systemd
+    finally:
+        systemd.close()
+
+
+def compiled(cache: Path) -> dict[str, int]:
+    """Kernels in the cache and when each was written."""
+    return {str(path.relative_to(cache)): path.stat().st_mtime_ns for path in cache.rglob("*.nb?")}
+
+
+def test_ready_watchdog_and_stopping_arrive(tmp_path):
+    with start(tmp_path) as systemd:
+        assert systemd.next_notice().startswith("READY=1\n")
+        for _ in range(3):
+            systemd.until("WATCHDOG=1")
+        code, logged = systemd.stop()
+        assert code == 0, logged
+        systemd.until("STOPPING=1")
+        assert "Traceback" not in logged
+        assert "/dev/bms/absent" in logged
+
+
+def test_a_second_start_takes_the_kernels_from_the_cache(tmp_path):
+    with start(tmp_path) as systemd:
+        systemd.until("READY=1")
+        assert systemd.stop()[0] == 0
+        first = compiled(systemd.cache)
+    assert any("estimate.run" in name for name in first)
+    with start(tmp_path) as systemd:
+        systemd.until("READY=1")
+        assert systemd.stop()[0] == 0
+        assert compiled(systemd.cache) == first
+
+
+def test_a_wrong_setting_ends_with_code_2_which_systemd_does_not_restart(tmp_path, deploy):
+    (tmp_path / "pack.toml").write_text("[pack]\nseries = 0\n")
+    command = [PROGRAM, "run", "--pack", tmp_path / "pack.toml"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 2
+    assert "pack.series = 0" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert "RestartPreventExitStatus=2\n" in (deploy / "bms-estimator.service").read_text()
