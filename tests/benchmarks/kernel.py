@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from load import pulses
+from load import CELL, pulses
 from observer_in_c import ObserverInC
 from table import Row
 
@@ -37,7 +37,7 @@ def rows() -> Iterator[Row]:
 
 def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
     """Time per sample of ``run`` and of its twin in C [ns]."""
-    estimator, twin = (Estimator(load_cell("chen_mora")) for _ in range(2))
+    estimator, twin = (Estimator(load_cell(CELL)) for _ in range(2))
     trace = np.zeros(BLOCK, dtype=TRACE)
     with tempfile.TemporaryDirectory() as folder:
         in_c = ObserverInC(Path(folder))
@@ -57,7 +57,7 @@ def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
 
 def calls_from_python(block: SampleBlock) -> tuple[float, float]:
     """Time of one ``Estimator.step``, and of the kernel's own ``step``, called sample by sample [ns]."""
-    estimator = Estimator(load_cell("chen_mora"))
+    estimator = Estimator(load_cell(CELL))
     state, settings = estimator.state, estimator.settings
     samples = [(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), 0) for x in block[:CALLS]]
 

@@ -1,4 +1,4 @@
-"""The load that benchmarks run on: a simulated Chen & Mora cell behind a converter."""
+"""The load that benchmarks run on: the thesis's pack behind a board, simulated."""
 
 import numpy as np
 
@@ -6,22 +6,27 @@ from bms_estimator.kernels.cell import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
-RATE_HZ = 100.0
-VOLTAGE_STEP_V = 1e-3
-CURRENT_STEP_A = 1e-4
+CELL = "thunder_power_6s"
+RATE_HZ = 100
+VOLTAGE_STEP_V = 25.0 / 1024 / 16
+"""A 10-bit converter behind the 5:1 divider, sixteen conversions averaged."""
+CURRENT_STEP_A = 5.0 / 1024 / 0.1 / 16
+ON_A, HALF_PERIOD_S = 0.7, 60.0
+"""Sixteen hours of these pulses take the pack from SOC 0.90 to 0.05."""
 
 
-def pulses(samples: int) -> SampleBlock:
-    """Pulses of 100 mA on the 275 mAh cell of Chen & Mora, 60 s on and 60 s off, at 100 Hz, noisy and rounded.
+def pulses(samples: int, rate_hz: int = RATE_HZ) -> SampleBlock:
+    """Pulses of current, 60 s on and 60 s off, noisy and rounded as a board's are.
 
     Args:
-        samples: How many; 900,000 empty the cell to a tenth.
+        samples: How many, dtype SAMPLE.
+        rate_hz: Samples per second.
     """
-    cell = load_cell("chen_mora")
+    cell = load_cell(CELL)
     block = np.zeros(samples, dtype=SAMPLE)
-    time_s = np.arange(samples) / RATE_HZ
-    current_a = 0.1 * (time_s % 120.0 < 60.0)
-    voltage_v, _ = simulate_cell((0.95, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
+    time_s = np.arange(samples) / rate_hz
+    current_a = ON_A * (time_s % (2.0 * HALF_PERIOD_S) < HALF_PERIOD_S)
+    voltage_v, _ = simulate_cell((0.9, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
     noise = np.random.default_rng(1).uniform(-0.5, 0.5, (2, samples))
     block["time_s"] = time_s
     block["current_a"] = np.round(current_a / CURRENT_STEP_A + noise[0]) * CURRENT_STEP_A

@@ -13,7 +13,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.settings import ObserverSettings
 
 sys.path.insert(0, str(Path(__file__).parent))
-from load import pulses
+from load import CELL, pulses
 from observer_in_c import ObserverInC
 
 
@@ -27,7 +27,7 @@ def test_c_and_kernel_agree(settings, tmp_path):
         pytest.skip("no C compiler (apt install gcc)")
     block = pulses(60_000)
     block["voltage_v"][20_000:20_010] = np.nan
-    estimator, twin = (Estimator(load_cell("chen_mora"), settings) for _ in range(2))
+    estimator, twin = (Estimator(load_cell(CELL), settings) for _ in range(2))
     expected = estimator.run(block)
     trace = np.zeros(block.size, dtype=TRACE)
     rows = ObserverInC(tmp_path).run(twin.state, twin.settings, block, trace)

@@ -1,0 +1,92 @@
+"""What others would use, on the same capture: a textbook EKF with fixed parameters, and RLS on the ARX form."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.cell import Floats, ocv
+
+EKF_VOLTAGE_SIGMA_V = 0.005
+"""Measurement noise of the textbook filter [V]."""
+
+
+@njit
+def fixed_ekf(time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats) -> Floats:
+    """Extended Kalman filter over (soc, v1, v2) with constant elements.
+
+    Args:
+        time_s: Shape (n,) [s].
+        current_a: Shape (n,), positive on discharge [A].
+        voltage_v: Shape (n,) [V].
+        soc0: Where it begins, 0..1.
+        cell: capacity [A s], R_s, R_1 [ohm], tau_1 [s], R_2 [ohm], tau_2 [s].
+        grid: Shape (2, m): OCV and its slope over SOC 0..1 [V].
+
+    Returns:
+        SOC at each sample, shape (n,).
+    """
+    capacity_as, r_s, r1, tau1, r2, tau2 = cell
+    x = np.array([soc0, 0.0, 0.0])
+    p = np.diag(np.array([0.2**2, 0.01**2, 0.01**2]))
+    q = np.array([1e-10, 1e-9, 1e-9])
+    soc = np.empty(len(time_s))
+    h = np.array([0.0, -1.0, -1.0])
+    for k in range(len(time_s)):
+        if k > 0:
+            dt = max(time_s[k] - time_s[k - 1], 0.0)
+            decay = np.array([1.0, math.exp(-dt / tau1), math.exp(-dt / tau2)])
+            gain = np.array([-dt / capacity_as, r1 * (1.0 - decay[1]), r2 * (1.0 - decay[2])])
+            x = decay * x + gain * current_a[k - 1]
+            p = decay.reshape(3, 1) * p * decay + np.diag(q * dt)
+        h[0] = (ocv(x[0] + 1e-4, grid[0], grid[1]) - ocv(x[0] - 1e-4, grid[0], grid[1])) / 2e-4
+        innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1] - x[2] - current_a[k] * r_s)
+        ph = p @ h
+        s = h @ ph + EKF_VOLTAGE_SIGMA_V**2
+        x = x + ph / s * innovation
+        p = p - np.outer(ph, ph) / s
+        soc[k] = x[0]
+    return soc
+
+
+@njit
+def rls_arx(current_a: Floats, overpotential_v: Floats, forgetting: float) -> Floats:
+    """Recursive least squares with forgetting on the ARX form of a 2RC model.
+
+    v[k] = c1 v[k-1] + c2 v[k-2] + c3 i[k] + c4 i[k-1] + c5 i[k-2], v the overpotential E_o - y.
+
+    Args:
+        current_a: Shape (n,), evenly sampled, positive on discharge [A].
+        overpotential_v: Shape (n,) [V].
+        forgetting: Factor per sample, below 1.
+
+    Returns:
+        Mean coefficients over the last half, shape (5,).
+    """
+    theta = np.zeros(5)
+    p = np.eye(5) * 1e3
+    total = np.zeros(5)
+    half = len(current_a) // 2
+    for k in range(2, len(current_a)):
+        phi = np.array(
+            [overpotential_v[k - 1], overpotential_v[k - 2], current_a[k], current_a[k - 1], current_a[k - 2]]
+        )
+        pp = p @ phi
+        gain = pp / (forgetting + phi @ pp)
+        theta = theta + gain * (overpotential_v[k] - phi @ theta)
+        p = (p - np.outer(gain, pp)) / forgetting
+        trace = np.trace(p)
+        if trace > 1e6:  # wind-up while nothing excites
+            p *= 1e6 / trace
+        if k >= half:
+            total += theta
+    return total / (len(current_a) - half)
+
+
+def simulate_arx(coefficients: NDArray[np.float64], current_a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Overpotential [V] of the ARX model under ``current_a`` [A], from rest. Shape (n,)."""
+    from scipy.signal import lfilter  # noqa: PLC0415 - scipy.signal is slow to import and used here only
+
+    c1, c2, c3, c4, c5 = coefficients
+    return np.asarray(lfilter([c3, c4, c5], [1.0, -c1, -c2], current_a))
