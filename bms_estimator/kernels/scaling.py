@@ -1,0 +1,90 @@
+"""From the board's sums to volts, amperes and degrees Celsius (firmware/PROTOCOL.md)."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from bms_estimator.kernels.state import Record
+
+SCALING = np.dtype(
+    [
+        ("known", "i8"),  # 1 once a hello was received
+        ("full_scale", "f8"),  # conversions at the reference: 2^bits
+        ("divider", "f8"),  # pack voltage over voltage at the pin
+        ("volts_per_ampere", "f8"),  # slope of the current sensor [V/A]
+        ("current_zero", "f8"),  # its output without current, as a part of the reference
+        ("bandgap_v", "f8"),  # the converter's internal reference [V]
+        ("reference_v", "f8"),  # the converter's full range [V]; NaN: measured against the bandgap
+        ("ntc_series_ohm", "f8"),
+        ("ntc_r25_ohm", "f8"),
+        ("ntc_beta_k", "f8"),
+        ("ntc_fitted", "i8"),
+        ("bandgap_mean", "f8"),  # filtered conversions of the bandgap
+        ("bandgap_weight", "f8"),  # conversions in that mean
+        ("ntc_mean", "f8"),  # filtered conversions of the NTC
+        ("ntc_weight", "f8"),
+    ],
+    align=True,
+)
+
+_BANDGAP_WEIGHT = 512.0  # at 16 readings a second half a minute: 0.5 LSB of noise becomes 0.02 LSB
+_NTC_WEIGHT = 32.0  # two seconds
+_RAIL = 0.01  # an NTC this near to either end of the range is open or shorted
+_ZERO_C_K = 273.15
+_R25_K = 298.15
+
+
+@njit(cache=True)
+def running_mean(mean: float, weight: float, total: float, count: float, longest: float) -> tuple[float, float]:
+    """Mean with ``count`` readings of sum ``total`` added: a plain mean at first, exponential from ``longest`` on."""
+    weight = min(weight + count, longest)
+    return mean + (total - mean * count) / weight, weight
+
+
+@njit(cache=True)
+def take_bandgap(s: Record, total: float, count: float) -> None:
+    """Filter readings of the bandgap."""
+    s.bandgap_mean, s.bandgap_weight = running_mean(s.bandgap_mean, s.bandgap_weight, total, count, _BANDGAP_WEIGHT)
+
+
+@njit(cache=True)
+def take_ntc(s: Record, total: float, count: float) -> None:
+    """Filter readings of the NTC."""
+    s.ntc_mean, s.ntc_weight = running_mean(s.ntc_mean, s.ntc_weight, total, count, _NTC_WEIGHT)
+
+
+@njit(cache=True)
+def reference(s: Record) -> float:
+    """The converter's full range [V]; NaN before the bandgap was measured."""
+    if math.isfinite(s.reference_v):
+        return s.reference_v
+    if s.bandgap_mean <= 0.0:
+        return math.nan
+    return s.bandgap_v * s.full_scale / s.bandgap_mean
+
+
+@njit(cache=True)
+def temperature(s: Record) -> float:
+    """Of the NTC [degC]; NaN without one or when it is open or shorted."""
+    x = s.ntc_mean / s.full_scale
+    if not s.ntc_fitted or s.ntc_weight == 0.0 or not _RAIL < x < 1.0 - _RAIL:
+        return math.nan
+    r_ohm = s.ntc_series_ohm * x / (1.0 - x)
+    return 1.0 / (1.0 / _R25_K + math.log(r_ohm / s.ntc_r25_ohm) / s.ntc_beta_k) - _ZERO_C_K
+
+
+@njit(cache=True)
+def voltage(s: Record, total: float, count: float, reference_v: float) -> float:
+    """At the pack's terminals [V]; NaN without a conversion."""
+    if count == 0.0:
+        return math.nan
+    return total / count / s.full_scale * reference_v * s.divider
+
+
+@njit(cache=True)
+def current(s: Record, total: float, count: float, reference_v: float) -> float:
+    """Through the sensor [A], positive as the board is wired; NaN without a conversion."""
+    if count == 0.0:
+        return math.nan
+    return (total / count / s.full_scale - s.current_zero) * reference_v / s.volts_per_ampere

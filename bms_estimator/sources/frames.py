@@ -1,0 +1,223 @@
+"""The binary board's bytes to samples: ``kernels.framing`` with its state, its messages and its counters."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from enum import Enum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.framing import DECODER, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
+from bms_estimator.kernels.scaling import SCALING, reference
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.sources.protocol import Ack, AckResult, Hello, MessageType
+
+CurrentSign = Literal["discharge_positive", "charge_positive"]
+
+DEAF_BYTES = 512
+"""So many bytes without one whole frame or line, and the line itself is at fault: eight of the longest frames."""
+_MESSAGES = 8
+
+
+class FrameFault(Enum):
+    """What is wrong with the line as a whole; the value says so to people."""
+
+    WRONG_BAUD = "bytes come, but no valid frame among them: wrong baud rate?"
+    TEXT = "the board prints text, not frames: sensor.protocol should be text"
+    BINARY = "the board sends bytes that are no text: wrong baud rate, or sensor.protocol should be binary"
+    NEWER_PROTOCOL = "the board speaks another version of the protocol: update this program or the firmware"
+    NO_HELLO = "frames come, but the board has not told its scaling yet"
+
+
+@dataclass(frozen=True)
+class FrameCounters:
+    """What came over the line since start; the same for frames and for text lines."""
+
+    bytes_received: int = 0
+    frames_received: int = 0
+    """Samples handed on."""
+    frames_lost: int = 0
+    """By gaps in the sequence, whatever became of them."""
+    crc_errors: int = 0
+    cobs_errors: int = 0
+    length_errors: int = 0
+    version_errors: int = 0
+    """Frames of another version of the protocol."""
+    type_errors: int = 0
+    duplicates: int = 0
+    out_of_order: int = 0
+    before_hello: int = 0
+    """Samples that came before their scaling was known."""
+    overruns: int = 0
+    """Samples before which the board had no room on the line."""
+    resets: int = 0
+    text_errors: int = 0
+    """Lines that are no numbers."""
+
+    def as_dict(self) -> dict[str, int]:
+        """By name."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class FixedScaling:
+    """What is configured; None: what the board says or measures counts."""
+
+    divider: float | None = None
+    volts_per_ampere: float | None = None
+    current_zero: float | None = None
+    """Sensor's output without current, as a part of the reference."""
+    bandgap_v: float | None = None
+    reference_v: float | None = None
+    """The converter's full range, if it is not to be measured against the bandgap [V]."""
+
+
+class FrameDecoder:
+    """Bytes of a board to samples.
+
+    All it yields follows from the calls of ``feed`` alone. It never raises on bytes; faults are counted by kind.
+
+    Args:
+        current_sign: What the board calls positive; samples are positive on discharge.
+        fixed: Scaling that is configured.
+    """
+
+    def __init__(self, *, current_sign: CurrentSign = "discharge_positive", fixed: FixedScaling | None = None) -> None:
+        self._state = np.zeros(1, dtype=DECODER)
+        self._state["boot_id"] = -1
+        self._state["current_sign"] = 1.0 if current_sign == "discharge_positive" else -1.0
+        self._scaling = np.zeros(1, dtype=SCALING)
+        self._fixed = _fixed_record(fixed or FixedScaling())
+        self._samples = np.zeros(256, dtype=SAMPLE)
+        self._messages = np.zeros((_MESSAGES, PACKET_BYTES), dtype=np.uint8)
+        self._hello: Hello | None = None
+        self._acks: list[Ack] = []
+        self._printable = 0
+        self._decode(np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0)  # compiles
+
+    @property
+    def hello(self) -> Hello | None:
+        """The board's last."""
+        return self._hello
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the board said of itself, for people; empty before its hello."""
+        if self._hello is None:
+            return {}
+        hello = self._hello
+        return {
+            "firmware": hello.firmware,
+            "serial": f"{hello.serial:08x}" if hello.serial else "",
+            "sample_rate_hz": str(hello.rate_hz),
+        }
+
+    @property
+    def reference_v(self) -> float:
+        """Full range of the board's converter [V]; NaN before it is known."""
+        return float(reference(self._scaling[0]))
+
+    @property
+    def counters(self) -> FrameCounters:
+        """Since start."""
+        state = self._state[0]
+        return FrameCounters(**{name: int(state[name]) for name in _COUNTERS})
+
+    @property
+    def fault(self) -> FrameFault | None:
+        """What is wrong with the line as a whole; None while frames come."""
+        state = self._state[0]
+        if state["bytes_received"] - state["heard_at"] > DEAF_BYTES:
+            return FrameFault.TEXT if self._printable > DEAF_BYTES else FrameFault.WRONG_BAUD
+        if state["frames_received"] == 0 and state["version_errors"] > 0:
+            return FrameFault.NEWER_PROTOCOL
+        if state["frames_received"] == 0 and state["before_hello"] > 0:
+            return FrameFault.NO_HELLO
+        return None
+
+    def take_acks(self) -> list[Ack]:
+        """Answers to commands that came since the last call."""
+        acks, self._acks = self._acks, []
+        return acks
+
+    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
+        """Decode one read of the line.
+
+        Args:
+            arrival_s: When it came, on any clock that never steps back [s].
+            data: What came.
+
+        Returns:
+            Samples, shape (n,), n may be 0. ``time_s`` is the board's clock since the first of them, unwrapped;
+            across a reset of the board it goes on by arrival.
+        """
+        block = self.feed_reads(np.array([arrival_s]), np.array([len(data)]), np.frombuffer(data, dtype=np.uint8))
+        if self._state["heard_at"][0] + DEAF_BYTES < self._state["bytes_received"][0]:
+            self._printable = self._printable + len(data) if is_text(data) else 0
+        return block
+
+    def feed_reads(
+        self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
+    ) -> SampleBlock:
+        """Decode many reads of the line at once: the same samples as ``feed`` for each.
+
+        Args:
+            arrivals_s: Shape (reads,): when each came [s].
+            ends: Shape (reads,): where in ``data`` each ends.
+            data: Their bytes, one behind the other.
+
+        Returns:
+            As ``feed``.
+        """
+        room = data.size // SAMPLE_FRAME_BYTES + 2
+        if self._samples.size < room:
+            self._samples = np.zeros(room, dtype=SAMPLE)
+        position = count = 0
+        while position < data.size:
+            position, samples, messages = self._decode(arrivals_s, ends, data, position, count)
+            count += samples
+            for packet in self._messages[:messages]:
+                self._take_message(packet)
+        return self._samples[:count].copy()
+
+    def _decode(
+        self,
+        arrivals_s: NDArray[np.float64],
+        ends: NDArray[np.int64],
+        data: NDArray[np.uint8],
+        position: int,
+        count: int,
+    ) -> tuple[int, int, int]:
+        """``kernels.framing.decode`` from ``position`` on, behind the ``count`` samples that are there."""
+        out = self._samples[count:]
+        return decode(data, position, ends, arrivals_s, self._state, self._scaling, self._fixed, out, self._messages)
+
+    def _take_message(self, packet: NDArray[np.uint8]) -> None:
+        if packet[1] == MessageType.HELLO:
+            self._hello = Hello.decode(packet[: 2 + Hello.LAYOUT.size].tobytes())
+        elif packet[3] in _ACK_RESULTS:
+            self._acks.append(Ack.decode(packet[: 2 + Ack.LAYOUT.size].tobytes()))
+            del self._acks[:-_MESSAGES]
+
+
+_ACK_RESULTS = frozenset(AckResult)
+_COUNTERS = [field.name for field in fields(FrameCounters) if field.name in (DECODER.names or ())]
+
+
+def is_text(data: bytes) -> bool:
+    """Whether bytes could be printed lines."""
+    return all(byte in _TEXT for byte in data)
+
+
+_TEXT = frozenset(b"\t\r\n" + bytes(range(0x20, 0x7F)))
+
+
+def _fixed_record(fixed: FixedScaling) -> NDArray[np.void]:
+    """Shape (1,), dtype SCALING, NaN where nothing is configured."""
+    record = np.zeros(1, dtype=SCALING)
+    for name in SCALING.names or ():
+        value = getattr(fixed, name, None)
+        if SCALING[name].kind == "f":
+            record[name] = np.nan if value is None else value
+    return record

@@ -1,0 +1,260 @@
+"""The messages of the serial line, one at a time (firmware/PROTOCOL.md): commands to the board, its hello and its acks.
+
+Samples in bulk are decoded by ``kernels.framing``; this codec is for what is rare, for the virtual board and for tests.
+"""
+
+import binascii
+import struct
+from dataclasses import dataclass, fields
+from enum import IntEnum, IntFlag
+from typing import ClassVar, Self
+
+from cobs import cobs
+
+PROTOCOL_VERSION = 1
+BAUD = 500_000
+RATE_HZ = range(1, 1001)
+DELIMITER = b"\0"
+NO_SERIAL = 0
+MODULUS = 1 << 32
+"""Sequence and microseconds count up to here and begin at 0 again."""
+
+
+class MessageType(IntEnum):
+    """Second byte of a packet."""
+
+    SAMPLE = 0x01
+    HELLO = 0x02
+    ACK = 0x03
+    COMMAND_HELLO = 0x10
+    COMMAND_SET_RATE = 0x11
+    COMMAND_ZERO_CURRENT = 0x12
+    COMMAND_RESTART = 0x13
+    COMMAND_SET_SERIAL = 0x14
+    COMMAND_SET_BANDGAP = 0x15
+
+
+class AckResult(IntEnum):
+    """What became of a command."""
+
+    OK = 0
+    UNKNOWN_COMMAND = 1
+    BAD_VALUE = 2
+    BUSY = 3
+    OTHER_VERSION = 4
+
+
+class BoardStatus(IntFlag):
+    """Status bits of a sample on the line; the upper half is ``ResetCause`` shifted by four."""
+
+    VOLTAGE_SATURATED = 0x01
+    CURRENT_SATURATED = 0x02
+    OVERRUN = 0x04
+    AUX_IS_NTC = 0x08
+
+
+class ResetCause(IntFlag):
+    """MCUSR of the ATmega328P after its last reset."""
+
+    POWER_ON = 1
+    EXTERNAL = 2
+    BROWN_OUT = 4
+    WATCHDOG = 8
+
+
+class ProtocolError(ValueError):
+    """Bytes that are no message of this protocol."""
+
+
+def seal(packet: bytes) -> bytes:
+    """The frame of a packet without its CRC."""
+    return bytes(cobs.encode(packet + struct.pack("<H", binascii.crc_hqx(packet, 0xFFFF)))) + DELIMITER
+
+
+def unseal(frame: bytes) -> bytes:
+    """The packet of a frame, without its CRC; the frame with or without its delimiter.
+
+    Raises:
+        ProtocolError: It is not COBS, too short, or its CRC is wrong.
+    """
+    try:
+        packet = bytes(cobs.decode(frame.removesuffix(DELIMITER)))
+    except cobs.DecodeError as error:
+        raise ProtocolError(f"not COBS: {error}") from None
+    if len(packet) < 4:
+        raise ProtocolError(f"a packet of {len(packet)} bytes")
+    if binascii.crc_hqx(packet[:-2], 0xFFFF) != int.from_bytes(packet[-2:], "little"):
+        raise ProtocolError("wrong CRC")
+    return packet[:-2]
+
+
+def command(kind: MessageType, body: bytes = b"") -> bytes:
+    """Frame of any command."""
+    return seal(bytes((PROTOCOL_VERSION, kind)) + body)
+
+
+def hello_command() -> bytes:
+    """Ask for the hello."""
+    return command(MessageType.COMMAND_HELLO)
+
+
+def set_rate_command(rate_hz: int) -> bytes:
+    """Ask for ``rate_hz`` samples per second.
+
+    Raises:
+        ValueError: Outside 1..1000.
+    """
+    if rate_hz not in RATE_HZ:
+        raise ValueError(f"{rate_hz} samples per second: must be within 1..1000")
+    return command(MessageType.COMMAND_SET_RATE, struct.pack("<H", rate_hz))
+
+
+def zero_current_command() -> bytes:
+    """Ask to take the present current as zero, for good."""
+    return command(MessageType.COMMAND_ZERO_CURRENT)
+
+
+def restart_command() -> bytes:
+    """Ask the board to reset itself through its watchdog."""
+    return command(MessageType.COMMAND_RESTART)
+
+
+def set_serial_command(serial: int) -> bytes:
+    """Give the board a serial number, 1..2^32 - 1, for good."""
+    return command(MessageType.COMMAND_SET_SERIAL, struct.pack("<I", serial))
+
+
+def set_bandgap_command(bandgap_v: float) -> bytes:
+    """Tell the board its internal reference as measured [V], 1.0..1.2, for good."""
+    return command(MessageType.COMMAND_SET_BANDGAP, struct.pack("<I", round(bandgap_v * 1e6)))
+
+
+@dataclass(frozen=True)
+class Hello:
+    """What a board says of itself; units as on the line."""
+
+    firmware_major: int
+    firmware_minor: int
+    firmware_patch: int
+    reset_cause: int
+    boot_id: int
+    serial: int
+    sequence: int
+    board_us: int
+    rate_hz: int
+    period_ns: int
+    adc_bits: int
+    channels: int
+    divider_ppm: int
+    current_uv_per_a: int
+    current_zero_ppm: int
+    bandgap_uv: int
+    bandgap_sum: int
+    bandgap_count: int
+    ntc_series_ohm: int
+    ntc_r25_ohm: int
+    ntc_beta_k: int
+
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<4BHIIIHIBBIIIIIHIIH")
+
+    def encode(self, version: int = PROTOCOL_VERSION) -> bytes:
+        """Frame."""
+        body = self.LAYOUT.pack(*(getattr(self, field.name) for field in fields(self)))
+        return seal(bytes((version, MessageType.HELLO)) + body)
+
+    @classmethod
+    def decode(cls, packet: bytes) -> Self:
+        """From a packet without its CRC.
+
+        Raises:
+            ProtocolError: Another message.
+        """
+        return cls(*cls.LAYOUT.unpack(body_of(packet, MessageType.HELLO, cls.LAYOUT.size)))
+
+    @property
+    def firmware(self) -> str:
+        """Version as people write it."""
+        return f"{self.firmware_major}.{self.firmware_minor}.{self.firmware_patch}"
+
+
+@dataclass(frozen=True)
+class Ack:
+    """The answer to a command."""
+
+    command: int
+    result: AckResult
+    value: int
+
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BBI")
+
+    def encode(self) -> bytes:
+        """Frame."""
+        body = self.LAYOUT.pack(self.command, self.result, self.value)
+        return seal(bytes((PROTOCOL_VERSION, MessageType.ACK)) + body)
+
+    @classmethod
+    def decode(cls, packet: bytes) -> Self:
+        """From a packet without its CRC.
+
+        Raises:
+            ProtocolError: Another message.
+        """
+        command_type, result, value = cls.LAYOUT.unpack(body_of(packet, MessageType.ACK, cls.LAYOUT.size))
+        try:
+            return cls(command_type, AckResult(result), value)
+        except ValueError as error:
+            raise ProtocolError(str(error)) from None
+
+
+@dataclass(frozen=True)
+class SampleMessage:
+    """A sample as it travels: sums of conversions and their counts."""
+
+    sequence: int
+    board_us: int
+    voltage_sum: int
+    current_sum: int
+    count: int
+    aux_sum: int
+    aux_count: int
+    status: int
+
+    HEAD: ClassVar[struct.Struct] = struct.Struct("<BBII")
+    TAIL: ClassVar[struct.Struct] = struct.Struct("<HHBB")
+    SUM_BYTES: ClassVar[int] = 3
+
+    def encode(self, version: int = PROTOCOL_VERSION) -> bytes:
+        """Frame."""
+        return seal(
+            self.HEAD.pack(version, MessageType.SAMPLE, self.sequence, self.board_us)
+            + self.voltage_sum.to_bytes(self.SUM_BYTES, "little")
+            + self.current_sum.to_bytes(self.SUM_BYTES, "little")
+            + self.TAIL.pack(self.count, self.aux_sum, self.aux_count, self.status)
+        )
+
+    @classmethod
+    def decode(cls, packet: bytes) -> Self:
+        """From a packet without its CRC.
+
+        Raises:
+            ProtocolError: Another message.
+        """
+        body = body_of(packet, MessageType.SAMPLE, cls.HEAD.size - 2 + 2 * cls.SUM_BYTES + cls.TAIL.size)
+        sequence, board_us = struct.unpack_from("<II", body)
+        sums = (int.from_bytes(body[i : i + cls.SUM_BYTES], "little") for i in (8, 8 + cls.SUM_BYTES))
+        return cls(sequence, board_us, *sums, *cls.TAIL.unpack_from(body, 8 + 2 * cls.SUM_BYTES))
+
+
+def body_of(packet: bytes, kind: MessageType, size: int) -> bytes:
+    """Body of a packet without its CRC.
+
+    Raises:
+        ProtocolError: Another version, another message or another length.
+    """
+    if packet[0] != PROTOCOL_VERSION:
+        raise ProtocolError(f"protocol version {packet[0]}: this is version {PROTOCOL_VERSION}")
+    if packet[1] != kind:
+        raise ProtocolError(f"message type {packet[1]:#04x} where {kind:#04x} was expected")
+    if len(packet) - 2 != size:
+        raise ProtocolError(f"a body of {len(packet) - 2} bytes where {size} were expected")
+    return packet[2:]
