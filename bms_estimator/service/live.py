@@ -162,10 +162,16 @@ async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Pub
 def _offer(requests: Requests, estimator: Estimator, publisher: Publisher) -> None:
     """Offer the requests that need the loop."""
 
-    def state(_: Mapping[str, Any]) -> Mapping[str, Any]:
+    async def state(_: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"estimate": publisher.latest.model_dump() if publisher.latest else None}
 
-    def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    async def parameters(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        return publisher.snapshot.parameters.model_dump()
+
+    async def health(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        return publisher.snapshot.health.model_dump()
+
+    async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         soc = number(arguments, "soc", 0.0, 1.0)
         if not estimator.state["started"][0]:
             raise UserError("no sample has been taken yet")
@@ -174,7 +180,5 @@ def _offer(requests: Requests, estimator: Estimator, publisher: Publisher) -> No
         log.info("SOC set on request", before=before, soc=soc)
         return {"soc": soc, "before": before}
 
-    requests.offer("state", state)
-    requests.offer("parameters", lambda _: publisher.snapshot.parameters.model_dump())
-    requests.offer("health", lambda _: publisher.snapshot.health.model_dump())
-    requests.offer("set_soc", set_soc)
+    for handler in (state, parameters, health, set_soc):
+        requests.offer(handler.__name__, handler)

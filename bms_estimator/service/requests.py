@@ -1,11 +1,11 @@
 """Requests that people and dashboards may make of a running service."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from bms_estimator.model.errors import UserError
 
-Handler = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+Handler = Callable[[Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
 """Takes the request's arguments, returns the response's data. Raises UserError when it cannot be granted."""
 
 
@@ -19,7 +19,7 @@ class Requests:
         """Make a request known."""
         self._handlers[name] = handler
 
-    def answer(self, name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    async def answer(self, name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Answer one request.
 
         Raises:
@@ -28,7 +28,7 @@ class Requests:
         handler = self._handlers.get(name)
         if handler is None:
             raise UserError(f"{name}: no such request; there are {', '.join(sorted(self._handlers))}")
-        return handler(arguments)
+        return await handler(arguments)
 
 
 def number(arguments: Mapping[str, Any], name: str, low: float, high: float) -> float:

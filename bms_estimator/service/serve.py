@@ -3,8 +3,9 @@
 import asyncio
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel
@@ -46,7 +47,12 @@ async def serve(
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     requests = Requests()
     board = SerialBoard(settings.sensor, tap=tap)
-    requests.offer("current_zero", lambda _: board.current_zero())
+
+    async def current_zero(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        await board.current_zero()
+        return {}
+
+    requests.offer("current_zero", current_zero)
     all_sinks = list(sinks)
     if settings.mqtt is not None:
         all_sinks.append(MqttSink(settings.mqtt, settings.pack.name, requests.answer))

@@ -3,13 +3,13 @@
 All sinks are peers: async context managers whose ``publish`` neither blocks nor fails.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 from bms_estimator.model.estimate import Snapshot
 
-Answer = Callable[[str, Mapping[str, Any]], Mapping[str, Any]]
+Answer = Callable[[str, Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
 """Answers a request by name and arguments with data. Raises UserError when it cannot be granted."""
 
 

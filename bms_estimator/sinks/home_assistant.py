@@ -54,7 +54,6 @@ def discovery(info: Info, root: str) -> dict[str, Any]:
         info: Of the pack.
         root: Topic of the device, ``bms/<device>``.
     """
-    board = info.board
     device = {
         "identifiers": [device_id(info.device)],
         "name": info.device,
@@ -62,8 +61,8 @@ def discovery(info: Info, root: str) -> dict[str, Any]:
         "manufacturer": "bms_estimator",
         "sw_version": info.version,
     }
-    if "serial_number" in board:
-        device["serial_number"] = board["serial_number"]
+    if info.board.get("serial"):
+        device["serial_number"] = info.board["serial"]
     return {
         "device": device,
         "origin": {"name": "bms_estimator", "sw_version": info.version},

@@ -70,7 +70,8 @@ class MqttSink:
         self._root = f"{settings.base_topic}/{device}"
         self._connection = _connection(settings)
         self._slot: Snapshot | None = None
-        self._sent: Snapshot | None = None  # what the broker holds of the retained messages
+        self._sent: Snapshot | None = None  # what the broker holds; only the sending task sets it
+        self._again = True  # the broker may hold nothing: send all of it
         self._wake = asyncio.Event()
         self._closing = False
         self._task: asyncio.Task[None] | None = None
@@ -109,7 +110,7 @@ class MqttSink:
         """Connect, serve, and again after a pause that doubles."""
         delay_s = self._first_delay_s
         while not self._closing:
-            self._sent = None
+            self._again = True
             try:
                 async with self._client() as client:
                     log.info("broker connected", url=self._settings.url)
@@ -157,7 +158,8 @@ class MqttSink:
         while True:
             await self._wake.wait()
             self._wake.clear()
-            if self._sent is None:
+            if self._again:
+                self._again, self._sent = False, None
                 await self._retain(client, "availability", b"online")
                 await self._retain(client, "schema", _json(schema()))
             snapshot, self._slot = self._slot, None
@@ -197,12 +199,12 @@ class MqttSink:
                     asyncio.get_running_loop().call_later(self._birth_delay_s, self._say_again)
             elif not message.retain:  # a retained request would be granted again with each connection
                 name = message.topic.value.rsplit("/", 1)[-1]
-                response = _respond(self._answer, name, message.payload)
+                response = await _respond(self._answer, name, message.payload)
                 await client.publish(f"{self._root}/response/{name}", _json(response), qos=1)
 
     def _say_again(self) -> None:
         """Send all retained messages again with the next snapshot."""
-        self._sent = None
+        self._again = True
 
 
 def schema() -> dict[str, Any]:
@@ -211,13 +213,13 @@ def schema() -> dict[str, Any]:
     return {topic: model.model_json_schema() for topic, model in topics.items()}
 
 
-def _respond(answer: Answer, name: str, payload: object) -> dict[str, Any]:
+async def _respond(answer: Answer, name: str, payload: object) -> dict[str, Any]:
     """The response to a request: status, data, error, transaction."""
     transaction = None
     try:
         arguments = _arguments(payload)
         transaction = arguments.get("transaction")
-        data = answer(name, arguments)
+        data = await answer(name, arguments)
     except UserError as error:
         return {"status": "error", "data": None, "error": str(error), "transaction": transaction}
     return {"status": "ok", "data": data, "error": None, "transaction": transaction}

@@ -190,18 +190,18 @@ async def test_requests_reach_the_running_estimator() -> None:
     async with running() as run:
         await run.sink.until(lambda _: True)
         with pytest.raises(UserError, match="no sample"):
-            run.requests.answer("set_soc", {"soc": 0.8})
+            await run.requests.answer("set_soc", {"soc": 0.8})
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.estimate is not None)
-        assert run.requests.answer("set_soc", {"soc": 0.8})["before"] == pytest.approx(0.5)
+        assert (await run.requests.answer("set_soc", {"soc": 0.8}))["before"] == pytest.approx(0.5)
         for wrong in ({}, {"soc": 1.5}, {"soc": "0.5"}, {"soc": True}, {"soc": float("nan")}):
             with pytest.raises(UserError, match=r"soc = .*must be a number from 0 to 1"):
-                run.requests.answer("set_soc", wrong)
+                await run.requests.answer("set_soc", wrong)
         with pytest.raises(UserError, match=r"health, parameters, set_soc, state"):
-            run.requests.answer("reboot", {})
-        assert run.requests.answer("state", {})["estimate"]["soc"] == pytest.approx(0.5)
-        assert set(run.requests.answer("parameters", {})["a"]) == {f"a{i}" for i in range(1, 22)}
-        assert run.requests.answer("health", {})["samples"]["samples"] == 1
+            await run.requests.answer("reboot", {})
+        assert (await run.requests.answer("state", {}))["estimate"]["soc"] == pytest.approx(0.5)
+        assert set((await run.requests.answer("parameters", {}))["a"]) == {f"a{i}" for i in range(1, 22)}
+        assert (await run.requests.answer("health", {}))["samples"]["samples"] == 1
         state = await run.end()
     assert state.state["soc"][0] == 0.8
 

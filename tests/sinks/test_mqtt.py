@@ -56,7 +56,7 @@ def snapshot(sensor_message: str | None = None) -> Snapshot:
 ONE = snapshot()
 
 
-def refuse(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+async def refuse(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     raise UserError(f"{name}: not here")
 
 
@@ -170,7 +170,7 @@ async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_
     ],
 )
 async def test_a_request_is_answered(broker: Broker, payload: bytes, status: str, transaction: object) -> None:
-    def echo(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    async def echo(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         if arguments.get("refuse"):
             raise UserError("refused")
         return {"name": name, "x": arguments.get("x")}
@@ -189,7 +189,7 @@ async def test_a_request_is_answered(broker: Broker, payload: bytes, status: str
 async def test_a_retained_request_is_not_granted_again_with_every_connection(broker: Broker) -> None:
     asked = []
 
-    def note(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    async def note(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         asked.append(name)
         return {}
 

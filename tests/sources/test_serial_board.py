@@ -1,0 +1,131 @@
+import asyncio
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources.serial_board import SerialBoard
+from tests.serial_line import Line
+
+LONG_S = 20.0
+
+
+def board(line: Line, **options: Any) -> SerialBoard:
+    settings = {"port": str(line.path), "protocol": "text", "baud": 115_200} | options.pop("settings", {})
+    return SerialBoard(SensorSettings(**settings), first_retry_s=0.05, silent_s=0.3, **options)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - the condition is the test's
+            await asyncio.sleep(0.01)
+
+
+async def take(source: SerialBoard, samples: int) -> SampleBlock:
+    blocks: list[SampleBlock] = []
+    async with asyncio.timeout(LONG_S):
+        async for block in source:
+            blocks.append(block.copy())
+            if sum(b.size for b in blocks) >= samples:
+                break
+    return np.concatenate(blocks)
+
+
+async def test_a_missing_port_is_waited_for_and_said(line: Line) -> None:
+    async with board(line) as source:
+        await until(lambda: source.message and "does not exist" in source.message)
+        assert str(line.path) in (source.message or "")
+        line.plug()
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"3.80,0.10\r\n3.81,0.20\r\n")
+        samples = await take(source, 2)
+        assert source.message is None
+    assert samples["voltage_v"].tolist() == [3.80, 3.81]
+    assert source.counters["reconnects"] == 0
+
+
+async def test_a_board_unplugged_in_mid_run_is_taken_up_again(line: Line) -> None:
+    line.plug()
+    async with board(line) as source:
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"3.80,0.10\n")
+        await take(source, 1)
+        line.unplug()
+        await until(lambda: source.message is not None)
+        line.plug()
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"3.70,0.10\n")
+        samples = await take(source, 1)
+    assert samples["voltage_v"].tolist() == [3.70]
+    assert source.counters["reconnects"] == 1
+
+
+async def test_a_port_held_by_another_process_names_the_process(line: Line) -> None:
+    line.plug()
+    script = (
+        "import serial,sys; s = serial.Serial(sys.argv[1], exclusive=True); print('open', flush=True); sys.stdin.read()"
+    )
+    other = subprocess.Popen(  # noqa: ASYNC220 - started at once
+        [sys.executable, "-c", script, str(line.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    try:
+        assert other.stdout
+        await asyncio.to_thread(other.stdout.readline)
+        async with board(line) as source:
+            await until(lambda: source.message and f"(pid {other.pid})" in source.message)
+            other.communicate()
+            await until(lambda: source.message and "no frame yet" in source.message)
+    finally:
+        other.communicate()
+
+
+async def test_a_silent_board_and_one_at_another_baud_rate_are_told_apart(line: Line) -> None:
+    line.plug()
+    async with board(line) as source:
+        await until(lambda: source.message and "silent" in source.message)
+        for _ in range(40):
+            line.write(bytes(range(128, 256)))
+            await asyncio.sleep(0.05)
+            if source.message and "baud" in source.message:
+                break
+        assert "at 115200 baud" in (source.message or "")
+        assert "wrong baud rate" in (source.message or "")
+        line.write(b"\n3.80,0.10\n")
+        await take(source, 1)
+        assert source.message is None
+
+
+async def test_the_sign_of_the_current_is_turned_once(line: Line) -> None:
+    line.plug()
+    async with board(line, settings={"current_sign": "charge_positive"}) as source:
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"3.80,-0.25\n")
+        samples = await take(source, 1)
+    assert samples["current_a"].tolist() == [0.25]
+
+
+async def test_the_tap_gets_what_the_decoder_is_fed(line: Line) -> None:
+    class Tap(list[tuple[float, bytes]]):
+        def write(self, arrival_s: float, data: bytes) -> None:
+            self.append((arrival_s, data))
+
+    tap = Tap()
+    line.plug()
+    async with board(line, tap=tap, wall=lambda: 1e9, monotonic=lambda: 5.0) as source:
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"junk\n3.80,0.10\n")
+        await take(source, 1)
+    assert b"".join(data for _, data in tap) == b"junk\n3.80,0.10\n"
+    assert {arrival_s for arrival_s, _ in tap} == {1e9}
+
+
+async def test_a_text_board_takes_no_commands(line: Line) -> None:
+    async with board(line) as source:
+        with pytest.raises(UserError, match="takes no commands"):
+            await source.current_zero()
