@@ -1,12 +1,14 @@
-"""All benchmarks in one table: ``make benchmark``, or ``make benchmark ARGS="kernel start"`` for some."""
+"""All benchmarks in one table: ``make benchmark``, or ``make benchmark ARGS="kernel live"`` for some."""
 
 import sys
 from itertools import chain
 
+import capture
 import kernel
+import live
 from table import show
 
-GROUPS = {"kernel": kernel.rows}
+GROUPS = {"kernel": kernel.rows, "capture": capture.rows, "live": live.rows}
 
 
 def main() -> None:

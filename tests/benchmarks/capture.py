@@ -1,0 +1,106 @@
+"""Replay of a raw serial capture through the command line, decoding included."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from load import CELL, RATE_HZ, pulses
+from numba import njit
+from table import Row
+from wire import hello, sample_frames
+
+from bms_estimator.kernels.framing import SAMPLE_FRAME_BYTES, crc16
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+HOURS = (4, 16)
+"""Short and long: memory must not grow from one to the other."""
+GROWTH_MIB = 16.0
+"""What an allocator may keep without the program growing with its input [MiB]."""
+PIECE = 1_000_000
+RECORD = np.dtype([("arrival_s", "<f8"), ("length", "<u4"), ("data", "u1", SAMPLE_FRAME_BYTES), ("crc", "<u2")])
+"""A record of the capture that holds one frame, as a live line at 100 Hz brings them."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One replay: what it said of itself, and the most memory it had."""
+
+    samples: int
+    wall_s: float
+    samples_per_s: float
+    lock_lost: bool
+    rss_mib: float
+
+
+def rows() -> Iterator[Row]:
+    """Sixteen hours at 100 Hz, and how much more memory they take than four."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pack.raw"
+        samples = [hours * 3600 * RATE_HZ for hours in HOURS]
+        block = pulses(samples[-1])
+        replays = []
+        for count in samples:
+            path.unlink(missing_ok=True)
+            write_capture(path, block[:count])
+            replay(path, Path(folder), count)  # the file is in memory, the kernels in their cache
+            replays.append(replay(path, Path(folder), count))
+        megabytes = path.stat().st_size / 1e6
+    short, long = replays
+    rate = long.samples_per_s
+    what = f"replay of {HOURS[1]} h at {RATE_HZ} Hz, {long.samples / 1e6:.2f} M samples, {megabytes:.0f} MB"
+    yield Row(what, "at least 500,000 /s", f"{rate:,.0f} /s ({long.wall_s:.1f} s)", rate >= 5e5)
+    grown = long.rss_mib - short.rss_mib
+    met = grown <= GROWTH_MIB
+    yield Row(
+        f"  memory, {HOURS[0]} h and {HOURS[1]} h", "does not grow", f"{short.rss_mib:.0f}, {long.rss_mib:.0f} MiB", met
+    )
+    yield Row("  lock", "kept", "lost" if long.lock_lost else "kept", not long.lock_lost)
+
+
+def write_capture(path: Path, block: SampleBlock) -> None:
+    """A capture of the frames of ``block``, one frame in each record, each a millisecond after its sample."""
+    with CaptureWriter(path, CaptureHeader()) as writer:
+        writer.write(0.0, b"\0" + hello(RATE_HZ))
+    with path.open("ab") as file:
+        for first in range(0, block.size, PIECE):
+            piece = block[first : first + PIECE]
+            records = np.zeros(piece.size, dtype=RECORD)
+            records["arrival_s"] = piece["time_s"] + 1e-3
+            records["length"] = SAMPLE_FRAME_BYTES
+            records["data"] = sample_frames(piece, first)
+            _seal(records.view(np.uint8).reshape(piece.size, RECORD.itemsize))
+            file.write(records.tobytes())
+
+
+@njit
+def _seal(records):
+    for j in range(records.shape[0]):
+        crc = crc16(records[j], 0, records.shape[1] - 2)
+        records[j, -2], records[j, -1] = crc & 0xFF, crc >> 8
+
+
+def replay(path: Path, folder: Path, samples: int) -> Replay:
+    """Run ``bms-estimator replay``.
+
+    Raises:
+        RuntimeError: It did not take every sample.
+    """
+    with (folder / "result.json").open("w+") as result:
+        process = subprocess.Popen([PROGRAM, "replay", path, "--cell", CELL, "--json"], stdout=result)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        result.seek(0)
+        text = result.read()
+    found = json.loads(text) if process.returncode == 0 else {}
+    if found.get("samples") != samples:
+        raise RuntimeError(f"{samples} samples were to be replayed, exit code {process.returncode}: {text}")
+    fields = {name: found[name] for name in ("samples", "wall_s", "samples_per_s", "lock_lost")}
+    return Replay(**fields, rss_mib=usage.ru_maxrss / 1024)

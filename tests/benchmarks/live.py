@@ -1,0 +1,154 @@
+"""The real service between a board on a pseudo-terminal and a subscriber of Mosquitto, each a process of its own."""
+
+import asyncio
+import json
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import aiomqtt
+import numpy as np
+import psutil
+from load import CELL
+from numpy.typing import NDArray
+from pty_board import PtyBoard
+from table import Row
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.mosquitto import MOSQUITTO, Broker
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+PUBLISH_RATE_HZ = 10
+"""The highest that the settings allow: each message holds the newest sample of its window."""
+SETTLE_S, MEASURE_S, PATIENCE_S = 2.0, 20.0, 30.0
+
+PACK = """
+[pack]
+name = "bench"
+cell = "{cell}"
+
+[sensor]
+port = "{port}"
+sample_rate_hz = {rate_hz}
+
+[mqtt]
+url = "{url}"
+publish_rate_hz = {publish_rate_hz}
+"""
+
+
+@dataclass(frozen=True)
+class State:
+    """One message on the state topic, and when it came on the monotonic clock [s]."""
+
+    arrival_s: float
+    board_time_s: float
+    frames_received: int
+    frames_lost: int
+    crc_errors: int
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run measured."""
+
+    first_s: float
+    """From the start of the service to its first estimate [s]."""
+    cpu: float
+    """Part of one core that the service took while measured."""
+    latency_s: NDArray[np.float64]
+    """From the bytes of a sample written to the estimate of that sample received [s]."""
+    sent: int
+    last: State
+
+
+def rows() -> Iterator[Row]:
+    """A fast board, a usual board, and the start."""
+    if MOSQUITTO is None:
+        yield Row("live over a PTY", "-", "mosquitto is not installed", None)
+        return
+    fast, usual = measure(1000), measure(100)
+    missing = fast.sent - fast.last.frames_received + fast.last.crc_errors
+    yield Row(
+        f"1,000 frames/s for {fast.sent / 1000:.0f} s", "none lost", f"{missing} of {fast.sent:,} lost", missing == 0
+    )
+    yield Row("  service's processor time", "below 25 % of a core", f"{fast.cpu:.1%}", fast.cpu < 0.25)
+    p50, p99, worst = np.percentile(usual.latency_s, [50, 99, 100]) * 1e3
+    what = f"100 frames/s, byte to subscriber p50 of {usual.latency_s.size} ({PUBLISH_RATE_HZ} Hz, QoS 0)"
+    yield Row(what, "at most 2 ms", f"{p50:.2f} ms", p50 <= 2.0)
+    yield Row("  p99, worst (the machine's)", "-", f"{p99:.1f} ms, {worst:.1f} ms", None)
+    yield Row("  service's processor time", "at most 12 % of a core", f"{usual.cpu:.1%}", usual.cpu <= 0.12)
+    yield Row("warm start to first estimate received", "at most 3 s", f"{usual.first_s:.2f} s", usual.first_s <= 3.0)
+
+
+def measure(rate_hz: int) -> Run:
+    """Run board, broker, service and subscriber."""
+    with tempfile.TemporaryDirectory() as folder, PtyBoard(rate_hz) as board, broker(Path(folder)) as server:
+        return asyncio.run(_measure(Path(folder), board, server))
+
+
+@contextmanager
+def broker(folder: Path) -> Iterator[Broker]:
+    """Mosquitto on a free port."""
+    server = Broker(folder).start()
+    try:
+        yield server
+    finally:
+        server.stop()
+
+
+async def _measure(folder: Path, board: PtyBoard, server: Broker) -> Run:
+    pack = folder / "pack.toml"
+    pack.write_text(
+        PACK.format(cell=CELL, port=board.port, rate_hz=board.rate_hz, url=server.url, publish_rate_hz=PUBLISH_RATE_HZ)
+    )
+    states: list[State] = []
+    async with aiomqtt.Client("127.0.0.1", server.port) as client:
+        await client.subscribe("bms/bench/state", qos=0)
+        listening = asyncio.create_task(_listen(client, states))
+        started_s = time.monotonic()
+        with (folder / "log").open("w") as log:
+            service = await asyncio.create_subprocess_exec(PROGRAM, "run", "--pack", pack, stdout=log, stderr=log)
+        try:
+            await _first(states, service, folder / "log")
+            await asyncio.sleep(SETTLE_S)
+            process, begin_s, heard = psutil.Process(service.pid), time.monotonic(), len(states)
+            before_s = sum(process.cpu_times()[:2])
+            await asyncio.sleep(MEASURE_S)
+            cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
+            measured = states[heard:]
+            board.stop()
+            await asyncio.sleep(5.0 / PUBLISH_RATE_HZ)
+        finally:
+            service.send_signal(signal.SIGINT)
+            await asyncio.wait_for(service.wait(), PATIENCE_S)
+            listening.cancel()
+    samples = np.rint(np.array([s.board_time_s for s in measured]) * board.rate_hz).astype(int)
+    latency_s = np.array([s.arrival_s for s in measured]) - board.sent_s[samples]
+    return Run(states[0].arrival_s - started_s, cpu, latency_s, board.sent, states[-1])
+
+
+async def _listen(client: aiomqtt.Client, states: list[State]) -> None:
+    async for message in client.messages:
+        arrival_s = time.monotonic()
+        state = json.loads(message.payload)
+        names = [name for name in State.__dataclass_fields__ if name != "arrival_s"]
+        states.append(State(arrival_s=arrival_s, **{name: state[name] for name in names}))
+
+
+async def _first(states: list[State], service: asyncio.subprocess.Process, log: Path) -> None:
+    """Wait for the first estimate.
+
+    Raises:
+        RuntimeError: The service ended, or none came in time.
+    """
+    until_s = time.monotonic() + PATIENCE_S
+    while not states:
+        if service.returncode is not None or time.monotonic() > until_s:
+            raise RuntimeError(f"no estimate came: {(await asyncio.to_thread(log.read_text))[-2000:]}")
+        await asyncio.sleep(0.02)
