@@ -28,7 +28,7 @@ from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.requests import Requests
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.table import TableSink, table_sink
-from bms_estimator.sources.replay import Replay, open_replay
+from bms_estimator.sources.replay import RawCapture, Replay, open_capture
 
 
 def replay(
@@ -57,8 +57,12 @@ def replay(
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
     if out is not None and out.exists() and out.samefile(capture):
         raise UserError(f"--out {out}: is the capture itself")
-    source = open_replay(capture, settings.sensor, speed=speed)
-    result = asyncio.run(_replay(settings, model, source, table_sink(out) if out else None))
+    source = open_capture(capture, settings.sensor if pack else None)
+    result = asyncio.run(_replay(settings, model, Replay(source, speed=speed), table_sink(out) if out else None))
+    if isinstance(source, RawCapture) and source.damaged:
+        typer.echo(
+            f"warning: {capture}: damaged after {result.duration_s or 0.0:.1f} s; the rest was not read", err=True
+        )
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
@@ -105,7 +109,7 @@ def _progress(source: Replay) -> Iterator[Callable[[], None]]:
     columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[samples]:,} samples"), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
         bar = progress.add_task("replay", total=1.0, samples=0)
-        yield lambda: progress.update(bar, completed=source.fraction, samples=source.samples)
+        yield lambda: progress.update(bar, completed=source.capture.fraction, samples=source.samples)
 
 
 def result_table(capture: Path, result: Result) -> Table:

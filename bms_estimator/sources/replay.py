@@ -3,7 +3,7 @@
 import asyncio
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
@@ -11,25 +11,71 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
-from bms_estimator.sources.table import READERS, Table, table_reader
+from bms_estimator.sources.frames import FrameDecoder
+from bms_estimator.sources.raw_capture import is_capture, read_capture, read_header
+from bms_estimator.sources.table import READERS, table_reader
+from bms_estimator.sources.text_lines import TextDecoder
 
 TICK_S = 0.05
 """A paced replay hands over what has become due this often [s]."""
 
 
-class Decoder(Protocol):
-    """What a raw capture's bytes went through."""
+class Capture(Protocol):
+    """Something recorded. Each iteration reads it from its start."""
 
     @property
-    def counters(self) -> Mapping[str, int]:
-        """Frames and faults by kind."""
+    def fraction(self) -> float:
+        """How much has been read, 0..1."""
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Blocks of samples.
+
+        Raises:
+            UserError: The file cannot be read.
+        """
+
+
+class RawCapture:
+    """The samples in the bytes of a raw capture.
+
+    Args:
+        path: What ``CaptureWriter`` wrote.
+        sensor: How to decode; None: as the capture's header says.
+
+    Attributes:
+        decoder: What the bytes have gone through so far.
+        damaged: The file has no readable record behind those that were read although it has not ended.
+
+    Raises:
+        UserError: No capture, or one of a later version.
+    """
+
+    def __init__(self, path: Path, sensor: SensorSettings | None = None) -> None:
+        header = read_header(path)
+        text = (sensor.protocol if sensor else header.mode) == "text"
+        sign = sensor.current_sign if sensor else header.current_sign
+        self.decoder = TextDecoder(current_sign=sign) if text else FrameDecoder(current_sign=sign)
+        self.damaged = False
+        self._path = path
+        self._read, self._size = 0, path.stat().st_size
 
     @property
-    def board(self) -> Mapping[str, str]:
-        """What the board said of itself."""
+    def fraction(self) -> float:
+        """How much has been read, 0..1; too fast where the file is packed."""
+        return min(self._read / self._size, 1.0)
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Blocks of samples, as ``Capture`` says."""
+        for batch in read_capture(self._path):
+            self._read += batch.data.size + RECORD_OVERHEAD_BYTES * batch.ends.size
+            self.damaged = batch.damaged
+            block = self.decoder.feed_reads(batch.arrivals_s, batch.ends, batch.data)
+            if block.size:
+                yield block
 
 
 class Replay:
@@ -39,7 +85,6 @@ class Replay:
 
     Args:
         capture: What is replayed.
-        decoder: Who decodes it, if it is raw.
         speed: Times as fast as it was recorded; None: as fast as it goes.
         monotonic: Monotonic clock [s].
     """
@@ -48,26 +93,17 @@ class Replay:
     """There is always a sample."""
 
     def __init__(
-        self,
-        capture: Table,
-        *,
-        decoder: Decoder | None = None,
-        speed: float | None = None,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, capture: Capture, *, speed: float | None = None, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
-        self._capture, self._decoder = capture, decoder
+        self.capture = capture
+        self._decoder = capture.decoder if isinstance(capture, RawCapture) else None
         self._speed, self._monotonic = speed, monotonic
         self.samples = 0
 
     @property
-    def fraction(self) -> float:
-        """How much has been read, 0..1."""
-        return self._capture.fraction
-
-    @property
     def counters(self) -> Mapping[str, int]:
         """The decoder's; of a table, how many rows came."""
-        return self._decoder.counters if self._decoder else {"frames_received": self.samples}
+        return self._decoder.counters.as_dict() if self._decoder else {"frames_received": self.samples}
 
     @property
     def board(self) -> Mapping[str, str]:
@@ -90,13 +126,13 @@ class Replay:
             yield block
 
     async def _at_once(self) -> AsyncIterator[SampleBlock]:
-        for block in self._capture:
+        for block in self.capture:
             yield block
 
     async def _paced(self, speed: float) -> AsyncIterator[SampleBlock]:
         """Each sample once its time has come; the first comes at once."""
         start_s, last_s, elapsed_s = self._monotonic(), math.nan, 0.0
-        for block in self._capture:
+        for block in self.capture:
             due_s = elapsed_s + _elapsed(block["time_s"], last_s)
             first = 0
             while first < block.size:
@@ -116,20 +152,21 @@ def _elapsed(time_s: NDArray[np.float64], last_s: float) -> NDArray[np.float64]:
     return np.cumsum(np.where(np.isfinite(steps), steps, 0.0).clip(min=0.0))
 
 
-def open_replay(path: Path, sensor: SensorSettings, *, speed: float | None = None) -> Replay:
-    """A capture as a source, told apart by the end of its name.
+def open_capture(path: Path, sensor: SensorSettings | None = None) -> Capture:
+    """A capture: a table by the end of its name, else a raw capture by its first bytes.
 
     Args:
-        path: The capture.
-        sensor: How raw bytes are to be decoded.
-        speed: Times as fast as it was recorded; None: as fast as it goes.
+        path: The file.
+        sensor: How to decode raw bytes; None: as the capture's header says.
 
     Raises:
-        UserError: No such file, or the name's end is unknown.
+        UserError: No such file, or it is neither.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     table = table_reader(path)
-    if table is None:
-        raise UserError(f"{path}: what this is cannot be told: the name must end in {', '.join(READERS)}")
-    return Replay(table, speed=speed)
+    if table is not None:
+        return table
+    if is_capture(path):
+        return RawCapture(path, sensor)
+    raise UserError(f"{path}: neither a raw capture nor a table; the name of a table ends in {', '.join(READERS)}")

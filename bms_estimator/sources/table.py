@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, NamedTuple, Protocol, cast
+from typing import IO, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,21 +35,6 @@ DIALECTS = (
     Dialect("time_s", "current_a", "voltage_v", "temperature_c", 1.0),
     Dialect("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", -1.0),  # Battery Data Format
 )
-
-
-class Table(Protocol):
-    """A capture that is a table. Each iteration reads it from its start."""
-
-    @property
-    def fraction(self) -> float:
-        """How much has been read, 0..1."""
-
-    def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of at most ``BLOCK_ROWS`` samples, dtype ``SAMPLE``, current positive on discharge.
-
-        Raises:
-            UserError: The file cannot be read; the message names file, line and column.
-        """
 
 
 class _Columns(NamedTuple):
@@ -81,7 +66,11 @@ class CsvTable:
         return 1.0 if self._raw.closed else self._raw.tell() / max(self._size, 1)
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of samples, as ``Table`` says."""
+        """Blocks of at most ``BLOCK_ROWS`` samples, current positive on discharge.
+
+        Raises:
+            UserError: The file cannot be read; the message names file, line and column.
+        """
         try:
             with self._path.open("rb") as self._raw:
                 self._size = self._path.stat().st_size
@@ -152,7 +141,11 @@ class ParquetTable:
         self.fraction = 0.0
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of samples, as ``Table`` says."""
+        """Blocks of at most ``BLOCK_ROWS`` samples, current positive on discharge.
+
+        Raises:
+            UserError: The file cannot be read; the message names file, line and column.
+        """
         import pyarrow as pa  # noqa: PLC0415 - optional
         from pyarrow import parquet  # noqa: PLC0415
 
@@ -192,7 +185,7 @@ READERS: dict[str, type[CsvTable | ParquetTable]] = {
 """End of a file's name -> who reads it."""
 
 
-def table_reader(path: Path) -> Table | None:
+def table_reader(path: Path) -> CsvTable | ParquetTable | None:
     """Who reads ``path`` by the end of its name; None when it is no table."""
     name = path.name.lower()
     return next((reader(path) for suffix, reader in READERS.items() if name.endswith(suffix)), None)
