@@ -1,10 +1,10 @@
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Estimate, Snapshot
+from bms_estimator.model.estimate import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.model.settings import MqttSettings, PackSettings, Settings
 from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
@@ -20,33 +20,12 @@ from bms_estimator.service.clock import Clock
 from bms_estimator.service.live import run_live
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.requests import Requests
+from tests.collector import Collector
 from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
 SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), mqtt=MqttSettings(publish_rate_hz=10.0))
 LONG_S = 20.0
-
-
-@dataclass
-class Collector:
-    """A sink that keeps what it gets."""
-
-    snapshots: list[Snapshot] = field(default_factory=list)
-
-    def publish(self, snapshot: Snapshot) -> None:
-        self.snapshots.append(snapshot)
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        pass
-
-    async def until(self, wanted: Callable[[Snapshot], bool]) -> Snapshot:
-        async with asyncio.timeout(LONG_S):
-            while not any(wanted(s) for s in self.snapshots):  # noqa: ASYNC110 - the predicate is the test's
-                await asyncio.sleep(0.01)
-        return next(s for s in self.snapshots if wanted(s))
 
 
 @dataclass
@@ -145,7 +124,7 @@ async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> Non
         assert "no usable sample" in (silent.health.sensor_message or "")
         seen = len(run.sink.snapshots)
         run.source.give((1.0, 0.1, 3.8))
-        await run.sink.until(lambda s: run.sink.snapshots.index(s) >= seen and s.health.sensor_online)
+        await run.sink.until(lambda s: s.health.sensor_online, skip=seen)
 
 
 async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> None:
@@ -178,7 +157,7 @@ async def test_a_step_of_the_wall_clock_changes_time_stamps_only() -> None:
         offset = -7200.0
         seen = len(run.sink.snapshots)
         run.source.give((0.1, 0.1, 3.8))
-        after = await run.sink.until(lambda s: run.sink.snapshots.index(s) >= seen and s.estimate is not None)
+        after = await run.sink.until(lambda s: s.estimate is not None, skip=seen)
         state = await run.end()
     assert after.estimate
     assert after.estimate.publish_time.startswith("2023-11-14T20:13:20")

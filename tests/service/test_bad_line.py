@@ -1,0 +1,196 @@
+"""What the line may do to a running service: bytes on a PTY -> decoder -> estimator -> published values."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.estimate import Health, Snapshot
+from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings
+from bms_estimator.service.live import run_live
+from bms_estimator.sources.protocol import MODULUS, Hello, SampleMessage
+from bms_estimator.sources.serial_board import SerialBoard
+from tests.collector import Collector
+from tests.serial_line import Line
+
+LONG_S = 20.0
+CELL = load_cell("chen_mora")
+RATE_HZ = 100
+PERIOD_US = 1_000_000 // RATE_HZ
+HELLO = Hello(
+    firmware_major=1, firmware_minor=2, firmware_patch=3, reset_cause=1, boot_id=7, serial=0xBEEF,
+    sequence=0, board_us=0, rate_hz=RATE_HZ, period_ns=1000 * PERIOD_US, adc_bits=10, channels=0,
+    divider_ppm=5_000_000, current_uv_per_a=100_000, current_zero_ppm=500_000,
+    bandgap_uv=1_100_000, bandgap_sum=225_280, bandgap_count=1000,  # a reference of 5.0 V
+    ntc_series_ohm=10_000, ntc_r25_ohm=10_000, ntc_beta_k=3950,
+)  # fmt: skip
+
+
+def sample(sequence: int, *, board_us: int | None = None, voltage_sum: int = 15_565, status: int = 0) -> SampleMessage:
+    """3.8 V, 0 A."""
+    at_us = (sequence + 1) * PERIOD_US if board_us is None else board_us
+    return SampleMessage(sequence % MODULUS, at_us % MODULUS, voltage_sum, 51_200, 100, 0, 0, status)
+
+
+def frames(first: int, count: int, **options: Any) -> bytes:
+    return b"".join(sample(n, **options).encode() for n in range(first, first + count))
+
+
+class Service:
+    def __init__(self, line: Line, sink: Collector, task: asyncio.Task[Estimator], stop: asyncio.Event) -> None:
+        self.line, self.sink, self.task, self._stop = line, sink, task, stop
+
+    async def until(self, wanted: Callable[[Snapshot], bool]) -> Snapshot:
+        return await self.sink.until(wanted)
+
+    async def received(self, frames: int) -> None:
+        await self.until(lambda s: s.health.line["frames_received"] >= frames)
+
+    async def end(self) -> tuple[Estimator, Health]:
+        self._stop.set()
+        estimator = await asyncio.wait_for(self.task, LONG_S)
+        return estimator, self.sink.snapshots[-1].health
+
+
+@asynccontextmanager
+async def service(line: Line, **sensor: Any) -> AsyncIterator[Service]:
+    """A running service with a board that has said hello."""
+    line.plug()
+    settings = Settings(
+        pack=PackSettings(initial_soc=0.5),
+        sensor=SensorSettings(port=str(line.path), **sensor),
+        mqtt=MqttSettings(publish_rate_hz=10.0),
+    )
+    board = SerialBoard(settings.sensor, first_retry_s=0.05, silent_s=0.3)
+    sink, stop = Collector(), asyncio.Event()
+    task = asyncio.create_task(run_live(settings, CELL, source=board, sinks=[sink], stop=stop))
+    async with asyncio.timeout(LONG_S):
+        while "no frame yet" not in (board.message or ""):  # noqa: ASYNC110 - the board has no event for it
+            await asyncio.sleep(0.01)
+    line.write(HELLO.encode())
+    try:
+        yield Service(line, sink, task, stop)
+    finally:
+        stop.set()
+        await asyncio.wait_for(task, LONG_S)
+
+
+async def test_good_frames_arrive_with_the_board_s_own_scaling_and_name(line: Line) -> None:
+    async with service(line) as live:
+        live.line.write(frames(0, 20))
+        fresh = await live.until(lambda s: s.estimate is not None)
+        named = await live.until(lambda s: bool(s.info.board))
+    assert fresh.estimate
+    assert fresh.estimate.voltage_v == pytest.approx(3.8, abs=1e-3)
+    assert fresh.estimate.current_a == pytest.approx(0.0, abs=1e-6)
+    assert fresh.health.sensor_message is None
+    assert named.info.board["firmware"] == "1.2.3"
+    assert named.info.board["serial"] == "0000beef"
+
+
+async def test_garbage_and_cut_frames_cost_only_themselves(line: Line) -> None:
+    async with service(line) as live:
+        good = sample(10).encode()
+        live.line.write(frames(0, 10) + bytes(range(1, 200)) + b"\0" + good[:9] + frames(10, 10) + frames(20, 10))
+        await live.received(29)  # the cut frame took the next one with it
+        estimator, health = await live.end()
+    assert estimator.state["samples"][0] == 29
+    assert health.line["frames_lost"] == 1
+    assert sum(health.line[kind] for kind in ("crc_errors", "cobs_errors", "length_errors")) == 2
+
+
+async def test_a_wrong_checksum_is_counted_and_its_sample_not_used(line: Line) -> None:
+    async with service(line) as live:
+        wrong = bytearray(sample(1).encode())
+        wrong[7] ^= 0x10
+        live.line.write(frames(0, 1) + bytes(wrong) + frames(2, 8))
+        await live.received(9)
+        _, health = await live.end()
+    assert health.line["crc_errors"] == 1
+    assert health.line["frames_lost"] == 1
+    assert live.sink.snapshots[-1].estimate is None or live.sink.snapshots[-1].estimate.crc_errors == 1
+
+
+async def test_a_board_with_a_newer_protocol_is_named_as_such(line: Line) -> None:
+    line.plug()
+    board = SerialBoard(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
+    async with board, asyncio.timeout(LONG_S):
+        while "another version of the protocol" not in (board.message or ""):
+            line.write(HELLO.encode(version=2) + sample(0).encode(version=2))
+            await asyncio.sleep(0.05)
+        assert board.counters["version_errors"] > 0
+
+
+async def test_duplicates_and_late_frames_are_dropped(line: Line) -> None:
+    async with service(line) as live:
+        live.line.write(frames(0, 10) + frames(9, 1) + frames(5, 2) + frames(10, 10))
+        await live.received(20)
+        estimator, health = await live.end()
+    assert estimator.state["samples"][0] == 20
+    assert health.line["duplicates"] + health.line["out_of_order"] == 3
+    assert health.samples["time_steps_back"] == 0
+
+
+async def test_sequence_and_microseconds_wrap_without_a_seam(line: Line) -> None:
+    async with service(line) as live:
+        start = MODULUS - 5
+        at_us = MODULUS - 5 * PERIOD_US
+        wrapping = (sample(start + n, board_us=at_us + n * PERIOD_US) for n in range(10))
+        live.line.write(replace(HELLO, sequence=start, board_us=at_us - PERIOD_US, boot_id=8).encode())
+        live.line.write(b"".join(message.encode() for message in wrapping))
+        await live.received(10)
+        estimator, health = await live.end()
+    assert health.line["frames_lost"] == 0
+    assert health.line["frames_received"] == 10
+    assert estimator.state["gaps"][0] == 0
+    assert estimator.state["time_steps_back"][0] == 0
+
+
+async def test_a_board_reset_in_mid_run_goes_on_in_time(line: Line) -> None:
+    async with service(line) as live:
+        live.line.write(frames(0, 50))
+        await live.received(50)
+        live.line.write(replace(HELLO, boot_id=9, reset_cause=8).encode() + frames(0, 20))
+        await live.received(70)
+        estimator, health = await live.end()
+    assert estimator.state["samples"][0] == 70
+    assert estimator.state["time_steps_back"][0] == 0
+    assert estimator.state["soc"][0] == pytest.approx(0.5)
+    assert health.line["resets"] == 1
+
+
+async def test_ten_seconds_without_frames_are_one_gap_and_the_lock_holds(line: Line) -> None:
+    async with service(line) as live:
+        live.line.write(frames(0, 50))
+        await live.received(50)
+        live.line.write(frames(1050, 50))  # the board's own clock: ten seconds later
+        await live.received(100)
+        estimator, health = await live.end()
+    assert health.line["frames_lost"] == 1000
+    assert health.samples["gaps"] == 1
+    assert health.lock_losses == 0
+    assert estimator.state["time_s"][0] == pytest.approx(10.99, abs=1e-3)
+
+
+async def test_saturated_and_impossible_voltages_are_dropped_and_the_sensor_is_not_called_fresh(line: Line) -> None:
+    async with service(line) as live:
+        live.line.write(frames(0, 5) + frames(5, 5, status=1) + frames(10, 5, voltage_sum=0))
+        stale = await live.until(lambda s: s.health.samples["samples"] == 5 and not s.health.sensor_online)
+        _, health = await live.end()
+    assert health.samples["dropped_saturated"] == 5
+    assert health.samples["dropped_range"] == 5
+    assert "dropped_range" in (stale.health.sensor_message or "")
+
+
+async def test_a_wrong_baud_rate_reaches_the_published_health(line: Line) -> None:
+    async with service(line, baud=9600) as live:
+        for n in range(100):
+            live.line.write(bytes((17 * n + k) % 255 + 1 for k in range(64)))
+            await asyncio.sleep(0.02)
+        said = await live.until(lambda s: "wrong baud rate" in (s.health.sensor_message or ""))
+    assert "9600 baud" in (said.health.sensor_message or "")
