@@ -1,0 +1,92 @@
+"""``bms-estimator config``: write, check and show a pack's settings."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tomlkit
+import typer
+
+from bms_estimator.cli.pack import load_pack
+from bms_estimator.cli.settings_file import settings_file
+from bms_estimator.estimator.lemma import Condition, failed
+from bms_estimator.estimator.records import observer_settings
+from bms_estimator.kernels.margins import delta
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.report import publish_rate_hz
+from bms_estimator.service.requests import Requests
+from bms_estimator.sinks.mqtt import MqttSink
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
+
+PackFile = Annotated[Path, typer.Argument(help="settings of the pack")]
+
+
+@app.command()
+def init(file: PackFile = Path("pack.toml")) -> None:
+    """Write a settings file with every setting, its unit, default and meaning."""
+    try:
+        with file.open("x", encoding="utf-8") as new:
+            new.write(settings_file(Settings))
+    except FileExistsError:
+        raise UserError(f"{file}: exists already and is left as it is; give another name") from None
+    except OSError as error:
+        raise UserError(f"{file}: cannot be written: {error.strerror}") from None
+    typer.echo(f"{file}: written; edit it, then: bms-estimator config check {file}")
+
+
+@app.command()
+def check(file: PackFile = Path("pack.toml")) -> None:
+    """Check a settings file and its cell file; name what is wrong, warn of what will not work well."""
+    settings, cell = load_pack(file)
+    if settings.mqtt is not None:
+        MqttSink(settings.mqtt, settings.pack.name, Requests().answer)  # reads password and certificates
+    for condition in failed(cell):
+        typer.echo(f"warning: {file}: {cell.cell.name}: {_unmet(condition)}", err=True)
+    typer.echo(f"{file}: good: {_in_short(settings, cell)}")
+
+
+@app.command()
+def show(file: Annotated[Path | None, typer.Argument(help="settings of the pack; else the defaults")] = None) -> None:
+    """Print the settings in effect, and what follows from them, as TOML."""
+    settings, cell = load_pack(file) if file else (Settings(), load_cell(Settings().pack.cell))
+    typer.echo(tomlkit.dumps(settings.model_dump(mode="json", by_alias=True, exclude_none=True)))
+    typer.echo("# What follows from them:")
+    for name, value in derived(settings, cell).items():
+        typer.echo(f"# {name} = {value:.6g}")
+
+
+def derived(settings: Settings, cell: CellModel) -> dict[str, float]:
+    """What is not set but follows: of the pack, of the observer, at the limits of Lemma 4.1.3."""
+    record = observer_settings(
+        cell, settings.observer, settings.sensor.voltage_resolution_v, settings.pack.initial_soc
+    )[0]
+    a = {i: cell.bounds(i).limit for i in range(7, 13)}
+    return {
+        "pack.capacity_ah": cell.cell.capacity_ah,
+        "pack.nominal_voltage_v": cell.cell.nominal_voltage_v,
+        "pack.series_count": cell.cell.series_count,
+        "observer.dead_zone_v": record["dead_zone_v"],
+        "observer.epsilon_v": record["epsilon_v"],
+        "observer.lock_error_v": record["lock_error_v"],
+        "observer.delta_1": delta(a[8], a[9], a[7]),  # (2.11)
+        "observer.delta_2": delta(a[11], a[12], a[10]),  # (2.12)
+        "publish_period_s": 1.0 / publish_rate_hz(settings),
+    }
+
+
+def _unmet(condition: Condition) -> str:
+    return (
+        f"condition {condition.name} of Lemma 4.1.1 fails: {condition.left:g} is not below {condition.right:g}; "
+        "a capacitance of the observer may turn negative above its SOC limit"
+    )
+
+
+def _in_short(settings: Settings, cell: CellModel) -> str:
+    c = cell.cell
+    broker = settings.mqtt.url if settings.mqtt else "no broker"
+    return (
+        f"{settings.pack.name}: {c.name}, {c.series_count} in series, {c.nominal_voltage_v:g} V, {c.capacity_ah:g} Ah; "
+        f"{settings.sensor.protocol} board on {settings.sensor.port}; {broker}"
+    )

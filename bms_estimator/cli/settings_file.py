@@ -1,0 +1,91 @@
+"""A commented settings file, made from the settings' models so that it cannot fall behind them."""
+
+import textwrap
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import tomlkit
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+UNITS = {"v": "V", "a": "A", "s": "s", "hz": "Hz", "ah": "Ah", "ohm": "ohm", "c": "°C"}
+"""Last part of a key -> the unit it stands for."""
+WIDTH = 110
+HEAD = """\
+# Settings of one pack. A setting that is commented out has the value shown; take the # away to change it.
+# Values are SI, the unit stands in the key. Current is positive on discharge.
+"""
+_SIGNS = {Gt: ("gt", "above"), Ge: ("ge", "at least"), Lt: ("lt", "below"), Le: ("le", "at most")}
+
+
+def settings_file(model: type[BaseModel]) -> str:
+    """TOML text with each section of ``model``, each setting with its meaning, unit, what is allowed, and default."""
+    lines = [HEAD]
+    for name, field in model.model_fields.items():
+        section = _model(field.annotation)
+        optional = field.default is None
+        why = f" {_sentence(field.description)}" if optional and field.description else ""
+        lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{why}")
+        lines += [f"{'#' if optional else ''}[{name}]", *_settings(section), ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _settings(section: type[BaseModel]) -> Iterator[str]:
+    for name, field in section.model_fields.items():
+        key = field.alias or name
+        yield from _comment("  ".join(part for part in (field.description, _allowed(key, field)) if part))
+        yield f"#{key} = {_value(field)}"
+
+
+def _value(field: FieldInfo) -> str:
+    """The default as TOML; nothing where there is none."""
+    default = field.get_default(call_default_factory=True)
+    return "" if default is None else tomlkit.item(default).as_string()
+
+
+def _allowed(key: str, field: FieldInfo) -> str:
+    """``[V, at least 0]``; empty where nothing is to say."""
+    choices, limits = _constraints(field.annotation)
+    limits += [_limit(item) for item in field.metadata if type(item) in _SIGNS]
+    unit = [UNITS[key.rsplit("_", 1)[-1]]] if "_" in key and key.rsplit("_", 1)[-1] in UNITS else []
+    one_of = [f"one of {', '.join(choices)}"] if choices else []
+    said = ", ".join(unit + one_of + limits)
+    return f"[{said}]" if said else ""
+
+
+def _constraints(annotation: Any) -> tuple[list[str], list[str]]:
+    """Choices and limits anywhere within an annotation."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Literal:
+        return [str(choice) for choice in arguments], []
+    choices: list[str] = []
+    limits: list[str] = []
+    if origin is Annotated:
+        for constraint in arguments[1:]:
+            limits += [_limit(item) for item in getattr(constraint, "metadata", [constraint]) if type(item) in _SIGNS]
+    for inner in arguments[:1] if origin is Annotated else arguments:
+        inner_choices, inner_limits = _constraints(inner)
+        choices += inner_choices
+        limits += inner_limits
+    return choices, limits
+
+
+def _limit(constraint: Any) -> str:
+    attribute, words = _SIGNS[type(constraint)]
+    return f"{words} {getattr(constraint, attribute):g}"
+
+
+def _model(annotation: Any) -> type[BaseModel]:
+    """The model in an annotation that may also allow None."""
+    options = [annotation, *get_args(annotation)]
+    return next(o for o in options if isinstance(o, type) and issubclass(o, BaseModel))
+
+
+def _sentence(text: str | None) -> str:
+    """With a full stop."""
+    return f"{(text or '').rstrip('.')}."
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ")
