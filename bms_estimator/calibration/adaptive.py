@@ -106,6 +106,7 @@ def adaptive_run(
     edges = np.unique(
         np.r_[
             np.arange(min(FIRST_SAMPLES, samples.size) + 1),
+            np.geomspace(1, samples.size, FIRST_SAMPLES).astype(int),
             np.linspace(0, samples.size, min(SNAPSHOTS, samples.size) + 1).astype(int),
         ]
     )
@@ -126,7 +127,9 @@ def adaptive_run(
     error, parameters = np.array(error_v), np.array(a)
     epsilon_v = float(estimator.settings["epsilon_v"][0])
     margin = found["stability_margin"] - float(estimator.settings["margin_guard"][0])
-    window = settled(found["time_s"], error, found["voltage_v"], margin, parameters, epsilon_v, t_int_s=t_int_s, t_unst_s=t_unst_s)
+    window = settled(
+        found["time_s"], error, found["voltage_v"], margin, parameters, epsilon_v, t_int_s=t_int_s, t_unst_s=t_unst_s
+    )
     lock_losses = int(estimator.state["lock_losses"][0])
     return AdaptiveRun(
         time_s=found["time_s"],

@@ -119,7 +119,7 @@ def averaged(time_s: Floats, a: Floats, window: Settled) -> Floats:
     """The mean of a_i(t) over t_int..t_unst, (3.19).
 
     Args:
-        time_s: Shape (n,) [s].
+        time_s: Shape (n,), increasing, in steps of any length [s].
         a: Shape (n, 16), a1..a15 at index 1..15.
         window: t_int and t_unst.
 
@@ -127,4 +127,8 @@ def averaged(time_s: Floats, a: Floats, window: Settled) -> Floats:
         Shape (16,). The last values when no sample lies between t_int and t_unst.
     """
     inside = (time_s >= window.t_int_s) & (time_s <= window.t_unst_s)
-    return np.asarray(a[inside].mean(axis=0) if inside.any() else a[-1], dtype=np.float64)  # (3.19)
+    if inside.sum() < 2:
+        return np.asarray(a[inside][-1] if inside.any() else a[-1], dtype=np.float64)
+    elapsed, values = time_s[inside], a[inside]
+    area = np.trapezoid(values, elapsed, axis=0)
+    return np.asarray(area / (elapsed[-1] - elapsed[0]), dtype=np.float64)  # (3.19)

@@ -66,13 +66,14 @@ Item = Table | Figure
 def number(value: float, digits: int = 4) -> str:
     """A number as tables show it: significant digits, no needless exponent."""
     if value != value:  # NaN  # noqa: PLR0124
-        return "–"
+        return "-"
     text = f"{value:.{digits}g}"
-    if "e" in text and 1e-4 <= abs(value) < 1e7:
+    if "e" in text and 1e-4 <= abs(value) < 1e9:
         text = f"{value:.{max(digits - 1, 0)}f}" if abs(value) < 1 else f"{value:.0f}"
     return text
 
 
 def percent(value: float, true: float) -> str:
     """Error of ``value`` in percent of the true value (E7)."""
-    return number(100.0 * abs(value - true) / abs(true), 3)
+    error = 100.0 * abs(value - true) / abs(true)
+    return "0" if error < 1e-4 else number(error, 3)

@@ -1,6 +1,7 @@
 """Plots as inline SVG (matplotlib)."""
 
 import io
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -38,6 +39,7 @@ STYLE: dict[str, Any] = {
     "legend.fontsize": 8.0,
     "lines.linewidth": 1.4,
     "figure.constrained_layout.use": True,
+    "axes.prop_cycle": f"cycler('color', {list(COLOURS)})",
 }
 
 
@@ -54,7 +56,8 @@ def plot(draw: Callable[[Any], None], *, rows: int = 1, columns: int = 1, salt: 
     from matplotlib.backends.backend_svg import FigureCanvasSVG  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    with mpl.rc_context(STYLE | {"axes.prop_cycle": mpl.cycler(color=COLOURS), "svg.hashsalt": salt}):
+    settings: Any = STYLE | {"svg.hashsalt": salt}
+    with mpl.rc_context(settings):
         figure = Figure(figsize=(WIDTH_IN, 0.3 + ROW_IN * rows))
         FigureCanvasSVG(figure)
         draw(figure.subplots(rows, columns))
@@ -71,7 +74,7 @@ def thin(x: Floats, *curves: Floats, points: int = POINTS) -> tuple[Floats, ...]
     y = curves[0]
     edges = np.linspace(0, x.size, points // 3 + 1).astype(int)
     kept = {x.size - 1}
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in itertools.pairwise(edges):
         part = y[first:last]
         kept |= {int(first), int(first + np.argmin(part)), int(first + np.argmax(part))}
     index = np.array(sorted(kept))

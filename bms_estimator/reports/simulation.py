@@ -192,7 +192,7 @@ class Simulation:
     @cached_property
     def r_s_fit(self) -> SeriesResistanceFit:
         """a13..a15."""
-        return fit_series_resistance(self.r_s_mean)
+        return fit_series_resistance(self.r_s_mean, LOWEST_SOC)
 
     @cached_property
     def pulsed(self) -> SampleBlock:

@@ -73,8 +73,7 @@ def measure(cell: CellModel) -> list[Measured]:
         limit = np.zeros(16)
         for i, b in bounds.items():
             limit[i] = b.limit
-        for c_rate in C_RATES:
-            found.append(_measure(bounded, name, c_rate, limit))
+        found += [_measure(bounded, name, c_rate, limit) for c_rate in C_RATES]
     return found
 
 

@@ -1,0 +1,80 @@
+"""What chapter 5 is run on: real captures, or the simulated pack through two sensor chains."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.reports.protocol import Capture, Protocol, kind_of
+from bms_estimator.reports.simulated_pack import SensorChain, captures, experiments, pack
+
+Floats = NDArray[np.float64]
+
+FINE, COARSE = SensorChain(16), SensorChain(10)
+"""The dSpace board of the thesis, and an Arduino."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Real captures.
+
+    Attributes:
+        cell: The cell file: capacity, limits, bounds.
+        samples: Name and samples of each.
+        voltage_step_v: One step of the voltage converter [V].
+    """
+
+    cell: CellModel
+    samples: tuple[tuple[str, SampleBlock], ...]
+    voltage_step_v: float
+
+
+class Experiment:
+    """The protocol on one pack, with what is known of it.
+
+    Args:
+        recorded: Real captures; None for the simulated pack.
+    """
+
+    def __init__(self, recorded: Recorded | None = None) -> None:
+        self.recorded = recorded
+
+    @cached_property
+    def _true(self) -> list[Capture]:
+        return experiments()
+
+    @cached_property
+    def protocol(self) -> Protocol:
+        """On the real captures, or on the simulated pack through 16 bits."""
+        if self.recorded is None:
+            return Protocol(pack(), captures(self._true, FINE), FINE.voltage_step_v)
+        cell = self.recorded.cell
+        found = [Capture(name, kind_of(s, cell.cell.capacity_ah), s) for name, s in self.recorded.samples]
+        return Protocol(cell, found, self.recorded.voltage_step_v)
+
+    @cached_property
+    def coarse(self) -> Protocol | None:
+        """On the simulated pack through 10 bits; None for real captures."""
+        if self.recorded is not None:
+            return None
+        return Protocol(pack(), captures(self._true, COARSE), COARSE.voltage_step_v)
+
+    @property
+    def truth(self) -> Floats | None:
+        """a1..a21 of the simulated pack at index 1..21; None for real captures."""
+        return pack().a if self.recorded is None else None
+
+    @property
+    def on(self) -> str:
+        """Where the numbers come from."""
+        if self.recorded is None:
+            return "the simulated 6S pack"
+        return f"{len(self.recorded.samples)} captures of {self.recorded.cell.cell.name}"
+
+    @property
+    def unpublished(self) -> str:
+        """Why the printed numbers cannot come out."""
+        return f"The thesis's recordings are not published. Its procedure was run on {self.on}."

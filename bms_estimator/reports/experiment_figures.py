@@ -1,0 +1,306 @@
+"""Figures 26 to 38 and 40 to 42: the procedure of chapter 5 on captures."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.reports.experiment import Experiment
+from bms_estimator.reports.items import Figure, Verdict
+from bms_estimator.reports.plot import COLOURS, FAINT, plot, thin
+from bms_estimator.reports.protocol import Kind, Protocol
+from bms_estimator.reports.simulation import SOC_GRID, element
+from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot
+
+Floats = NDArray[np.float64]
+
+PER_FIGURE = 4
+"""Loads in one figure, as in Fig. 32."""
+
+
+def _figure(key: str, title: str, svg: str, experiment: Experiment, reason: str) -> Figure:
+    return Figure(key, title, svg, Verdict.NOT, f"{experiment.unpublished} {reason}")
+
+
+def figure_26(experiment: Experiment) -> Figure:
+    """E_o over SOC."""
+    p = experiment.protocol
+
+    def draw(axes: Any) -> None:
+        grid = np.linspace(0.0, 1.0, 600)
+        for colour, test in zip(np.resize(COLOURS, len(p.tests)), p.tests, strict=True):
+            axes[0].errorbar(test.soc, test.ocv_v, 2.0 * test.std_v, fmt="o", ms=3, color=colour, label=test.name)
+        axes[0].plot(grid, p.joint_fit(grid), color="black", linewidth=1.0, label="(2.10), joint fit")
+        axes[0].plot(grid, p.table(grid), color=FAINT, linewidth=1.0, label="table")
+        axes[0].set(xlabel="SOC", ylabel="E_o [V]")
+        axes[0].legend()
+        for colour, test in zip(np.resize(COLOURS, len(p.tests)), p.tests, strict=True):
+            axes[1].plot(test.soc, 1e3 * (test.ocv_v - p.joint_fit(test.soc)), "o", ms=3, color=colour)
+        axes[1].axhline(0.0, color=FAINT, linewidth=0.8)
+        axes[1].set(xlabel="SOC", ylabel="mV", title="points less (2.10)")
+
+    return _figure(
+        "26",
+        "E_o over SOC from voltage relaxation tests",
+        plot(draw, columns=2, salt="figure-26"),
+        experiment,
+        "Bars: two standard deviations of the extrapolation to infinite rest.",
+    )
+
+
+def figure_27(experiment: Experiment) -> Figure:
+    """Currents of the relaxation tests."""
+    tests = experiment.protocol.of(Kind.RELAXATION)
+    return _figure("27", "Currents of the voltage relaxation tests", _currents(tests, "27"), experiment, "")
+
+
+def _currents(captures: list[Any], key: str) -> str:
+    columns = 2 if len(captures) > 1 else 1
+    rows = -(-len(captures) // columns)
+
+    def draw(axes: Any) -> None:
+        for ax, capture in zip(np.atleast_1d(axes).flat, captures, strict=False):
+            hours, current = thin(capture.samples["time_s"] / 3600.0, capture.samples["current_a"], points=3000)
+            ax.plot(hours, current, linewidth=0.8)
+            ax.set(xlabel="time [h]", ylabel="A", title=capture.name)
+        for ax in np.atleast_1d(axes).flat[len(captures) :]:
+            ax.set_axis_off()
+
+    return plot(draw, rows=rows, columns=columns, salt=f"figure-{key}")
+
+
+def figure_28(experiment: Experiment) -> Figure:
+    """Crossings."""
+    run = experiment.protocol.adaptive
+    found = ", ".join(f"{c.parameter} at SOC {c.soc:.5f}" for c in run.crossings)
+    if min(c.soc for c in run.crossings) <= 0.0:
+        return _figure("28", "a8 and a11 meet their stability conditions", "", experiment, f"They never do: {found}.")
+    return _figure(
+        "28",
+        "a8 and a11 meet their stability conditions",
+        plot(lambda axes: crossing_plot(axes, run), columns=2, salt="figure-28"),
+        experiment,
+        f"{found}.",
+    )
+
+
+def figure_29(experiment: Experiment) -> Figure:
+    """Products."""
+    run, truth = experiment.protocol.adaptive, experiment.truth
+
+    def draw(axes: Any) -> None:
+        for ax, name in zip(axes, ("R_ts C_ts", "R_tl C_tl"), strict=True):
+            if truth is not None:
+                ax.plot(SOC_GRID, element(name, truth), label="true")
+            ax.plot(SOC_GRID, element(name, run.average), "--", label="estimated")
+            ax.set(xlabel="SOC", ylabel="s", title=name.replace(" ", " · "))
+            ax.legend()
+
+    return _figure(
+        "29",
+        "R_ts·C_ts and R_tl·C_tl as estimated",
+        plot(draw, columns=2, salt="figure-29"),
+        experiment,
+        "They are the products of the bounds' limits (E3).",
+    )
+
+
+def figure_30(experiment: Experiment) -> Figure:
+    """Elements."""
+    run, truth = experiment.protocol.adaptive, experiment.truth
+    return _figure(
+        "30",
+        "R_tl, R_ts, C_tl, C_ts with the stability conditions",
+        plot(lambda axes: elements_plot(axes, truth, run.average, run), rows=2, columns=2, salt="figure-30"),
+        experiment,
+        "",
+    )
+
+
+def figure_31(experiment: Experiment) -> Figure:
+    """R_s."""
+    p, truth = experiment.protocol, experiment.truth
+
+    def draw(axes: Any) -> None:
+        for name, found in p.r_s_curves.items():
+            axes.plot(found.soc, 1e3 * found.r_s_ohm, label=name, linewidth=1.0)
+        axes.plot(p.r_s_mean.soc, 1e3 * p.r_s_mean.r_s_ohm, "k", label="mean", linewidth=1.6)
+        axes.plot(SOC_GRID, 1e3 * p.r_s_fit(SOC_GRID), "k--", label="fit (2.9)")
+        if truth is not None:
+            true = truth[13] * np.exp(-truth[14] * SOC_GRID) + truth[15]
+            axes.plot(SOC_GRID, 1e3 * true, color=FAINT, linewidth=2.4, label="true")
+        middle = 1e3 * float(np.median(p.r_s_mean.r_s_ohm))
+        axes.set(
+            xlabel="SOC", ylabel="R_s [mΩ]", ylim=(min(0.5 * middle, 1.5 * middle), max(0.5 * middle, 1.5 * middle))
+        )
+        axes.legend(ncols=2)
+
+    return _figure(
+        "31", "R_s by (4.2) for different loads", plot(draw, salt="figure-31"), experiment, "Sign of (4.2) as (2.4)."
+    )
+
+
+def _constant(p: Protocol) -> list[str]:
+    return [c.name for c in p.of(Kind.CONSTANT)][:PER_FIGURE]
+
+
+def _steps(p: Protocol) -> list[str]:
+    return [name for name in p.dynamic if name not in _constant(p)][:2]
+
+
+def _grid(names: list[str], one: Callable[[Any, str], None], key: str) -> str:
+    columns = 2 if len(names) > 1 else 1
+    rows = max(-(-len(names) // columns), 1)
+
+    def draw(axes: Any) -> None:
+        flat = np.atleast_1d(axes).flat
+        for ax, name in zip(flat, names, strict=False):
+            one(ax, name)
+            ax.set_title(name)
+        for ax in np.atleast_1d(axes).flat[len(names) :]:
+            ax.set_axis_off()
+
+    return plot(draw, rows=rows, columns=columns, salt=f"figure-{key}")
+
+
+def _voltages(p: Protocol) -> Callable[[Any, str], None]:
+    def one(ax: Any, name: str) -> None:
+        run = p.dynamic[name]
+        t, y, yhat = thin(run.time_s / 3600.0, run.voltage_v, run.predicted_v)
+        ax.plot(t, y, color=COLOURS[0], alpha=0.45, linewidth=2.4, label="actual")
+        ax.plot(t, yhat, "--", color=COLOURS[1], label="estimated", linewidth=1.0)
+        ax.set(xlabel="time [h]", ylabel="V")
+        ax.legend()
+
+    return one
+
+
+def _errors(p: Protocol) -> Callable[[Any, str], None]:
+    def one(ax: Any, name: str) -> None:
+        run = p.dynamic[name]
+        t, e = thin(run.time_s / 3600.0, run.error_percent)
+        ax.plot(t, e, linewidth=0.8)
+        ax.set(xlabel="time [h]", ylabel="|e| [%]")
+
+    return one
+
+
+def figure_32(experiment: Experiment) -> Figure:
+    """Constant loads, voltages."""
+    p = experiment.protocol
+    title = "Constant loads: actual and estimated voltage"
+    return _figure("32", title, _grid(_constant(p), _voltages(p), "32"), experiment, "")
+
+
+def figure_33(experiment: Experiment) -> Figure:
+    """Constant loads, errors."""
+    p = experiment.protocol
+    worst = max(p.dynamic[name].max_percent for name in _constant(p))
+    svg = _grid(_constant(p), _errors(p), "33")
+    return _figure("33", "Constant loads: error", svg, experiment, f"Largest {worst:.2f} % (printed 0.9 %).")
+
+
+def figure_34(experiment: Experiment) -> Figure:
+    """Constant loads, currents."""
+    captures = experiment.protocol.of(Kind.CONSTANT)[:PER_FIGURE]
+    return _figure("34", "Constant loads: currents", _currents(captures, "34"), experiment, "")
+
+
+def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> Figure:
+    p = experiment.protocol
+    names = _steps(p)[index : index + 1] or _steps(p)[-1:]
+    worst = max(p.dynamic[name].max_percent for name in names)
+    return _figure(key, title, _grid(names, _voltages(p), key), experiment, f"Largest error {worst:.2f} %.")
+
+
+def figure_35(experiment: Experiment) -> Figure:
+    """Steps."""
+    return _step_voltage(experiment, "35", "Constant steps: actual and estimated voltage", 0)
+
+
+def figure_36(experiment: Experiment) -> Figure:
+    """Currents of the steps."""
+    p = experiment.protocol
+    captures = [c for c in p.captures if c.name in _steps(p)]
+    return _figure("36", "Steps: currents", _currents(captures, "36"), experiment, "")
+
+
+def figure_37(experiment: Experiment) -> Figure:
+    """Variable steps."""
+    return _step_voltage(experiment, "37", "Variable steps: actual and estimated voltage", 1)
+
+
+def figure_38(experiment: Experiment) -> Figure:
+    """Errors of the steps."""
+    p = experiment.protocol
+    return _figure("38", "Steps: error", _grid(_steps(p), _errors(p), "38"), experiment, "Printed: at most 1.5 %.")
+
+
+def figure_40(experiment: Experiment) -> Figure:
+    """Dynamic and static."""
+    p = experiment.protocol
+    name = (_steps(p) or _constant(p))[-1]
+    svg = plot(lambda axes: dynamic_static_plot(axes, p.dynamic[name], p.static[name]), columns=2, salt="figure-40")
+    return _figure("40", f"Dynamic and static model on {name}", svg, experiment, "")
+
+
+def figure_41(experiment: Experiment) -> Figure:
+    """SOC by interpolation."""
+    p = experiment.protocol
+    run, (soc, _) = p.dynamic[p.largest], p.interpolated
+    rms = float(np.sqrt(np.mean((soc - run.soc) ** 2)))
+
+    def draw(axes: Any) -> None:
+        hours, counted, looked_up = thin(run.time_s / 3600.0, run.soc, soc)
+        axes[0].plot(hours, counted, color=COLOURS[0], alpha=0.45, linewidth=2.4, label="coulomb counting")
+        axes[0].plot(hours, looked_up, "--", color=COLOURS[1], linewidth=1.0, label="interpolation in E_o")
+        axes[0].set(xlabel="time [h]", ylabel="SOC")
+        axes[0].legend()
+        hours, difference = thin(run.time_s / 3600.0, 100.0 * (soc - run.soc))
+        axes[1].plot(hours, difference, linewidth=0.9)
+        axes[1].set(xlabel="time [h]", ylabel="% of SOC", title="interpolated less counted")
+
+    return _figure(
+        "41",
+        f"SOC by coulomb counting and by interpolation in E_o, {p.largest}",
+        plot(draw, columns=2, salt="figure-41"),
+        experiment,
+        f"They differ by {100 * rms:.2f} % of SOC RMS.",
+    )
+
+
+def figure_42(experiment: Experiment) -> Figure:
+    """E_o over both SOCs."""
+    p = experiment.protocol
+    run, (soc, e_o) = p.dynamic[p.largest], p.interpolated
+
+    def draw(axes: Any) -> None:
+        x, y = thin(run.soc, e_o)
+        axes.plot(x, y, color=COLOURS[0], label="E_o = y + x2 + x3 + i R_s over counted SOC")
+        x, y = thin(soc, e_o)
+        axes.plot(x, y, "--", color=COLOURS[1], label="over interpolated SOC")
+        axes.set(xlabel="SOC", ylabel="V")
+        axes.legend()
+
+    return _figure("42", f"E_o over SOC, {p.largest}", plot(draw, salt="figure-42"), experiment, "")
+
+
+FIGURES: dict[str, Callable[[Experiment], Figure]] = {
+    "26": figure_26,
+    "27": figure_27,
+    "28": figure_28,
+    "29": figure_29,
+    "30": figure_30,
+    "31": figure_31,
+    "32": figure_32,
+    "33": figure_33,
+    "34": figure_34,
+    "35": figure_35,
+    "36": figure_36,
+    "37": figure_37,
+    "38": figure_38,
+    "40": figure_40,
+    "41": figure_41,
+    "42": figure_42,
+}
