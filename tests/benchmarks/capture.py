@@ -1,10 +1,11 @@
 """Replay of a raw serial capture through the command line, decoding included."""
 
 import json
-import os
+import re
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,14 +94,22 @@ def replay(path: Path, folder: Path, samples: int) -> Replay:
     Raises:
         RuntimeError: It did not take every sample.
     """
+    rss_mib = 0.0
     with (folder / "result.json").open("w+") as result:
         process = subprocess.Popen([PROGRAM, "replay", path, "--cell", CELL, "--json"], stdout=result)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
+        while process.poll() is None:
+            rss_mib = max(rss_mib, peak_mib(process.pid))
+            time.sleep(0.05)
         result.seek(0)
         text = result.read()
     found = json.loads(text) if process.returncode == 0 else {}
     if found.get("samples") != samples:
         raise RuntimeError(f"{samples} samples were to be replayed, exit code {process.returncode}: {text}")
     fields = {name: found[name] for name in ("samples", "wall_s", "samples_per_s", "lock_lost")}
-    return Replay(**fields, rss_mib=usage.ru_maxrss / 1024)
+    return Replay(**fields, rss_mib=rss_mib)
+
+
+def peak_mib(pid: int) -> float:
+    """Most memory that a process has had resident so far [MiB]; what wait4 says includes the parent's at the fork."""
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    return int(found[1]) / 1024 if found else 0.0
