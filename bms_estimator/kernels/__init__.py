@@ -35,4 +35,4 @@ def _cache_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="bms_estimator-"))  # nowhere to keep them: compile at every start
 
 
-numba.config.CACHE_DIR = str(_cache_folder())
+numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]

@@ -74,7 +74,7 @@ class SerialBoard:
         self._first_retry_s, self._silent_s = first_retry_s, silent_s
         make_decoder(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
         self._decoder = make_decoder(settings)
-        self._blocks: asyncio.Queue[SampleBlock | None] = asyncio.Queue()
+        self._reads: asyncio.Queue[tuple[float, bytes] | None] = asyncio.Queue()
         self._message: str | None = "not opened yet"
         self._line: serial.Serial | None = None
         self._lost = asyncio.Event()
@@ -102,7 +102,7 @@ class SerialBoard:
     async def __aenter__(self) -> Self:
         """Begin to open the port; it need not be there yet."""
         self._task = asyncio.create_task(self._stay_open(), name="serial board")
-        self._task.add_done_callback(lambda _: self._blocks.put_nowait(None))
+        self._task.add_done_callback(lambda _: self._reads.put_nowait(None))
         return self
 
     async def __aexit__(
@@ -114,11 +114,30 @@ class SerialBoard:
             await asyncio.gather(self._task, return_exceptions=True)
 
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:
-        """Blocks as the descriptor brings them."""
-        while (block := await self._blocks.get()) is not None:
-            yield block
+        """Blocks as the descriptor brings them.
+
+        What the tap gets is what has been yielded: nothing is recorded that the caller has not taken.
+        """
+        while (read := await self._reads.get()) is not None:
+            block = self._decode(*read)
+            if block.size:
+                self._message = None
+                yield block
         if self._task is not None and not self._task.cancelled():
             self._task.result()
+
+    def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
+        if self._tap is not None:
+            try:
+                self._tap.write(arrival_s, data)
+            except OSError as error:  # a full disk does not end the estimate
+                log.warning("recording ended", reason=str(error))
+                self._tap = None
+        block = self._decoder.feed(arrival_s, data)
+        for ack in self._decoder.take_acks():
+            if ack.command == MessageType.COMMAND_ZERO_CURRENT and self._zeroed and not self._zeroed.done():
+                self._zeroed.set_result(ack.result)
+        return block
 
     async def current_zero(self) -> None:
         """Have the board take the present current as zero, for good: nothing may flow meanwhile.
@@ -201,15 +220,7 @@ class SerialBoard:
             asyncio.get_running_loop().remove_reader(descriptor)
             self._lost.set()
             return
-        if self._tap is not None:
-            self._tap.write(arrival_s, data)
-        block = self._decoder.feed(arrival_s, data)
-        if block.size:
-            self._message = None
-            self._blocks.put_nowait(block)
-        for ack in self._decoder.take_acks():
-            if ack.command == MessageType.COMMAND_ZERO_CURRENT and self._zeroed and not self._zeroed.done():
-                self._zeroed.set_result(ack.result)
+        self._reads.put_nowait((arrival_s, data))
 
     def _ask(self) -> None:
         """Ask a binary board for its hello, then for the wanted rate."""

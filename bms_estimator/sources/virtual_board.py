@@ -1,0 +1,344 @@
+"""A sensor board without hardware: speaks the firmware's protocol on a pseudo-terminal, faults at will.
+
+For trying things out (``bms-estimator simulate``), for the demo where the firmware's simulator is absent, and for tests.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import math
+import os
+import random
+import struct
+import tty
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from enum import Enum
+from types import TracebackType
+from typing import Literal, Self
+
+from bms_estimator.sources.protocol import (
+    DELIMITER,
+    MODULUS,
+    PROTOCOL_VERSION,
+    RATE_HZ,
+    Ack,
+    AckResult,
+    BoardStatus,
+    Hello,
+    MessageType,
+    ProtocolError,
+    ResetCause,
+    SampleMessage,
+    unseal,
+)
+from bms_estimator.sources.virtual_converter import FULL_SCALE, BoardParts, Reading, VirtualConverter, window_of
+
+Signal = Callable[[float], Reading] | Iterable[Reading]
+"""Readings by time [s], or one for each sample; the board stops where they end."""
+
+FIRMWARE = (0, 1, 0)
+RATE_HZ_AT_RESET = 100
+_LINE_BYTES = 2048
+"""So much waits for a host that does not read; then samples are dropped, as a board drops them."""
+_WAKE_S = 0.002
+"""Samples that fall due within so short a time leave together, as on USB [s]."""
+_BURST = 256
+_BOOT_READINGS = 256
+_NEAR_MIDDLE = 0.1
+
+
+class BoardFault(Enum):
+    """What can happen to a sample's frame."""
+
+    DROP = "never sent"
+    CORRUPT = "one byte changed"
+    TRUNCATE = "its second half missing"
+    DUPLICATE = "sent twice"
+    SWAP = "sent after the next one"
+    NEWER_VERSION = "of the next protocol version"
+    GARBAGE = "noise before it"
+
+
+class VirtualBoard:
+    """A board on a pseudo-terminal. Open it as a context manager, then ``run`` it.
+
+    Args:
+        signal: What is at its sensors.
+        rate_hz: Samples per second until the host asks for others.
+        mode: ``text`` prints ``voltage,current,temperature`` lines and takes no commands.
+        speed: Board seconds per second; ``math.inf``: as fast as the host reads.
+        parts: Its parts as built.
+        noise_lsb: Noise of its converter [steps].
+        serial: Its serial number.
+        clock_us: Where its microseconds begin at each reset.
+        seed: Of noise and garbage.
+    """
+
+    def __init__(
+        self,
+        signal: Signal,
+        *,
+        rate_hz: int = RATE_HZ_AT_RESET,
+        mode: Literal["binary", "text"] = "binary",
+        speed: float = 1.0,
+        parts: BoardParts | None = None,
+        noise_lsb: float = 0.5,
+        serial: int = 1,
+        clock_us: int = 0,
+        seed: int = 0,
+    ) -> None:
+        self._mode, self._speed = mode, speed
+        self._readings = self._by_time(signal) if callable(signal) else iter(signal)
+        self._reading = Reading(0.0, 0.0)
+        self._converter = VirtualConverter(parts or BoardParts(), noise_lsb, seed)
+        self._serial, self._clock_us = serial, clock_us
+        self._bandgap_uv = round(self._converter.parts.bandgap_v * 1e6)
+        self._zero_ppm = round(self._converter.parts.current_zero * 1e6)
+        self._random = random.Random(seed)
+        self._boot_id = self._random.randrange(1 << 16)
+        self._first_rate_hz = rate_hz
+        self._faults: deque[BoardFault] = deque()
+        self._late = b""
+        self._inbox = b""
+        self._line = bytearray()
+        self._drained = asyncio.Event()
+        self._master = self._slave = -1
+        self.path = ""
+        """Of the pseudo-terminal."""
+        self.time_s = 0.0
+        """Of the signal, at the end of the last sample; goes on across resets."""
+        self.samples = 0
+        """Samples taken since the board was made."""
+        self._boot(ResetCause.POWER_ON)
+
+    def __enter__(self) -> Self:
+        """Open the pseudo-terminal."""
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Pull the plug: the host's descriptor dies."""
+        for descriptor in (self._master, self._slave):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._master = self._slave = -1
+
+    async def run(self, seconds: float = math.inf) -> None:
+        """Sample and send for ``seconds`` of the board's time, or until the signal ends."""
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._master, self._hear)
+        try:
+            await self._sample_until(self.time_s + seconds, loop)
+            while self._line:
+                self._drained.clear()
+                await self._drained.wait()
+        finally:
+            loop.remove_reader(self._master)
+            loop.remove_writer(self._master)
+
+    def inject(self, fault: BoardFault, frames: int = 1) -> None:
+        """Let ``fault`` happen to the next ``frames`` samples that have none yet."""
+        self._faults.extend(itertools.repeat(fault, frames))
+
+    def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> None:
+        """Restart the board: sequence and clock begin anew, the rate is the first one, a hello is sent."""
+        self._boot(cause)
+
+    def send(self, data: bytes) -> None:
+        """Put any bytes on the line."""
+        self._line += data
+        self._flush()
+
+    def _by_time(self, signal: Callable[[float], Reading]) -> Iterator[Reading]:
+        while True:
+            yield signal(self.time_s)
+
+    def _boot(self, cause: ResetCause) -> None:
+        self._cause = cause
+        self._boot_id = (self._boot_id + 1) % (1 << 16)
+        self._sequence, self._ns, self._overrun, self._aux_is_ntc = 0, self._clock_us * 1000, False, False
+        self._set_rate(self._first_rate_hz)
+        self._boot_bandgap = self._converter.bandgap(_BOOT_READINGS)
+        if self._mode == "binary":
+            self.send(self._hello().encode())
+
+    def _set_rate(self, rate_hz: int) -> None:
+        self._rate_hz = rate_hz
+        self._count, self._period_ns = window_of(rate_hz)
+
+    async def _sample_until(self, end_s: float, loop: asyncio.AbstractEventLoop) -> None:
+        offset_s = loop.time() - self.time_s / self._speed
+        while self.time_s < end_s:
+            for _ in range(_BURST):
+                due_s = offset_s + (self.time_s + self._period_ns * 1e-9) / self._speed
+                if due_s > loop.time() or self.time_s >= end_s:
+                    break
+                if not self._take_sample():
+                    return
+            self._flush()
+            if math.isinf(self._speed) and self._line:
+                self._drained.clear()
+                await self._drained.wait()
+            else:
+                await asyncio.sleep(max(due_s - loop.time(), 0.0 if math.isinf(self._speed) else _WAKE_S))
+
+    def _take_sample(self) -> bool:
+        """Take one sample and put it on the line. Returns False when the signal has ended."""
+        self.time_s += self._period_ns * 1e-9
+        reading = next(self._readings, None)
+        if reading is None:
+            return False
+        self._reading = reading
+        self._ns += self._period_ns
+        self.samples += 1
+        message = self._message(reading)
+        self._sequence = (self._sequence + 1) % MODULUS
+        if len(self._line) > _LINE_BYTES and not math.isinf(self._speed):
+            self._overrun = True
+            return True
+        self._overrun = False
+        self._line += self._text(message, reading) if self._mode == "text" else self._frame(message)
+        return True
+
+    def _message(self, reading: Reading) -> SampleMessage:
+        sums = self._converter.window(reading, self._count)
+        status = BoardStatus.AUX_IS_NTC * self._aux_is_ntc + (self._cause << 4)
+        status |= BoardStatus.VOLTAGE_SATURATED * sums.voltage_saturated
+        status |= BoardStatus.CURRENT_SATURATED * sums.current_saturated
+        status |= BoardStatus.OVERRUN * self._overrun
+        aux = self._converter.ntc(reading.temperature_c) if self._aux_is_ntc else self._converter.bandgap(1)
+        self._aux_is_ntc = not self._aux_is_ntc
+        board_us = self._ns // 1000 % MODULUS
+        return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, 1, int(status))
+
+    def _text(self, message: SampleMessage, reading: Reading) -> bytes:
+        """The line that a hobby sketch prints."""
+        parts = self._converter.parts
+        volts_per_step = parts.supply_v / FULL_SCALE / message.count
+        voltage_v = message.voltage_sum * volts_per_step * parts.divider
+        current_a = (
+            message.current_sum * volts_per_step - parts.current_zero * parts.supply_v
+        ) / parts.volts_per_ampere
+        if math.isnan(reading.temperature_c):
+            return b"%.3f,%.3f\r\n" % (voltage_v, current_a)
+        return b"%.3f,%.3f,%.1f\r\n" % (voltage_v, current_a, reading.temperature_c)
+
+    def _frame(self, message: SampleMessage) -> bytes:
+        """Bytes for a sample, with what faults make of them."""
+        frame, late, self._late = message.encode(), self._late, b""
+        if not self._faults:
+            return frame + late
+        match self._faults.popleft():
+            case BoardFault.DROP:
+                frame = b""
+            case BoardFault.CORRUPT:
+                at = self._random.randrange(len(frame) - 1)
+                changed = frame[at] % 255 + 1  # another byte, but no delimiter
+                frame = frame[:at] + bytes((changed,)) + frame[at + 1 :]
+            case BoardFault.TRUNCATE:
+                frame = frame[: len(frame) // 2] + DELIMITER
+            case BoardFault.DUPLICATE:
+                frame *= 2
+            case BoardFault.SWAP:
+                frame, self._late = b"", frame
+            case BoardFault.NEWER_VERSION:
+                frame = message.encode(PROTOCOL_VERSION + 1)
+            case BoardFault.GARBAGE:
+                frame = self._random.randbytes(40) + DELIMITER + frame
+        return frame + late
+
+    def _hello(self) -> Hello:
+        parts = self._converter.parts
+        return Hello(
+            *FIRMWARE,
+            reset_cause=self._cause,
+            boot_id=self._boot_id,
+            serial=self._serial,
+            sequence=self._sequence,
+            board_us=self._ns // 1000 % MODULUS,
+            rate_hz=self._rate_hz,
+            period_ns=self._period_ns,
+            adc_bits=10,
+            channels=1,
+            divider_ppm=round(parts.divider * 1e6),
+            current_uv_per_a=round(parts.volts_per_ampere * 1e6),
+            current_zero_ppm=self._zero_ppm,
+            bandgap_uv=self._bandgap_uv,
+            bandgap_sum=self._boot_bandgap,
+            bandgap_count=_BOOT_READINGS,
+            ntc_series_ohm=parts.ntc_series_ohm,
+            ntc_r25_ohm=parts.ntc_r25_ohm,
+            ntc_beta_k=parts.ntc_beta_k,
+        )
+
+    def _hear(self) -> None:
+        """Bytes of the host."""
+        with contextlib.suppress(BlockingIOError):
+            self._inbox += os.read(self._master, 4096)
+        *frames, self._inbox = self._inbox.split(DELIMITER)
+        if self._mode == "text":
+            return
+        for frame in frames:
+            with contextlib.suppress(ProtocolError):  # no answer: the host asks again
+                self._obey(unseal(frame) if frame else b"")
+
+    def _obey(self, packet: bytes) -> None:
+        if not packet:
+            return
+        kind, body = packet[1], packet[2:]
+        if packet[0] != PROTOCOL_VERSION:
+            self._answer(kind, AckResult.OTHER_VERSION, PROTOCOL_VERSION)
+        elif kind == MessageType.COMMAND_HELLO:
+            self.send(self._hello().encode())
+        elif kind == MessageType.COMMAND_RESTART:
+            self._answer(kind, AckResult.OK, 0)
+            self.reset(ResetCause.WATCHDOG)
+        elif kind == MessageType.COMMAND_ZERO_CURRENT:
+            self._zero_current()
+        elif kind == MessageType.COMMAND_SET_RATE and len(body) == 2:
+            (rate_hz,) = struct.unpack("<H", body)
+            if rate_hz in RATE_HZ:
+                self._set_rate(rate_hz)
+            self._answer(kind, AckResult.OK if rate_hz in RATE_HZ else AckResult.BAD_VALUE, self._period_ns)
+        elif kind == MessageType.COMMAND_SET_SERIAL and len(body) == 4:
+            (self._serial,) = struct.unpack("<I", body)
+            self._answer(kind, AckResult.OK, self._serial)
+        elif kind == MessageType.COMMAND_SET_BANDGAP and len(body) == 4:
+            (bandgap_uv,) = struct.unpack("<I", body)
+            good = 1_000_000 <= bandgap_uv <= 1_200_000
+            self._bandgap_uv = bandgap_uv if good else self._bandgap_uv
+            self._answer(kind, AckResult.OK if good else AckResult.BAD_VALUE, self._bandgap_uv)
+        else:
+            self._answer(kind, AckResult.UNKNOWN_COMMAND, 0)
+
+    def _zero_current(self) -> None:
+        """Take the present current as zero."""
+        count = window_of(1)[0]
+        part = self._converter.window(self._reading, count).current / count / FULL_SCALE
+        good = abs(part - 0.5) <= _NEAR_MIDDLE
+        self._zero_ppm = round(part * 1e6) if good else self._zero_ppm
+        result = AckResult.OK if good else AckResult.BAD_VALUE
+        self._answer(MessageType.COMMAND_ZERO_CURRENT, result, self._zero_ppm)
+
+    def _answer(self, command: int, result: AckResult, value: int) -> None:
+        self.send(Ack(command, result, value).encode())
+
+    def _flush(self) -> None:
+        """Write what the pseudo-terminal takes; the rest when it takes more."""
+        if self._master < 0:
+            return
+        with contextlib.suppress(BlockingIOError):
+            while self._line:
+                del self._line[: os.write(self._master, self._line)]
+        if self._line:
+            asyncio.get_running_loop().add_writer(self._master, self._flush)
+        else:
+            self._drained.set()
+            with contextlib.suppress(RuntimeError):  # before the loop runs there is no writer either
+                asyncio.get_running_loop().remove_writer(self._master)

@@ -1,0 +1,105 @@
+"""Divider, current sensor, NTC and 10-bit converter of the board, in Python: what the virtual board measures with."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FULL_SCALE = 1024
+CLOCK_HZ = 16_000_000
+SLOTS_PER_S = 8000
+"""Conversions of the firmware per second; a pair of them is one of voltage and one of current."""
+_NOISE_POINTS = 1 << 16
+
+
+class Reading(NamedTuple):
+    """What is at the sensors; current positive on discharge, temperature NaN without an NTC."""
+
+    current_a: float
+    voltage_v: float
+    temperature_c: float = math.nan
+
+
+class Sums(NamedTuple):
+    """Conversions of one window, added up."""
+
+    voltage: int
+    current: int
+    pairs: int
+    voltage_saturated: bool
+    current_saturated: bool
+
+
+@dataclass(frozen=True)
+class BoardParts:
+    """The parts on the board as built; the defaults are the firmware's."""
+
+    supply_v: float = 5.0
+    """AVcc, the converter's reference, which the host has to find out."""
+    bandgap_v: float = 1.1
+    divider: float = 5.0
+    volts_per_ampere: float = 0.1
+    current_zero: float = 0.5
+    """Sensor's output without current, as a part of the supply."""
+    ntc_series_ohm: int = 10_000
+    ntc_r25_ohm: int = 10_000
+    ntc_beta_k: int = 3950
+
+
+class VirtualConverter:
+    """Converts readings as the firmware does: many times in a window, rounded to 10 bits, added up.
+
+    Args:
+        parts: The board as built.
+        noise_lsb: Standard deviation of a conversion [steps of the converter].
+        seed: Of the noise.
+    """
+
+    def __init__(self, parts: BoardParts, noise_lsb: float, seed: int) -> None:
+        self.parts = parts
+        self._noise = np.random.default_rng(seed).normal(0.0, noise_lsb, _NOISE_POINTS) if noise_lsb else None
+        self._cursor = 0
+
+    def window(self, reading: Reading, count: int) -> Sums:
+        """Sums of ``count`` pairs of conversions."""
+        parts = self.parts
+        voltage = self.convert(reading.voltage_v / parts.divider / parts.supply_v, count)
+        current = self.convert(parts.current_zero + reading.current_a * parts.volts_per_ampere / parts.supply_v, count)
+        return Sums(
+            int(voltage.sum()),
+            int(current.sum()),
+            count,
+            bool(voltage.max() == FULL_SCALE - 1),
+            bool(current.max() == FULL_SCALE - 1 or current.min() == 0),
+        )
+
+    def bandgap(self, count: int) -> int:
+        """Sum of ``count`` conversions of the internal reference."""
+        return int(self.convert(self.parts.bandgap_v / self.parts.supply_v, count).sum())
+
+    def ntc(self, temperature_c: float) -> int:
+        """One conversion of the NTC; an open input without one."""
+        if math.isnan(temperature_c):
+            return FULL_SCALE - 1
+        parts = self.parts
+        r_ohm = parts.ntc_r25_ohm * math.exp(parts.ntc_beta_k * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
+        return int(self.convert(r_ohm / (r_ohm + parts.ntc_series_ohm), 1)[0])
+
+    def convert(self, part_of_reference: float, count: int) -> NDArray[np.float64]:
+        """``count`` conversions of a voltage given as a part of the reference."""
+        steps: NDArray[np.float64] = np.full(count, part_of_reference * FULL_SCALE)
+        if self._noise is not None:
+            if self._cursor + count > _NOISE_POINTS:
+                self._cursor = 0
+            steps += self._noise[self._cursor : self._cursor + count]
+            self._cursor += count
+        return np.clip(np.rint(steps), 0, FULL_SCALE - 1)
+
+
+def window_of(rate_hz: int) -> tuple[int, int]:
+    """Pairs of conversions in a sample's window and its length [ns], as the firmware divides its clock."""
+    slots = SLOTS_PER_S // rate_hz // 2 * 2
+    cycles = round(CLOCK_HZ / (rate_hz * slots))
+    return slots // 2, slots * cycles * 1_000_000_000 // CLOCK_HZ
