@@ -47,6 +47,11 @@ def with_pack(settings: Settings, **changes: object) -> Settings:
     return settings.model_copy(update={"pack": pack})
 
 
+def with_port(settings: Settings, port: str) -> Settings:
+    """Settings with another serial port."""
+    return settings.model_copy(update={"sensor": settings.sensor.model_copy(update={"port": port})})
+
+
 def with_broker(settings: Settings, url: str) -> Settings:
     """Settings with another broker.
 

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES, split_records
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.frames import CurrentSign
 
 MAGIC = b"BMSRAW1\n"
@@ -62,6 +63,11 @@ class CaptureHeader:
     """Wall clock at the first byte, ISO 8601 UTC; set by the writer when empty."""
     extra: dict[str, Any] = field(default_factory=dict)
     version: int = VERSION
+
+
+def header_of(sensor: SensorSettings) -> CaptureHeader:
+    """What a capture of this board's line says of it."""
+    return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign)
 
 
 @dataclass(frozen=True)
