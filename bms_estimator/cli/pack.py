@@ -47,9 +47,11 @@ def with_pack(settings: Settings, **changes: object) -> Settings:
     return settings.model_copy(update={"pack": pack})
 
 
-def with_port(settings: Settings, port: str) -> Settings:
-    """Settings with another serial port."""
-    return settings.model_copy(update={"sensor": settings.sensor.model_copy(update={"port": port})})
+def with_sensor(settings: Settings, **changes: object) -> Settings:
+    """Settings with some of ``[sensor]`` changed; None leaves a value as it is."""
+    given = {name: value for name, value in changes.items() if value is not None}
+    sensor = SensorSettings.model_validate(settings.sensor.model_dump() | given)
+    return settings.model_copy(update={"sensor": sensor})
 
 
 def with_broker(settings: Settings, url: str) -> Settings:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.pack import load_pack, with_broker, with_port
+from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.service.logs import configure_logs
 from bms_estimator.service.serve import serve
 from bms_estimator.sinks.console import ConsoleSink
@@ -32,7 +32,7 @@ def run(
 ) -> None:
     """Estimate live from a board and publish, until SIGINT or SIGTERM."""
     settings, cell = load_pack(pack)
-    settings = with_port(settings, port) if port else settings
+    settings = with_sensor(settings, port=port)
     settings = with_broker(settings, mqtt) if mqtt else settings
     shown = sys.stdout.isatty() if view is None else view
     log: deque[str] = deque(maxlen=LOG_LINES)

@@ -1,0 +1,152 @@
+"""``bms-estimator record``: a board's raw bytes with their arrival times."""
+
+import asyncio
+import time
+from collections import deque
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from bms_estimator.cli.interrupt import stop_on_signal, until_first_ends
+from bms_estimator.cli.pack import load_pack, with_sensor
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import SensorSettings, Settings
+from bms_estimator.service.logs import configure_logs
+from bms_estimator.sources.raw_capture import CaptureWriter, header_of
+from bms_estimator.sources.serial_board import SerialBoard
+
+REDRAW_S = 0.25
+SYNC_S = 5.0
+"""The disk has all but the last seconds, even when the power fails [s]."""
+
+
+def record(
+    out: Annotated[Path, typer.Argument(help="new file", show_default=False)],
+    pack: Annotated[
+        Path | None, typer.Option(help="settings of the pack, for its [sensor]", show_default=False)
+    ] = None,
+    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
+    baud: Annotated[int | None, typer.Option(min=1200, help="in place of sensor.baud")] = None,
+    rate_hz: Annotated[int | None, typer.Option(min=1, max=1000, help="in place of sensor.sample_rate_hz")] = None,
+    text: Annotated[bool, typer.Option("--text", help="the board prints text lines")] = False,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="from the first bytes; else until Ctrl-C", show_default=False)
+    ] = None,
+) -> None:
+    """Record a board's raw bytes with their arrival times, until Ctrl-C.
+
+    Each read of the line goes to the file at once: whatever kills the recorder, ``replay`` reads all to the last whole
+    frame. Without --pack and --port the only board that is there is taken.
+    """
+    settings = load_pack(pack)[0] if pack else Settings()
+    protocol = "text" if text else None
+    sensor = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol).sensor
+    with CaptureWriter(out, header_of(sensor)) as writer:
+        asyncio.run(_record(sensor, Recorder(writer), seconds))
+
+
+class Recorder:
+    """Tap of a board: writes, counts, and keeps the error that ended it."""
+
+    def __init__(self, writer: CaptureWriter) -> None:
+        self._writer = writer
+        self.started = asyncio.Event()
+        self.failed = asyncio.Event()
+        self.error: OSError | None = None
+        self.bytes = 0
+
+    def write(self, arrival_s: float, data: bytes) -> None:
+        """Append one read of the line."""
+        try:
+            self._writer.write(arrival_s, data)
+        except OSError as error:
+            self.error = error
+            self.failed.set()
+            raise
+        self.bytes += len(data)
+        self.started.set()
+
+    def sync(self) -> None:
+        """Have the disk take what there is."""
+        self._writer.sync()
+
+
+async def _record(sensor: SensorSettings, recorder: Recorder, seconds: float | None) -> None:
+    """Board -> file, until a signal, the time's end or the disk's."""
+    stop = stop_on_signal()
+    console, log = Console(stderr=True), deque[str]()
+    configure_logs(log if console.is_terminal else None)
+    async with SerialBoard(sensor, tap=recorder) as board:
+        progress = Progress(board, recorder)
+        await until_first_ends(
+            stop.wait(),
+            recorder.failed.wait(),
+            _drain(board),
+            _time_over(recorder, seconds),
+            _sync_often(recorder),
+            _show(console, progress, log),
+        )
+    if recorder.error is not None:
+        raise UserError(f"recording ended: {recorder.error.strerror}")
+    typer.echo(progress.summary(), err=True)
+
+
+async def _drain(board: SerialBoard) -> None:
+    async for _ in board:
+        pass
+
+
+async def _time_over(recorder: Recorder, seconds: float | None) -> None:
+    """Ends ``seconds`` after the first bytes; with None never."""
+    await recorder.started.wait()
+    await (asyncio.Event().wait() if seconds is None else asyncio.sleep(seconds))
+
+
+async def _sync_often(recorder: Recorder) -> None:
+    while True:
+        await asyncio.sleep(SYNC_S)
+        await asyncio.to_thread(recorder.sync)
+
+
+async def _show(console: Console, progress: "Progress", log: deque[str]) -> None:
+    """A progress line where there is a terminal, the log's lines above it."""
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        while True:
+            while log:
+                console.print(Text.from_ansi(log.popleft()))
+            if console.is_terminal:
+                live.update(progress.line(), refresh=True)
+            await asyncio.sleep(REDRAW_S)
+
+
+class Progress:
+    """What has been recorded so far."""
+
+    def __init__(self, board: SerialBoard, recorder: Recorder) -> None:
+        self._board, self._recorder = board, recorder
+        self._started_s = time.monotonic()
+        self._last = (self._started_s, 0)
+        self._rate_hz = 0.0
+
+    def line(self) -> Text:
+        """For a screen that is drawn anew."""
+        why = f"  {self._board.message}" if self._board.message else ""
+        now_s, frames = time.monotonic(), self._board.counters["frames_received"]
+        if now_s - self._last[0] >= 1.0:
+            self._rate_hz = (frames - self._last[1]) / (now_s - self._last[0])
+            self._last = now_s, frames
+        return Text(f"{self.summary()}, {self._rate_hz:.0f} Hz{why}", no_wrap=True, overflow="ellipsis")
+
+    def summary(self) -> str:
+        """Of the whole recording."""
+        counters = self._board.counters
+        faults = sum(counters[name] for name in ("cobs_errors", "length_errors", "version_errors", "text_errors"))
+        return (
+            f"{time.monotonic() - self._started_s:.1f} s, {self._recorder.bytes:,} bytes, "
+            f"{counters['frames_received']:,} frames, {counters['frames_lost']:,} lost, "
+            f"{counters['crc_errors']:,} CRC errors, {faults:,} other faults"
+        )

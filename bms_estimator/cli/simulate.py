@@ -1,0 +1,57 @@
+"""``bms-estimator simulate``: a board without hardware, on a pseudo-terminal."""
+
+import asyncio
+import math
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.interrupt import stop_on_signal, until_first_ends
+from bms_estimator.model.cell import load_cell
+from bms_estimator.sources.simulated_pack import LOADS, LoadName, SimulatedPack
+from bms_estimator.sources.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
+
+DEFAULT_LOAD_C = 3.0
+"""A load of so many times the capacity per hour moves SOC while one looks."""
+
+
+def simulate(
+    cell: Annotated[str, typer.Option(help="shipped cell's name or a cell file")] = "chen_mora",
+    series: Annotated[int, typer.Option(min=1, help="of them in series")] = 1,
+    load: Annotated[LoadName, typer.Option(help="what it is under")] = LoadName.RANDOM,
+    current_a: Annotated[
+        float | None, typer.Option(help="of the load, positive on discharge; else 3C", show_default=False)
+    ] = None,
+    soc: Annotated[float, typer.Option(min=0.0, max=1.0, help="at the start")] = 0.9,
+    rate_hz: Annotated[
+        int, typer.Option(min=1, max=1000, help="samples per second until the host asks for others")
+    ] = RATE_HZ_AT_RESET,
+    text: Annotated[bool, typer.Option("--text", help="print text lines, as hobby sketches do")] = False,
+    noise_lsb: Annotated[float, typer.Option(min=0.0, help="of its converter, in steps")] = 0.5,
+    speed: Annotated[float, typer.Option(min=1e-3, help="its seconds per second")] = 1.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, help="of its time; else until Ctrl-C", show_default=False)
+    ] = math.inf,
+    seed: Annotated[int, typer.Option(help="of load and noise")] = 0,
+) -> None:
+    """Serve a simulated board on a pseudo-terminal, until Ctrl-C.
+
+    Prints the path of the pseudo-terminal, for ``run --port PATH``. The board speaks the firmware's protocol; a
+    simulated pack with a 10-bit converter is at its pins.
+    """
+    model = load_cell(cell).pack(series, 1)
+    ampere = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
+    pack = SimulatedPack(model, LOADS[load](ampere, seed), soc=soc)
+    board = VirtualBoard(
+        pack, rate_hz=rate_hz, mode="text" if text else "binary", speed=speed, noise_lsb=noise_lsb, seed=seed
+    )
+    asyncio.run(_serve(board, seconds))
+    typer.echo(f"{board.samples:,} samples in {board.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
+
+
+async def _serve(board: VirtualBoard, seconds: float) -> None:
+    """Until ``seconds`` are over, or SIGINT or SIGTERM."""
+    stop = stop_on_signal()
+    with board:
+        typer.echo(board.path)
+        await until_first_ends(stop.wait(), board.run(seconds))

@@ -1,0 +1,120 @@
+"""A simulated pack under a load: what a simulated board has at its sensors.
+
+The cell of Chen and Mora (2.1)-(2.4) under a load that never ends: an empty pack is charged, a full one loaded again.
+"""
+
+import math
+import random
+from collections.abc import Callable, Iterator
+from enum import StrEnum
+from pathlib import Path
+
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels.cell import cell_step, ocv, r_s
+from bms_estimator.model.cell import CellModel
+from bms_estimator.sources.virtual_converter import Reading
+
+EMPTY_SOC, FULL_SOC = 0.05, 0.95
+"""The load stops at the one and begins again at the other; in between the pack is charged."""
+ROOM_C = 25.0
+PULSE_S = 10.0
+SHORTEST_STEP_S, LONGEST_STEP_S = 1.0, 5.0
+MOST_CHARGE = 0.25
+"""Random steps also charge, with up to this part of the current."""
+
+Load = Iterator[tuple[float, float]]
+"""Seconds, current [A], positive on discharge; endless."""
+
+
+def constant(current_a: float, _seed: int = 0) -> Load:
+    """One current."""
+    while True:
+        yield math.inf, current_a
+
+
+def pulses(current_a: float, _seed: int = 0) -> Load:
+    """On and off, ``PULSE_S`` each."""
+    while True:
+        yield PULSE_S, current_a
+        yield PULSE_S, 0.0
+
+
+def random_steps(current_a: float, seed: int = 0) -> Load:
+    """Steps of random length and height, some of them charging."""
+    dice = random.Random(seed)
+    while True:
+        yield dice.uniform(SHORTEST_STEP_S, LONGEST_STEP_S), current_a * dice.uniform(-MOST_CHARGE, 1.0)
+
+
+class LoadName(StrEnum):
+    """Kinds of load."""
+
+    CONSTANT = "constant"
+    PULSE = "pulse"
+    RANDOM = "random"
+
+
+LOADS: dict[LoadName, Callable[[float, int], Load]] = {
+    LoadName.CONSTANT: constant,
+    LoadName.PULSE: pulses,
+    LoadName.RANDOM: random_steps,
+}
+"""By name: from the current [A] and a seed."""
+
+
+class SimulatedPack:
+    """Signal of a board: call it with times that never step back.
+
+    Args:
+        cell: The pack as one object.
+        load: What it is under.
+        soc: At time 0, 0..1; the pack is at rest then.
+    """
+
+    def __init__(self, cell: CellModel, load: Load, *, soc: float = 0.9) -> None:
+        self._a, self._capacity_as = cell.a, cell.cell.capacity_ah * 3600.0
+        self._ocv = ocv_grid(cell)
+        self._charge_a = -cell.cell.capacity_ah  # 1C
+        self._load = load
+        self._left_s, self._load_a = next(load)
+        self._charging = False
+        self._state = (soc, 0.0, 0.0)
+        self._current_a = self._load_a
+        self.time_s = 0.0
+        """Of the last reading."""
+
+    @property
+    def soc(self) -> float:
+        """The truth, 0..1."""
+        return self._state[0]
+
+    def __call__(self, time_s: float) -> Reading:
+        """What is at the pack's terminals at ``time_s`` [s]."""
+        dt_s, self.time_s = time_s - self.time_s, time_s
+        self._state = cell_step(self._state, self._current_a, dt_s, self._capacity_as, self._a)
+        self._current_a = self._next_current(dt_s)
+        soc, v_ts, v_tl = self._state
+        voltage_v = ocv(soc, *self._ocv) - v_ts - v_tl - self._current_a * r_s(soc, self._a)  # (2.4)
+        return Reading(self._current_a, float(voltage_v), ROOM_C)
+
+    def _next_current(self, dt_s: float) -> float:
+        """Of the load ``dt_s`` later; charging holds its time."""
+        self._charging = self.soc <= (FULL_SOC if self._charging else EMPTY_SOC)
+        if self._charging:
+            return self._charge_a
+        self._left_s -= dt_s
+        while self._left_s <= 0.0:
+            seconds, self._load_a = next(self._load)
+            self._left_s += seconds
+        return self._load_a
+
+
+def write_readings(path: Path, pack: SimulatedPack, seconds: float, rate_hz: int) -> None:
+    """What the pack does in the next ``seconds`` as a table for the firmware's simulator."""
+    start_s = pack.time_s
+    with path.open("w", encoding="ascii") as file:
+        file.write("time_s,current_a,voltage_v,temperature_c\n")
+        for n in range(round(seconds * rate_hz)):
+            time_s = n / rate_hz
+            reading = pack(start_s + time_s)
+            file.write(f"{time_s:.4f},{reading.current_a:.6f},{reading.voltage_v:.6f},{reading.temperature_c:.2f}\n")
