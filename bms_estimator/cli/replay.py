@@ -124,6 +124,7 @@ def result_table(capture: Path, result: Result) -> Table:
         "dropped": dropped or "none",
         "duration": _text(result.duration_s, ",.1f", "s"),
         "SOC": f"{_text(result.soc_initial, '.2%')} to {_text(result.soc_final, '.2%')}",
+        "SOC, std at the end": _text(result.soc_std_final, ".2%"),
         "innovation, RMS": _text(result.innovation_rms_v, ".3f", "mV", 1e3),
         "voltage error, RMS": _text(result.voltage_rms_error_v, ".3f", "mV", 1e3),
         "lock": lock,

@@ -18,6 +18,8 @@ class Result:
     duration_s: float | None  # from the first to the last of them, on the capture's clock
     soc_initial: float | None
     soc_final: float | None
+    soc_std_final: float | None  # of the identifier; None without it
+    soc_rms_difference_to_coulomb: float | None
     innovation_rms_v: float | None  # measured less predicted, before the correction
     voltage_rms_error_v: float | None  # measured less estimated, after it
     lock_lost: bool
@@ -39,7 +41,7 @@ class Summary:
         self._rows = 0
         self._first: np.void | None = None
         self._last: np.void | None = None
-        self._innovation = self._error = 0.0
+        self._innovation = self._error = self._soc_difference = 0.0
 
     def add(self, trace: NDArray[np.void]) -> None:
         """Take a block of dtype TRACE."""
@@ -52,6 +54,8 @@ class Summary:
         error = trace["voltage_v"] - trace["voltage_estimate_v"]
         self._innovation += float(trace["innovation_v"] @ trace["innovation_v"])
         self._error += float(error @ error)
+        difference = trace["soc"] - trace["soc_coulomb"]
+        self._soc_difference += float(difference @ difference)
 
     def result(self, state: np.void, read: int, wall_s: float) -> Result:
         """The outcome.
@@ -67,6 +71,8 @@ class Summary:
             duration_s=_between(self._first, self._last),
             soc_initial=_field(self._first, "soc"),
             soc_final=_field(self._last, "soc"),
+            soc_std_final=_field(self._last, "soc_std"),
+            soc_rms_difference_to_coulomb=self._rms(self._soc_difference),
             innovation_rms_v=self._rms(self._innovation),
             voltage_rms_error_v=self._rms(self._error),
             lock_lost=bool(state["lock_losses"]),

@@ -3,16 +3,22 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator.records import observer_settings
+from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import estimate as kernel
 from bms_estimator.kernels.estimate import Verdict
-from bms_estimator.kernels.state import OBSERVER_STATE, TRACE
+from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
+from bms_estimator.kernels.identifier_state import SOC, V_TL, V_TS
+from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import ObserverSettings
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
+SET_SOC_STD = 0.01
+"""How far an SOC that someone sets may be off."""
+UNSEEN_SOC_STD = 0.02
+"""How far the SOC may have gone while nobody measured."""
 
 
 class Estimator:
@@ -23,11 +29,16 @@ class Estimator:
     Args:
         cell: The pack as one two-terminal object (``CellModel.pack``).
         observer: The adaptive observer's settings.
+        identifier: The identifier's settings; None: off, the thesis's method alone.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
+        voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
         initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
 
     Attributes:
-        state: Shape (1,), dtype ``OBSERVER_STATE``. It can be copied, saved, compared and put back.
+        record: Shape (1,), dtype ``ESTIMATOR_STATE``: all there is. It can be copied, saved, compared and put back.
+        settings_record: Shape (1,), dtype ``ESTIMATOR_SETTINGS``.
+        state: The observer's part of ``record``, shape (1,), dtype ``OBSERVER_STATE``.
+        settings: The observer's part of ``settings_record``, shape (1,), dtype ``OBSERVER_SETTINGS``.
     """
 
     def __init__(
@@ -35,12 +46,23 @@ class Estimator:
         cell: CellModel,
         observer: ObserverSettings | None = None,
         *,
+        identifier: IdentifierSettings | None = None,
         voltage_resolution_v: float = 1e-3,
+        voltage_noise_v: float | None = None,
         initial_soc: float | None = None,
     ) -> None:
         self.cell = cell
-        self.settings = observer_settings(cell, observer or ObserverSettings(), voltage_resolution_v, initial_soc)
-        self.state: NDArray[np.void] = np.zeros(1, dtype=OBSERVER_STATE)
+        self.settings_record = estimator_settings(
+            cell,
+            observer or ObserverSettings(),
+            identifier or IdentifierSettings(enabled=False),
+            voltage_resolution_v=voltage_resolution_v,
+            voltage_noise_v=voltage_noise_v,
+            initial_soc=initial_soc,
+        )
+        self.settings: NDArray[np.void] = self.settings_record["observer"]
+        self.record: NDArray[np.void] = np.zeros(1, dtype=ESTIMATOR_STATE)
+        self.state: NDArray[np.void] = self.record["observer"]
         self._trace: TraceBlock = np.zeros(0, dtype=TRACE)
 
     def step(self, time_s: float, current_a: float, voltage_v: float, status: int = 0) -> Verdict:
@@ -55,7 +77,7 @@ class Estimator:
         Returns:
             Whether it was accepted, else why not; the state counts each kind.
         """
-        return Verdict(kernel.step(self.state, self.settings, time_s, current_a, voltage_v, status))
+        return Verdict(kernel.step(self.record, self.settings_record, time_s, current_a, voltage_v, status))
 
     def run(self, block: SampleBlock) -> TraceBlock:
         """Take a block of samples, dtype ``SAMPLE``.
@@ -65,5 +87,30 @@ class Estimator:
         """
         if self._trace.size < block.size:
             self._trace = np.zeros(block.size, dtype=TRACE)
-        rows = kernel.run(self.state, self.settings, block, self._trace)
+        rows = kernel.run(self.record, self.settings_record, block, self._trace)
         return self._trace[:rows]
+
+    @property
+    def identifying(self) -> bool:
+        """Whether the identifier is at work."""
+        return bool(self.settings_record["identify"][0])
+
+    def set_soc(self, soc: float) -> None:
+        """Take ``soc`` (0..1) as the state of charge from now on, known to ``SET_SOC_STD``."""
+        self.state["soc"] = self.state["soc_coulomb"] = soc
+        x = self.record[0]["identifier"]
+        x["mean"][SOC] = soc
+        x["covariance"][SOC, :] = x["covariance"][:, SOC] = 0.0
+        x["covariance"][SOC, SOC] = SET_SOC_STD**2
+
+    def resume(self) -> None:
+        """Prepare for samples of another clock, after a time in which nobody measured.
+
+        Time begins with the next sample, which is taken as a clock set back. The SOC may have moved, and the branch
+        voltages are what they may be at a first sample.
+        """
+        self.state["time_s"] = np.inf
+        x, p = self.record[0]["identifier"], self.settings_record[0]["identifier"]
+        x["covariance"][SOC, SOC] += UNSEEN_SOC_STD**2
+        for branch in (V_TS, V_TL):
+            x["covariance"][branch, branch] += p["variance"][branch]

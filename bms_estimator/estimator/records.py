@@ -4,12 +4,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.kernels.cell import OCV_POINTS, emf
+from bms_estimator.kernels.estimator_state import ESTIMATOR_SETTINGS
+from bms_estimator.kernels.identifier_state import Tuning, identifier_settings
 from bms_estimator.kernels.mittag_leffler import decay_table, series_coefficients
 from bms_estimator.kernels.nussbaum import Nussbaum
 from bms_estimator.kernels.state import OBSERVER_SETTINGS, PARAMETERS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv
-from bms_estimator.model.settings import ObserverSettings
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 
 SETTLED_STEPS = 2.0
 """Width of the dead zone in steps of the converter: half a step of rounding, half of noise, and as much again."""
@@ -17,6 +20,8 @@ LOCK_FRACTION = 0.02
 """An error of this fraction of the nominal voltage is no tracking."""
 GAP_S = 5.0
 """A step longer than this counts as a gap [s]."""
+ELEMENTS_AT_SOC = 0.5
+"""The identifier starts from the configured elements at this SOC, where they are flat."""
 IMPROVED = range(1, 13)
 """Parameters that the improved method adapts (Algorithm 1); a13..a15 come from (4.2)."""
 
@@ -30,6 +35,61 @@ def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]
         return np.array([emf(x, a) for x in soc]), slope
     curve = PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v, extrapolate=True)
     return curve(soc), curve.derivative()(soc)
+
+
+def estimator_settings(
+    cell: CellModel,
+    observer: ObserverSettings,
+    identifier: IdentifierSettings,
+    *,
+    voltage_resolution_v: float,
+    voltage_noise_v: float | None,
+    initial_soc: float | None,
+) -> NDArray[np.void]:
+    """The settings record of the whole estimator.
+
+    Args:
+        cell: The pack as one object.
+        observer: Its ``[observer]`` section.
+        identifier: Its ``[identifier]`` section.
+        voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
+        voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
+        initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
+
+    Returns:
+        Shape (1,), dtype ``ESTIMATOR_SETTINGS``.
+    """
+    record = np.zeros(1, dtype=ESTIMATOR_SETTINGS)
+    p = record[0]
+    p["observer"] = observer_settings(cell, observer, voltage_resolution_v, initial_soc)[0]
+    p["identify"] = identifier.enabled
+    p["hand_over"] = observer.law in ("improved", "scheme-3")  # (3.16) and (3.17) have no limit to set
+    p["map_memory_s"] = identifier.map_memory_h * 3600.0
+    p["configured"][1:] = cell.a[1:PARAMETERS]
+    for i in range(1, PARAMETERS):
+        p["lower"][i], p["upper"][i] = cell.bounds(i).lower, cell.bounds(i).upper
+    p["identifier"] = identifier_settings(
+        cell.cell.capacity_ah,
+        p["observer"]["ocv_v"],
+        p["observer"]["ocv_slope_v"],
+        0.5 if initial_soc is None else initial_soc,
+        _elements(cell),
+        noise_v=0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v,
+        resolution_v=voltage_resolution_v,
+        tuning=Tuning(
+            current_offset_std_a=identifier.current_offset_std_a,
+            capacity_std=identifier.capacity_std,
+            hysteresis_charge_v=identifier.hysteresis_v,
+        ).pack(cell.cell.series_count),
+    )[0]
+    return record
+
+
+def _elements(cell: CellModel) -> tuple[float, float, float, float, float]:
+    """R_s [ohm], R_ts [ohm], R_ts C_ts [s], R_tl [ohm], R_tl C_tl [s] of the cell file where they are flat."""
+    soc, a = ELEMENTS_AT_SOC, cell.a
+    ohm_ts, ohm_tl = chen_mora.r_ts(soc, a), chen_mora.r_tl(soc, a)
+    return chen_mora.r_s(soc, a), ohm_ts, ohm_ts * chen_mora.c_ts(soc, a), ohm_tl, ohm_tl * chen_mora.c_tl(soc, a)
 
 
 def observer_settings(

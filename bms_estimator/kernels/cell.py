@@ -83,14 +83,22 @@ def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
 def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
     """SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of the grid, thesis 7.1.
 
-    Bisection: right for every increasing curve, and the nearest end outside its range.
+    Bisection, of the nodes and then between two: right for every increasing curve, and the nearest end outside its range.
     """
-    low, high = 0.0, 1.0
+    last = ocv_v.shape[0] - 1
     if voltage_v <= ocv_v[0]:
         return 0.0
-    if voltage_v >= ocv_v[ocv_v.shape[0] - 1]:
+    if voltage_v >= ocv_v[last]:
         return 1.0
-    for _ in range(48):
+    below, above = 0, last
+    while above - below > 1:
+        middle = (below + above) // 2
+        if ocv_v[middle] < voltage_v:
+            below = middle
+        else:
+            above = middle
+    low, high = below / last, above / last
+    for _ in range(24):
         middle = 0.5 * (low + high)
         if ocv(middle, ocv_v, ocv_slope_v) < voltage_v:
             low = middle

@@ -47,52 +47,55 @@ ELEMENT_FIT = np.dtype(
 
 
 @njit(cache=True)
-def learn(m: Record, element: int, soc: float, ln_value: float, variance: float, dt_s: float) -> None:
-    """Add what is known of one element at ``soc`` to its bin: ln of its value and the variance of that."""
+def learn(m: Record, element: int, soc: float, ln_value: float, variance: float, dt_s: float) -> bool:
+    """Add what is known of one element at ``soc`` to its bin: ln of its value and the variance of that.
+
+    Returns:
+        Whether it was known well enough to be added.
+    """
     if not 0.0 < variance < LEARNED_VARIANCE:
-        return
+        return False
     b = min(max(int(soc * BINS), 0), BINS - 1)
     m.weight[element, b] += dt_s / variance
     m.moment[element, b] += ln_value * dt_s / variance
     m.soc_moment[element, b] += soc * dt_s / variance
     m.dwell_s[element, b] += dt_s
+    return True
 
 
 @njit(cache=True)
-def age(m: Record, factor: float) -> None:
-    """Let the map forget: what it knows counts ``factor`` times as much from now on."""
-    for e in range(ELEMENTS):
-        for b in range(BINS):
-            m.weight[e, b] *= factor
-            m.moment[e, b] *= factor
-            m.soc_moment[e, b] *= factor
-            m.dwell_s[e, b] *= factor
+def age(m: Record, e: int, factor: float) -> None:
+    """Let row ``e`` of the map forget: what it knows counts ``factor`` times as much from now on."""
+    for b in range(BINS):
+        m.weight[e, b] *= factor
+        m.moment[e, b] *= factor
+        m.soc_moment[e, b] *= factor
+        m.dwell_s[e, b] *= factor
 
 
 @njit(cache=True)
-def fit_map(m: Record, prior: Floats, fit: Record) -> None:
-    """Fit (2.5)-(2.9) to the map.
+def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
+    """Fit the function of one element, of (2.5)-(2.9), to its row of the map.
 
     Args:
         m: Record of ELEMENT_MAP.
+        e: Row of the map, 0..4.
         prior: Configured a1..a15 at index 1..15: stands in, weakly, where the map is empty.
         fit: Record of ELEMENT_FIT, written.
     """
-    x = np.empty(BINS)
-    y = np.empty(BINS)
-    w = np.empty(BINS)
-    for e in range(ELEMENTS):
-        base = 3 * e + 1
-        sign = -1.0 if e in (2, 3) else 1.0  # capacitances rise with SOC: (2.7), (2.8)
-        fit.bins[e] = _observations(m, e, prior, base, sign, x, y, w)
-        exponent = _best_exponent(prior[base + 1], sign, x, y, w)
-        amplitude, offset, _ = _linear_part(exponent, sign, x, y, w)
-        fit.a[base], fit.a[base + 1], fit.a[base + 2] = amplitude, exponent, offset
-        _standard_errors(fit, base, sign, x, w)
-        if fit.bins[e] == 0:
-            for i in range(base, base + 3):
-                fit.a[i] = prior[i]
-                fit.std[i] = math.nan
+    x, y, w = np.empty(BINS), np.empty(BINS), np.empty(BINS)
+    base = 3 * e + 1
+    sign = -1.0 if e in (2, 3) else 1.0  # capacitances rise with SOC: (2.7), (2.8)
+    fit.bins[e] = _observations(m, e, prior, base, sign, x, y, w)
+    if fit.bins[e] == 0:
+        for i in range(base, base + 3):
+            fit.a[i] = prior[i]
+            fit.std[i] = math.nan
+        return
+    exponent = _best_exponent(prior[base + 1], sign, x, y, w)
+    amplitude, offset, _ = _linear_part(exponent, sign, x, y, w)
+    fit.a[base], fit.a[base + 1], fit.a[base + 2] = amplitude, exponent, offset
+    _standard_errors(fit, base, sign, x, w)
 
 
 @njit(cache=True)
@@ -147,7 +150,7 @@ def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -
 @njit(cache=True)
 def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) -> tuple[float, float, float]:
     """Amplitude and offset, both positive, of least weighted squares for this exponent; and the cost."""
-    sw = sg = sgg = sy = sgy = 0.0
+    sw = sg = sgg = sy = sgy = syy = 0.0
     for b in range(BINS):
         g = sign * math.exp(-exponent * x[b])
         sw += w[b]
@@ -155,6 +158,7 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
         sgg += w[b] * g * g
         sy += w[b] * y[b]
         sgy += w[b] * g * y[b]
+        syy += w[b] * y[b] * y[b]
     det = sw * sgg - sg * sg
     offset = sy / sw
     amplitude = 1e-3 * offset
@@ -162,10 +166,8 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
         free = (sw * sgy - sg * sy) / det
         amplitude = max(amplitude, free)
     offset = max((sy - sg * amplitude) / sw, 1e-3 * offset)
-    cost = 0.0
-    for b in range(BINS):
-        r = offset + amplitude * sign * math.exp(-exponent * x[b]) - y[b]
-        cost += w[b] * r * r
+    cross = offset * sw * offset + amplitude * (2.0 * offset * sg + amplitude * sgg)
+    cost = syy + cross - 2.0 * (offset * sy + amplitude * sgy)
     return amplitude, offset, cost
 
 

@@ -7,7 +7,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.observer import observer_step, start
+from bms_estimator.kernels.cell import r_s, soc_from_ocv
+from bms_estimator.kernels.identification import identify, start_identifier
+from bms_estimator.kernels.identifier import element_ln_stds, element_values, soc_std
+from bms_estimator.kernels.identifier_state import V_TL, V_TS
+from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
 
 Records = NDArray[np.void]
@@ -33,7 +37,10 @@ _VOLTAGE_SATURATED_BIT = 1  # SampleStatus.VOLTAGE_SATURATED
 
 @njit(cache=True)
 def judge(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
-    """Whether a sample can be used; counts those that cannot by their kind."""
+    """Whether a sample can be used; counts those that cannot by their kind.
+
+    ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+    """
     if not (math.isfinite(time_s) and math.isfinite(current_a) and math.isfinite(voltage_v)):
         s.dropped_not_finite += 1
         return _NOT_FINITE
@@ -54,8 +61,8 @@ def step(state: Records, settings: Records, time_s: float, current_a: float, vol
     """Take one sample.
 
     Args:
-        state: Shape (1,), dtype OBSERVER_STATE; updated in place.
-        settings: Shape (1,), dtype OBSERVER_SETTINGS.
+        state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
+        settings: Shape (1,), dtype ESTIMATOR_SETTINGS.
         time_s: Time stamp [s].
         current_a: Current [A], positive on discharge.
         voltage_v: Terminal voltage [V].
@@ -64,23 +71,30 @@ def step(state: Records, settings: Records, time_s: float, current_a: float, vol
     Returns:
         A ``Verdict``.
     """
-    s, p = state[0], settings[0]
+    s, p = state[0].observer, settings[0].observer
     verdict = judge(s, p, time_s, current_a, voltage_v, status)
     if verdict != _ACCEPTED:
         return verdict
     s.samples += 1
     if not s.started:
         start(s, p, time_s, current_a, voltage_v)
+        if settings[0].identify:
+            start_identifier(state[0], settings[0], current_a, voltage_v)
         return verdict
     dt_s = time_s - s.time_s
     s.time_s = time_s
     if dt_s < 0.0:  # the clock was set back: go on from here
         s.time_steps_back += 1
-        s.current_a = current_a
+        s.current_a = state[0].identifier.current_a = current_a
         return verdict
     if dt_s > p.gap_s:
         s.gaps += 1
-    observer_step(s, p, dt_s, current_a, voltage_v)
+    count_charge(s, p, dt_s, current_a)
+    if settings[0].identify:
+        identify(state[0], settings[0], dt_s, current_a, voltage_v)
+    else:
+        s.soc = s.soc_coulomb
+    observer_step(s, p, dt_s, voltage_v)
     return verdict
 
 
@@ -101,21 +115,22 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
     for j in range(samples.shape[0]):
         x = samples[j]
         if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status) == _ACCEPTED:
-            write_row(trace[rows], state[0], settings[0], x)
+            write_observer(trace[rows], state[0].observer, settings[0].observer, x)
+            write_identifier(trace[rows], state[0], settings[0])
             rows += 1
     return rows
 
 
 @njit(cache=True)
-def write_row(row: Record, s: Record, p: Record, x: Record) -> None:
-    """What there is to say of an accepted sample ``x``."""
+def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
+    """What the observer says of an accepted sample ``x``; records as in ``judge``."""
     row.time_s = x.time_s
     row.voltage_v = x.voltage_v
     row.current_a = x.current_a
     row.temperature_c = x.temperature_c
     row.soc = s.soc
     row.voltage_estimate_v = s.voltage_estimate_v
-    row.innovation_v = s.innovation_v
+    row.tracking_error_v = s.innovation_v
     row.nussbaum_gain = s.gain
     row.k = s.k
     row.delta_1 = s.delta_1
@@ -123,3 +138,33 @@ def write_row(row: Record, s: Record, p: Record, x: Record) -> None:
     row.stability_margin = s.soc - max(s.delta_1, s.delta_2)
     row.lock = s.lock
     row.converged = 1 if abs(s.innovation_v) < p.epsilon_v else 0
+    row.soc_coulomb = s.soc_coulomb
+
+
+@njit(cache=True)
+def write_identifier(row: Record, s: Record, p: Record) -> None:
+    """What the identifier says; records as in ``step``. Without it, what the observer has in its place, else NaN."""
+    o = s.observer
+    if not p.identify:
+        row.innovation_v = o.innovation_v
+        row.soc_ocv = soc_from_ocv(
+            row.voltage_v + o.v_ts + o.v_tl + row.current_a * r_s(o.soc, o.a) * p.observer.output_r_s,
+            p.observer.ocv_v,
+            p.observer.ocv_slope_v,
+        )
+        row.soc_std = math.nan
+        row.r_s_ohm = row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
+        row.r_s_std_ohm = row.r_ts_std_ohm = row.tau_ts_std_s = row.r_tl_std_ohm = row.tau_tl_std_s = math.nan
+        return
+    x = s.identifier
+    ohm_s, ohm_ts, tau_ts, _, ohm_tl, tau_tl, _ = element_values(x)
+    std_s, std_ts, std_tau_ts, _, std_tl, std_tau_tl, _ = element_ln_stds(x)
+    row.innovation_v = x.innovation_v
+    e_o = row.voltage_v + x.mean[V_TS] + x.mean[V_TL] + row.current_a * ohm_s  # (2.4) solved for E_o
+    row.soc_ocv = soc_from_ocv(e_o, p.observer.ocv_v, p.observer.ocv_slope_v)
+    row.soc_std = soc_std(x)
+    row.r_s_ohm, row.r_s_std_ohm = ohm_s, ohm_s * std_s
+    row.r_ts_ohm, row.r_ts_std_ohm = ohm_ts, ohm_ts * std_ts
+    row.tau_ts_s, row.tau_ts_std_s = tau_ts, tau_ts * std_tau_ts
+    row.r_tl_ohm, row.r_tl_std_ohm = ohm_tl, ohm_tl * std_tl
+    row.tau_tl_s, row.tau_tl_std_s = tau_tl, tau_tl * std_tau_tl

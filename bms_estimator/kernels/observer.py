@@ -30,6 +30,7 @@ def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
     if math.isnan(s.soc):
         ohmic = current_a * r_s(1.0, s.a)
         s.soc = soc_from_ocv(voltage_v + ohmic, p.ocv_v, p.ocv_slope_v)
+    s.soc_coulomb = s.soc
     s.k = p.k0
     s.gain = nussbaum_gain(s.k, p)
     s.lock = 1
@@ -41,11 +42,16 @@ def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
 
 
 @njit(cache=True)
-def observer_step(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
-    """Advance the observer by one sample: Algorithm 1, lines 2 to 7."""
+def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
+    """SOC by coulomb counting (3.1), the current being straight between samples."""
     charge_as = 0.5 * (s.current_a + current_a) * dt_s
-    s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)  # (3.1)
+    s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
+
+
+@njit(cache=True)
+def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
+    """Advance the observer by one sample at the SOC it finds: Algorithm 1, lines 2 to 7."""
     e_o = ocv(s.soc, p.ocv_v, p.ocv_slope_v)
 
     floor = max(s.delta_1, s.delta_2) + p.margin_guard

@@ -53,7 +53,8 @@ OBSERVER_STATE = np.dtype(
     [
         ("time_s", "f8"),  # of the last accepted sample
         ("current_a", "f8"),  # of the last accepted sample
-        ("soc", "f8"),  # x1, by coulomb counting (3.1), 0..1
+        ("soc", "f8"),  # x1, 0..1: the identifier's, else by coulomb counting
+        ("soc_coulomb", "f8"),  # by coulomb counting alone (3.1), 0..1
         ("v_ts", "f8"),  # x2 [V]
         ("v_tl", "f8"),  # x3 [V]
         ("k", "f8"),  # adaptive gain state (3.13) [V^2 s]
@@ -92,14 +93,28 @@ TRACE = np.dtype(
         ("temperature_c", "f8"),
         ("soc", "f8"),
         ("voltage_estimate_v", "f8"),
-        ("innovation_v", "f8"),
+        ("innovation_v", "f8"),  # measured less predicted: the identifier's, else the observer's e
+        ("tracking_error_v", "f8"),  # the observer's e (3.15)
         ("nussbaum_gain", "f8"),
         ("k", "f8"),
         ("delta_1", "f8"),
         ("delta_2", "f8"),
         ("stability_margin", "f8"),  # soc - max(delta_1, delta_2)
         ("lock", "i8"),
-        ("converged", "i8"),  # |innovation| < eps2
+        ("converged", "i8"),  # |e| < eps2
+        ("soc_coulomb", "f8"),  # by coulomb counting alone
+        ("soc_ocv", "f8"),  # by the inverted OCV (7.1)
+        ("soc_std", "f8"),  # from here on the identifier's; NaN without it
+        ("r_s_ohm", "f8"),
+        ("r_s_std_ohm", "f8"),
+        ("r_ts_ohm", "f8"),
+        ("r_ts_std_ohm", "f8"),
+        ("tau_ts_s", "f8"),
+        ("tau_ts_std_s", "f8"),
+        ("r_tl_ohm", "f8"),
+        ("r_tl_std_ohm", "f8"),
+        ("tau_tl_s", "f8"),
+        ("tau_tl_std_s", "f8"),
     ],
     align=True,
 )

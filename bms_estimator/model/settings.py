@@ -36,6 +36,9 @@ class SensorSettings(Strict):
         default="discharge_positive", description="what the board calls positive; inside, discharge is"
     )
     voltage_resolution_v: Positive = Field(default=25.0 / 1024, description="one step of the voltage converter")
+    voltage_noise_v: NotNegative | None = Field(
+        default=None, description="standard deviation of one voltage sample; half a step when left out"
+    )
     current_resolution_a: Positive = Field(default=0.05, description="one step of the current converter")
 
 
@@ -78,6 +81,24 @@ class ObserverSettings(Strict):
         return table
 
 
+class IdentifierSettings(Strict):
+    """The identifier: SOC with its error, the cell's own parameters."""
+
+    enabled: bool = Field(
+        default=True, description="false: SOC by coulomb counting, parameters as the observer's bounds have them"
+    )
+    map_memory_h: Positive = Field(default=336.0, description="time constant with which learned elements are forgotten")
+    current_offset_std_a: NotNegative = Field(
+        default=0.0, description="how wrong the current sensor's zero may be; 0: it is taken as right"
+    )
+    capacity_std: Annotated[float, Field(ge=0, le=0.3)] = Field(
+        default=0.0, description="how wrong the declared capacity may be, relative; 0: it is taken as right"
+    )
+    hysteresis_v: NotNegative = Field(
+        default=0.0, description="OCV after charge less that after discharge, of one cell; for LFP some 0.02"
+    )
+
+
 class MqttSettings(Strict):
     """The broker and how often to publish."""
 
@@ -108,6 +129,7 @@ class Settings(Strict):
     pack: PackSettings = PackSettings()
     sensor: SensorSettings = SensorSettings()
     observer: ObserverSettings = ObserverSettings()
+    identifier: IdentifierSettings = IdentifierSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
     state: StateSettings = StateSettings()
 

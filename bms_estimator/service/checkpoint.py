@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.settings import Settings
 
-FORMAT = 1
+FORMAT = 2
 """Raise it to make all older checkpoints invalid."""
 LONGEST_FILE = 1 << 20
 """A checkpoint has some kilobytes; a longer file is none [bytes]."""
@@ -26,12 +27,16 @@ COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", 
 
 
 def pack_identity(settings: Settings, cell: CellModel) -> str:
-    """Hash of all that gives the state its meaning: the pack, its cell, its sensor, the observer, the record's layout."""
+    """Hash of all that gives the state its meaning: pack, cell, sensor, observer, identifier, the record's layout."""
     digest = hashlib.sha256()
-    sensor = settings.sensor.model_dump_json(include={"current_sign", "voltage_resolution_v", "current_resolution_a"})
-    parts = (cell.model_dump_json(), settings.pack.model_dump_json(), sensor, settings.observer.model_dump_json())
-    for part in (*parts, str(OBSERVER_STATE.descr)):
-        digest.update(part.encode() + b"\0")
+    sensor = {"current_sign", "voltage_resolution_v", "voltage_noise_v", "current_resolution_a"}
+    digest.update(
+        settings.model_dump_json(
+            include={"pack": True, "sensor": sensor, "observer": True, "identifier": True}
+        ).encode()
+    )
+    for part in (cell.model_dump_json(), str(ESTIMATOR_STATE)):
+        digest.update(b"\0" + part.encode())
     return digest.hexdigest()
 
 
@@ -40,7 +45,7 @@ class Restored:
     """What a checkpoint file held."""
 
     state: NDArray[np.void] | None
-    """Shape (1,), dtype OBSERVER_STATE; None when it was refused."""
+    """Shape (1,), dtype ESTIMATOR_STATE; None when it was refused."""
     restarts: int
     """Starts that found a checkpoint, this one included."""
     reason: str
@@ -105,7 +110,7 @@ class CheckpointFile:
         insane = _insane(state, cell)
         if insane:
             return Restored(None, restarts, f"refused: {insane}")
-        return Restored(state, restarts, f"restored: SOC {float(state['soc'][0]):.4f}")
+        return Restored(state, restarts, f"restored: SOC {float(state['observer']['soc'][0]):.4f}")
 
 
 class _RefusedError(Exception):
@@ -114,12 +119,13 @@ class _RefusedError(Exception):
 
 def _insane(state: NDArray[np.void], cell: CellModel) -> str:
     """Why a state cannot be used; empty when it can."""
-    if state.dtype != OBSERVER_STATE or state.shape != (1,):
+    if state.dtype != ESTIMATOR_STATE or state.shape != (1,):
         return f"state has dtype of {state.dtype.itemsize} bytes and shape {state.shape}"
-    for name in OBSERVER_STATE.names or ():
-        if not np.isfinite(state[name]).all():
-            return f"{name} is not finite"
-    s = state[0]
+    for part in ("observer", "identifier", "map"):
+        for name in ESTIMATOR_STATE[part].names or ():
+            if not np.isfinite(state[part][name]).all():
+                return f"{name} of the {part} is not finite"
+    s = state[0]["observer"]
     if not s["started"]:
         return "no sample was taken"
     ranges = {
@@ -137,12 +143,8 @@ def _insane(state: NDArray[np.void], cell: CellModel) -> str:
 
 
 def resume(estimator: Estimator, state: NDArray[np.void]) -> None:
-    """Go on from a checkpoint's state.
-
-    The board's clock has started anew and nobody knows what flowed meanwhile: time begins with the next sample,
-    which the estimator takes as a clock set back. The counters count from this start.
-    """
-    estimator.state[...] = state
-    estimator.state["time_s"] = np.inf
+    """Go on from a checkpoint's state, on the board's new clock. The counters count from this start."""
+    estimator.record[...] = state
+    estimator.resume()
     for name in COUNTERS:
         estimator.state[name] = 0

@@ -89,7 +89,9 @@ def new_estimator(settings: Settings, cell: CellModel) -> Estimator:
         return Estimator(
             cell,
             settings.observer,
+            identifier=settings.identifier,
             voltage_resolution_v=settings.sensor.voltage_resolution_v,
+            voltage_noise_v=settings.sensor.voltage_noise_v,
             initial_soc=settings.pack.initial_soc,
         )
 
@@ -148,11 +150,10 @@ async def _save_often(
 
 async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, restarts: int) -> None:
     """Save what samples have taught; writing waits for the disk in a thread."""
-    state = estimator.state.copy()
-    if not (state["started"][0] and state["samples"][0]):
+    if not (estimator.state["started"][0] and estimator.state["samples"][0]):
         return
     try:
-        await asyncio.to_thread(checkpoint.save, state, restarts)
+        await asyncio.to_thread(checkpoint.save, estimator.record.copy(), restarts)
         publisher.checkpoint = "saved"
     except OSError as error:
         publisher.checkpoint = f"cannot be saved: {error}"
@@ -176,7 +177,7 @@ def _offer(requests: Requests, estimator: Estimator, publisher: Publisher) -> No
         if not estimator.state["started"][0]:
             raise UserError("no sample has been taken yet")
         before = float(estimator.state["soc"][0])
-        estimator.state["soc"] = soc
+        estimator.set_soc(soc)
         log.info("SOC set on request", before=before, soc=soc)
         return {"soc": soc, "before": before}
 

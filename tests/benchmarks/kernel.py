@@ -46,7 +46,7 @@ def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
             in_c.run(twin.state, twin.settings, block, trace)
 
         def run_kernel() -> None:
-            kernel.run(estimator.state, estimator.settings, block, trace)
+            kernel.run(estimator.record, estimator.settings_record, block, trace)
 
         run_kernel()
         best = np.full(2, np.inf)
@@ -58,7 +58,7 @@ def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
 def calls_from_python(block: SampleBlock) -> tuple[float, float]:
     """Time of one ``Estimator.step``, and of the kernel's own ``step``, called sample by sample [ns]."""
     estimator = Estimator(load_cell(CELL))
-    state, settings = estimator.state, estimator.settings
+    state, settings = estimator.record, estimator.settings_record
     samples = [(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), 0) for x in block[:CALLS]]
 
     def step() -> None:

@@ -36,12 +36,21 @@ static double ocv(double soc, const settings_t *p)
 
 static double soc_from_ocv(double voltage_v, const settings_t *p)
 {
-    double low = 0.0, high = 1.0;
+    const int last = OCV_POINTS - 1;
     if (voltage_v <= p->ocv_v[0])
         return 0.0;
-    if (voltage_v >= p->ocv_v[OCV_POINTS - 1])
+    if (voltage_v >= p->ocv_v[last])
         return 1.0;
-    for (int n = 0; n < 48; n++) {
+    int below = 0, above = last;
+    while (above - below > 1) {
+        int middle = (below + above) / 2;
+        if (p->ocv_v[middle] < voltage_v)
+            below = middle;
+        else
+            above = middle;
+    }
+    double low = (double)below / last, high = (double)above / last;
+    for (int n = 0; n < 24; n++) {
         double middle = 0.5 * (low + high);
         if (ocv(middle, p) < voltage_v)
             low = middle;
@@ -148,6 +157,7 @@ static void start(state_t *s, const settings_t *p, double time_s, double current
         s->soc = soc_from_ocv(voltage_v + current_a * element(s->a[13], s->a[14], s->a[15], 1.0), p);
     s->k = p->k0;
     s->gain = nussbaum_gain(s->k, p);
+    s->soc_coulomb = s->soc;
     s->lock = s->adapting = s->started = 1;
     s->voltage_estimate_v = ocv(s->soc, p);
     s->innovation_v = voltage_v - s->voltage_estimate_v;
@@ -190,7 +200,7 @@ static void watch_lock(state_t *s, const settings_t *p, double dt_s, double volt
 static void observer_step(state_t *s, const settings_t *p, double dt_s, double current_a, double voltage_v)
 {
     double charge_as = 0.5 * (s->current_a + current_a) * dt_s;
-    s->soc = fmin(fmax(s->soc - charge_as / p->capacity_as, 0.0), 1.0); /* (3.1) */
+    s->soc = s->soc_coulomb = fmin(fmax(s->soc_coulomb - charge_as / p->capacity_as, 0.0), 1.0); /* (3.1) */
     s->current_a = current_a;
     double e_o = ocv(s->soc, p);
 
@@ -277,7 +287,7 @@ static void write_row(trace_t *row, const state_t *s, const settings_t *p, const
     row->temperature_c = x->temperature_c;
     row->soc = s->soc;
     row->voltage_estimate_v = s->voltage_estimate_v;
-    row->innovation_v = s->innovation_v;
+    row->innovation_v = row->tracking_error_v = s->innovation_v;
     row->nussbaum_gain = s->gain;
     row->k = s->k;
     row->delta_1 = s->delta_1;
@@ -285,6 +295,12 @@ static void write_row(trace_t *row, const state_t *s, const settings_t *p, const
     row->stability_margin = s->soc - fmax(s->delta_1, s->delta_2);
     row->lock = s->lock;
     row->converged = fabs(s->innovation_v) < p->epsilon_v;
+    row->soc_coulomb = s->soc_coulomb;
+    double ohmic_v = row->current_a * element(s->a[13], s->a[14], s->a[15], s->soc) * p->output_r_s;
+    row->soc_ocv = soc_from_ocv(row->voltage_v + s->v_ts + s->v_tl + ohmic_v, p); /* (7.1) */
+    row->soc_std = NAN;
+    row->r_s_ohm = row->r_ts_ohm = row->tau_ts_s = row->r_tl_ohm = row->tau_tl_s = NAN;
+    row->r_s_std_ohm = row->r_ts_std_ohm = row->tau_ts_std_s = row->r_tl_std_ohm = row->tau_tl_std_s = NAN;
 }
 
 int64_t run(state_t *state, const settings_t *settings, const sample_t *samples, trace_t *trace, int64_t n)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.kernels import cell
-from bms_estimator.kernels.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS, age, fit_map, learn
+from bms_estimator.kernels.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS, age, fit_element, learn
 from bms_estimator.model.cell import load_cell
 
 TRUTH = load_cell("chen_mora").a
@@ -24,7 +24,8 @@ def filled(low: float, high: float, noise: float = 0.0) -> np.ndarray:
 
 def fitted(table: np.ndarray, prior: np.ndarray) -> np.void:
     fit = np.zeros(1, dtype=ELEMENT_FIT)
-    fit_map(table[0], prior, fit[0])
+    for e in range(ELEMENTS):
+        fit_element(table[0], e, prior, fit[0])
     return fit[0]
 
 
@@ -64,7 +65,7 @@ def test_a_value_that_is_not_known_adds_nothing() -> None:
 def test_new_evidence_outweighs_aged_evidence() -> None:
     table = np.zeros(1, dtype=ELEMENT_MAP)
     learn(table[0], 4, 0.5, math.log(0.1), 0.01**2, 100.0)
-    age(table[0], 0.01)
+    age(table[0], 4, 0.01)
     learn(table[0], 4, 0.5, math.log(0.2), 0.01**2, 100.0)
     value = math.exp(table["moment"][0, 4, 12] / table["weight"][0, 4, 12])
     assert value == pytest.approx(0.2, rel=0.02)

@@ -159,7 +159,7 @@ async def test_a_board_reset_in_mid_run_goes_on_in_time(line: Line) -> None:
         estimator, health = await live.end()
     assert estimator.state["samples"][0] == 70
     assert estimator.state["time_steps_back"][0] == 0
-    assert estimator.state["soc"][0] == pytest.approx(0.5)
+    assert estimator.state["soc_coulomb"][0] == pytest.approx(0.5)
     assert health.line["resets"] == 1
 
 

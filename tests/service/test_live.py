@@ -17,7 +17,7 @@ from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.model.settings import MqttSettings, PackSettings, Settings
 from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
 from bms_estimator.service.clock import Clock
-from bms_estimator.service.live import run_live
+from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.requests import Requests
 from tests.collector import Collector
@@ -77,12 +77,10 @@ async def test_a_run_in_blocks_leaves_the_state_of_single_steps() -> None:
         for i in range(0, 500, 7):
             run.source.give(*rows[i : i + 7])
         live = await run.end()
-    alone = Estimator(
-        CELL, SETTINGS.observer, voltage_resolution_v=SETTINGS.sensor.voltage_resolution_v, initial_soc=0.5
-    )
+    alone = new_estimator(SETTINGS, CELL)
     for row in rows:
         alone.step(*row)
-    assert live.state.tobytes() == alone.state.tobytes()
+    assert live.record.tobytes() == alone.record.tobytes()
 
 
 async def test_samples_that_cannot_be_used_are_dropped_counted_and_published() -> None:
@@ -208,15 +206,15 @@ async def test_a_restart_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
     async with running(checkpoint=checkpoint(file)) as run:
         run.source.give(*((float(i), 0.275, 3.8) for i in range(361)))  # a tenth of the capacity
         first = await run.end()
-    assert first.state["soc"][0] == pytest.approx(0.4)
+    assert first.state["soc_coulomb"][0] == pytest.approx(0.4)
     async with running(checkpoint=checkpoint(file)) as run:
         run.source.give((5.0, 0.275, 3.8), (6.0, 0.275, 3.8))  # the board's clock has started anew
         second = await run.end()
-    assert second.state["soc"][0] == pytest.approx(0.4 - 1.0 / 3600.0, abs=1e-9)
+    assert second.state["soc_coulomb"][0] == pytest.approx(0.4 - 1.0 / 3600.0, abs=1e-9)
     assert second.state["samples"][0] == 2
     health = run.sink.snapshots[-1].health
     assert health.restarts == 1
-    assert health.checkpoint == "restored: SOC 0.4000"
+    assert health.checkpoint == f"restored: SOC {first.state['soc'][0]:.4f}"
 
 
 @pytest.mark.parametrize("damage", ["other pack", "other cell", "nan", "range", "truncated", "garbage", "format"])
@@ -224,15 +222,15 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
     tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "pack.npz"
-    estimator = Estimator(CELL, initial_soc=0.3)
+    estimator = new_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
     settings, cell = SETTINGS, CELL
     reason = "refused: it belongs to another pack"
     if damage == "nan":
-        estimator.state["a"][0][3], reason = np.nan, "refused: a is not finite"
+        estimator.state["a"][0][3], reason = np.nan, "refused: a of the observer is not finite"
     if damage == "range":
         estimator.state["soc"], reason = 1.7, r"refused: soc = 1.7 is outside 0.0..1.0"
-    checkpoint(file).save(estimator.state, restarts=0)
+    checkpoint(file).save(estimator.record, restarts=0)
     if damage == "other pack":
         settings = SETTINGS.model_copy(update={"pack": PackSettings(name="other", initial_soc=0.5)})
     if damage == "other cell":
@@ -242,14 +240,14 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
         file.write_bytes(content)
         reason = "refused: unreadable"
     if damage == "format":
-        monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", 2)
-        reason = "refused: format 1, this version reads 2"
+        monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", 3)
+        reason = "refused: format 2, this version reads 3"
     async with running(settings, cell, checkpoint=checkpoint(file, settings, cell)) as run:
         snapshot = await run.sink.until(lambda _: True)
         run.source.give((0.0, 0.0, 3.8 * cell.cell.series_count))
         estimator = await run.end()
     assert snapshot.health.checkpoint.startswith(reason)
-    assert estimator.state["soc"][0] == 0.5
+    assert estimator.state["soc_coulomb"][0] == 0.5
 
 
 async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes_on(tmp_path: Path) -> None:

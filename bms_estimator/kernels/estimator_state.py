@@ -1,0 +1,34 @@
+"""The records of the whole estimator: observer, identifier, map of the elements and the fit to it, in one each."""
+
+import numpy as np
+
+from bms_estimator.kernels.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS
+from bms_estimator.kernels.identifier_state import IDENTIFIER_SETTINGS, IDENTIFIER_STATE
+from bms_estimator.kernels.state import OBSERVER_SETTINGS, OBSERVER_STATE, PARAMETERS
+
+ESTIMATOR_SETTINGS = np.dtype(
+    [
+        ("observer", OBSERVER_SETTINGS),
+        ("identifier", IDENTIFIER_SETTINGS),
+        ("identify", "i8"),  # 0: SOC by coulomb counting, parameters as configured
+        ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
+        ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
+        ("lower", "f8", PARAMETERS),  # the configured bounds guard what is handed over
+        ("upper", "f8", PARAMETERS),
+        ("map_memory_s", "f8"),  # time constant with which the map forgets [s]
+    ],
+    align=True,
+)
+
+ESTIMATOR_STATE = np.dtype(
+    [
+        ("observer", OBSERVER_STATE),
+        ("identifier", IDENTIFIER_STATE),
+        ("map", ELEMENT_MAP),
+        ("fit", ELEMENT_FIT),
+        ("fit_age_s", "f8"),  # since an element was fitted
+        ("next_element", "i8"),  # to be fitted
+        ("unlearned_s", "f8", ELEMENTS),  # since the map learned of each element
+    ],
+    align=True,
+)
