@@ -1,0 +1,44 @@
+// Voltage (A0), current (A1) and temperature (A2) of a battery pack, for an ATmega328P at 16 MHz: Uno, Nano.
+// Timer 1 triggers the converter, its interrupt sums up, this loop sends. PROTOCOL.md tells what.
+
+#include <avr/interrupt.h>
+#include <avr/io.h>
+
+#include "commands.h"
+#include "line.h"
+#include "protocol.h"
+#include "reset.h"
+#include "sampling.h"
+#include "settings.h"
+
+static bool overrun;
+
+void setup() {
+    TIMSK0 = 0;  // nobody asks for millis(), and its interrupt would only delay ours
+    reset_start_watchdog();
+    settings_load();
+    line_start();
+    const boot_readings boot = sampling_measure_at_boot();
+    sampling_start(boot.ntc_fitted);
+    commands_start(boot);  // long before the first window ends
+}
+
+static void send(sample_message *sample) {
+    uint8_t packet[SAMPLE_BYTES];
+    sample->status |= (uint8_t)(reset_cause() << 4);
+    if (overrun) sample->status |= STATUS_OVERRUN;
+    overrun = !line_send(packet, encode_sample(packet, sample));
+}
+
+void loop() {
+    reset_feed_watchdog();
+    sample_message *sample = sampling_window();
+    if (sample) {
+        commands_see(*sample);
+        send(sample);
+        sampling_release();
+    }
+    commands_poll();
+    settings_write_on();
+    sampling_sleep();
+}

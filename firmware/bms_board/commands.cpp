@@ -1,0 +1,144 @@
+#include "commands.h"
+
+#include "line.h"
+#include "reset.h"
+#include "settings.h"
+
+#define FIRMWARE_MAJOR 0
+#define FIRMWARE_MINOR 1
+#define FIRMWARE_PATCH 0
+
+#define ADC_BITS 10
+#define DIVIDER_PPM 5000000UL       // 30 kohm over 7.5 kohm: 25 V become 5 V
+#define CURRENT_UV_PER_A 100000UL   // LA 25-NP with its burden
+#define NTC_SERIES_OHM 10000UL
+#define NTC_R25_OHM 10000UL
+#define NTC_BETA_K 3950
+
+#define ZERO_US 1000000UL
+
+static boot_readings boot;
+static uint16_t boot_id;
+
+static uint8_t answer[HELLO_BYTES];
+static uint8_t answer_length;  // 0: none waits
+
+static struct {
+    bool measuring, begun;
+    uint32_t begin_us, sum, count;
+} zero;
+
+static void answer_ack(uint8_t command, uint8_t result, uint32_t value) {
+    const ack_message ack = {command, result, value};
+    answer_length = encode_ack(answer, &ack);
+}
+
+static void answer_hello() {
+    hello_message hello = {};
+    hello.firmware_major = FIRMWARE_MAJOR;
+    hello.firmware_minor = FIRMWARE_MINOR;
+    hello.firmware_patch = FIRMWARE_PATCH;
+    hello.reset_cause = reset_cause();
+    hello.boot_id = boot_id;
+    hello.serial = settings_get(SETTING_SERIAL);
+    sampling_progress(&hello.sequence, &hello.board_us);
+    hello.rate_hz = sampling_timing().rate_hz;
+    hello.period_ns = period_ns(&sampling_timing());
+    hello.adc_bits = ADC_BITS;
+    hello.channels = boot.ntc_fitted ? CHANNEL_NTC : 0;
+    hello.divider_ppm = DIVIDER_PPM;
+    hello.current_uv_per_a = CURRENT_UV_PER_A;
+    hello.current_zero_ppm = settings_get(SETTING_CURRENT_ZERO_PPM);
+    hello.bandgap_uv = settings_get(SETTING_BANDGAP_UV);
+    hello.bandgap_sum = boot.bandgap_sum;
+    hello.bandgap_count = boot.bandgap_count;
+    hello.ntc_series_ohm = NTC_SERIES_OHM;
+    hello.ntc_r25_ohm = NTC_R25_OHM;
+    hello.ntc_beta_k = NTC_BETA_K;
+    answer_length = encode_hello(answer, &hello);
+}
+
+static void answer_setting(uint8_t command, setting which, uint32_t value) {
+    const bool set = settings_set(which, value);
+    answer_ack(command, set ? ACK_OK : ACK_BAD_VALUE, settings_get(which));
+}
+
+static void set_rate(uint32_t rate_hz) {
+    const bool good = rate_hz >= RATE_MIN_HZ && rate_hz <= RATE_MAX_HZ;
+    if (good) sampling_set_timing(timing_of((uint16_t)rate_hz));
+    answer_ack(COMMAND_SET_RATE, good ? ACK_OK : ACK_BAD_VALUE, period_ns(&sampling_timing()));
+}
+
+static void zero_current() {
+    if (zero.measuring) {
+        answer_ack(COMMAND_ZERO_CURRENT, ACK_BUSY, settings_get(SETTING_CURRENT_ZERO_PPM));
+        return;
+    }
+    zero.measuring = true;
+    zero.begun = false;
+    zero.sum = zero.count = 0;
+}
+
+void commands_see(const sample_message &sample) {
+    if (!zero.measuring) return;
+    if (!zero.begun) {  // this window may have begun before the command
+        zero.begun = true;
+        zero.begin_us = sample.board_us;
+        return;
+    }
+    zero.sum += sample.current_sum;
+    zero.count += sample.count;
+}
+
+static bool zero_is_measured() {
+    uint32_t sequence, board_us;
+    sampling_progress(&sequence, &board_us);
+    return zero.measuring && zero.count != 0 && board_us - zero.begin_us >= ZERO_US;
+}
+
+static void end_zero() {
+    zero.measuring = false;
+    // sum / count / 1024 in millionths; 64 bits since a second's sum times a million needs 42
+    const uint64_t scaled = (uint64_t)zero.sum * 1000000UL / zero.count;
+    answer_setting(COMMAND_ZERO_CURRENT, SETTING_CURRENT_ZERO_PPM, (uint32_t)((scaled + (1 << 9)) >> ADC_BITS));
+}
+
+static void obey(const uint8_t *packet, uint8_t length) {
+    const uint8_t command = packet[1], *body = packet + 2, bytes = length - 2;
+    if (packet[0] != PROTOCOL_VERSION)
+        answer_ack(command, ACK_OTHER_VERSION, PROTOCOL_VERSION);
+    else if (command == COMMAND_HELLO)
+        answer_hello();
+    else if (command == COMMAND_SET_RATE && bytes == 2)
+        set_rate(take(body, 2));
+    else if (command == COMMAND_ZERO_CURRENT)
+        zero_current();
+    else if (command == COMMAND_SET_SERIAL && bytes == 4)
+        answer_setting(command, SETTING_SERIAL, take(body, 4));
+    else if (command == COMMAND_SET_BANDGAP && bytes == 4)
+        answer_setting(command, SETTING_BANDGAP_UV, take(body, 4));
+    else if (command == COMMAND_RESTART) {
+        answer_ack(command, ACK_OK, 0);
+        reset_restart();
+    } else
+        answer_ack(command, ACK_UNKNOWN_COMMAND, 0);
+}
+
+void commands_start(const boot_readings &readings) {
+    boot = readings;
+    boot_id = reset_count_boot();
+    answer_hello();
+    commands_poll();
+}
+
+void commands_poll() {
+    if (answer_length && !line_send(answer, answer_length)) return;
+    answer_length = 0;
+    if (zero_is_measured()) {
+        end_zero();
+        return;
+    }
+    uint8_t length;
+    const uint8_t *packet = line_receive(&length);
+    if (packet) obey(packet, length);
+}

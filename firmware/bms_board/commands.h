@@ -1,0 +1,16 @@
+// What the host asks for.
+#ifndef BMS_BOARD_COMMANDS_H
+#define BMS_BOARD_COMMANDS_H
+
+#include "sampling.h"
+
+// Queues the first hello.
+void commands_start(const boot_readings &boot);
+
+// Takes and answers what has come. An answer waits until the line has room, and so do the commands behind it.
+void commands_poll();
+
+// Every sample passes here: a measurement of the current's zero adds it up.
+void commands_see(const sample_message &sample);
+
+#endif
