@@ -16,6 +16,8 @@ State = tuple[float, float, float]
 
 OCV_POINTS = 401
 """Nodes of the OCV grid, evenly spaced over SOC 0..1."""
+INVERSE_ERROR_V = 1e-10
+"""An SOC whose OCV is as close to the voltage asked for is its SOC [V]."""
 
 
 @njit(cache=True)
@@ -83,7 +85,7 @@ def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
 def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
     """SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of the grid, thesis 7.1.
 
-    Bisection, of the nodes and then between two: right for every increasing curve, and the nearest end outside its range.
+    Bisection of the nodes, false position (Illinois) between two: right for every increasing curve, and the nearest end outside its range.
     """
     last = ocv_v.shape[0] - 1
     if voltage_v <= ocv_v[0]:
@@ -98,13 +100,23 @@ def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
         else:
             above = middle
     low, high = below / last, above / last
-    for _ in range(24):
-        middle = 0.5 * (low + high)
-        if ocv(middle, ocv_v, ocv_slope_v) < voltage_v:
-            low = middle
+    miss_low, miss_high = ocv_v[below] - voltage_v, ocv_v[above] - voltage_v
+    side = 0
+    soc = low
+    for _ in range(50):
+        soc = (low * miss_high - high * miss_low) / (miss_high - miss_low)
+        miss = ocv(soc, ocv_v, ocv_slope_v) - voltage_v
+        if abs(miss) < INVERSE_ERROR_V:
+            break
+        if miss < 0.0:
+            low, miss_low = soc, miss
+            miss_high *= 0.5 if side == -1 else 1.0
+            side = -1
         else:
-            high = middle
-    return 0.5 * (low + high)
+            high, miss_high = soc, miss
+            miss_low *= 0.5 if side == 1 else 1.0
+            side = 1
+    return soc
 
 
 @njit(cache=True)

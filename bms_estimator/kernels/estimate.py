@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import r_s, soc_from_ocv
+from bms_estimator.kernels.cell import soc_from_ocv
 from bms_estimator.kernels.identification import identify, start_identifier
 from bms_estimator.kernels.identifier import element_ln_stds, element_values, soc_std
 from bms_estimator.kernels.identifier_state import V_TL, V_TS
@@ -143,16 +143,13 @@ def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
 
 @njit(cache=True)
 def write_identifier(row: Record, s: Record, p: Record) -> None:
-    """What the identifier says; records as in ``step``. Without it, what the observer has in its place, else NaN."""
-    o = s.observer
+    """What the identifier says; records as in ``step``. Without it: the observer's e, and NaN.
+
+    The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.
+    """
     if not p.identify:
-        row.innovation_v = o.innovation_v
-        row.soc_ocv = soc_from_ocv(
-            row.voltage_v + o.v_ts + o.v_tl + row.current_a * r_s(o.soc, o.a) * p.observer.output_r_s,
-            p.observer.ocv_v,
-            p.observer.ocv_slope_v,
-        )
-        row.soc_std = math.nan
+        row.innovation_v = s.observer.innovation_v
+        row.soc_ocv = row.soc_std = math.nan
         row.r_s_ohm = row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
         row.r_s_std_ohm = row.r_ts_std_ohm = row.tau_ts_std_s = row.r_tl_std_ohm = row.tau_tl_std_s = math.nan
         return

@@ -103,8 +103,8 @@ TRACE = np.dtype(
         ("lock", "i8"),
         ("converged", "i8"),  # |e| < eps2
         ("soc_coulomb", "f8"),  # by coulomb counting alone
-        ("soc_ocv", "f8"),  # by the inverted OCV (7.1)
-        ("soc_std", "f8"),  # from here on the identifier's; NaN without it
+        ("soc_ocv", "f8"),  # by the inverted OCV (7.1); from here on the identifier's, NaN without it
+        ("soc_std", "f8"),
         ("r_s_ohm", "f8"),
         ("r_s_std_ohm", "f8"),
         ("r_ts_ohm", "f8"),

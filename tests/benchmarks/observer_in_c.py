@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import OCV_POINTS
+from bms_estimator.kernels.cell import INVERSE_ERROR_V, OCV_POINTS
 from bms_estimator.kernels.mittag_leffler import SERIES_LIMIT, SERIES_TERMS, TABLE_POINTS
 from bms_estimator.kernels.state import OBSERVER_SETTINGS, OBSERVER_STATE, TRACE
 from bms_estimator.model.sample import SAMPLE
@@ -48,6 +48,7 @@ def header() -> str:
     """The record types as C structures: numpy aligned them as C does."""
     constants = {
         "OCV_POINTS": OCV_POINTS,
+        "INVERSE_ERROR_V": INVERSE_ERROR_V,
         "SERIES_TERMS": SERIES_TERMS,
         "SERIES_LIMIT": SERIES_LIMIT,
         "TABLE_POINTS": TABLE_POINTS,

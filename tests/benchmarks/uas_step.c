@@ -49,15 +49,25 @@ static double soc_from_ocv(double voltage_v, const settings_t *p)
         else
             above = middle;
     }
-    double low = (double)below / last, high = (double)above / last;
-    for (int n = 0; n < 24; n++) {
-        double middle = 0.5 * (low + high);
-        if (ocv(middle, p) < voltage_v)
-            low = middle;
-        else
-            high = middle;
+    double low = (double)below / last, high = (double)above / last, soc = low;
+    double miss_low = p->ocv_v[below] - voltage_v, miss_high = p->ocv_v[above] - voltage_v;
+    int side = 0;
+    for (int n = 0; n < 50; n++) {
+        soc = (low * miss_high - high * miss_low) / (miss_high - miss_low);
+        double miss = ocv(soc, p) - voltage_v;
+        if (fabs(miss) < INVERSE_ERROR_V)
+            break;
+        if (miss < 0.0) {
+            low = soc, miss_low = miss;
+            miss_high *= side == -1 ? 0.5 : 1.0;
+            side = -1;
+        } else {
+            high = soc, miss_high = miss;
+            miss_low *= side == 1 ? 0.5 : 1.0;
+            side = 1;
+        }
     }
-    return 0.5 * (low + high);
+    return soc;
 }
 
 static double delta(double exponent, double offset, double amplitude) /* (2.11), (2.12) */
@@ -296,9 +306,7 @@ static void write_row(trace_t *row, const state_t *s, const settings_t *p, const
     row->lock = s->lock;
     row->converged = fabs(s->innovation_v) < p->epsilon_v;
     row->soc_coulomb = s->soc_coulomb;
-    double ohmic_v = row->current_a * element(s->a[13], s->a[14], s->a[15], s->soc) * p->output_r_s;
-    row->soc_ocv = soc_from_ocv(row->voltage_v + s->v_ts + s->v_tl + ohmic_v, p); /* (7.1) */
-    row->soc_std = NAN;
+    row->soc_ocv = row->soc_std = NAN;
     row->r_s_ohm = row->r_ts_ohm = row->tau_ts_s = row->r_tl_ohm = row->tau_tl_s = NAN;
     row->r_s_std_ohm = row->r_ts_std_ohm = row->tau_ts_std_s = row->r_tl_std_ohm = row->tau_tl_std_s = NAN;
 }
