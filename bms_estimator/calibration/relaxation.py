@@ -207,7 +207,7 @@ def _empty_v(good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], rests: 
 
 def _check_charge(name: str, good: SampleBlock, soc: Floats, capacity_ah: float) -> None:
     """Sign of the current, charging inside, capacity."""
-    given = -np.minimum(np.diff(soc), 0.0).sum()
+    given = np.maximum(-np.diff(soc), 0.0).sum()
     taken = np.maximum(np.diff(soc), 0.0).sum()
     if taken > max(given, CHARGING_AH):
         raise UserError(

@@ -31,6 +31,8 @@ COMMANDS = {
     "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
     "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
     "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
+    "ocv": Entry("bms_estimator.cli.ocv:ocv", "Open-circuit voltage from relaxation tests, into a cell file."),
+    "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
 }
 

@@ -199,7 +199,7 @@ def table_5(simulation: Simulation) -> Table:
         Verdict.CORRECTED,
         "After E4 (weights 10 and 20 for a8) the printed estimates are the Lemma 4.1.3 limits, weighted means of the bounds "
         "whatever the data say (E3), averaged from the very first sample on: over 328 s, one fitted number, a1 to a6 and a9 "
-        "come out to the last printed digit, a8, a10 to a12 to 0.03 %. a7 is 0.2 % off: its printed value is the limit of "
+        "come out to the last printed digit (a4 cut off, not rounded), a8, a10 to a12 to 0.03 %. a7 is 0.2 % off: its printed value is the limit of "
         "weights 70 and 65, not 60 and 55. Errors are of the desired value (E7). The conditions of Lemma 4.1.1 do not all "
         f"hold, as E6 says: {condition}. delta1 and delta2 (E13): {deltas[0]} from the desired values, {deltas[1]} from "
         f"the printed estimates, {deltas[2]} from the recomputed ones. The run is at {SMALL_CURRENT_A} A.",

@@ -1,0 +1,92 @@
+"""``bms-estimator thesis``: the thesis recomputed, as a report."""
+
+import textwrap
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from bms_estimator.cli.captures import name_of, read_whole
+from bms_estimator.cli.pack import TABLE_RESOLUTION_V
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports import items
+from bms_estimator.reports.experiment import Recorded
+from bms_estimator.reports.html import write
+from bms_estimator.reports.thesis import Report, build
+
+WIDE = 160
+"""A table of the thesis is not squeezed into fewer columns."""
+
+
+def thesis(
+    captures: Annotated[
+        list[Path] | None,
+        typer.Argument(help="for chapter 5: recorded captures, CSV (.gz) or Parquet; else a simulated 6S pack"),
+    ] = None,
+    cell: Annotated[str | None, typer.Option(help="of the captures: shipped cell's name or a cell file")] = None,
+    resolution_v: Annotated[
+        float, typer.Option(min=1e-9, help="one step of the captures' voltage [V]")
+    ] = TABLE_RESOLUTION_V,
+    out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
+    table: Annotated[str | None, typer.Option(help="this table only, 1 to 13", show_default=False)] = None,
+    figure: Annotated[str | None, typer.Option(help="this figure only, 1 to 50", show_default=False)] = None,
+) -> None:
+    """Recompute the thesis's tables and figures, and write them beside the printed ones as one HTML page.
+
+    Chapters 2 to 4 are simulated. Chapter 5 runs on the captures: at least one voltage relaxation test and one
+    constant load, all from the same type of cell.
+    """
+    recorded = _recorded(captures, cell, resolution_v) if captures else None
+    started_s = time.perf_counter()
+    with _progress() as show:
+        report = build(recorded, table=table, figure=figure, progress=show)
+        try:
+            path = write(report, out)
+        except OSError as error:
+            raise UserError(f"--out {out}: cannot be written: {error.strerror}") from None
+    console = Console()
+    if table or figure:
+        _show(console, report)
+    counts = Counter(item.verdict.value for item in report.items)
+    typer.echo("; ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    typer.echo(f"{path}: written in {time.perf_counter() - started_s:.1f} s")
+
+
+def _recorded(captures: list[Path], cell: str | None, resolution_v: float) -> Recorded:
+    if cell is None:
+        raise UserError("captures need --cell NAME|CELL.toml: its capacity, limits and bounds")
+    return Recorded(load_cell(cell), tuple((name_of(path), read_whole(path)) for path in captures), resolution_v)
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on stderr where that is a terminal; the value is told what is made next."""
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        bar = progress.add_task("", total=None)
+        yield lambda title, done, total: progress.update(bar, description=title, completed=done, total=total)
+
+
+def _show(console: Console, report: Report) -> None:
+    """What was asked for, in the terminal."""
+    for item in report.items:
+        if isinstance(item, items.Table):
+            shown = Table(title=f"Table {item.key}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)
+            for column in item.columns:
+                shown.add_column(textwrap.fill(column, 12), justify="right", no_wrap=True)
+            for row in item.rows:
+                shown.add_row(*row)
+            Console(width=max(console.width, WIDE)).print(shown)
+        else:
+            console.print(f"Figure {item.key}  {item.title}", highlight=False)
+        console.print(f"{item.verdict.value}: {item.reason}", highlight=False)
