@@ -1,0 +1,223 @@
+"""Captures, simulated cells and a loop for the identifier's tests."""
+
+import csv
+import gzip
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels.cell import c_tl, c_ts, r_s, r_tl, r_ts, simulate_cell
+from bms_estimator.kernels.identifier import element_ln_stds, element_values, identifier_init, identifier_step, nis
+from bms_estimator.kernels.identifier_state import IDENTIFIER_STATE, Tuning, identifier_settings
+from bms_estimator.model.cell import CellModel, load_cell
+
+TRACE = np.dtype(
+    [("soc", "f8"), ("soc_std", "f8"), ("innovation_v", "f8"), ("nis", "f8"), ("ln", "f8", 5), ("ln_std", "f8", 5)]
+)
+LN_NAMES = ("R_s", "R_ts", "tau_ts", "R_tl", "tau_tl")
+SENSOR = {"noise_v": 0.0005, "resolution_v": 0.001}
+"""Of the captures: about that of the instrument."""
+PROTOCOL_CAPACITY_AH = 3.0
+"""True SOC of a capture is its initial SOC less Ah over this."""
+INITIAL_SOC = {
+    "cell1_hppc": 1.0,
+    "cell5_hppc": 0.982,
+    "cell1_random_steps": 0.977,
+    "cell5_random_steps": 0.998,
+    "cell1_dst": 1.0,
+    "cell5_relaxation_c2": 1.0,
+    "cell1_discharge_c20": 1.0,
+    "cell1_discharge_c4": 1.0,
+    "cell1_discharge_1c5": 1.0,
+    "cell1_charge_c20": 0.0,
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """Input, truth and what the identifier made of it; all arrays of shape (n,)."""
+
+    time_s: np.ndarray
+    current_a: np.ndarray
+    soc: np.ndarray
+    trace: np.ndarray
+    state: np.ndarray
+
+    def after(self, start_s: float, least_soc: float = 0.05) -> np.ndarray:
+        """Which samples are judged."""
+        return (self.time_s >= self.time_s[0] + start_s) & (self.soc >= least_soc)
+
+    @property
+    def error(self) -> np.ndarray:
+        """Error of the published SOC, 0..1."""
+        return np.clip(self.trace["soc"], 0.0, 1.0) - self.soc
+
+    def soc_rms_percent(self, start_s: float) -> float:
+        return 100.0 * rms(self.error[self.after(start_s)])
+
+    def coverage(self) -> float:
+        """Share of samples whose true SOC is inside the 2-sigma band."""
+        return float(np.mean(np.abs(self.error) <= 2.0 * self.trace["soc_std"]))
+
+    def innovation_rms_mv(self, start_s: float) -> float:
+        return 1e3 * rms(self.trace["innovation_v"][self.after(start_s)])
+
+
+def rms(x: np.ndarray) -> float:
+    return math.sqrt(float(np.mean(np.square(x))))
+
+
+@njit(cache=True)
+def loop(state, settings, time_s, current_a, voltage_v, trace):
+    """Every sample in turn; what was known after it goes to ``trace``. Returns the mean of |P - P'| over the run."""
+    s, p = state[0], settings[0]
+    last = time_s[0]
+    for j in range(len(time_s)):
+        identifier_step(s, p, time_s[j] - last, current_a[j], voltage_v[j])
+        last = time_s[j]
+        row = trace[j]
+        row.soc = s.mean[0]
+        row.soc_std = math.sqrt(s.covariance[0, 0])
+        row.innovation_v = s.innovation_v
+        row.nis = nis(s)
+        for k in range(5):
+            row.ln[k] = s.mean[3 + k]
+            row.ln_std[k] = math.sqrt(s.covariance[3 + k, 3 + k])
+
+
+@njit(cache=True)
+def fast(state, settings, dt_s, current_a, voltage_v):
+    """Samples at an even step, without a trace."""
+    for j in range(len(current_a)):
+        identifier_step(state[0], settings[0], dt_s, current_a[j], voltage_v[j])
+
+
+@njit(cache=True)
+def elements_of(state):
+    return element_values(state[0]), element_ln_stds(state[0])
+
+
+@cache
+def cell(name: str) -> CellModel:
+    return load_cell(name)
+
+
+def elements(model: CellModel, soc: float) -> np.ndarray:
+    """R_s, R_ts, tau_ts, R_tl, tau_tl of the model at ``soc``."""
+    a = model.a
+    return np.array([r_s(soc, a), r_ts(soc, a), r_ts(soc, a) * c_ts(soc, a), r_tl(soc, a), r_tl(soc, a) * c_tl(soc, a)])
+
+
+def settings(
+    model: CellModel,
+    soc: float,
+    factors=(1.0,) * 5,
+    *,
+    capacity_ah: float | None = None,
+    ocv: CellModel | None = None,
+    noise_v: float = SENSOR["noise_v"],
+    resolution_v: float = SENSOR["resolution_v"],
+    tuning: Tuning | None = None,
+) -> np.ndarray:
+    """The identifier's settings for a cell, its elements at SOC 0.5 times ``factors``."""
+    return identifier_settings(
+        capacity_ah or model.cell.capacity_ah,
+        *ocv_grid(ocv or model),
+        soc,
+        tuple(elements(model, 0.5) * factors),
+        noise_v=noise_v,
+        resolution_v=resolution_v,
+        tuning=tuning,
+    )
+
+
+def new_state(p: np.ndarray) -> np.ndarray:
+    state = np.zeros(1, dtype=IDENTIFIER_STATE)
+    identifier_init(state[0], p[0])
+    return state
+
+
+def identify(p, time_s, current_a, voltage_v, soc, state=None) -> Run:
+    """Run the identifier over a record."""
+    state = new_state(p) if state is None else state
+    trace = np.zeros(len(time_s), dtype=TRACE)
+    columns = [np.ascontiguousarray(x, dtype=np.float64) for x in (time_s, current_a, voltage_v)]
+    loop(state, p, *columns, trace)
+    return Run(columns[0], columns[1], soc, trace, state)
+
+
+@cache
+def capture(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Time [s], current [A], voltage [V], true SOC of a capture, without its glitches in voltage."""
+    with gzip.open(folder / "ncr18650" / f"{name}.csv.gz", "rt") as file:
+        rows = [[float(x) for x in row[:3]] for row in list(csv.reader(file))[1:]]
+    time_s, current_a, voltage_v = (x[np.newaxis] for x in np.array(rows).T)
+    time_s, current_a, voltage_v = np.concatenate([time_s, current_a, voltage_v])[
+        :, (voltage_v[0] > 2.0) & (voltage_v[0] < 4.4)
+    ]
+    step_s = np.clip(np.diff(time_s), 0.0, None)
+    moved_ah = np.concatenate([[0.0], np.cumsum(current_a[:-1] * step_s)]) / 3600.0
+    return time_s, current_a, voltage_v, INITIAL_SOC[name] - moved_ah / PROTOCOL_CAPACITY_AH
+
+
+def identify_capture(folder: Path, name: str, factors=(1.0,) * 5, wrong_soc: float = -0.2, **kwargs) -> Run:
+    """The identifier on a real capture, started at a wrong SOC with wrong elements."""
+    time_s, current_a, voltage_v, soc = capture(folder, name)
+    p = settings(cell("ncr18650"), min(soc[0] + wrong_soc, 1.0), factors, **kwargs)
+    return identify(p, time_s, current_a, voltage_v, soc)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulated cell under load, seen through a converter."""
+
+    time_s: np.ndarray
+    current_a: np.ndarray
+    voltage_v: np.ndarray
+    soc: np.ndarray
+    noise_v: float
+    resolution_v: float
+
+
+def pulses(hours: float, rate_hz: float, amplitude_a: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Five minutes of steps of random height 0..2 ``amplitude_a``, ten minutes of rest, over again."""
+    time_s = np.arange(round(hours * 3600 * rate_hz)) / rate_hz
+    height = amplitude_a * rng.uniform(0.0, 2.0, int(time_s[-1] // 60) + 1)
+    on = (time_s % 900.0 < 300.0) & (time_s >= 10.0)
+    return time_s, np.where(on, height[(time_s // 60.0).astype(int)], 0.0)
+
+
+def convert(
+    voltage_v: np.ndarray, bits: int, full_scale_v: float, rng: np.random.Generator
+) -> tuple[np.ndarray, float]:
+    """A converter's view: half a step of noise, rounding. Also its step [V]."""
+    step_v = full_scale_v / 2**bits
+    return step_v * np.round(voltage_v / step_v + 0.5 * rng.standard_normal(len(voltage_v))), step_v
+
+
+def simulate(
+    model: CellModel,
+    time_s: np.ndarray,
+    current_a: np.ndarray,
+    *,
+    bits: int = 16,
+    soc: float = 1.0,
+    a: np.ndarray | None = None,
+    seed: int = 0,
+) -> Simulated:
+    """Terminal voltage of a cell through a converter of 5 V."""
+    capacity_as = model.cell.capacity_ah * 3600.0
+    voltage_v, truth = simulate_cell((soc, 0.0, 0.0), time_s, current_a, capacity_as, model.a if a is None else a)
+    seen_v, step_v = convert(voltage_v, bits, 5.0, np.random.default_rng(seed))
+    return Simulated(time_s, current_a, seen_v, truth, 0.5 * step_v, step_v)
+
+
+def identify_simulated(model: CellModel, x: Simulated, factors=(1.0,) * 5, wrong_soc: float = -0.2, **kwargs) -> Run:
+    """The identifier on a simulated cell."""
+    p = settings(model, x.soc[0] + wrong_soc, factors, noise_v=x.noise_v, resolution_v=x.resolution_v, **kwargs)
+    return identify(p, x.time_s, x.current_a, x.voltage_v, x.soc)
