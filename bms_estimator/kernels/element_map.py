@@ -14,8 +14,9 @@ from bms_estimator.kernels.state import PARAMETERS, Record
 
 BINS = 25
 """Bins of equal width over SOC 0..1."""
-ELEMENTS = 5
-"""In the order of their parameters: R_ts (a1..a3), R_tl (a4..a6), C_ts (a7..a9), C_tl (a10..a12), R_s (a13..a15)."""
+ELEMENT_NAMES = ("r_ts_ohm", "r_tl_ohm", "c_ts_farad", "c_tl_farad", "r_s_ohm")
+"""In the order of their parameters: a1..a3, a4..a6, a7..a9, a10..a12, a13..a15."""
+ELEMENTS = len(ELEMENT_NAMES)
 LEARNED_VARIANCE = 0.3**2
 """A logarithm known worse than this (30 %) adds nothing to the map."""
 MODEL_ERROR = 0.02

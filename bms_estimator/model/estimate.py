@@ -27,14 +27,22 @@ class Estimate(Report):
     temperature_c: float | None = Field(description="temperature [C], mean; null without a sensor")
     soc: float | None = Field(description="state of charge, 0..1")
     soc_percent: float | None = Field(description="state of charge [%]")
+    soc_std: float | None = Field(description="standard deviation of soc; null without the identifier")
+    soc_coulomb: float | None = Field(description="state of charge by coulomb counting alone, 0..1")
+    soc_ocv: float | None = Field(description="state of charge by the inverted OCV (7.1), 0..1")
+    remaining_capacity_ah: float | None = Field(description="charge down to SOC 0 [Ah]")
+    usable_capacity_ah: float | None = Field(description="charge down to max(delta_1, delta_2) [Ah]")
+    remaining_energy_wh: float | None = Field(description="energy at the terminals down to SOC 0 at current_a [Wh]")
+    time_to_empty_s: float | None = Field(description="down to SOC 0 at current_a [s]; null unless it discharges")
     voltage_estimate_v: float | None = Field(description="the observer's terminal voltage [V]")
     innovation_v: float | None = Field(description="measured less predicted voltage before the correction [V]")
+    tracking_error_v: float | None = Field(description="the observer's e (3.15) [V]")
     delta_1: float | None = Field(description="SOC below which C_ts is negative (2.11)")
     delta_2: float | None = Field(description="SOC below which C_tl is negative (2.12)")
     stability_margin: float | None = Field(description="soc - max(delta_1, delta_2)")
     adaptive_gain_k: float | None = Field(description="k of (3.13) [V^2 s]")
     nussbaum_gain: float | None = Field(description="N(k) of (3.12)")
-    converged: bool = Field(description="|innovation_v| is below eps2 of Algorithm 1")
+    converged: bool = Field(description="|tracking_error_v| is below eps2 of Algorithm 1")
     lock: bool = Field(description="the observer tracks the measured voltage")
     frames_received: int = Field(description="valid frames since start")
     frames_lost: int = Field(description="frames missing from the sequence since start")
@@ -49,7 +57,7 @@ class Parameter(Report):
     std: float | None = Field(description="standard deviation, same unit; null when unknown")
     valid: bool = Field(description="the value rests on data or configuration that may be relied on")
     source: Literal["configured", "identified"]
-    since: str | None = Field(default=None, description="valid since, ISO 8601, UTC")
+    updated: str | None = Field(default=None, description="when data last told of it, ISO 8601, UTC")
     reason: str | None = Field(default=None, description="why not valid, with the numbers")
 
 
@@ -60,6 +68,9 @@ class ParameterReport(Report):
     soc: float | None = Field(description="state of charge the elements belong to, 0..1")
     a: dict[str, Parameter] = Field(description="a1..a21 of (2.5)-(2.10)")
     elements: dict[str, Parameter] = Field(description="r_s_ohm, r_ts_ohm, c_ts_farad, r_tl_ohm, c_tl_farad, e_o_v")
+    state_of_health: dict[str, Parameter] = Field(
+        description="capacity and r_s over those of the cell file: 1 is as new; r_s at the present SOC"
+    )
 
 
 class Health(Report):

@@ -10,9 +10,11 @@ from bms_estimator.model.estimate import Estimate, Health, Info, Snapshot
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.clock import Clock
 from bms_estimator.service.health import health_report, sample_counters
-from bms_estimator.service.report import estimate_report, info_report, parameter_report, publish_rate_hz
+from bms_estimator.service.parameters import parameter_report
+from bms_estimator.service.remaining import remaining_charge
+from bms_estimator.service.report import estimate_report, info_report, publish_rate_hz
 from bms_estimator.service.source import Source
-from bms_estimator.service.window import Window
+from bms_estimator.service.window import Window, WindowSummary
 from bms_estimator.sinks import Sink
 
 SLOW_S = 1.0
@@ -103,7 +105,7 @@ class Publisher:
         """The estimate of this window; of the rest, what is old enough to be made anew."""
         _, parameters, health, info = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
-        estimate = estimate_report(summary, self._source.counters, wall_s) if summary else None
+        estimate = self._estimate(summary, wall_s) if summary else None
         message = self._sensor_message(now_s)
         old = now_s - self._slow_s >= SLOW_S
         if old:
@@ -112,6 +114,10 @@ class Publisher:
         if old or health.sensor_online != (message is None):
             health = self._health(now_s, message)
         return Snapshot(estimate, parameters, health, info)
+
+    def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
+        remaining = remaining_charge(self._estimator, window.current_a)
+        return estimate_report(window, remaining, self._source.counters, wall_s)
 
     def _health(self, now_s: float, message: str | None) -> Health:
         return health_report(

@@ -17,7 +17,9 @@ from bms_estimator.model.estimate import Estimate, Snapshot
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import MqttSettings, Settings
 from bms_estimator.service.health import health_report
-from bms_estimator.service.report import estimate_report, info_report, parameter_report
+from bms_estimator.service.parameters import parameter_report
+from bms_estimator.service.remaining import remaining_charge
+from bms_estimator.service.report import estimate_report, info_report
 from bms_estimator.service.window import Window
 from bms_estimator.sinks.mqtt import MqttSink
 from tests.mosquitto import MOSQUITTO, Broker, Listener
@@ -38,7 +40,7 @@ def snapshot(sensor_message: str | None = None) -> Snapshot:
     summary = window.take()
     assert summary
     return Snapshot(
-        estimate_report(summary, {"crc_errors": 3}, NOW),
+        estimate_report(summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW),
         parameter_report(estimator, NOW),
         health_report(
             estimator.state[0],

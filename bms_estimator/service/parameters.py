@@ -1,0 +1,114 @@
+"""Topic ``parameters``: a1..a21 and the elements, each with its error, where it comes from, and why it is not valid."""
+
+import math
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.learned import Learned, fitted_parameter, present_elements, relative_capacity
+from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.identifier_state import LN_CAPACITY
+from bms_estimator.model.estimate import Parameter, ParameterReport
+from bms_estimator.service.clock import iso_utc
+from bms_estimator.service.report import finite
+
+CONFIGURED = "configured value: no data has identified it"
+VALID_STD = 0.3
+"""An element known better than this, relative, is identified."""
+VALID_FIT_STD = 0.5
+"""The same for a1..a15: amplitudes and exponents show only where the SOC was swept."""
+VALID_CAPACITY_STD = 0.03
+_FUNCTIONS = {
+    "r_s_ohm": chen_mora.r_s,  # (2.9)
+    "r_ts_ohm": chen_mora.r_ts,  # (2.5)
+    "c_ts_farad": chen_mora.c_ts,  # (2.7)
+    "r_tl_ohm": chen_mora.r_tl,  # (2.6)
+    "c_tl_farad": chen_mora.c_tl,  # (2.8)
+}
+
+
+def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
+    """Topic ``parameters``: a1..a15 as the observer holds them, a16..a21 of the cell file, elements at the present SOC.
+
+    Args:
+        estimator: Read only.
+        now_s: Wall clock [s since 1970].
+    """
+    a, state = estimator.cell.a.copy(), estimator.state[0]
+    if not state["started"]:
+        return ParameterReport(
+            publish_time=iso_utc(now_s), soc=None, a=_of_cell_file(a), elements={}, state_of_health={}
+        )
+    a[1:16] = state["a"][1:16]
+    parameters, elements = _of_cell_file(a), _configured_elements(estimator, a)
+    health: dict[str, Parameter] = {}
+    if estimator.identifying:
+        record = estimator.record[0]
+        parameters |= {f"a{i}": _parameter(a[i], fitted_parameter(record, i), now_s) for i in range(1, 16)}
+        present = present_elements(record)
+        elements |= {name: _identified(one, elements[name], VALID_STD, now_s) for name, one in present.items()}
+        health = _state_of_health(estimator, present["r_s_ohm"], now_s)
+    return ParameterReport(
+        publish_time=iso_utc(now_s), soc=finite(state["soc"]), a=parameters, elements=elements, state_of_health=health
+    )
+
+
+def _of_cell_file(a: np.ndarray) -> dict[str, Parameter]:
+    return {f"a{i}": _configured(a[i], "the OCV is a table: (2.10) does not apply") for i in range(1, 22)}
+
+
+def _configured_elements(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
+    """(2.5)-(2.10) at the present SOC; below delta1 (delta2) the capacitance is not positive and is left out."""
+    state, ocv = estimator.state[0], estimator.settings[0]
+    soc = float(state["soc"])
+    limits = {"c_ts_farad": "delta_1", "c_tl_farad": "delta_2"}
+    elements = {}
+    for name, function in _FUNCTIONS.items():
+        value, limit = function(soc, a), limits.get(name, "")
+        why_not = f"SOC {soc:.4f} is not above {limit} = {state[limit]:.4f}" if limit else ""
+        elements[name] = _configured(value if value > 0.0 else math.nan, why_not)
+    elements["e_o_v"] = _configured(chen_mora.ocv(soc, ocv["ocv_v"], ocv["ocv_slope_v"]), "")
+    return elements
+
+
+def _state_of_health(estimator: Estimator, r_s: Learned, now_s: float) -> dict[str, Parameter]:
+    """Capacity and R_s over those of the cell file."""
+    new = chen_mora.r_s(float(estimator.state[0]["soc"]), estimator.cell.a)
+    ratio = Learned(r_s.value / new, r_s.std / new, r_s.unlearned_s)
+    if estimator.settings_record["identifier"]["variance"][0][LN_CAPACITY] > 0.0:
+        capacity = _identified(relative_capacity(estimator.record[0]), _configured(1.0, ""), VALID_CAPACITY_STD, now_s)
+    else:
+        capacity = _configured(1.0, "").model_copy(update={"reason": "identifier.capacity_std is 0: taken as declared"})
+    return {"capacity": capacity, "r_s": _identified(ratio, _configured(1.0, ""), VALID_STD, now_s)}
+
+
+def _parameter(held: float, fit: Learned | None, now_s: float) -> Parameter:
+    """a_i as the observer holds it, with the error that the fit has."""
+    configured = _configured(held, "")
+    if fit is None:
+        return configured
+    return _identified(fit, configured, VALID_FIT_STD, now_s).model_copy(update={"value": finite(held)})
+
+
+def _identified(learned: Learned, configured: Parameter, limit: float, now_s: float) -> Parameter:
+    """What was learned where that is known well enough, else the configured value and how far learning has come."""
+    if learned.relative_std < limit:
+        updated = iso_utc(now_s - learned.unlearned_s)
+        return Parameter(
+            value=finite(learned.value), std=finite(learned.std), valid=True, source="identified", updated=updated
+        )
+    if configured.value is None:
+        return configured
+    why = f"configured value: identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
+    return configured.model_copy(update={"reason": why})
+
+
+def _configured(value: float, why_missing: str) -> Parameter:
+    number = finite(value)
+    return Parameter(
+        value=number,
+        std=None,
+        valid=False,
+        source="configured",
+        reason=why_missing if number is None else CONFIGURED,
+    )

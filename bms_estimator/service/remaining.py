@@ -1,0 +1,55 @@
+"""What is left in the pack at the present state and load."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.learned import present_elements, relative_capacity
+from bms_estimator.kernels import cell as chen_mora
+
+LONGEST_H = 1000.0
+"""A load that would take longer to empty the pack is none."""
+
+
+@dataclass(frozen=True)
+class RemainingCharge:
+    """NaN where it is not known."""
+
+    capacity_ah: float = math.nan  # down to SOC 0
+    usable_ah: float = math.nan  # down to max(delta1, delta2), below which the model does not hold
+    energy_wh: float = math.nan  # at the terminals, down to SOC 0, at the present current
+    time_to_empty_s: float = math.nan  # down to SOC 0, at the present current
+
+
+def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
+    """What is left.
+
+    Args:
+        estimator: Read only.
+        current_a: The load [A], positive on discharge; charging counts as none.
+    """
+    state, settings = estimator.state[0], estimator.settings[0]
+    if not state["started"]:
+        return RemainingCharge()
+    soc, load_a = float(state["soc"]), max(current_a, 0.0)
+    capacity_ah = float(settings["capacity_as"]) / 3600.0
+    if estimator.identifying:
+        capacity_ah *= relative_capacity(estimator.record[0]).value
+    charge_ah = soc * capacity_ah
+    usable_ah = max(soc - max(state["delta_1"], state["delta_2"]), 0.0) * capacity_ah
+    path, grid = np.linspace(0.0, soc, 101), np.linspace(0.0, 1.0, settings["ocv_v"].size)
+    open_circuit_wh = float(np.trapezoid(np.interp(path, grid, settings["ocv_v"]), path)) * capacity_ah
+    lost_wh = load_a * _resistance(estimator, soc) * charge_ah
+    hours = charge_ah / load_a if load_a * LONGEST_H > capacity_ah else math.nan
+    return RemainingCharge(charge_ah, usable_ah, max(open_circuit_wh - lost_wh, 0.0), 3600.0 * hours)
+
+
+def _resistance(estimator: Estimator, soc: float) -> float:
+    """All of it, settled [ohm]."""
+    if estimator.identifying:
+        elements = present_elements(estimator.record[0])
+        return sum(elements[name].value for name in ("r_s_ohm", "r_ts_ohm", "r_tl_ohm"))
+    a = estimator.state[0]["a"]
+    return float(chen_mora.r_s(soc, a) + chen_mora.r_ts(soc, a) + chen_mora.r_tl(soc, a))
