@@ -17,8 +17,8 @@ TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
 SET_SOC_STD = 0.01
 """How far an SOC that someone sets may be off."""
-UNSEEN_SOC_STD = 0.02
-"""How far the SOC may have gone while nobody measured."""
+UNSEEN_PER_H, UNSEEN_MOST = 0.5, 0.3
+"""How far the SOC may have gone while nobody measured: so much in an hour, and at most."""
 
 
 class Estimator:
@@ -103,14 +103,17 @@ class Estimator:
         x["covariance"][SOC, :] = x["covariance"][:, SOC] = 0.0
         x["covariance"][SOC, SOC] = SET_SOC_STD**2
 
-    def resume(self) -> None:
+    def resume(self, unseen_s: float) -> None:
         """Prepare for samples of another clock, after a time in which nobody measured.
 
         Time begins with the next sample, which is taken as a clock set back. The SOC may have moved, and the branch
         voltages are what they may be at a first sample.
+
+        Args:
+            unseen_s: How long nobody measured [s]; infinite when nobody knows.
         """
         self.state["time_s"] = np.inf
         x, p = self.record[0]["identifier"], self.settings_record[0]["identifier"]
-        x["covariance"][SOC, SOC] += UNSEEN_SOC_STD**2
+        x["covariance"][SOC, SOC] += min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST) ** 2
         for branch in (V_TS, V_TL):
             x["covariance"][branch, branch] += p["variance"][branch]

@@ -2,7 +2,9 @@
 
 import hashlib
 import io
+import math
 import os
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +48,8 @@ class Restored:
 
     state: NDArray[np.void] | None
     """Shape (1,), dtype ESTIMATOR_STATE; None when it was refused."""
+    unseen_s: float
+    """Since it was saved [s]; infinite when the wall clock says it lies ahead."""
     restarts: int
     """Starts that found a checkpoint, this one included."""
     reason: str
@@ -71,7 +75,7 @@ class CheckpointFile:
             OSError: The file cannot be written.
         """
         content = io.BytesIO()
-        np.savez(content, format=FORMAT, identity=self._identity, restarts=restarts, state=state)
+        np.savez(content, format=FORMAT, identity=self._identity, restarts=restarts, state=state, saved_s=time.time())
         new = self.path.with_suffix(".new")
         with new.open("wb") as file:
             file.write(content.getvalue())
@@ -90,11 +94,11 @@ class CheckpointFile:
             with np.load(io.BytesIO(self._read()), allow_pickle=False) as file:
                 return self._checked(file, cell)
         except FileNotFoundError:
-            return Restored(None, 0, "none found")
+            return Restored(None, 0.0, 0, "none found")
         except _RefusedError as error:
-            return Restored(None, 0, f"refused: {error}")
+            return Restored(None, 0.0, 0, f"refused: {error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return Restored(None, 0, f"refused: unreadable ({type(error).__name__}: {error})")
+            return Restored(None, 0.0, 0, f"refused: unreadable ({type(error).__name__}: {error})")
 
     def _read(self) -> bytes:
         if self.path.stat().st_size > LONGEST_FILE:
@@ -109,8 +113,14 @@ class CheckpointFile:
         state, restarts = file["state"], int(file["restarts"]) + 1
         insane = _insane(state, cell)
         if insane:
-            return Restored(None, restarts, f"refused: {insane}")
-        return Restored(state, restarts, f"restored: SOC {float(state['observer']['soc'][0]):.4f}")
+            return Restored(None, 0.0, restarts, f"refused: {insane}")
+        unseen_s = time.time() - float(file["saved_s"])
+        return Restored(
+            state,
+            unseen_s if unseen_s >= 0.0 else math.inf,
+            restarts,
+            f"restored: SOC {float(state['observer']['soc'][0]):.4f}",
+        )
 
 
 class _RefusedError(Exception):
@@ -142,9 +152,9 @@ def _insane(state: NDArray[np.void], cell: CellModel) -> str:
     return ""
 
 
-def resume(estimator: Estimator, state: NDArray[np.void]) -> None:
-    """Go on from a checkpoint's state, on the board's new clock. The counters count from this start."""
+def resume(estimator: Estimator, state: NDArray[np.void], unseen_s: float) -> None:
+    """Go on from a checkpoint's state, saved ``unseen_s`` ago, on the board's new clock. The counters count from this start."""
     estimator.record[...] = state
-    estimator.resume()
+    estimator.resume(unseen_s)
     for name in COUNTERS:
         estimator.state[name] = 0

@@ -135,7 +135,7 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, cell: Cell
         return 0, "off"
     found = checkpoint.load(cell)
     if found.state is not None:
-        resume(estimator, found.state)
+        resume(estimator, found.state, found.unseen_s)
     log.info("checkpoint", file=str(checkpoint.path), outcome=found.reason)
     return found.restarts, found.reason
 

@@ -1,0 +1,163 @@
+"""Identifier and observer together: what is learned is handed over, guarded, saved and taken up again."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.learned import fitted_parameter, present_elements
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.element_map import ELEMENTS
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+
+ON = IdentifierSettings()
+TRUTH = load_cell("ncr18650")
+NOISE_V = 3e-4
+
+
+def wrong_cell(factor: float) -> CellModel:
+    """The true cell with every resistance ``factor`` times as large."""
+    parts = {}
+    for name in ("r_s", "r_ts", "r_tl"):
+        part = getattr(TRUTH, name)
+        parts[name] = part.model_copy(
+            update={"amplitude_ohm": part.amplitude_ohm * factor, "offset_ohm": part.offset_ohm * factor}
+        )
+    return TRUTH.model_copy(update=parts)
+
+
+def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleBlock, np.ndarray]:
+    """Random pulses and rests at 1 Hz that empty the true cell, and its true SOC."""
+    rng = np.random.default_rng(seed)
+    block = np.zeros(int(3600 * hours), dtype=SAMPLE)
+    block["time_s"] = np.arange(block.size)
+    steps = np.repeat(rng.choice([0.0, 0.0, 0.75, 1.5, 3.0, -0.5], block.size // 60), 60)
+    block["current_a"] = steps
+    ocv_v, slope_v = ocv_grid(TRUTH)
+    a, capacity_as = TRUTH.a, TRUTH.cell.capacity_ah * 3600.0
+    x, true_soc = (soc, 0.0, 0.0), np.empty(block.size)
+    for n, i in enumerate(steps):
+        block["voltage_v"][n] = chen_mora.ocv(x[0], ocv_v, slope_v) - x[1] - x[2] - i * chen_mora.r_s(x[0], a)
+        true_soc[n] = x[0]
+        x = chen_mora.cell_step(x, i, 1.0, capacity_as, a)
+    block["voltage_v"] = np.round((block["voltage_v"] + rng.normal(0, NOISE_V, block.size)) / 1e-3) * 1e-3
+    return block, true_soc
+
+
+@pytest.fixture(scope="module")
+def load() -> tuple[SampleBlock, np.ndarray]:
+    return pulses()
+
+
+def test_step_and_run_leave_the_same_record_to_the_last_bit(load) -> None:
+    block = load[0][:3000]
+    whole, stepped, pieces = (Estimator(TRUTH, identifier=ON, initial_soc=0.8) for _ in range(3))
+    whole.run(block)
+    for row in block:
+        stepped.step(row["time_s"], row["current_a"], row["voltage_v"])
+    for part in np.array_split(block, 17):
+        pieces.run(part)
+    assert whole.record.tobytes() == stepped.record.tobytes() == pieces.record.tobytes()
+
+
+def test_a_wrong_soc_and_wrong_resistances_are_found(load) -> None:
+    block, true_soc = load
+    estimator = Estimator(wrong_cell(2.0), identifier=ON, initial_soc=0.8)
+    trace = estimator.run(block)
+    late = slice(1800, None)
+    error = trace["soc"] - true_soc
+    assert np.abs(error[late]).max() < 0.01
+    assert np.mean(np.abs(error[late]) < 2.0 * trace["soc_std"][late]) > 0.9
+    assert trace["soc_coulomb"][5000] == pytest.approx(true_soc[5000] - 0.2, abs=1e-3)
+    elements, soc, a = present_elements(estimator.record[0]), true_soc[-1], TRUTH.a
+    assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=0.02)
+    assert elements["r_ts_ohm"].value == pytest.approx(chen_mora.r_ts(soc, a), rel=0.15)
+    assert elements["r_tl_ohm"].value == pytest.approx(chen_mora.r_tl(soc, a), rel=0.3)
+
+
+def test_the_identified_values_are_where_the_adaptation_law_leads(load) -> None:
+    estimator = Estimator(wrong_cell(2.0), identifier=ON, initial_soc=0.8)
+    estimator.run(load[0])
+    record, a = estimator.record[0], estimator.state[0]["a"]
+    for soc in (0.3, 0.6, 0.9):
+        assert chen_mora.r_s(soc, a) == pytest.approx(chen_mora.r_s(soc, TRUTH.a), rel=0.03)
+        assert chen_mora.r_ts(soc, a) == pytest.approx(chen_mora.r_ts(soc, TRUTH.a), rel=0.25)
+    for i in (1, 2, 3):
+        fit = fitted_parameter(record, i)
+        assert fit is not None
+        bounds = estimator.cell.bounds(i)
+        assert a[i] == pytest.approx(min(max(fit.value, bounds.lower), bounds.upper), rel=1e-3)
+
+
+def test_the_configured_bounds_stay_the_guard(load) -> None:
+    cell = wrong_cell(1.0).model_copy(
+        update={"adaptation": {"a3": TRUTH.bounds(3).model_copy(update={"upper": 0.01, "lower": 0.009})}}
+    )
+    estimator = Estimator(cell, identifier=ON, initial_soc=1.0)
+    estimator.run(load[0])
+    assert fitted_parameter(estimator.record[0], 3).value > 0.01
+    assert estimator.state[0]["a"][3] == pytest.approx(0.01, rel=1e-3)
+
+
+@pytest.mark.parametrize("law", ["scheme-1", "scheme-2"])
+def test_laws_without_a_limit_get_none(load, law: str) -> None:
+    estimator = Estimator(TRUTH, ObserverSettings(law=law), identifier=ON, initial_soc=1.0)
+    targets = estimator.settings[0]["target"].copy()
+    estimator.run(load[0])
+    assert np.array_equal(estimator.state[0]["target"], targets)
+
+
+def test_without_the_identifier_nothing_is_learned(load) -> None:
+    estimator = Estimator(TRUTH, initial_soc=0.8)
+    trace = estimator.run(load[0])
+    assert np.isnan(trace["soc_std"]).all()
+    assert np.array_equal(trace["soc"], trace["soc_coulomb"])
+    assert (estimator.record[0]["fit"]["bins"] == 0).all()
+
+
+def test_a_saved_record_goes_on_as_if_nothing_had_happened(load) -> None:
+    block = load[0]
+    straight, first, second = (Estimator(TRUTH, identifier=ON, initial_soc=0.9) for _ in range(3))
+    straight.run(block)
+    first.run(block[:5000])
+    second.record[...] = first.record
+    second.run(block[5000:])
+    assert straight.record.tobytes() == second.record.tobytes()
+
+
+def test_after_a_pause_the_soc_is_less_certain_and_found_again(load) -> None:
+    block, true_soc = load
+    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
+    before = estimator.run(block[:5000])["soc_std"][-1]
+    estimator.resume(1800.0)
+    after = estimator.run(block[6800:])
+    assert after["soc_std"][1] > before
+    assert np.abs(after["soc"][1800:] - true_soc[8600:]).max() < 0.015
+
+
+def test_a_soc_that_is_set_is_believed_but_not_blindly(load) -> None:
+    block, true_soc = load
+    estimator = Estimator(TRUTH, identifier=ON, initial_soc=0.8)
+    estimator.run(block[:10])
+    estimator.set_soc(float(true_soc[9]))
+    assert estimator.record[0]["observer"]["soc"] == true_soc[9]
+    trace = estimator.run(block[10:600])
+    assert np.abs(trace["soc"] - true_soc[10:600]).max() < 0.01
+
+
+def test_a_clock_set_back_and_repeated_stamps_harm_nothing(load) -> None:
+    block, true_soc = load[0].copy(), load[1]
+    block["time_s"][4000:] -= 2000.0
+    block["time_s"][6000:6020] = block["time_s"][5999]
+    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
+    trace = estimator.run(block)
+    assert estimator.state[0]["time_steps_back"] == 1
+    assert estimator.state[0]["dropped_repeated"] == 20
+    assert abs(trace["soc"][-1] - true_soc[-1]) < 0.01
+
+
+def test_the_map_holds_nothing_before_its_first_sample() -> None:
+    estimator = Estimator(TRUTH, identifier=ON)
+    assert [fitted_parameter(estimator.record[0], 3 * e + 1) for e in range(ELEMENTS)] == [None] * ELEMENTS
