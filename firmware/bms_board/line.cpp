@@ -12,8 +12,8 @@ static uint8_t transmit_ring[256], receive_ring[256];
 static volatile uint8_t transmit_head, transmit_tail, receive_head, receive_tail;
 
 void line_start() {
-    UBRR0 = F_CPU / 8 / PROTOCOL_BAUD - 1;
     UCSR0A = _BV(U2X0);
+    UBRR0 = F_CPU / 8 / PROTOCOL_BAUD - 1;
     UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
     UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
 }

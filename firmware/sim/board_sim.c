@@ -18,7 +18,8 @@
 #include "sensors.h"
 
 #define TURN_CYCLES 16000    // of line and clock: 1 ms
-#define BYTE_CYCLES 320      // of 8N1 at 500,000 baud
+#define BYTE_CYCLES 352      // simavr counts 11 bits a byte where the chip has 10, and drops what comes faster
+#define NEVER UINT64_MAX
 #define LATE_S 0.05          // later than this is not made up for
 #define BOOT_LOADER_S 0.05   // from the host's opening until the board starts
 
@@ -77,23 +78,39 @@ static void on_transmit(struct avr_irq_t *irq, uint32_t byte, void *param) {
     line_put((uint8_t)byte);
 }
 
-static avr_cycle_count_t receive(avr_t *avr, avr_cycle_count_t when, void *param) {
-    (void)avr;
-    (void)param;
+static avr_cycle_count_t hear_byte(avr_cycle_count_t now) {
+    if (heard_used == heard_length) return NEVER;
     avr_raise_irq(uart_input, heard[heard_used++]);
-    return heard_used < heard_length ? when + BYTE_CYCLES : 0;
+    return now + BYTE_CYCLES;
 }
 
-static avr_cycle_count_t turn(avr_t *avr, avr_cycle_count_t when, void *param) {
-    (void)param;
+static void turn(double board_s) {
     line_flush(&stop);
     if (heard_used == heard_length) {
         heard_used = 0;
         heard_length = line_read(heard, sizeof heard);
-        if (heard_length > 0) avr_cycle_timer_register(avr, BYTE_CYCLES, receive, NULL);
     }
-    pace((double)avr->cycle / (double)avr->frequency);
-    return when + TURN_CYCLES;
+    pace(board_s);
+}
+
+// simavr's own timers would end with a reset of the board: hence by hand.
+static int run(avr_t *avr, const options *o) {
+    avr_cycle_count_t next_turn = 0, next_byte = NEVER;
+    while (!stop && !(o->stop_at_end && readings_ended())) {
+        const int state = avr_run(avr);
+        if (state == cpu_Done || state == cpu_Crashed) {
+            fprintf(stderr, "the firmware has stopped\n");
+            return 1;
+        }
+        if (avr->cycle >= next_byte) next_byte = hear_byte(avr->cycle);
+        if (avr->cycle >= next_turn) {
+            turn((double)avr->cycle / (double)avr->frequency);
+            next_turn = avr->cycle + TURN_CYCLES;
+            if (next_byte == NEVER && heard_length > 0) next_byte = avr->cycle + BYTE_CYCLES;
+        }
+    }
+    line_flush(&stop);
+    return 0;
 }
 
 // simavr would sleep in real time here; ``pace`` does it in larger steps.
@@ -176,14 +193,5 @@ int main(int argc, char **argv) {
     pause_s(BOOT_LOADER_S);
     speed = o.speed;
     anchor_s = wall_s();
-    avr_cycle_timer_register(avr, TURN_CYCLES, turn, NULL);
-    while (!stop && !(o.stop_at_end && readings_ended())) {
-        const int state = avr_run(avr);
-        if (state == cpu_Done || state == cpu_Crashed) {
-            fprintf(stderr, "the firmware has stopped\n");
-            return 1;
-        }
-    }
-    line_flush(&stop);
-    return 0;
+    return run(avr, &o);
 }

@@ -1,0 +1,95 @@
+"""The host's end of the board's line, one message at a time."""
+
+import os
+import select
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from bms_estimator.sources.protocol import (
+    Ack,
+    Hello,
+    MessageType,
+    ProtocolError,
+    SampleMessage,
+    unseal,
+)
+
+LONG_S = 30.0
+"""What has not come by then will not come."""
+
+
+class Host:
+    """Reads and remembers all that the board sends.
+
+    Attributes:
+        hellos: With the number of samples before each.
+        bad: Frames that were none.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._rest = b""
+        self.samples: list[SampleMessage] = []
+        self.hellos: list[tuple[int, Hello]] = []
+        self.acks: list[Ack] = []
+        self.bad: list[bytes] = []
+
+    def __enter__(self) -> Self:
+        self._fd = os.open(self._path, os.O_RDWR | os.O_NOCTTY)  # no flush as pyserial's: nothing may be missed
+        self.until(lambda: bool(self.hellos))  # before that the board does not listen
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._fd)
+
+    def send(self, data: bytes) -> None:
+        os.write(self._fd, data)
+
+    def read(self) -> None:
+        """Take what has come, or wait a little for it."""
+        if not select.select([self._fd], [], [], 0.1)[0]:
+            return
+        *frames, self._rest = (self._rest + os.read(self._fd, 1 << 16)).split(b"\0")
+        for frame in filter(None, frames):
+            try:
+                self._take(unseal(frame))
+            except ProtocolError:
+                self.bad.append(frame)
+
+    def _take(self, packet: bytes) -> None:
+        match packet[1]:
+            case MessageType.SAMPLE:
+                self.samples.append(SampleMessage.decode(packet))
+            case MessageType.HELLO:
+                self.hellos.append((len(self.samples), Hello.decode(packet)))
+            case _:
+                self.acks.append(Ack.decode(packet))
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + LONG_S
+        while not condition():
+            assert time.monotonic() < deadline, "the board did not bring what was wanted"
+            self.read()
+
+    def take(self, samples: int) -> list[SampleMessage]:
+        """The next ``samples`` samples."""
+        begin = len(self.samples)
+        self.until(lambda: len(self.samples) >= begin + samples)
+        return self.samples[begin : begin + samples]
+
+    def hello(self) -> Hello:
+        """The next hello."""
+        begin = len(self.hellos)
+        self.until(lambda: len(self.hellos) > begin)
+        return self.hellos[begin][1]
+
+    def ask(self, command: bytes) -> Ack:
+        """The answer to a command."""
+        begin = len(self.acks)
+        self.send(command)
+        self.until(lambda: len(self.acks) > begin)
+        return self.acks[begin]

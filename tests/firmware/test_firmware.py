@@ -1,0 +1,286 @@
+"""The firmware's ELF in simavr, asked and read over its serial line."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.sample import SampleStatus
+from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources.frames import FrameDecoder
+from bms_estimator.sources.protocol import (
+    PROTOCOL_VERSION,
+    AckResult,
+    BoardStatus,
+    MessageType,
+    ResetCause,
+    SampleMessage,
+    command,
+    hello_command,
+    restart_command,
+    seal,
+    set_bandgap_command,
+    set_rate_command,
+    set_serial_command,
+    zero_current_command,
+)
+from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.sources.virtual_converter import window_of
+from tests.firmware.host import Host
+from tests.simavr_board import SimavrBoard, write_readings
+
+pytestmark = pytest.mark.usefixtures("firmware")
+
+FLAT_OUT = math.inf
+STEADY = [(0.0, 2.5, 22.2, 25.0)]
+AUX_PAIRS = 2
+"""Pairs of conversions that an aux reading takes from its window."""
+
+Start = Callable[..., Host]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start a board with readings and options; gives its host."""
+    with ExitStack() as stack:
+
+        def begin(readings: list[tuple[float, ...]] = STEADY, speed: float = FLAT_OUT, **options: int | float) -> Host:
+            file = write_readings(tmp_path / "readings.csv", readings)
+            board = stack.enter_context(SimavrBoard(file, speed=speed, **options))  # type: ignore[arg-type]
+            return stack.enter_context(Host(board.path))
+
+        yield begin
+
+
+def means(samples: list[SampleMessage]) -> tuple[float, float]:
+    """Mean conversion of voltage and of current."""
+    pairs = sum(s.count for s in samples)
+    return sum(s.voltage_sum for s in samples) / pairs, sum(s.current_sum for s in samples) / pairs
+
+
+def test_the_hello_comes_before_the_first_sample_and_tells_how_the_board_is_built(start: Start) -> None:
+    host = start()
+    host.take(1)
+    before, hello = host.hellos[0]
+    assert before == 0
+    assert hello.reset_cause == ResetCause.POWER_ON
+    assert (hello.serial, hello.sequence, hello.board_us) == (0, 0, 0)
+    assert (hello.rate_hz, hello.period_ns, hello.adc_bits, hello.channels) == (100, 10_000_000, 10, 1)
+    assert (hello.divider_ppm, hello.current_uv_per_a) == (5_000_000, 100_000)
+    assert (hello.current_zero_ppm, hello.bandgap_uv) == (500_000, 1_100_000)
+    assert (hello.ntc_series_ohm, hello.ntc_r25_ohm, hello.ntc_beta_k) == (10_000, 10_000, 3950)
+    assert hello.bandgap_sum / hello.bandgap_count == pytest.approx(1.1 / 5.0 * 1024, abs=0.2)
+
+
+def test_a_hello_on_request_tells_where_the_board_is(start: Start) -> None:
+    host = start()
+    host.take(50)
+    host.send(hello_command())
+    hello = host.hello()
+    at, _ = host.hellos[-1]
+    assert hello.sequence == host.samples[at - 1].sequence + 1
+    assert hello.board_us == host.samples[at - 1].board_us
+
+
+def test_samples_are_ten_milliseconds_apart_to_the_microsecond(start: Start) -> None:
+    samples = start().take(1000)
+    assert [s.sequence for s in samples] == list(range(1000))
+    assert [s.board_us for s in samples] == [10_000 * (i + 1) for i in range(1000)]
+
+
+def test_the_boards_clock_is_the_clock_that_triggers_the_converter(start: Start) -> None:
+    """A signal that changes every second does so in the same conversion of each hundredth window: no slot is lost."""
+    seconds = 30
+    changes = [(0.5 * i, 0.0, 12.0 if i % 2 else 16.0, 25.0) for i in range(2 * seconds)]
+    samples = start(changes, noise_lsb=0.0).take(100 * (seconds - 1))
+    split = np.array([[s.voltage_sum, s.count] for s in samples]).reshape(-1, 100, 2)
+    assert (split == split[0]).all()
+    assert len(np.unique(split[0, :, 0] / split[0, :, 1])) >= 3, "no window holds the change itself"
+
+
+@pytest.mark.parametrize("rate_hz", [1, 7, 10, 300, 999, 1000])
+def test_every_rate_has_its_exact_period_from_the_next_sample_on(start: Start, rate_hz: int) -> None:
+    host = start()
+    pairs, period_ns = window_of(rate_hz)
+    ack = host.ask(set_rate_command(rate_hz))
+    assert (ack.command, ack.result, ack.value) == (MessageType.COMMAND_SET_RATE, AckResult.OK, period_ns)
+    host.take(2)  # the window that had begun, and one that may have ended before the command
+    samples = host.take(min(2 * rate_hz, 1500) + 1)
+    assert [s.sequence for s in samples] == list(range(samples[0].sequence, samples[0].sequence + len(samples)))
+    assert all(s.count + AUX_PAIRS * s.aux_count == pairs for s in samples)
+    since_us = np.array([s.board_us for s in samples]) - samples[0].board_us
+    assert np.abs(since_us - np.arange(len(samples)) * period_ns * 1e-3).max() <= 1.0
+    assert not any(s.status & BoardStatus.OVERRUN for s in samples)
+    aux = [s for s in samples if s.aux_count]
+    assert len(aux) == pytest.approx(len(samples) / max(rate_hz // 100, 1), abs=1)
+    assert all((a.status ^ b.status) & BoardStatus.AUX_IS_NTC for a, b in itertools.pairwise(aux))
+
+
+@pytest.mark.parametrize("rate_hz", [0, 1001, 65535])
+def test_a_rate_out_of_range_changes_nothing(start: Start, rate_hz: int) -> None:
+    host = start()
+    ack = host.ask(command(MessageType.COMMAND_SET_RATE, rate_hz.to_bytes(2, "little")))
+    assert (ack.result, ack.value) == (AckResult.BAD_VALUE, 10_000_000)
+
+
+@pytest.mark.parametrize("avcc_mv", [5000, 4750])
+def test_what_is_fed_is_measured_within_the_converters_resolution_at_any_supply(start: Start, avcc_mv: int) -> None:
+    fed = [(0.0, 0.0), (-20.0, 3.0), (20.0, 23.0), (1.234, 22.2), (0.01, 12.345)]
+    host = start([(0.5 * i, *reading, 25.0) for i, reading in enumerate(fed)], avcc_mv=avcc_mv)
+    host.take(len(fed) * 50)
+    decoder = FrameDecoder()
+    block = decoder.feed(0.0, b"".join([host.hellos[0][1].encode(), *(s.encode() for s in host.samples)]))
+    assert decoder.reference_v == pytest.approx(avcc_mv * 1e-3, rel=3e-4)
+    volt_step = decoder.reference_v / 1024
+    for i, (current_a, voltage_v) in enumerate(fed):
+        part = block[50 * i + 10 : 50 * i + 40]
+        for name, truth, step in (("voltage_v", voltage_v, 5.0 * volt_step), ("current_a", current_a, volt_step / 0.1)):
+            if name == "voltage_v" and truth == 0.0:
+                continue  # noise below zero is cut off by the converter
+            assert np.abs(part[name] - truth).max() < 1.0 * step
+            assert abs(part[name].mean() - truth) < 0.2 * step + 3e-4 * abs(truth)
+
+
+@pytest.mark.parametrize(
+    ("current_a", "voltage_v", "bits"),
+    [
+        (0.0, 25.5, SampleStatus.VOLTAGE_SATURATED),
+        (26.0, 12.0, SampleStatus.CURRENT_SATURATED),
+        (-26.0, 12.0, SampleStatus.CURRENT_SATURATED),
+        (24.0, 24.0, 0),
+    ],
+)
+def test_readings_beyond_the_converters_range_are_marked(
+    start: Start, current_a: float, voltage_v: float, bits: int
+) -> None:
+    marks = BoardStatus.VOLTAGE_SATURATED | BoardStatus.CURRENT_SATURATED
+    assert {s.status & marks for s in start([(0.0, current_a, voltage_v, 25.0)]).take(20)} == {bits}
+
+
+def test_the_ntc_is_read_by_turns_with_the_bandgap(start: Start) -> None:
+    decoder = FrameDecoder()
+    fed = [-20.0, 25.0, 60.0]
+    host = start([(3.0 * i, 0.0, 22.2, celsius) for i, celsius in enumerate(fed)])
+    host.take(900)
+    block = decoder.feed(0.0, b"".join([host.hellos[0][1].encode(), *(s.encode() for s in host.samples)]))
+    assert block["temperature_c"][[280, 580, 880]] == pytest.approx(fed, abs=0.5)
+
+
+def test_without_an_ntc_only_the_bandgap_is_read(start: Start) -> None:
+    host = start([(0.0, 0.0, 22.2)])
+    samples = host.take(20)
+    assert host.hellos[0][1].channels == 0
+    assert all(s.aux_count == 1 and not s.status & BoardStatus.AUX_IS_NTC for s in samples)
+    assert np.mean([s.aux_sum for s in samples]) == pytest.approx(1.1 / 5.0 * 1024, abs=1.0)
+
+
+def test_a_restart_is_a_watchdog_reset_and_what_is_kept_in_eeprom_survives_it(start: Start) -> None:
+    host = start([(0.0, 0.8, 22.2, 25.0)])
+    first = host.hellos[0][1]
+    zero = host.ask(zero_current_command())
+    assert (zero.command, zero.result) == (MessageType.COMMAND_ZERO_CURRENT, AckResult.OK)
+    assert zero.value == pytest.approx(516_000, abs=30)  # 0.5 + 0.8 A x 0.1 V/A / 5 V
+    assert host.ask(set_serial_command(0xC0FFEE)).value == 0xC0FFEE
+    assert host.ask(set_bandgap_command(1.085)).value == 1_085_000
+    host.take(20)  # an EEPROM takes 3.4 ms for a byte
+    assert host.ask(restart_command()).result == AckResult.OK
+    host.until(lambda: len(host.hellos) == 2)
+    hello = host.hellos[1][1]
+    assert hello.reset_cause == ResetCause.WATCHDOG
+    assert hello.boot_id != first.boot_id
+    assert (hello.sequence, hello.board_us, hello.rate_hz) == (0, 0, 100)
+    assert (hello.serial, hello.bandgap_uv, hello.current_zero_ppm) == (0xC0FFEE, 1_085_000, zero.value)
+    sample = host.take(10)[-1]
+    assert sample.sequence < 20
+    assert sample.status >> 4 == ResetCause.WATCHDOG
+
+
+def test_the_decoder_goes_on_across_a_restart(start: Start) -> None:
+    host = start()
+    host.take(100)
+    host.ask(restart_command())
+    host.until(lambda: len(host.hellos) == 2)
+    host.take(100)
+    decoder, (cut, hello) = FrameDecoder(), host.hellos[-1]
+    decoder.feed(0.0, host.hellos[0][1].encode())
+    before = decoder.feed(1.0, b"".join(s.encode() for s in host.samples[:cut]))
+    after = decoder.feed(1.5, hello.encode() + b"".join(s.encode() for s in host.samples[cut:]))
+    assert decoder.counters.resets == 1
+    assert decoder.counters.frames_lost == 0
+    assert after["status"][0] & SampleStatus.RESET
+    assert after["time_s"][0] > before["time_s"][-1]
+
+
+def test_a_sensor_far_from_its_middle_is_no_zero(start: Start) -> None:
+    host = start([(0.0, 8.0, 22.2, 25.0)])
+    ack = host.ask(zero_current_command())
+    assert (ack.result, ack.value) == (AckResult.BAD_VALUE, 500_000)
+
+
+def test_a_second_zero_is_refused_while_the_first_is_measured(start: Start) -> None:
+    host = start()
+    assert host.ask(zero_current_command() * 2).result == AckResult.BUSY
+    host.until(lambda: len(host.acks) == 2)
+    assert host.acks[1].result == AckResult.OK
+
+
+def test_a_bandgap_that_no_part_has_is_refused(start: Start) -> None:
+    ack = start().ask(set_bandgap_command(1.3))
+    assert (ack.result, ack.value) == (AckResult.BAD_VALUE, 1_100_000)
+
+
+def test_garbage_is_ignored_and_the_next_command_is_heard(start: Start) -> None:
+    host = start()
+    good = set_serial_command(7)
+    wrong_crc = seal(b"\x01\x14\x09\0\0\0")[:-2] + b"\x01\0"
+    noise = np.random.default_rng(1).integers(0, 256, 3000, dtype=np.uint8).tobytes()
+    for junk in (wrong_crc, b"\0\0\0", b"\xff" * 500 + b"\0", good[:4] + b"\0", noise + b"\0"):
+        host.send(junk)
+        host.take(20)
+    assert host.acks == []
+    assert host.ask(good).value == 7
+    assert host.bad == []
+
+
+def test_commands_of_other_versions_and_unknown_ones_are_answered_as_such(start: Start) -> None:
+    host = start()
+    other = host.ask(seal(bytes((PROTOCOL_VERSION + 1, MessageType.COMMAND_SET_RATE, 1, 0))))
+    assert (other.result, other.value) == (AckResult.OTHER_VERSION, PROTOCOL_VERSION)
+    assert host.ask(seal(bytes((PROTOCOL_VERSION, 0x7F)))).result == AckResult.UNKNOWN_COMMAND
+    short = command(MessageType.COMMAND_SET_SERIAL, b"\x01")
+    assert host.ask(short).result == AckResult.UNKNOWN_COMMAND
+
+
+def test_a_line_without_room_loses_samples_but_never_their_time(start: Start) -> None:
+    host = start(speed=1.0)
+    host.ask(set_rate_command(1000))
+    host.send(hello_command() * 400)
+    host.until(lambda: len(host.hellos) >= 200)
+    host.until(lambda: any(s.status & BoardStatus.OVERRUN for s in host.samples))
+    host.take(500)
+    steps = [(b.sequence - a.sequence, b) for a, b in itertools.pairwise(host.samples)]
+    lost = sum(step - 1 for step, _ in steps)
+    assert lost > 0
+    assert all((step > 1) == bool(b.status & BoardStatus.OVERRUN) for step, b in steps)
+    last, first = host.samples[-1], host.samples[-400]
+    assert last.board_us - first.board_us == 1000 * (last.sequence - first.sequence)
+    assert host.bad == []
+
+
+async def test_the_services_own_source_sets_the_rate_and_reads(tmp_path: Path) -> None:
+    readings = write_readings(tmp_path / "readings.csv", STEADY)
+    with SimavrBoard(readings) as simulated:
+        settings = SensorSettings(port=simulated.path, sample_rate_hz=250)
+        async with SerialBoard(settings, first_retry_s=0.05) as board:
+            async for block in board:
+                assert block["voltage_v"] == pytest.approx(22.2, abs=0.03)
+                assert block["current_a"] == pytest.approx(2.5, abs=0.06)
+                if len(block) and board.board.get("sample_rate_hz") == "250":
+                    break
+            assert board.counters["frames_lost"] == 0
+            assert board.counters["crc_errors"] == 0
+            assert board.message is None
