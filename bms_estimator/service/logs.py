@@ -26,7 +26,7 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             *last,
         ],
-        logger_factory=structlog.PrintLoggerFactory(file=sys.stderr) if lines is None else lambda: _Lines(lines),
+        logger_factory=structlog.PrintLoggerFactory(file=sys.stderr) if lines is None else lambda *_: _Lines(lines),
         cache_logger_on_first_use=True,
     )
 

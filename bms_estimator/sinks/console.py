@@ -22,6 +22,7 @@ class ConsoleSink:
     Args:
         console: Where; standard output when left out.
         log: Log lines to show below, the last ones; the screen hides what others write.
+        hint: A line that stays at the foot of the screen.
         monotonic: Monotonic clock [s].
     """
 
@@ -30,9 +31,10 @@ class ConsoleSink:
         console: Console | None = None,
         *,
         log: Iterable[str] = (),
+        hint: str = "",
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._console, self._log, self._monotonic = console or Console(), log, monotonic
+        self._console, self._log, self._hint, self._monotonic = console or Console(), log, hint, monotonic
         self._live = Live(console=self._console, auto_refresh=False, screen=True)
         self._latest: Estimate | None = None
         self._snapshot: Snapshot | None = None
@@ -69,4 +71,4 @@ class ConsoleSink:
             self._live.update(self._view(snapshot), refresh=True)
 
     def _view(self, snapshot: Snapshot) -> RenderableType:
-        return view(snapshot, self._latest, list(self._voltage_v), list(self._current_a), self._log)
+        return view(snapshot, self._latest, list(self._voltage_v), list(self._current_a), self._log, self._hint)

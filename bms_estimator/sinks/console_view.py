@@ -35,6 +35,7 @@ def view(
     voltage_v: Sequence[float],
     current_a: Sequence[float],
     log: Iterable[str] = (),
+    hint: str = "",
 ) -> RenderableType:
     """The whole screen.
 
@@ -44,13 +45,14 @@ def view(
         voltage_v: Voltages of the last publications, oldest first.
         current_a: Currents of the same.
         log: The last log lines, ANSI colours allowed.
+        hint: The last line.
     """
     grid = Table.grid(expand=True)
     grid.add_column(ratio=1)
     grid.add_column(ratio=1)
     grid.add_row(_measured(latest, voltage_v, current_a), _observer(latest, snapshot.info))
     grid.add_row(_elements(snapshot.parameters.elements), _link(latest, snapshot.health))
-    return Group(_header(snapshot), _charge(latest), grid, _messages(snapshot.health, log))
+    return Group(_header(snapshot), _charge(latest), grid, _messages(snapshot.health, log, hint))
 
 
 def line(snapshot: Snapshot) -> str:
@@ -190,10 +192,11 @@ def _link(e: Estimate | None, health: Health) -> Panel:
     return _panel(table, "Link and service")
 
 
-def _messages(health: Health, log: Iterable[str]) -> Text:
-    """Why values are stale, then the last of the log."""
+def _messages(health: Health, log: Iterable[str], hint: str) -> Text:
+    """Why values are stale, then the last of the log, then the hint."""
     why = [Text(f" {health.sensor_message}", style="bold red")] if health.sensor_message else []
     lines = why + [Text.from_ansi(f" {entry}") for entry in list(log)[len(why) - MESSAGE_LINES :]]
+    lines += [Text(f" {hint}", style="cyan")] if hint else []
     text = Text("\n").join(lines)
     text.no_wrap, text.overflow = True, "ellipsis"
     return text

@@ -7,7 +7,6 @@ import math
 import random
 from collections.abc import Callable, Iterator
 from enum import StrEnum
-from pathlib import Path
 
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import cell_step, ocv, r_s
@@ -107,14 +106,3 @@ class SimulatedPack:
             seconds, self._load_a = next(self._load)
             self._left_s += seconds
         return self._load_a
-
-
-def write_readings(path: Path, pack: SimulatedPack, seconds: float, rate_hz: int) -> None:
-    """What the pack does in the next ``seconds`` as a table for the firmware's simulator."""
-    start_s = pack.time_s
-    with path.open("w", encoding="ascii") as file:
-        file.write("time_s,current_a,voltage_v,temperature_c\n")
-        for n in range(round(seconds * rate_hz)):
-            time_s = n / rate_hz
-            reading = pack(start_s + time_s)
-            file.write(f"{time_s:.4f},{reading.current_a:.6f},{reading.voltage_v:.6f},{reading.temperature_c:.2f}\n")

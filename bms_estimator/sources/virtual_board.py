@@ -43,6 +43,8 @@ _LINE_BYTES = 2048
 """So much waits for a host that does not read; then samples are dropped, as a board drops them."""
 _WAKE_S = 0.002
 """Samples that fall due within so short a time leave together, as on USB [s]."""
+_PATIENCE_S = 1.0
+"""For so long the last bytes wait for a host that may not read [s]."""
 _BURST = 256
 _BOOT_READINGS = 256
 _NEAR_MIDDLE = 0.1
@@ -135,12 +137,18 @@ class VirtualBoard:
         loop.add_reader(self._master, self._hear)
         try:
             await self._sample_until(self.time_s + seconds, loop)
-            while self._line:
-                self._drained.clear()
-                await self._drained.wait()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(None if math.isinf(self._speed) else _PATIENCE_S):
+                    await self._drain()
         finally:
             loop.remove_reader(self._master)
             loop.remove_writer(self._master)
+
+    async def _drain(self) -> None:
+        """Until the line has taken all."""
+        while self._line:
+            self._drained.clear()
+            await self._drained.wait()
 
     def inject(self, fault: BoardFault, frames: int = 1) -> None:
         """Let ``fault`` happen to the next ``frames`` samples that have none yet."""
@@ -183,8 +191,7 @@ class VirtualBoard:
                     return
             self._flush()
             if math.isinf(self._speed) and self._line:
-                self._drained.clear()
-                await self._drained.wait()
+                await self._drain()
             else:
                 await asyncio.sleep(max(due_s - loop.time(), 0.0 if math.isinf(self._speed) else _WAKE_S))
 
