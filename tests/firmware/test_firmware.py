@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
     """Start a board with readings and options; gives its host."""
     with ExitStack() as stack:
 
-        def begin(readings: list[tuple[float, ...]] = STEADY, speed: float = FLAT_OUT, **options: Any) -> Host:
+        def begin(readings: Sequence[tuple[float, ...]] = STEADY, speed: float = FLAT_OUT, **options: Any) -> Host:
             file = write_readings(tmp_path / "readings.csv", readings)
             board = stack.enter_context(SimavrBoard(file, speed=speed, **options))
             return stack.enter_context(Host(board.path))
