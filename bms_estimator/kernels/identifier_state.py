@@ -29,6 +29,10 @@ STATES = 11
 SOC, V_TS, V_TL, LN_R_S, LN_R_TS, LN_TAU_TS, LN_R_TL, LN_TAU_TL, OCV_ERROR, CURRENT_OFFSET, LN_CAPACITY = range(STATES)
 ELEMENTS = 5
 """LN_R_S .. LN_TAU_TL."""
+CORRELATED = 0.01
+"""Share of the predicted variance that neighbouring innovations have in common when the model's error is as told."""
+LEAST_MISFIT = 0.001
+"""A model's error is never less than 3 % of what the tuning says."""
 
 IDENTIFIER_SETTINGS = np.dtype(
     [
@@ -66,6 +70,7 @@ IDENTIFIER_SETTINGS = np.dtype(
         ("hysteresis_error_length", "f8"),  # SOC over which that changes
         ("excited_v", "f8"),  # a parameter whose effect on the voltage is below this is hardly excited [V]
         ("excitation_s", "f8"),  # memory of the excitation [s]
+        ("misfit_s", "f8"),  # memory of the model's error, counted while the branches are out of balance [s]
         ("surprise_s", "f8"),  # memory of the squared normalised innovation that widens the drift [s]
         ("surprise_gain", "f8"),
         ("surprise_limit", "f8"),
@@ -95,6 +100,10 @@ IDENTIFIER_STATE = np.dtype(
         ("voltage_v", "f8"),  # predicted, before the sample corrected the state [V]
         ("surprise", "f8"),  # running mean of the squared normalised innovation
         ("excitation", "f8", ELEMENTS),  # information on LN_R_S .. LN_TAU_TL in the last ``excitation_s``
+        ("misfit", "f8"),  # size of the model's error as a variance, LEAST_MISFIT..1 of what the settings say
+        ("correlated", "f8"),  # running mean of an innovation times the one before, as a share of its variance
+        ("believed_v", "f8"),  # the innovation before, 0 when it was not believed [V]
+        ("unsettled_v2", "f8"),  # how far the branches are from R i, squared [V^2]
         ("innovation_slope_v_a", "f8"),  # running mean of innovation times current [V A]
         ("current_square", "f8"),  # running mean of the current squared [A^2]
         ("gated_in_row", "i8"),
@@ -168,6 +177,7 @@ class Tuning:
     """Std of SOC gained over the whole range: linearity of the current sensor."""
     excited_v: float = 0.003
     excitation_s: float = 1200.0
+    misfit_s: float = 200.0
     surprise_s: float = 20.0
     surprise_gain: float = 20.0
     surprise_limit: float = 100.0

@@ -17,7 +17,15 @@ from bms_estimator.kernels.identifier_state import IDENTIFIER_STATE, Tuning, ide
 from bms_estimator.model.cell import CellModel, load_cell
 
 TRACE = np.dtype(
-    [("soc", "f8"), ("soc_std", "f8"), ("innovation_v", "f8"), ("nis", "f8"), ("ln", "f8", 5), ("ln_std", "f8", 5)]
+    [
+        ("soc", "f8"),
+        ("soc_std", "f8"),
+        ("innovation_v", "f8"),
+        ("nis", "f8"),
+        ("misfit", "f8"),
+        ("ln", "f8", 5),
+        ("ln_std", "f8", 5),
+    ]
 )
 LN_NAMES = ("R_s", "R_ts", "tau_ts", "R_tl", "tau_tl")
 SENSOR = {"noise_v": 0.0005, "resolution_v": 0.001}
@@ -85,6 +93,7 @@ def loop(state, settings, time_s, current_a, voltage_v, trace):
         row.soc_std = math.sqrt(s.covariance[0, 0])
         row.innovation_v = s.innovation_v
         row.nis = nis(s)
+        row.misfit = s.misfit
         for k in range(5):
             row.ln[k] = s.mean[3 + k]
             row.ln_std[k] = math.sqrt(s.covariance[3 + k, 3 + k])

@@ -1,0 +1,75 @@
+"""What keeps the identifier sane for years: bounds and the last good state.
+
+``s`` is a record of IDENTIFIER_STATE, ``p`` of IDENTIFIER_SETTINGS.
+"""
+
+import math
+
+from numba import njit
+
+from bms_estimator.kernels.identifier_correction import absorb
+from bms_estimator.kernels.identifier_state import ELEMENTS, LN_R_S, LN_TAU_TL, LN_TAU_TS, STATES
+from bms_estimator.kernels.state import Record
+
+BOUND_STD = 0.05
+"""How firmly a bound of a logarithm is held."""
+
+
+@njit(cache=True)
+def constrain(s: Record, p: Record) -> None:
+    """Keep the time constants apart, the mean within its bounds and the variances within theirs."""
+    x, cov, n = s.mean, s.covariance, p.active
+    if x[LN_TAU_TL] - x[LN_TAU_TS] < p.tau_ratio:
+        hold(s, p, LN_TAU_TL, LN_TAU_TS, p.tau_ratio)
+    for j in range(n):
+        if not p.lower[j] <= x[j] <= p.upper[j]:
+            bound = p.lower[j] if x[j] < p.lower[j] else p.upper[j]
+            if LN_R_S <= j < LN_R_S + ELEMENTS:
+                hold(s, p, j, -1, bound)
+            x[j] = min(max(x[j], p.lower[j]), p.upper[j])
+        if cov[j, j] > p.variance_ceiling[j]:
+            shrink = math.sqrt(p.variance_ceiling[j] / cov[j, j])
+            for k in range(n):
+                cov[j, k] *= shrink
+                cov[k, j] *= shrink
+        elif cov[j, j] < p.variance_floor[j]:
+            cov[j, j] = p.variance_floor[j]
+
+
+@njit(cache=True)
+def hold(s: Record, p: Record, j: int, less: int, value: float) -> None:
+    """Correct as if x[j] - x[less] (``less`` < 0: x[j]) had been measured as ``value``."""
+    x, cov, g = s.mean, s.covariance, s.projected
+    for k in range(p.active):
+        g[k] = cov[j, k] - (cov[less, k] if less >= 0 else 0.0)
+    expected = g[j] - (g[less] if less >= 0 else 0.0)
+    absorb(s, p, value - x[j] + (x[less] if less >= 0 else 0.0), expected + BOUND_STD**2)
+
+
+@njit(cache=True)
+def guard(s: Record, p: Record, dt_s: float) -> None:
+    """Back to the last good state when anything is not finite; else keep this one now and then."""
+    total = 0.0
+    for j in range(p.active):
+        total += s.mean[j] + s.covariance[j, j] + s.gain[j]
+    if not math.isfinite(total):
+        for j in range(STATES):
+            s.mean[j] = s.good_mean[j]
+            for k in range(STATES):
+                s.covariance[j, k] = s.good_covariance[j, k]
+        s.surprise = 0.0
+        s.reset += 1
+        return
+    s.good_age_s += dt_s
+    if s.good_age_s >= p.snapshot_s:
+        keep(s)
+
+
+@njit(cache=True)
+def keep(s: Record) -> None:
+    """Keep the state as the last good one."""
+    for j in range(STATES):
+        s.good_mean[j] = s.mean[j]
+        for k in range(STATES):
+            s.good_covariance[j, k] = s.covariance[j, k]
+    s.good_age_s = 0.0
