@@ -1,0 +1,103 @@
+"""What in a capture contradicts the cell it is said to come from, in words and numbers."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.held_current import Load
+from bms_estimator.calibration.relaxation import REST_CURRENT_C, SOC_SLACK
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels.cell import ocv, r_s, soc_from_ocv
+from bms_estimator.model.cell import CellModel
+
+Floats = NDArray[np.float64]
+
+LEAST_CURRENT_C = 0.02
+"""A capture whose current never exceeds this C-rate says nothing of the elements [1/h]."""
+STEP_C = 0.1
+"""Change of current between two samples that counts as a step [1/h]."""
+STEP_S = 3.0
+"""Two samples further apart do not show the ohmic step [s]."""
+LEAST_STEPS = 5
+"""Fewer steps do not tell the sign."""
+LONG_REST_S = 300.0
+"""After such a rest the voltage is near the OCV [s]."""
+SOC_OFF, VOLTAGE_OFF_V = 0.1, 0.1
+"""A rested voltage this far off the OCV at the counted SOC, in SOC and per cell in volts, cannot be the model's error."""
+LEAST_SWEEP = 0.05
+"""SOC that must have moved for the sign to show in the voltage's trend."""
+
+
+def contradictions(load: Load, cell: CellModel) -> list[str]:
+    """One line for each, with what to do; empty where all is well. The first one found explains the others."""
+    for found in (_no_excitation(load, cell), _sign(load, cell), _capacity(load, cell)):
+        if found:
+            return [f"{load.name}: {found}"]
+    return []
+
+
+def step_resistance(load: Load) -> float | None:
+    """Median of -dV/dI over the steps of current [ohm], negative under a wrong sign; None with too few steps."""
+    change_a = np.diff(load.current_a)
+    largest_a = float(np.abs(load.current_a).max(initial=0.0))
+    steps = (np.abs(change_a) > STEP_C * largest_a) & (np.diff(load.time_s) <= STEP_S)
+    if steps.sum() < LEAST_STEPS:
+        return None
+    return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
+
+
+def _no_excitation(load: Load, cell: CellModel) -> str | None:
+    largest_a = float(np.abs(load.current_a).max())
+    least_a = LEAST_CURRENT_C * cell.cell.capacity_ah
+    if largest_a >= least_a:
+        return None
+    return (
+        f"no excitation: the current never exceeds {largest_a:.4f} A in {load.time_s[-1] / 3600.0:.2f} h, and at least "
+        f"{least_a:.4f} A ({LEAST_CURRENT_C:g} C) is needed; record a load with steps and rests"
+    )
+
+
+def _sign(load: Load, cell: CellModel) -> str | None:
+    ohm = step_resistance(load)
+    if ohm is not None and ohm < 0.0:
+        return (
+            f"the current's sign is wrong: at its steps the voltage rises with the current, by {-1e3 * ohm:.1f} mV per "
+            "ampere (median); discharge must be positive"
+        )
+    soc = -load.discharged_ah / cell.cell.capacity_ah
+    if ohm is None and np.ptp(soc) > LEAST_SWEEP and np.cov(soc, load.voltage_v)[0, 1] < 0.0:
+        return (
+            f"the current's sign is wrong: {load.discharged_ah[-1]:.3f} Ah drawn while the voltage went from "
+            f"{load.voltage_v[0]:.3f} to {load.voltage_v[-1]:.3f} V; discharge must be positive"
+        )
+    return None
+
+
+def _capacity(load: Load, cell: CellModel) -> str | None:
+    capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
+    start_a = 0.0 if load.resting_samples else float(load.current_a[0])
+    start = soc_from_ocv(load.start_v + start_a * r_s(0.5, cell.a), *grid)
+    soc = start - load.discharged_ah / capacity_ah
+    if soc.min() < -2.0 * SOC_SLACK or soc.max() > 1.0 + 2.0 * SOC_SLACK:
+        return (
+            f"SOC runs from {soc.min():.3f} to {soc.max():.3f}, outside 0..1: from {start:.3f} at the start "
+            f"({load.start_v:.3f} V), {np.ptp(load.discharged_ah):.3f} Ah were moved with a capacity of "
+            f"{capacity_ah:g} Ah; give the right capacity, or the OCV of this cell"
+        )
+    for j in _ends_of_long_rests(load, capacity_ah):
+        rested_v = float(load.voltage_v[j])
+        expected_v, seen = ocv(soc[j], *grid), soc_from_ocv(rested_v, *grid)
+        if abs(rested_v - expected_v) > VOLTAGE_OFF_V * cell.cell.series_count and abs(seen - soc[j]) > SOC_OFF:
+            return (
+                f"charge and voltage disagree: after {load.discharged_ah[j]:.3f} Ah, at rest at {load.time_s[j]:.0f} s, "
+                f"SOC is {soc[j]:.3f} by the charge and a capacity of {capacity_ah:g} Ah, but {seen:.3f} by "
+                f"{rested_v:.3f} V; give the right capacity, or find this cell's OCV with `ocv`"
+            )
+    return None
+
+
+def _ends_of_long_rests(load: Load, capacity_ah: float) -> NDArray[np.intp]:
+    """Last sample of each rest longer than ``LONG_REST_S``."""
+    resting = np.abs(load.current_a) < REST_CURRENT_C * capacity_ah
+    edges = np.flatnonzero(np.diff(np.r_[False, resting, False].astype(np.int8)))
+    first, last = edges[::2], edges[1::2] - 1
+    return np.asarray(last[load.time_s[last] - load.time_s[first] > LONG_REST_S], dtype=np.intp)

@@ -1,0 +1,166 @@
+"""A capture as the fit wants it: without glitches, and with stretches of steady current as single long steps.
+
+The model's step is exact for a current that holds, so nothing is lost by thinning a rest or a constant load; charge
+is kept exactly, as the mean current between the samples that are kept.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.relaxation import REST_CURRENT_C, without_glitches
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+
+Floats = NDArray[np.float64]
+
+STEADY_C = 0.01
+"""A current that stays within this C-rate of its value at the last kept sample counts as held [1/h]."""
+DENSE_SAMPLES = 5
+"""Samples kept one by one after each change of current."""
+GROWTH = 0.1
+"""Then a step may be this fraction of the time since the change: relaxation is smooth in log time."""
+LONGEST_STEP_S = 60.0
+"""No step is longer [s]."""
+LARGEST_DROP = 1e-3
+"""Nor moves SOC by more than this, so that the elements held at mid-step are right."""
+NEIGHBOURS = 2
+"""Samples on either side that a glitch is told by."""
+SPIKE_V = 0.03
+"""A voltage off its neighbours' median by more than this, per cell, and more than the current explains, is a glitch [V]."""
+SPIKE_C = 0.1
+"""A current off its neighbours' median by more than this C-rate while the voltage does not move is a glitch [1/h]."""
+EXPLAINED = 3.0
+"""Times its series resistance at mid SOC that a change of current may move the voltage by."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """One capture.
+
+    Attributes:
+        name: What to call it.
+        time_s: Shape (n,), increasing, from 0 [s].
+        current_a: Shape (n,), at the sample, discharge positive [A].
+        held_a: Shape (n,), mean from the sample to the next kept one [A].
+        voltage_v: Shape (n,), measured [V].
+        discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
+        resting_samples: How many of the first samples are at rest.
+        samples: How many samples the capture had.
+        glitches: How many of them were left out as glitches.
+    """
+
+    name: str
+    time_s: Floats
+    current_a: Floats
+    held_a: Floats
+    voltage_v: Floats
+    discharged_ah: Floats
+    resting_samples: int
+    samples: int
+    glitches: int
+
+    @property
+    def start_v(self) -> float:
+        """Voltage of the first rest [V]; of the first sample where the capture starts under load."""
+        return float(np.median(self.voltage_v[: max(self.resting_samples, 1)]))
+
+
+def whole_load(name: str, samples: SampleBlock, cell: CellModel) -> Load:
+    """All good samples of a capture.
+
+    Raises:
+        UserError: Fewer than two good samples.
+    """
+    good = _without_spikes(_within_limits(name, without_glitches(samples), cell), cell)
+    time_s = np.ascontiguousarray(good["time_s"] - good["time_s"][0])
+    current_a = np.ascontiguousarray(good["current_a"])
+    resting = np.abs(current_a) < REST_CURRENT_C * cell.cell.capacity_ah
+    return Load(
+        name=name,
+        time_s=time_s,
+        current_a=current_a,
+        held_a=current_a,
+        voltage_v=np.ascontiguousarray(good["voltage_v"]),
+        discharged_ah=np.r_[0.0, np.cumsum(current_a[:-1] * np.diff(time_s))] / 3600.0,
+        resting_samples=int(np.argmin(resting)) if not resting.all() else resting.size,
+        samples=samples.size,
+        glitches=samples.size - good.size,
+    )
+
+
+def thinned(load: Load, capacity_ah: float) -> Load:
+    """The same with stretches of steady current as long steps."""
+    kept = np.flatnonzero(_kept(load, capacity_ah))
+    step_s = np.diff(load.time_s[kept])
+    held_a = np.r_[np.diff(load.discharged_ah[kept]) * 3600.0 / step_s, load.current_a[kept[-1]]]
+    return Load(
+        name=load.name,
+        time_s=load.time_s[kept],
+        current_a=load.current_a[kept],
+        held_a=held_a,
+        voltage_v=load.voltage_v[kept],
+        discharged_ah=load.discharged_ah[kept],
+        resting_samples=int(np.searchsorted(kept, load.resting_samples)),
+        samples=load.samples,
+        glitches=load.glitches,
+    )
+
+
+def _kept(load: Load, capacity_ah: float) -> NDArray[np.bool_]:
+    """Which samples stay."""
+    kept = np.zeros(load.time_s.size, dtype=np.bool_)
+    kept[[0, -1]] = True
+    steady_a = STEADY_C * capacity_ah
+    times, currents, charges = load.time_s.tolist(), load.current_a.tolist(), load.discharged_ah.tolist()
+    changed = last = 0
+    for j in range(1, len(times)):
+        if abs(currents[j] - currents[last]) > steady_a:
+            kept[j - 1] = kept[j] = True
+            changed = last = j
+            continue
+        longest_s = min(GROWTH * (times[j] - times[changed]), LONGEST_STEP_S)
+        ahead_s = times[min(j + 1, len(times) - 1)] - times[last]
+        drop = abs(charges[j] - charges[last]) / capacity_ah
+        if j - changed < DENSE_SAMPLES or ahead_s > longest_s or drop > LARGEST_DROP:
+            kept[j] = True
+            last = j
+    return kept
+
+
+def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBlock:
+    limits = cell.cell
+    voltage_v, current_a = samples["voltage_v"], samples["current_a"]
+    good: SampleBlock = samples[
+        (voltage_v >= limits.voltage_min_v)
+        & (voltage_v <= limits.voltage_max_v)
+        & (np.abs(current_a) <= limits.current_max_a)
+    ]
+    if good.size < 0.5 * samples.size or good.size < 2 * NEIGHBOURS + 1:
+        raise UserError(
+            f"{name}: {good.size} of {samples.size} samples lie within the cell's limits ({limits.voltage_min_v:g} to "
+            f"{limits.voltage_max_v:g} V, {limits.current_max_a:g} A); the capture runs from {voltage_v.min():.3f} to "
+            f"{voltage_v.max():.3f} V and {current_a.min():.3f} to {current_a.max():.3f} A: is it this cell's?"
+        )
+    return good
+
+
+def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
+    """Samples whose voltage and current their neighbours bear out."""
+    off_v = np.abs(_off_median(samples["voltage_v"]))
+    off_a = np.abs(_off_median(samples["current_a"]))
+    ohm = EXPLAINED * (cell.a[13] * np.exp(-0.5 * cell.a[14]) + cell.a[15])
+    jumped = off_v > SPIKE_V * cell.cell.series_count + ohm * off_a
+    unheard = (off_a > SPIKE_C * cell.cell.capacity_ah) & (off_v < 0.01 * ohm * off_a)
+    good: SampleBlock = samples[~(jumped | unheard)]
+    return good
+
+
+def _off_median(values: Floats) -> Floats:
+    """Each value less the median of itself and its neighbours; 0 at the ends."""
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
+    off = np.zeros(values.size)
+    off[NEIGHBOURS:-NEIGHBOURS] = values[NEIGHBOURS:-NEIGHBOURS] - np.median(windows, axis=1)
+    return off

@@ -1,0 +1,139 @@
+"""Validation of a cell on a capture: open-loop simulation with frozen parameters, (5.3) and chapter 6."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.capture_checks import contradictions
+from bms_estimator.calibration.held_current import whole_load
+from bms_estimator.calibration.identify import initial_soc as soc_of_first_rest
+from bms_estimator.calibration.relaxation import REST_CURRENT_C
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels.sensitivity import sensitivities
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.sample import SampleBlock
+
+Floats = NDArray[np.float64]
+
+LOW_SOC = 0.1
+"""Below it the form of the elements fails for every cell; errors are given with and without."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Measured against simulated voltage over some samples; NaN of none.
+
+    Attributes:
+        samples: How many.
+        voltage_rms_v: Root mean square [V].
+        mean_abs_percent: Mean magnitude, of the measured voltage [%].
+        max_abs_percent: Largest magnitude, of the measured voltage [%].
+    """
+
+    samples: int
+    voltage_rms_v: float
+    mean_abs_percent: float
+    max_abs_percent: float
+
+
+@dataclass(frozen=True)
+class Validation:
+    """One capture against one cell.
+
+    Attributes:
+        samples: How many the capture had.
+        glitches: How many were left out as glitches.
+        initial_soc: SOC at the first sample that was used, 0..1.
+        initial_soc_from: ``given``, ``first rest`` or ``first sample under load``.
+        final_soc: SOC at the last sample, counted.
+        all: Over all samples.
+        above: Over the samples at SOC above ``LOW_SOC``.
+        resting: Of these, those without current: the open-circuit voltage's error, and what has not relaxed.
+        loaded: Of these, those with current.
+        extra_ohm: Series resistance that would make the error over ``above`` least: contacts, temperature, age [ohm].
+        without_extra_ohm: The error over ``above`` with that resistance.
+        warnings: What in the capture contradicts the cell.
+        time_s: Shape (n,), good samples, from 0 [s].
+        error_v: Shape (n,), measured less simulated [V].
+        soc: Shape (n,), counted.
+    """
+
+    samples: int
+    glitches: int
+    initial_soc: float
+    initial_soc_from: str
+    final_soc: float
+    all: Errors
+    above: Errors
+    resting: Errors
+    loaded: Errors
+    extra_ohm: float
+    without_extra_ohm: Errors
+    warnings: tuple[str, ...]
+    time_s: Floats
+    error_v: Floats
+    soc: Floats
+
+
+def validate(name: str, samples: SampleBlock, cell: CellModel, initial_soc: float | None = None) -> Validation:
+    """Simulate a capture's voltage from its current alone and compare.
+
+    Where C_ts, C_tl turn negative (below delta1, delta2) they are held just above 0, so that the simulation goes on.
+
+    Args:
+        name: What to call the capture in messages.
+        samples: Dtype ``SAMPLE``, raw; it should start from rest.
+        cell: What is validated.
+        initial_soc: SOC 0..1 at the first good sample; None: from the voltage of the first rest.
+
+    Raises:
+        UserError: Most samples lie outside the cell's limits.
+    """
+    load = whole_load(name, samples, cell)
+    start = soc_of_first_rest(load, cell) if initial_soc is None else initial_soc
+    simulated_v = np.empty(load.time_s.size)
+    sensitivities(
+        load.time_s,
+        load.current_a,
+        load.held_a,
+        start,
+        0.0,
+        cell.cell.capacity_ah * 3600.0,
+        cell.a[:16],
+        *ocv_grid(cell),
+        np.zeros(4),
+        simulated_v,
+        np.empty((0, 0)),
+    )
+    error_v = load.voltage_v - simulated_v
+    soc = start - load.discharged_ah / cell.cell.capacity_ah
+    above = soc > LOW_SOC
+    resting = np.abs(load.current_a) < REST_CURRENT_C * cell.cell.capacity_ah
+    current_a = load.current_a[above]
+    extra_ohm = -float(error_v[above] @ current_a) / max(float(current_a @ current_a), 1e-12)
+    found_from = "first rest" if load.resting_samples else "first sample under load"
+    return Validation(
+        samples=load.samples,
+        glitches=load.glitches,
+        initial_soc=start,
+        initial_soc_from=found_from if initial_soc is None else "given",
+        final_soc=float(soc[-1]),
+        all=_errors(error_v, load.voltage_v),
+        above=_errors(error_v[above], load.voltage_v[above]),
+        resting=_errors(error_v[above & resting], load.voltage_v[above & resting]),
+        loaded=_errors(error_v[above & ~resting], load.voltage_v[above & ~resting]),
+        extra_ohm=extra_ohm,
+        without_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, load.voltage_v[above]),
+        warnings=tuple(contradictions(load, cell)),
+        time_s=load.time_s,
+        error_v=error_v,
+        soc=soc,
+    )
+
+
+def _errors(error_v: Floats, voltage_v: Floats) -> Errors:
+    if error_v.size == 0:
+        return Errors(0, float("nan"), float("nan"), float("nan"))
+    percent = 100.0 * np.abs(error_v) / voltage_v
+    return Errors(error_v.size, float(np.sqrt(np.mean(error_v**2))), float(percent.mean()), float(percent.max()))
