@@ -4,13 +4,14 @@ VENV    := .venv
 BIN     := $(VENV)/bin
 PYTHON  ?= python3
 READY   := $(VENV)/.ready
+COMPARE := .venv-compare
 ARGS    ?=
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark firmware lock
+.PHONY: help venv apt check test demo benchmark compare firmware lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -38,6 +39,11 @@ demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--
 
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)
+
+compare: ## methods side by side on real captures, PyBOP among them: minutes
+	@[ -x $(COMPARE)/bin/python ] || $(PYTHON) -m venv $(COMPARE)
+	@$(COMPARE)/bin/pip install --quiet --disable-pip-version-check -e . pybop==26.3
+	@$(COMPARE)/bin/python tests/benchmarks/side_by_side.py
 
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
