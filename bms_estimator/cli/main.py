@@ -32,6 +32,10 @@ COMMANDS = {
     "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
     "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
     "ocv": Entry("bms_estimator.cli.ocv:ocv", "Open-circuit voltage from relaxation tests, into a cell file."),
+    "identify": Entry(
+        "bms_estimator.cli.identify:identify_command", "A cell's elements from captures, into a cell file."
+    ),
+    "validate": Entry("bms_estimator.cli.validate:validate_command", "A cell's model against a capture, open loop."),
     "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
 }
