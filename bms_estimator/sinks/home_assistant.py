@@ -17,6 +17,11 @@ _ESTIMATE = {
     "power_w": ("Power (discharge positive)", "W", "power", 2),
     "temperature_c": ("Temperature", "°C", "temperature", 1),
     "soc_percent": ("State of charge", "%", "battery", 1),
+    "remaining_capacity_ah": ("Remaining capacity", "Ah", None, 3),
+    "remaining_energy_wh": ("Remaining energy", "Wh", "energy_storage", 2),
+    "time_to_empty_s": ("Time to empty", "s", "duration", 0),
+    "usable_capacity_ah": ("Usable capacity", "Ah", None, 3),
+    "soc_std": ("State of charge, standard deviation", None, None, 4),
     "voltage_estimate_v": ("Estimated voltage", "V", "voltage", 3),
     "innovation_v": ("Innovation", "V", "voltage", 4),
     "stability_margin": ("Stability margin", None, None, 4),
@@ -34,7 +39,8 @@ _ELEMENTS = {
     "c_tl_farad": ("C_tl", "F", 1),
 }
 _FAULTS = {"frames_lost": "Frames lost", "crc_errors": "CRC errors"}
-_DIAGNOSTIC = frozenset(_ESTIMATE) - {"voltage_v", "current_a", "power_w", "temperature_c", "soc_percent"}
+_MAIN = {"voltage_v", "current_a", "power_w", "temperature_c", "soc_percent", "time_to_empty_s"}
+_MAIN |= {"remaining_capacity_ah", "remaining_energy_wh"}
 
 
 def device_id(device: str) -> str:
@@ -97,7 +103,7 @@ def _components(info: Info, root: str) -> dict[str, Any]:
             device_class=device_class,
             state_class="measurement",
             suggested_display_precision=decimals,
-            entity_category="diagnostic" if key in _DIAGNOSTIC else None,
+            entity_category=None if key in _MAIN else "diagnostic",
             expire_after=stale_s,
         )
     for key, (name, unit, decimals) in _ELEMENTS.items():
