@@ -95,12 +95,15 @@ def test_samples_are_ten_milliseconds_apart_to_the_microsecond(start: Start) -> 
     assert [s.board_us for s in samples] == [10_000 * (i + 1) for i in range(1000)]
 
 
-def test_the_boards_clock_is_the_clock_that_triggers_the_converter(start: Start) -> None:
-    """A signal that changes every second does so in the same conversion of each hundredth window: no slot is lost."""
-    seconds = 30
-    changes = [(0.5 * i, 0.0, 12.0 if i % 2 else 16.0, 25.0) for i in range(2 * seconds)]
-    samples = start(changes, noise_lsb=0.0).take(100 * (seconds - 1))
-    split = np.array([[s.voltage_sum, s.count] for s in samples]).reshape(-1, 100, 2)
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 20), (1000, 6)])
+def test_the_boards_clock_is_the_clock_that_triggers_the_converter(start: Start, rate_hz: int, seconds: int) -> None:
+    """A signal with a period of a second changes in the same conversion of the same window each time: no slot is lost."""
+    changes = [(0.5 * i + 0.0004, 0.0, 12.0 if i % 2 else 16.0, 25.0) for i in range(2 * seconds)]
+    host = start(changes, noise_lsb=0.0)
+    host.ask(set_rate_command(rate_hz))
+    host.take(rate_hz)
+    samples = host.take(rate_hz * (seconds - 3))
+    split = np.array([[s.voltage_sum, s.count] for s in samples]).reshape(-1, rate_hz, 2)
     assert (split == split[0]).all()
     assert len(np.unique(split[0, :, 0] / split[0, :, 1])) >= 3, "no window holds the change itself"
 

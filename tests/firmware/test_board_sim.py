@@ -1,0 +1,76 @@
+"""The simulator as a program."""
+
+import math
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.firmware.host import Host
+from tests.simavr_board import ELF, SIMULATOR, SimavrBoard, write_readings
+
+pytestmark = pytest.mark.usefixtures("firmware")
+
+LONG_S = 30.0
+
+
+def run(*arguments: str | Path, text: str = "") -> subprocess.CompletedProcess[str]:
+    command = [SIMULATOR, *arguments]
+    return subprocess.run(command, input=text, capture_output=True, text=True, timeout=LONG_S, check=False)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    ended = run(ELF, "--readings", tmp_path / "none.csv")
+    assert ended.returncode == 2
+    assert "none.csv" in ended.stderr
+    readings = write_readings(tmp_path / "readings.csv", [(0.0, 0.0, 12.0)])
+    ended = run(tmp_path / "none.elf", "--readings", readings)
+    assert ended.returncode == 2
+    assert "none.elf" in ended.stderr
+
+
+def test_a_file_without_readings_is_refused(tmp_path: Path) -> None:
+    ended = run(ELF, "--readings", write_readings(tmp_path / "empty.csv", []))
+    assert ended.returncode == 2
+    assert "time_s" in ended.stderr
+
+
+@pytest.mark.parametrize("arguments", [[], ["--speed", "0"], ["--noise-lsb", "-1"], ["--unknown"], ["--avcc-mv", "0"]])
+def test_wrong_arguments_get_the_usage(tmp_path: Path, arguments: list[str]) -> None:
+    readings = [] if not arguments else ["--readings", str(write_readings(tmp_path / "r.csv", [(0.0, 0.0, 12.0)]))]
+    ended = run(ELF, *readings, *arguments)
+    assert ended.returncode == 2
+    assert "usage" in ended.stderr
+
+
+def test_it_ends_when_told_though_no_host_ever_came(tmp_path: Path) -> None:
+    with SimavrBoard(write_readings(tmp_path / "readings.csv", [(0.0, 0.0, 12.0)])) as board:
+        assert board.path  # leaving asserts the clean end
+
+
+def test_a_looped_file_begins_again(tmp_path: Path) -> None:
+    readings = write_readings(tmp_path / "readings.csv", [(0.0, 0.0, 10.0), (0.5, 0.0, 20.0), (1.0, 0.0, 10.0)])
+    with SimavrBoard(readings, speed=math.inf, loop=True) as board, Host(board.path) as host:
+        host.take(300)
+        means = [s.voltage_sum / s.count for s in host.samples]
+    low, high = 10.0 / 25.0 * 1024, 20.0 / 25.0 * 1024
+    for second in range(3):
+        assert means[100 * second + 20] == pytest.approx(low, abs=1.0)
+        assert means[100 * second + 70] == pytest.approx(high, abs=1.0)
+
+
+def test_readings_come_through_a_pipe_and_their_end_can_be_the_boards() -> None:
+    command = [SIMULATOR, ELF, "--readings", "-", "--speed", "inf", "--stop-at-end"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as board:
+        assert board.stdin
+        assert board.stdout
+        board.stdin.write("0,0,10\n1,0,20\n2,0,20\n")
+        board.stdin.flush()
+        with Host(board.stdout.readline().strip()) as host:
+            host.take(150)
+            board.stdin.close()
+            host.until(lambda: board.poll() is not None)
+            means = [s.voltage_sum / s.count for s in host.samples]
+        assert board.returncode == 0
+    assert means[50] == pytest.approx(10.0 / 25.0 * 1024, abs=1.0)
+    assert means[140] == pytest.approx(20.0 / 25.0 * 1024, abs=1.0)
