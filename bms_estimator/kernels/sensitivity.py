@@ -2,6 +2,7 @@
 
 The derivatives go along with the states: d(x2, x3)/dtheta obeys the step of x2 and x3 differentiated (exact for
 current held over the step), so that one pass over a capture gives the whole Jacobian, at any length of step.
+Below SOC 0 the elements stay as they are at 0: their exponentials would run away.
 
 Columns of a Jacobian, with m coefficients of the OCV correction: a1..a15, the m coefficients, SOC at the first sample,
 a series resistance of the capture's own. Units as in ``kernels.cell``.
@@ -57,7 +58,7 @@ def spline_weights(soc: float, count: int, w: Floats) -> int:
 
 
 @njit(cache=True)
-def _branch_step(d: Floats, v: float, x: Floats, b: int, soc: float, below: float, i: float, dt: float) -> float:
+def _branch_step(d: Floats, v: float, x: Floats, b: int, middle: float, wanted: float, i: float, dt: float) -> float:
     """One RC branch over one step, with its derivatives.
 
     Args:
@@ -65,8 +66,8 @@ def _branch_step(d: Floats, v: float, x: Floats, b: int, soc: float, below: floa
         v: Branch voltage before the step [V].
         x: a1..a15 at index 1..15.
         b: 0 for the short-term branch, 1 for the long-term one.
-        soc: At mid-step.
-        below: 1 where the derivatives are wanted, else 0.
+        middle: SOC at mid-step.
+        wanted: 1 where the derivatives are wanted, else 0.
         i: Discharge current [A].
         dt: Step [s].
 
@@ -74,6 +75,7 @@ def _branch_step(d: Floats, v: float, x: Floats, b: int, soc: float, below: floa
         Branch voltage after the step [V].
     """
     r0, c0 = 1 + 3 * b, 7 + 3 * b
+    soc = max(middle, 0.0)
     er = math.exp(-x[r0 + 1] * soc)
     ec = math.exp(-x[c0 + 1] * soc)
     r = x[r0] * er + x[r0 + 2]  # (2.5), (2.6)
@@ -83,7 +85,7 @@ def _branch_step(d: Floats, v: float, x: Floats, b: int, soc: float, below: floa
     c = max(c, least)
     tau = r * c
     decay = math.exp(-dt / tau)
-    if below > 0.0:
+    if wanted > 0.0:
         by_tau = (v - i * r) * decay * dt / (tau * tau)
         by_r = i * (1.0 - decay) + by_tau * c
         by_c = by_tau * r
@@ -95,7 +97,7 @@ def _branch_step(d: Floats, v: float, x: Floats, b: int, soc: float, below: floa
         d[3] = decay * d[3] - d_c * ec
         d[4] = decay * d[4] + d_c * x[c0] * soc * ec
         d[5] = decay * d[5] + (by_c * LEAST_CAPACITANCE if held else d_c)
-        d[6] = decay * d[6] + by_soc
+        d[6] = decay * d[6] + (by_soc if middle > 0.0 else 0.0)
     return v * decay + i * r * (1.0 - decay)  # (2.2), (2.3)
 
 
@@ -148,7 +150,7 @@ def sensitivities(
         added = 0.0
         for k in range(4):
             added += w[k] * correction_v[first + k]
-        es = math.exp(-x[14] * soc)
+        es = math.exp(-x[14] * max(soc, 0.0))
         r_s = x[13] * es + x[15] + extra_ohm  # (2.9)
         voltage_v[j] = ocv(soc, ocv_v, ocv_slope_v) + added - v_ts - v_tl - i * r_s  # (2.4)
         if wanted > 0.0:
@@ -160,13 +162,13 @@ def sensitivities(
                 row[6 + k] = -d_ts[3 + k]
                 row[9 + k] = -d_tl[3 + k]
             row[12] = -i * es
-            row[13] = i * x[13] * soc * es
+            row[13] = i * x[13] * max(soc, 0.0) * es
             row[14] = -i
             slope = ocv_slope(soc, ocv_v, ocv_slope_v)
             for k in range(4):
                 row[ELEMENTS + first + k] = w[k]
                 slope += w[4 + k] * correction_v[first + k]
-            row[ELEMENTS + m] = slope + i * x[13] * x[14] * es - d_ts[6] - d_tl[6]
+            row[ELEMENTS + m] = slope + (i * x[13] * x[14] * es if soc > 0.0 else 0.0) - d_ts[6] - d_tl[6]
             row[ELEMENTS + m + 1] = -i
 
 
