@@ -184,8 +184,9 @@ int main(int argc, char **argv) {
     avr_t *avr = power_up(&o);
     const char *path = avr ? line_open() : NULL;
     if (!path) return 2;
-    signal(SIGTERM, on_signal);
-    signal(SIGINT, on_signal);
+    const struct sigaction ending = {.sa_handler = on_signal};  // without SA_RESTART: a wait for stdin ends, too
+    sigaction(SIGTERM, &ending, NULL);
+    sigaction(SIGINT, &ending, NULL);
     printf("%s\n", path);
     fflush(stdout);
 

@@ -14,7 +14,7 @@ typedef struct {
 // From a file or, with "-", from stdin; a heading is passed over. Returns false, and has said why, when it cannot be read.
 bool readings_open(const char *path, bool loop);
 
-// What holds at time_s, which never goes back: the last line not after it. The first line also holds before its time.
+// What holds at time_s since the first line, which never goes back: the last line not after it.
 const reading *readings_at(double time_s);
 
 // Whether the last line's time has come.

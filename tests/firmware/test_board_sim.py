@@ -60,7 +60,7 @@ def test_a_looped_file_begins_again(tmp_path: Path) -> None:
 
 
 def test_readings_come_through_a_pipe_and_their_end_can_be_the_boards() -> None:
-    command = [SIMULATOR, ELF, "--readings", "-", "--speed", "inf", "--stop-at-end"]
+    command = [str(SIMULATOR), str(ELF), "--readings", "-", "--speed", "inf", "--stop-at-end"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as board:
         assert board.stdin
         assert board.stdout
@@ -74,3 +74,16 @@ def test_readings_come_through_a_pipe_and_their_end_can_be_the_boards() -> None:
         assert board.returncode == 0
     assert means[50] == pytest.approx(10.0 / 25.0 * 1024, abs=1.0)
     assert means[140] == pytest.approx(20.0 / 25.0 * 1024, abs=1.0)
+
+
+def test_it_ends_when_told_while_it_waits_for_readings() -> None:
+    command = [str(SIMULATOR), str(ELF), "--readings", "-", "--speed", "inf"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as board:
+        assert board.stdin
+        assert board.stdout
+        board.stdin.write("0,0,10\n1,0,20\n")
+        board.stdin.flush()
+        with Host(board.stdout.readline().strip()) as host:
+            host.take(50)  # the third line is not there when the second's time comes
+            board.terminate()
+            assert board.wait(LONG_S) == 0

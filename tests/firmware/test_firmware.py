@@ -99,7 +99,7 @@ def test_samples_are_ten_milliseconds_apart_to_the_microsecond(start: Start) -> 
 def test_the_boards_clock_is_the_clock_that_triggers_the_converter(start: Start, rate_hz: int, seconds: int) -> None:
     """A signal with a period of a second changes in the same conversion of the same window each time: no slot is lost."""
     changes = [(0.5 * i + 0.0004, 0.0, 12.0 if i % 2 else 16.0, 25.0) for i in range(2 * seconds)]
-    host = start(changes, noise_lsb=0.0)
+    host = start([(0.0, 0.0, 12.0, 25.0), *changes], noise_lsb=0.0)
     host.ask(set_rate_command(rate_hz))
     host.take(rate_hz)
     samples = host.take(rate_hz * (seconds - 3))
