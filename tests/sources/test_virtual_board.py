@@ -1,0 +1,218 @@
+"""The board in Python: what it sends is what it was fed, and faults arrive as what they are."""
+
+import asyncio
+import contextlib
+import math
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources.decoder import make_decoder
+from bms_estimator.sources.frames import FrameCounters, FrameDecoder
+from bms_estimator.sources.protocol import (
+    AckResult,
+    ResetCause,
+    hello_command,
+    restart_command,
+    set_bandgap_command,
+    set_rate_command,
+    set_serial_command,
+    zero_current_command,
+)
+from bms_estimator.sources.virtual_board import BoardFault, VirtualBoard
+from bms_estimator.sources.virtual_converter import BoardParts, Reading, window_of
+
+STEADY = Reading(2.5, 22.2, 25.0)
+LONG_S = 20.0
+
+Event = Callable[[VirtualBoard], None]
+
+
+async def received(board: VirtualBoard, samples: int, events: dict[int, Event] | None = None) -> bytes:
+    """All that a board sends while it takes ``samples`` samples; events by the number of samples before them."""
+    data = bytearray()
+
+    async def run() -> None:
+        for at in sorted({*(events or {}), samples}):
+            await board.run((at - board.samples - 0.5) * window_of(100)[1] * 1e-9)  # the last one begins by then
+            if events and at in events:
+                events[at](board)
+
+    with board:
+        host = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            async with asyncio.timeout(LONG_S):
+                task = asyncio.create_task(run())
+                quiet = 0
+                while not task.done() or quiet < 3:
+                    await asyncio.sleep(0.005)
+                    before = len(data)
+                    with contextlib.suppress(BlockingIOError):
+                        data += os.read(host, 1 << 16)
+                    quiet = quiet + 1 if len(data) == before else 0
+                await task
+        finally:
+            os.close(host)
+    return bytes(data)
+
+
+def board(reading: Reading = STEADY, **options: Any) -> VirtualBoard:
+    return VirtualBoard(lambda _: reading, speed=math.inf, **options)
+
+
+def decoded(data: bytes) -> tuple[SampleBlock, FrameCounters]:
+    decoder = FrameDecoder()
+    return decoder.feed(0.0, data), decoder.counters
+
+
+async def test_frames_hold_the_readings_within_the_converters_resolution() -> None:
+    block, counters = decoded(await received(board(), 500))
+    assert block.size == 500
+    assert np.allclose(np.diff(block["time_s"]), 0.01, rtol=0.0, atol=1e-9)
+    step_v = 5.0 / 1024
+    assert np.abs(block["voltage_v"] - 22.2).max() < 5.0 * step_v
+    assert np.abs(block["current_a"] - 2.5).max() < step_v / 0.1
+    assert block["voltage_v"].mean() == pytest.approx(22.2, abs=0.2 * 5.0 * step_v)
+    assert block["temperature_c"][-1] == pytest.approx(25.0, abs=0.3)
+    assert counters == FrameCounters(bytes_received=counters.bytes_received, frames_received=500)
+
+
+async def test_a_supply_that_is_not_five_volts_is_found_out() -> None:
+    block, _ = decoded(await received(board(parts=BoardParts(supply_v=4.75)), 300))
+    assert block["voltage_v"].mean() == pytest.approx(22.2, rel=1e-3)
+
+
+async def test_the_same_seed_sends_the_same_bytes() -> None:
+    assert await received(board(seed=3), 50) == await received(board(seed=3), 50)
+    assert await received(board(seed=3), 50) != await received(board(seed=4), 50)
+
+
+@pytest.mark.parametrize(
+    ("reading", "status"),
+    [
+        (Reading(0.0, 25.6, 25.0), SampleStatus.VOLTAGE_SATURATED),
+        (Reading(26.0, 12.0, 25.0), SampleStatus.CURRENT_SATURATED),
+        (Reading(-26.0, 12.0, 25.0), SampleStatus.CURRENT_SATURATED),
+    ],
+)
+async def test_saturation_is_marked(reading: Reading, status: SampleStatus) -> None:
+    block, _ = decoded(await received(board(reading), 10))
+    assert (block["status"] == status).all()
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [
+        (BoardFault.DROP, {"frames_received": 57, "frames_lost": 3}),
+        (BoardFault.CORRUPT, {"frames_received": 57, "frames_lost": 3}),
+        (BoardFault.TRUNCATE, {"frames_received": 57, "frames_lost": 3}),
+        (BoardFault.DUPLICATE, {"frames_received": 60, "duplicates": 3}),
+        (BoardFault.NEWER_VERSION, {"frames_received": 57, "frames_lost": 3, "version_errors": 3}),
+        (BoardFault.GARBAGE, {"frames_received": 60, "frames_lost": 0}),
+    ],
+)
+async def test_faults_are_counted_as_what_they_are(fault: BoardFault, expected: dict[str, int]) -> None:
+    data = await received(board(), 60, {20: lambda b: b.inject(fault, 3)})
+    _, counters = decoded(data)
+    assert {name: getattr(counters, name) for name in expected} == expected
+    damaged = counters.crc_errors + counters.cobs_errors + counters.length_errors
+    assert (damaged >= 3) == (fault in {BoardFault.CORRUPT, BoardFault.TRUNCATE, BoardFault.GARBAGE})
+
+
+async def test_a_sample_after_its_successor_is_out_of_order() -> None:
+    _, counters = decoded(await received(board(), 60, {20: lambda b: b.inject(BoardFault.SWAP)}))
+    assert (counters.out_of_order + counters.duplicates, counters.frames_lost) == (1, 1)
+    assert counters.frames_received == 59
+
+
+async def test_a_reset_in_mid_run_goes_on_and_is_marked() -> None:
+    block, counters = decoded(await received(board(), 60, {30: lambda b: b.reset(ResetCause.EXTERNAL)}))
+    assert (counters.frames_received, counters.resets, counters.frames_lost) == (60, 1, 0)
+    assert list(np.flatnonzero(block["status"] & SampleStatus.RESET)) == [30]
+    assert (np.diff(block["time_s"]) > 0.0).all()
+
+
+async def test_the_wrap_of_the_microseconds_is_no_step() -> None:
+    block, counters = decoded(await received(board(clock_us=2**32 - 100_000), 50))
+    assert np.allclose(np.diff(block["time_s"]), 0.01, rtol=0.0, atol=1e-9)
+    assert counters.resets == 0
+
+
+async def test_commands_are_obeyed_and_answered() -> None:
+    virtual = VirtualBoard(lambda _: STEADY)
+    decoder = FrameDecoder()
+    with virtual:
+        host = os.open(virtual.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        running = asyncio.create_task(virtual.run())
+
+        async def ask(command: bytes) -> tuple[AckResult, int]:
+            os.write(host, command)
+            async with asyncio.timeout(LONG_S):
+                while True:
+                    with contextlib.suppress(BlockingIOError):
+                        chunk = os.read(host, 1 << 16)
+                        decoder.feed(0.0, chunk)
+                    if acks := decoder.take_acks():
+                        return acks[0].result, acks[0].value
+                    await asyncio.sleep(0.005)
+
+        try:
+            assert await ask(set_rate_command(250)) == (AckResult.OK, window_of(250)[1])
+            assert await ask(set_serial_command(77)) == (AckResult.OK, 77)
+            assert await ask(set_bandgap_command(1.3)) == (AckResult.BAD_VALUE, 1_100_000)
+            result, zero_ppm = await ask(zero_current_command())
+            assert result == AckResult.OK
+            assert abs(zero_ppm - 550_000) < 100  # 0.5 + 2.5 A x 0.1 V/A / 5 V
+            os.write(host, b"\x05garbage\0")
+            assert await ask(hello_command() + set_serial_command(78)) == (AckResult.OK, 78)
+            assert decoder.hello is not None
+            assert (decoder.hello.rate_hz, decoder.hello.serial) == (250, 77)
+            await ask(restart_command())
+            await ask(hello_command() + set_serial_command(79))
+            assert decoder.hello.reset_cause == ResetCause.WATCHDOG
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+            os.close(host)
+
+
+async def test_a_host_that_does_not_read_loses_samples_and_is_told() -> None:
+    virtual = VirtualBoard(lambda _: STEADY, rate_hz=1000, speed=50.0)
+    with virtual:
+        host = os.open(virtual.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        running = asyncio.create_task(virtual.run())
+        async with asyncio.timeout(LONG_S):
+            while virtual.samples < 2000:  # noqa: ASYNC110 - the board's own count
+                await asyncio.sleep(0.01)
+        decoder = FrameDecoder()
+        blocks = []
+        try:
+            async with asyncio.timeout(LONG_S):
+                while decoder.counters.overruns == 0:
+                    await asyncio.sleep(0.001)
+                    with contextlib.suppress(BlockingIOError):
+                        blocks.append(decoder.feed(0.0, os.read(host, 1 << 16)))
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+            os.close(host)
+    block = np.concatenate(blocks)
+    overrun = block["status"] & SampleStatus.OVERRUN != 0
+    assert (overrun == (block["status"] & SampleStatus.GAP != 0)).all()
+    assert decoder.counters.frames_lost > 0
+    assert decoder.counters.crc_errors == 0
+
+
+async def test_text_mode_prints_what_a_hobby_sketch_prints() -> None:
+    data = await received(board(mode="text"), 50)
+    decoder = make_decoder(SensorSettings(port="x", protocol="text", baud=115_200))
+    block = decoder.feed(0.0, data)
+    assert block.size == 50
+    assert block["voltage_v"] == pytest.approx(22.2, abs=0.03)
+    assert block["current_a"] == pytest.approx(2.5, abs=0.06)
+    assert block["temperature_c"] == pytest.approx(25.0, abs=0.3)
