@@ -23,13 +23,16 @@ LONG_REST_S = 300.0
 """After such a rest the voltage is near the OCV [s]."""
 SOC_OFF, VOLTAGE_OFF_V = 0.1, 0.1
 """A rested voltage this far off the OCV at the counted SOC, in SOC and per cell in volts, cannot be the model's error."""
+GAP_STEPS, GAP_CHARGE = 10.0, 0.01
+"""A step this many times the median one, over which the current of its start would draw this part of the capacity, is
+a gap in which nobody knows the charge."""
 LEAST_SWEEP = 0.05
 """SOC that must have moved for the sign to show in the voltage's trend."""
 
 
 def contradictions(load: Load, cell: CellModel) -> list[str]:
     """One line for each, with what to do; empty where all is well. The first one found explains the others."""
-    for found in (_no_excitation(load, cell), _sign(load, cell), _capacity(load, cell)):
+    for found in (_no_excitation(load, cell), _sign(load, cell), _gap(load, cell), _capacity(load, cell)):
         if found:
             return [f"{load.name}: {found}"]
     return []
@@ -70,6 +73,19 @@ def _sign(load: Load, cell: CellModel) -> str | None:
             f"{load.voltage_v[0]:.3f} to {load.voltage_v[-1]:.3f} V; discharge must be positive"
         )
     return None
+
+
+def _gap(load: Load, cell: CellModel) -> str | None:
+    step_s = np.diff(load.time_s)
+    charge_ah = np.abs(load.current_a[:-1]) * step_s / 3600.0
+    gaps = (step_s > GAP_STEPS * np.median(step_s)) & (charge_ah > GAP_CHARGE * cell.cell.capacity_ah)
+    if not gaps.any():
+        return None
+    j = int(np.argmax(gaps))
+    return (
+        f"a gap of {step_s[j]:.0f} s at {load.time_s[j]:.0f} s, under {load.current_a[j]:.3f} A: the charge drawn in it "
+        f"is unknown (up to {charge_ah[j]:.3f} Ah); cut the capture there and give its parts"
+    )
 
 
 def _capacity(load: Load, cell: CellModel) -> str | None:

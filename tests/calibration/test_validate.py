@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.validate import validate
+from bms_estimator.cli.captures import read_whole
+from bms_estimator.model.cell import CellModel
+from tests.calibration.simulated_load import TRUTH, capture, constant, steps
+
+
+def with_series_resistance(extra_ohm):
+    table = TRUTH.model_dump()
+    table["r_s"]["offset_ohm"] += extra_ohm
+    return CellModel.model_validate(table)
+
+
+def test_the_true_cell_leaves_the_noise():
+    found = validate("steps", capture(steps(), noise_v=1e-3), TRUTH)
+    assert found.initial_soc == pytest.approx(0.98, abs=1e-3)
+    assert found.initial_soc_from == "first rest"
+    assert found.above.voltage_rms_v == pytest.approx(1e-3, rel=0.05)
+    assert found.above.mean_abs_percent < found.all.mean_abs_percent * 1.5 < 0.05
+    assert found.warnings == ()
+
+
+def test_a_resistance_beside_the_cell_is_seen():
+    found = validate("steps", capture(steps(), cell=with_series_resistance(0.005)), TRUTH)
+    assert found.extra_ohm == pytest.approx(0.005, abs=1e-4)
+    assert found.without_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < found.above.voltage_rms_v
+    assert found.resting.voltage_rms_v < 1e-3 < found.loaded.voltage_rms_v
+
+
+def test_initial_soc_can_be_given():
+    samples = capture(steps())
+    found = validate("steps", samples, TRUTH, 0.9)
+    assert (found.initial_soc, found.initial_soc_from) == (0.9, "given")
+    assert found.above.voltage_rms_v > 10e-3
+
+
+def test_a_capture_that_starts_under_load_starts_at_its_voltage_with_the_ohmic_drop():
+    found = validate("constant", capture(constant(), soc=0.8), TRUTH)
+    assert found.initial_soc_from == "first sample under load"
+    assert found.initial_soc == pytest.approx(0.8, abs=0.005)
+
+
+def test_samples_below_soc_a_tenth_count_only_in_all():
+    found = validate("steps", capture(steps()), TRUTH)
+    assert found.all.samples == found.time_s.size == found.error_v.size
+    assert found.above.samples == int((found.soc > 0.1).sum()) < found.all.samples
+    assert found.resting.samples + found.loaded.samples == found.above.samples
+
+
+def test_glitches_are_left_out_and_counted():
+    samples = capture(steps())
+    samples["voltage_v"][[500, 900, 5000]] = [0.0, 1.0, np.nan]
+    found = validate("steps", samples, TRUTH)
+    assert found.glitches == 3
+    assert found.above.voltage_rms_v < 1e-3
+
+
+def test_wrong_sign_is_measured_and_warned_of():
+    samples = capture(steps())
+    samples["current_a"] *= -1.0
+    found = validate("steps", samples, TRUTH)
+    assert "sign is wrong" in found.warnings[0]
+    assert np.isfinite(found.all.voltage_rms_v)
+    assert found.all.voltage_rms_v > 0.1
+
+
+def test_simulation_goes_on_below_delta_and_below_empty():
+    current_a = np.r_[np.zeros(10), np.full(9000, 1.3)]
+    samples = capture(current_a, soc=0.98)
+    longer = np.concatenate([samples, samples[-600:]])
+    longer["time_s"] = np.arange(longer.size)
+    found = validate("empty", longer, TRUTH)
+    assert found.final_soc < 0.0
+    assert np.isfinite(found.error_v).all()
+
+
+def test_charging_from_empty(shared_data):
+    found = validate("charge", read_whole(shared_data / "ncr18650" / "cell1_charge_c20.csv.gz"), TRUTH)
+    assert found.initial_soc < 0.02
+    assert found.final_soc > 0.98
+    assert found.above.voltage_rms_v < 60e-3

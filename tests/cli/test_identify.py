@@ -1,0 +1,99 @@
+import json
+
+import numpy as np
+import pytest
+
+from bms_estimator.cli.main import main
+from bms_estimator.model.cell import load_cell
+from tests.calibration.simulated_load import TRUTH, capture, steps
+
+ERRORS = ["samples", "voltage_rms_mv", "mean_abs_percent", "max_abs_percent"]
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory):
+    """Two captures as files."""
+    folder = tmp_path_factory.mktemp("captures")
+    for seed in (0, 7):
+        samples = capture(steps(seed), seed=seed)
+        rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
+        np.savetxt(
+            folder / f"steps{seed}.csv",
+            rows,
+            delimiter=",",
+            header="time_s,current_a,voltage_v",
+            comments="",
+            fmt="%.6f",
+        )
+    return folder
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, stderr of the command line."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+def test_identify_writes_a_cell_that_validates_on_another_capture(tables, tmp_path, capsys):
+    out = tmp_path / "mine.toml"
+    code, text, _ = run(capsys, "identify", tables / "steps0.csv", "--cell", "ncr18650", "--out", out, "--json")
+    found = json.loads(text)
+    assert code == 0
+    assert list(found["parameters"]) == [f"a{i}" for i in range(1, 16)]
+    assert set(found["parameters"]["a15"]) == {
+        "value",
+        "std",
+        "relative_std",
+        "verdict",
+        "at_limit",
+        "leans_on",
+        "correlation",
+    }
+    assert found["parameters"]["a15"]["verdict"] == "identified"
+    assert np.shape(found["correlation"]) == (15, 15)
+    assert found["elements"][1]["soc"] == 0.5
+    assert {"r_s_ohm", "r_s_ohm_std", "c_tl_F"} <= set(found["elements"][1])
+    assert found["captures"][0]["initial_soc"] == pytest.approx(0.98, abs=0.005)
+    assert {"not_told", "ocv_correction_rms_mv", "iterations", "seconds"} <= set(found)
+
+    cell = load_cell(out)
+    assert cell.cell.name == "mine"
+    assert cell.a[15] == pytest.approx(found["parameters"]["a15"]["value"], rel=1e-7)
+    code, text, err = run(capsys, "validate", tables / "steps7.csv", "--cell", out, "--json")
+    validated = json.loads(text)
+    assert (code, err) == (0, "")
+    assert set(ERRORS) | {f"{key}_soc_above_0_1" for key in ERRORS} <= set(validated)
+    assert validated["voltage_rms_mv_soc_above_0_1"] < 1.0
+    assert validated["initial_soc"] == pytest.approx(0.98, abs=0.005)
+    assert validated["initial_soc_from"] == "first rest"
+
+
+def test_for_people(tables, tmp_path, capsys):
+    captures = [tables / "steps0.csv", tables / "steps7.csv"]
+    code, text, _ = run(capsys, "identify", *captures, "--cell", "ncr18650", "--out", tmp_path / "c.toml", "--keep-ocv")
+    assert code == 0
+    assert "a15" in text
+    assert "steps7" in text
+    assert load_cell(tmp_path / "c.toml").ocv == TRUTH.ocv
+    assert "# Identified from steps0.csv" in (tmp_path / "c.toml").read_text()
+    code, text, _ = run(capsys, "validate", tables / "steps0.csv", "--cell", "ncr18650", "--soc", "0.9")
+    assert code == 0
+    assert "SOC 0.9000 (given)" in text
+
+
+def test_what_a_person_can_mend_ends_with_code_2_and_its_numbers(tables, tmp_path, capsys):
+    rows = np.loadtxt(tables / "steps0.csv", delimiter=",", skiprows=1) * [1, -1, 1]
+    flipped = tmp_path / "flipped.csv"
+    np.savetxt(flipped, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
+    code, text, err = run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", tmp_path / "c.toml")
+    assert (code, text) == (2, "")
+    assert "flipped.csv: the current's sign is wrong" in err
+    assert not (tmp_path / "c.toml").exists()
+    code, _, err = run(capsys, "validate", flipped, "--cell", "ncr18650", "--json")
+    assert code == 0
+    assert "warning: flipped.csv: the current's sign is wrong" in err
+    code, _, err = run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", flipped)
+    assert code == 2
+    assert "is a capture itself" in err
