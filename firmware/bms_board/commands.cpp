@@ -20,20 +20,24 @@
 static boot_readings boot;
 static uint16_t boot_id;
 
-static uint8_t answer[HELLO_BYTES];
-static uint8_t answer_length;  // 0: none waits
+static uint32_t next_sequence, last_us;  // as the samples that have passed here tell
+
+static bool hello_wanted;
+static uint8_t ack[ACK_BYTES];
+static uint8_t ack_length;  // 0: none waits
 
 static struct {
-    bool measuring, begun;
+    bool measuring, begun, measured;
     uint32_t begin_us, sum, count;
 } zero;
 
 static void answer_ack(uint8_t command, uint8_t result, uint32_t value) {
-    const ack_message ack = {command, result, value};
-    answer_length = encode_ack(answer, &ack);
+    const ack_message message = {command, result, value};
+    ack_length = encode_ack(ack, &message);
 }
 
-static void answer_hello() {
+// Made when there is room, not when it is asked for: its sequence must not lie behind a sample sent meanwhile.
+static bool send_hello() {
     hello_message hello = {};
     hello.firmware_major = FIRMWARE_MAJOR;
     hello.firmware_minor = FIRMWARE_MINOR;
@@ -41,7 +45,8 @@ static void answer_hello() {
     hello.reset_cause = reset_cause();
     hello.boot_id = boot_id;
     hello.serial = settings_get(SETTING_SERIAL);
-    sampling_progress(&hello.sequence, &hello.board_us);
+    hello.sequence = next_sequence;
+    hello.board_us = last_us;
     hello.rate_hz = sampling_timing().rate_hz;
     hello.period_ns = period_ns(&sampling_timing());
     hello.adc_bits = ADC_BITS;
@@ -55,7 +60,8 @@ static void answer_hello() {
     hello.ntc_series_ohm = NTC_SERIES_OHM;
     hello.ntc_r25_ohm = NTC_R25_OHM;
     hello.ntc_beta_k = NTC_BETA_K;
-    answer_length = encode_hello(answer, &hello);
+    uint8_t packet[HELLO_BYTES];
+    return line_send(packet, encode_hello(packet, &hello));
 }
 
 static void answer_setting(uint8_t command, setting which, uint32_t value) {
@@ -75,12 +81,11 @@ static void zero_current() {
         return;
     }
     zero.measuring = true;
-    zero.begun = false;
+    zero.begun = zero.measured = false;
     zero.sum = zero.count = 0;
 }
 
-void commands_see(const sample_message &sample) {
-    if (!zero.measuring) return;
+static void add_to_zero(const sample_message &sample) {
     if (!zero.begun) {  // this window may have begun before the command
         zero.begun = true;
         zero.begin_us = sample.board_us;
@@ -88,12 +93,13 @@ void commands_see(const sample_message &sample) {
     }
     zero.sum += sample.current_sum;
     zero.count += sample.count;
+    zero.measured = sample.board_us - zero.begin_us >= ZERO_US;
 }
 
-static bool zero_is_measured() {
-    uint32_t sequence, board_us;
-    sampling_progress(&sequence, &board_us);
-    return zero.measuring && zero.count != 0 && board_us - zero.begin_us >= ZERO_US;
+void commands_see(const sample_message &sample) {
+    next_sequence = sample.sequence + 1;
+    last_us = sample.board_us;
+    if (zero.measuring && !zero.measured) add_to_zero(sample);
 }
 
 static void end_zero() {
@@ -108,7 +114,7 @@ static void obey(const uint8_t *packet, uint8_t length) {
     if (packet[0] != PROTOCOL_VERSION)
         answer_ack(command, ACK_OTHER_VERSION, PROTOCOL_VERSION);
     else if (command == COMMAND_HELLO)
-        answer_hello();
+        hello_wanted = true;
     else if (command == COMMAND_SET_RATE && bytes == 2)
         set_rate(take(body, 2));
     else if (command == COMMAND_ZERO_CURRENT)
@@ -127,14 +133,16 @@ static void obey(const uint8_t *packet, uint8_t length) {
 void commands_start(const boot_readings &readings) {
     boot = readings;
     boot_id = reset_count_boot();
-    answer_hello();
+    hello_wanted = true;
     commands_poll();
 }
 
 void commands_poll() {
-    if (answer_length && !line_send(answer, answer_length)) return;
-    answer_length = 0;
-    if (zero_is_measured()) {
+    if (hello_wanted && !send_hello()) return;
+    hello_wanted = false;
+    if (ack_length && !line_send(ack, ack_length)) return;
+    ack_length = 0;
+    if (zero.measuring && zero.measured) {
         end_zero();
         return;
     }

@@ -171,13 +171,6 @@ sample_message *sampling_window() { return window_waits ? &windows[filling ^ 1] 
 
 void sampling_release() { window_waits = false; }
 
-void sampling_progress(uint32_t *sequence, uint32_t *board_us) {
-    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-        *sequence = next_sequence;
-        *board_us = elapsed_us;
-    }
-}
-
 void sampling_sleep() {
     cli();
     const uint16_t cycles = TCNT1;

@@ -23,9 +23,6 @@ const window_timing &sampling_timing();
 sample_message *sampling_window();
 void sampling_release();
 
-// Sequence of the next sample and the end of the last sample's window.
-void sampling_progress(uint32_t *sequence, uint32_t *board_us);
-
 // Sleeps until the next interrupt while a conversion runs: a halted CPU is quiet, and a conversion must be running
 // since halting the CPU between two would start one.
 void sampling_sleep();

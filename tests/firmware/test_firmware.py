@@ -271,6 +271,9 @@ def test_a_line_without_room_loses_samples_but_never_their_time(start: Start) ->
     lost = sum(step - 1 for step, _ in steps)
     assert lost > 0
     assert all((step > 1) == bool(b.status & BoardStatus.OVERRUN) for step, b in steps)
+    inner = [(at, hello.sequence) for at, hello in host.hellos if 0 < at < len(host.samples)]
+    assert len(inner) > 10
+    assert all(host.samples[at - 1].sequence < told <= host.samples[at].sequence for at, told in inner)
     last, first = host.samples[-1], host.samples[-400]
     assert last.board_us - first.board_us == 1000 * (last.sequence - first.sequence)
     assert host.bad == []
