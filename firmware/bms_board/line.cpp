@@ -8,7 +8,7 @@
 #define TRANSMIT_ROOM 255  // indices of eight bits wrap by themselves
 #define RECEIVE_ROOM 255
 
-static uint8_t transmit_ring[256], receive_ring[256];
+static volatile uint8_t transmit_ring[256], receive_ring[256];
 static volatile uint8_t transmit_head, transmit_tail, receive_head, receive_tail;
 
 void line_start() {

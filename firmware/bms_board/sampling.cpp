@@ -1,5 +1,6 @@
 #include "sampling.h"
 
+#include <avr/cpufunc.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <avr/sleep.h>
@@ -167,9 +168,16 @@ void sampling_set_timing(const window_timing &wanted) {
 
 const window_timing &sampling_timing() { return next_timing; }
 
-sample_message *sampling_window() { return window_waits ? &windows[filling ^ 1] : nullptr; }
+sample_message *sampling_window() {
+    if (!window_waits) return nullptr;
+    _MemoryBarrier();  // nothing of the window is read before the flag
+    return &windows[filling ^ 1];
+}
 
-void sampling_release() { window_waits = false; }
+void sampling_release() {
+    _MemoryBarrier();
+    window_waits = false;
+}
 
 void sampling_sleep() {
     cli();
