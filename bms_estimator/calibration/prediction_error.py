@@ -38,7 +38,8 @@ LOW_SOC, LEAST_WEIGHT = 0.1, 0.01
 THETA_STD = 0.7
 """The cell file's elements are right within a factor of 2, where a load says nothing (log parameters)."""
 OCV_STD_V, BEND_STD_V = 0.03, 0.006
-"""Correction of the OCV per cell: its size, and the second difference of its coefficients [V]."""
+"""Correction of the OCV per cell [V]: of the curve as a whole (hysteresis, temperature) and of each coefficient beside;
+and the second difference of the coefficients."""
 COEFFICIENTS = 43
 """Of the correction: knots 0.025 of SOC apart."""
 OCV_END = elements.SIZE + COEFFICIENTS
@@ -173,8 +174,8 @@ class Problem:
         layout, information = self.layout, np.zeros((self.layout.size, self.layout.size))
         information[layout.theta, layout.theta] = np.eye(elements.SIZE) / THETA_STD**2
         bend = np.diff(np.eye(COEFFICIENTS), 2, axis=0) / (BEND_STD_V * self._series)
-        level = np.eye(COEFFICIENTS) / (OCV_STD_V * self._series)
-        smooth = level.T @ level + bend.T @ bend
+        level = (OCV_STD_V * self._series) ** 2 * (np.eye(COEFFICIENTS) + 1.0)
+        smooth = np.linalg.inv(level) + bend.T @ bend
         information[layout.ocv, layout.ocv] = smooth if refine_ocv else 1e8 * smooth
         soc_std = [SOC_STD if load.resting_samples else SOC_STD_LOADED for load in self.loads]
         information[layout.soc, layout.soc] = np.diag(np.array(soc_std) ** -2)

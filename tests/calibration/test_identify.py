@@ -9,6 +9,7 @@ from bms_estimator.calibration.identify import corrected_ocv, identify, spline
 from bms_estimator.calibration.prediction_error import COEFFICIENTS
 from bms_estimator.calibration.validate import validate
 from bms_estimator.cli.captures import read_whole
+from bms_estimator.cli.main import main
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import c_tl, c_ts, r_s, r_tl, r_ts
 from bms_estimator.kernels.sensitivity import sensitivities
@@ -83,6 +84,16 @@ def test_captures_are_fitted_jointly_with_their_own_soc_and_contacts():
     found = identify([("first", first), ("second", second)], wrong_start())
     assert [c.initial_soc for c in found.captures] == pytest.approx([0.97, 0.70], abs=0.006)
     assert found.captures[1].contact_ohm - found.captures[0].contact_ohm == pytest.approx(0.006, abs=5e-4)
+
+
+def test_a_pack_is_identified_as_well_as_a_cell():
+    pack = TRUTH.pack(6, 2)
+    samples = capture(2.0 * steps(), cell=pack, noise_v=3e-3)
+    found = identify([("pack", samples)], wrong_start().pack(6, 2))
+    elements = {name: value for name, (value, _) in found.elements[0.5].items()}
+    assert elements["r_s"] == pytest.approx(3.0 * r_s(0.5, TRUTH.a), rel=0.01)
+    assert elements["r_ts"] * elements["c_ts"] == pytest.approx(r_ts(0.5, TRUTH.a) * c_ts(0.5, TRUTH.a), rel=0.05)
+    assert validate("pack", samples, found.cell).above.voltage_rms_v < 6e-3
 
 
 def test_glitches_do_no_harm(identified):
@@ -212,16 +223,26 @@ def test_a_good_capture_contradicts_nothing():
     assert contradictions(whole_load("good", capture(steps()), TRUTH), TRUTH) == []
 
 
-def test_real_relaxation_test_predicts_random_steps(shared_data):
-    folder = shared_data / "ncr18650"
-    relaxation, hppc, other = (
-        read_whole(folder / f"cell5_{name}.csv.gz") for name in ("relaxation_c2", "hppc", "random_steps")
-    )
-    alone = identify([("relaxation", relaxation)], TRUTH)
-    errors = validate("random steps", other, alone.cell).above
+def errors_on_random_steps(folder, cell, *names):
+    """What a cell identified from some captures of cell 5 leaves of another one."""
+    found = identify([(name, read_whole(folder / f"cell5_{name}.csv.gz")) for name in names], cell)
+    return validate("random steps", read_whole(folder / "cell5_random_steps.csv.gz"), found.cell).above
+
+
+@pytest.mark.parametrize("names", [("relaxation_c2",), ("relaxation_c2", "hppc")])
+def test_real_cell_predicts_random_steps(shared_data, names):
+    errors = errors_on_random_steps(shared_data / "ncr18650", TRUTH, *names)
     assert errors.voltage_rms_v <= 6e-3
     assert errors.mean_abs_percent <= 0.13
-    joint = identify([("relaxation", relaxation), ("hppc", hppc)], TRUTH)
-    errors = validate("random steps", other, joint.cell).above
-    assert errors.voltage_rms_v <= 6e-3
+
+
+@pytest.mark.parametrize("form", ["table", "chen-mora"])
+def test_real_cell_from_its_relaxation_test_alone(shared_data, tmp_path, capsys, form):
+    folder, out = shared_data / "ncr18650", tmp_path / "own.toml"
+    test = folder / "cell5_relaxation_c2.csv.gz"
+    with pytest.raises(SystemExit) as ended:
+        main(["ocv", str(test), "--capacity-ah", "3.0", "--form", form, "--out", str(out)])
+    assert not ended.value.code
+    errors = errors_on_random_steps(folder, load_cell(out), "relaxation_c2")
+    assert errors.voltage_rms_v <= 6.1e-3
     assert errors.mean_abs_percent <= 0.13
