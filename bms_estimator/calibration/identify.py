@@ -7,8 +7,8 @@ by their magnitudes: Huber).
 
 With a1..a15 go: the SOC at the start of each capture, held by the voltage of its first rest; where several captures
 are fitted, a contact resistance of each; and a smooth correction of the open-circuit voltage, a cubic B-spline held to
-zero and to smoothness. Captures not used for the fit are predicted better with the correction, by a sixth of the error
-(NCR18650): relaxation goes on for hours, and what is left of it after a rest of minutes depends on the test.
+zero and to smoothness. Captures not used for the fit are predicted better with the correction, by a sixth to a quarter
+of the error (NCR18650): relaxation goes on for hours, and what is left after a rest of minutes depends on the test.
 """
 
 from collections.abc import Sequence
@@ -94,7 +94,7 @@ def identify(
 
     Args:
         captures: Name and raw samples of each; each should start from rest.
-        cell: Capacity, limits and OCV; its elements are where the search starts, a factor of 5 off does no harm.
+        cell: Capacity, limits and OCV; its elements are where the search starts, a factor of 2 off does no harm.
         refine_ocv: Correct the open-circuit voltage as well.
 
     Raises:
