@@ -1,7 +1,7 @@
 """Identification of a1..a15 from captures: a prediction-error fit with analytic sensitivities.
 
-What the model leaves of a voltage wanders for minutes under the noise of the samples. Taken as white it would claim a
-hundredfold the information there is, and let the slow part of the error decide. So errors pass the Kalman predictor of
+What the model leaves of a voltage wanders for minutes under the noise of the samples. Taken as white it would claim
+seven to twenty-five times the information there is (NCR18650), and let the slow part of the error decide. So errors pass the Kalman predictor of
 white noise plus a Gauss-Markov drift, and the squares of its one-step prediction errors are made least (large ones
 by their magnitudes: Huber).
 

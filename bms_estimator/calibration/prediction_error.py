@@ -22,7 +22,8 @@ BLOCK_S = 600.0
 """The prediction errors of stretches this long are taken as independent of each other [s]."""
 CAUTION = 3.0
 """The errors' standard deviation counts this many times: a model's error is the same each time the same load comes.
-Chosen, like the priors, by the error on captures that were not used: 8.24 mV with 1, 7.94 with 3, 8.03 with 4.5."""
+Chosen, like the priors, on the NCR18650 captures, by the error on those left out of each fit: 8.2 mV with 1, 7.9 with
+3, 8.0 with 4.5. Captures of other cells had no part in it, neither in the choice nor as a check."""
 FIRST_SCALE_V = 0.02
 """Standard deviation of the errors of the first pass, per cell: of a cell file that does not fit yet [V]."""
 LEAST_SCALE_V = 2e-4
