@@ -34,6 +34,7 @@ from bms_estimator.kernels.identifier_state import (
     V_TL,
     V_TS,
 )
+from bms_estimator.kernels.identifier_suspicion import SIGN_OF_CURRENT, watch
 from bms_estimator.kernels.state import Record
 
 Elements = tuple[float, float, float, float, float, float, float]
@@ -52,6 +53,8 @@ def identifier_init(s: Record, p: Record) -> None:
         for k in range(STATES):
             s.covariance[j, k] = 0.0
         s.covariance[j, j] = p.variance[j]
+        s.offset_sense[j] = 0.0
+        s.capacity_sense[j] = 0.0
     for j in range(ELEMENTS):
         s.excitation[j] = 0.0
     s.branch = 0.0
@@ -62,8 +65,16 @@ def identifier_init(s: Record, p: Record) -> None:
     s.correlated = CORRELATED
     s.believed_v = 0.0
     s.unsettled_v2 = 0.0
-    s.innovation_slope_v_a = 0.0
-    s.current_square = 0.0
+    s.offset_information = 0.0
+    s.capacity_information = 0.0
+    s.offset_score = 0.0
+    s.capacity_score = 0.0
+    s.suspects = 0
+    s.sign_evidence = 0.0
+    s.change_v_a = 0.0
+    s.change_a2 = 0.0
+    s.outliers = 0.0
+    s.breaks = 0.0
     s.gated_in_row = 0
     s.gated_s = 0.0
     s.started = 0
@@ -86,6 +97,7 @@ def identifier_step(s: Record, p: Record, dt_s: float, current_a: float, voltage
         return
     if s.started == 0:
         start(s, p, current_a)
+        s.slow_v, s.slow_a = voltage_v, current_a
         dt_s = FIRST_SAMPLE_S
     elif dt_s < SHORTEST_STEP_S:
         s.ignored += 1
@@ -96,6 +108,19 @@ def identifier_step(s: Record, p: Record, dt_s: float, current_a: float, voltage
     constrain(s, p)
     s.current_a = current_a
     guard(s, p, dt_s)
+    before = s.suspects
+    watch(s, p, dt_s, current_a, voltage_v)
+    if before & SIGN_OF_CURRENT and not s.suspects & SIGN_OF_CURRENT:
+        forget(s, p, current_a)
+
+
+@njit(cache=True)
+def forget(s: Record, p: Record, current_a: float) -> None:
+    """The current has its right sign again: what was learned under the wrong one is worth nothing."""
+    last = s.mean[SOC]
+    identifier_init(s, p)
+    s.mean[SOC] = s.good_mean[SOC] = last
+    start(s, p, current_a)
 
 
 @njit(cache=True)
@@ -105,6 +130,12 @@ def start(s: Record, p: Record, current_a: float) -> None:
     s.current_a = current_a
     s.covariance[V_TS, V_TS] = p.variance[V_TS] + (math.exp(s.mean[LN_R_TS]) * current_a) ** 2
     s.covariance[V_TL, V_TL] = p.variance[V_TL] + (math.exp(s.mean[LN_R_TL]) * current_a) ** 2
+
+
+@njit(cache=True)
+def suspects(s: Record) -> int:
+    """Bits of ``model.suspect.Suspect``."""
+    return s.suspects
 
 
 @njit(cache=True)

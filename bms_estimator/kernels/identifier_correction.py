@@ -8,6 +8,7 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.cell import Floats
+from bms_estimator.kernels.identifier_bias import correct_biases
 from bms_estimator.kernels.identifier_gate import reopen
 from bms_estimator.kernels.identifier_misfit import learn_misfit
 from bms_estimator.kernels.identifier_state import (
@@ -24,13 +25,14 @@ from bms_estimator.kernels.identifier_state import (
 )
 from bms_estimator.kernels.state import Record
 
+IMPLAUSIBLE = 3.0
+"""So many times its expected size no OCV curve is wrong."""
+LEAST_SLOPE_V = 0.1
 ITERATIONS = 3
 LARGE_SOC_STEP = 0.01
 """A correction of the SOC beyond this is iterated: the OCV's slope changes."""
 CURVED_SOC_VARIANCE = 0.01**2
 """Below this variance of the SOC the OCV is straight enough."""
-STATISTICS_S = 600.0
-"""Memory of the innovation's dependence on current [s]."""
 
 
 @njit(cache=True)
@@ -92,8 +94,7 @@ def correct(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: floa
     else:
         s.gated_in_row = 0
         s.gated_s = 0.0
-    note(s, p, dt_s, current_a, p.gate * s.innovation_v**2 / gate_v2)
-
+    s.surprise += min(1.0, dt_s / p.surprise_s) * (p.gate * s.innovation_v**2 / gate_v2 - s.surprise)
     learn_misfit(s, p, dt_s, sensor_v2)
     total_v2 = expected_v2 + repeated_v2
     innovation_v = s.innovation_v
@@ -108,6 +109,21 @@ def correct(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: floa
             innovation_v = voltage_v - (e_o + rest_v - ohm * i) + slope * d_soc - ohm * i * d_ln
             total_v2 = project(s, p, slope, ohm, -ohm * i, scale_v) + repeated_v2
     absorb(s, p, innovation_v, total_v2)
+    correct_biases(s, p, dt_s, slope, ohm, -ohm * i, scale_v, s.innovation_v, total_v2)
+    if abs(x[OCV_ERROR]) > IMPLAUSIBLE:
+        doubt_count(s, p, x[OCV_ERROR] * scale_v / max(slope, LEAST_SLOPE_V))
+
+
+@njit(cache=True)
+def doubt_count(s: Record, p: Record, error: float) -> None:
+    """The OCV curve cannot be so wrong: the SOC is, by about ``error``. Its count starts again from the voltage."""
+    cov = s.covariance
+    for k in range(p.active):
+        cov[OCV_ERROR, k] = cov[k, OCV_ERROR] = 0.0
+    cov[OCV_ERROR, OCV_ERROR] = p.variance[OCV_ERROR]
+    s.mean[OCV_ERROR] = 0.0
+    cov[SOC, SOC] += error * error
+    s.doubted += 1
 
 
 @njit(cache=True)
@@ -153,15 +169,6 @@ def branch_second_order(s: Record) -> float:
         + (x[V_TL] * cov[LN_R_TL, LN_R_TL]) ** 2
         + (s.tau_tl_effect_v * cov[LN_TAU_TL, LN_TAU_TL]) ** 2
     )
-
-
-@njit(cache=True)
-def note(s: Record, p: Record, dt_s: float, current_a: float, normalised: float) -> None:
-    """Running means of the squared normalised innovation and of how the innovation goes with the current."""
-    s.surprise += min(1.0, dt_s / p.surprise_s) * (normalised - s.surprise)
-    weight = min(1.0, dt_s / STATISTICS_S)
-    s.innovation_slope_v_a += weight * (s.innovation_v * current_a - s.innovation_slope_v_a)
-    s.current_square += weight * (current_a * current_a - s.current_square)
 
 
 @njit(cache=True)

@@ -7,6 +7,7 @@ import math
 
 from numba import njit
 
+from bms_estimator.kernels.identifier_bias import bias, predict_biases
 from bms_estimator.kernels.identifier_state import (
     CURRENT_OFFSET,
     LN_CAPACITY,
@@ -21,6 +22,9 @@ from bms_estimator.kernels.identifier_state import (
     V_TS,
 )
 from bms_estimator.kernels.state import Record
+from bms_estimator.model.suspect import Suspect
+
+SIGN_OF_CURRENT = int(Suspect.SIGN_OF_CURRENT)
 
 
 @njit(cache=True)
@@ -60,6 +64,7 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
         cov[k, V_TS] = e_ts * cov[k, V_TS] + r_ts * cov[k, LN_R_TS] + t_ts * cov[k, LN_TAU_TS]
         cov[k, V_TL] = e_tl * cov[k, V_TL] + r_tl * cov[k, LN_R_TL] + t_tl * cov[k, LN_TAU_TL]
         cov[k, OCV_ERROR] *= fade
+    predict_biases(s, e_ts, e_tl, r_ts, r_tl, t_ts, t_tl, fade, o_s, o_ts, o_tl, moved)
     if n > CURRENT_OFFSET:
         spread_optional(s, n, o_s, o_ts, o_tl, moved)
 
@@ -70,11 +75,28 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     unknown_a = p.timing * (current_a - s.current_a)
     if dt_s > p.gap_s:
         unknown_a = 0.5 * max(abs(current_a), abs(s.current_a)) + p.idle_current_a
+    wrong = miscount(s, o_s, moved)
     cov[SOC, SOC] += p.drift_per_soc[SOC] * abs(moved) + (unknown_a * o_s) ** 2
+    cov[SOC, SOC] += (wrong + 2.0 * math.sqrt(cov[SOC, SOC])) * wrong  # the error grows by so much, always the same way
     cov[V_TS, V_TS] += (unknown_a * o_ts) ** 2
     cov[V_TL, V_TL] += (unknown_a * o_tl) ** 2
     cov[CURRENT_OFFSET, CURRENT_OFFSET] += p.drift_per_s[CURRENT_OFFSET] * dt_s
     drift(s, p, current_a, dt_s, abs(moved) * widen)
+
+
+@njit(cache=True)
+def miscount(s: Record, o_s: float, moved: float) -> float:
+    """SOC by which this step's count is wrong, as far as the innovations tell.
+
+    Args:
+        s: Record of IDENTIFIER_STATE.
+        o_s: d soc / d offset over the step [1/A].
+        moved: Charge moved, per unit of SOC.
+    """
+    if s.suspects & SIGN_OF_CURRENT:
+        return 2.0 * abs(moved)
+    by_offset = abs(bias(s.offset_score, s.offset_information)) * o_s
+    return max(by_offset, abs(bias(s.capacity_score, s.capacity_information) * moved))
 
 
 @njit(cache=True)

@@ -80,6 +80,7 @@ IDENTIFIER_SETTINGS = np.dtype(
         ("gap_s", "f8"),  # over a longer step the current is not known [s]
         ("idle_current_a", "f8"),  # std of a current that nobody measured [A]
         ("tau_ratio", "f8"),  # least ln(tau_tl / tau_ts)
+        ("bias_s", "f8"),  # memory of offset and capacity [s]
         ("snapshot_s", "f8"),  # how often the state is kept as the last good one [s]
     ],
     align=True,
@@ -104,8 +105,12 @@ IDENTIFIER_STATE = np.dtype(
         ("correlated", "f8"),  # running mean of an innovation times the one before, as a share of its variance
         ("believed_v", "f8"),  # the innovation before, 0 when it was not believed [V]
         ("unsettled_v2", "f8"),  # how far the branches are from R i, squared [V^2]
-        ("innovation_slope_v_a", "f8"),  # running mean of innovation times current [V A]
-        ("current_square", "f8"),  # running mean of the current squared [A^2]
+        ("offset_sense", "f8", STATES),  # error of the state by an offset of the current [1/A]
+        ("capacity_sense", "f8", STATES),  # the same by ln(true / declared capacity)
+        ("offset_information", "f8"),  # of the innovations on the offset [1/A^2]
+        ("capacity_information", "f8"),
+        ("offset_score", "f8"),  # [1/A]
+        ("capacity_score", "f8"),
         ("gated_in_row", "i8"),
         ("gated_s", "f8"),  # how long samples have been gated [s]
         ("good_mean", "f8", STATES),  # last good state
@@ -115,7 +120,20 @@ IDENTIFIER_STATE = np.dtype(
         ("gated", "i8"),  # samples not believed
         ("asynchronous", "i8"),  # samples whose voltage was taken before the current had changed
         ("reopened", "i8"),  # so many samples gated in a row that the state was widened
+        ("doubted", "i8"),  # the OCV's error became implausible: the SOC was taken from the voltage
         ("reset", "i8"),  # not finite: back to the last good state
+        ("suspects", "i8"),  # bits of model.suspect.Suspect
+        ("slow_v", "f8"),  # voltage and ...
+        ("slow_a", "f8"),  # ... current without their fast changes
+        ("sign_evidence", "f8"),  # 0..1: how much was seen of
+        ("change_v_a", "f8"),  # running mean of the fast change of voltage times that of current [V A]
+        ("change_a2", "f8"),  # the same of the current's squared [A^2]
+        ("outliers", "f8"),  # single samples not believed of late
+        ("breaks", "f8"),  # doubted and reopened of late
+        ("seen_gated", "i8"),
+        ("seen_asynchronous", "i8"),
+        ("seen_doubted", "i8"),
+        ("seen_reopened", "i8"),
         ("ignored", "i8"),  # not finite or not later than the sample before
     ],
     align=True,
@@ -197,6 +215,7 @@ class Tuning:
     """Std gained by the offset in an hour [A]."""
     capacity_std: float = 0.0
     """Initial relative error of the capacity, std; 0 leaves the state out."""
+    bias_s: float = 36000.0
     snapshot_s: float = 60.0
 
     def pack(self, series: int) -> "Tuning":

@@ -23,6 +23,7 @@ TRACE = np.dtype(
         ("innovation_v", "f8"),
         ("nis", "f8"),
         ("misfit", "f8"),
+        ("ocv_error", "f8"),
         ("ln", "f8", 5),
         ("ln_std", "f8", 5),
     ]
@@ -94,6 +95,7 @@ def loop(state, settings, time_s, current_a, voltage_v, trace):
         row.innovation_v = s.innovation_v
         row.nis = nis(s)
         row.misfit = s.misfit
+        row.ocv_error = s.mean[8]
         for k in range(5):
             row.ln[k] = s.mean[3 + k]
             row.ln_std[k] = math.sqrt(s.covariance[3 + k, 3 + k])

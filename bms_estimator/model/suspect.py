@@ -1,0 +1,32 @@
+"""What the identifier suspects of its input, and what a person may do about it."""
+
+from enum import IntFlag
+
+
+class Suspect(IntFlag):
+    """Bits of ``kernels.identifier.suspects``; several may be set."""
+
+    SIGN_OF_CURRENT = 1
+    OFFSET = 2
+    CAPACITY = 4
+    OCV = 8
+    OUTLIERS = 16
+
+    @property
+    def text(self) -> str:
+        """What was seen and what to do, of every bit set; empty when none is."""
+        return "; ".join(_TEXT[suspect] for suspect in Suspect if suspect in self)
+
+
+_TEXT = {
+    Suspect.SIGN_OF_CURRENT: "innovation grows with current, the voltage rises when discharge is said to rise: "
+    "check the sign of the current (sensor.current_sign)",
+    Suspect.OFFSET: "counted charge and voltage drift apart with time: "
+    "check the zero of the current sensor with the load disconnected",
+    Suspect.CAPACITY: "counted charge and voltage drift apart with charge moved: check the declared capacity, "
+    "the cell may have aged",
+    Suspect.OCV: "voltage and SOC agree with no nearby OCV: check that the OCV curve belongs to this cell's chemistry "
+    "and the number of cells in series",
+    Suspect.OUTLIERS: "single samples far from those around them: check wiring and supply of the sensors, "
+    "and that voltage and current are taken at the same time",
+}
