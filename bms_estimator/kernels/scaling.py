@@ -64,7 +64,7 @@ def reference(s: Record) -> float:
     return s.bandgap_v * s.full_scale / s.bandgap_mean
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")  # a board that scales by zero gives inf or NaN, which the estimator drops
 def temperature(s: Record) -> float:
     """Of the NTC [degC]; NaN without one or when it is open or shorted."""
     x = s.ntc_mean / s.full_scale
@@ -82,7 +82,7 @@ def voltage(s: Record, total: float, count: float, reference_v: float) -> float:
     return total / count / s.full_scale * reference_v * s.divider
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")  # a board that scales by zero gives inf or NaN, which the estimator drops
 def current(s: Record, total: float, count: float, reference_v: float) -> float:
     """Through the sensor [A], positive as the board is wired; NaN without a conversion."""
     if count == 0.0:

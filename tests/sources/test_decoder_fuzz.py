@@ -86,9 +86,9 @@ frames = st.builds(
     status=st.integers(0, 255),
 ).map(SampleMessage.encode)
 widths = {"B": 8, "H": 16, "I": 32}
-numbers = [st.integers(1, 2 ** widths[code] - 1) for code in "BBBBHIIIHIBBIIIIIHIIH"]
+numbers = [st.integers(0, 2 ** widths[code] - 1) for code in "BBBBHIIIHIBBIIIIIHIIH"]
 hellos = st.builds(Hello, *numbers).map(Hello.encode)
-sealed_nonsense = st.binary(max_size=80).filter(lambda body: body[:2] != b"\x01\x02").map(seal)
+sealed_nonsense = st.binary(max_size=80).map(seal)
 damaged = st.builds(
     lambda frame, at, byte: frame[: at % len(frame)] + bytes((byte,)) + frame[at % len(frame) + 1 :],
     frames | st.just(HELLO),
@@ -146,9 +146,6 @@ def test_a_sample_with_one_byte_changed_is_no_sample(at: int, change: int) -> No
     assert sum(getattr(counters, name) for name in COUNTED) >= 1
 
 
-@pytest.mark.xfail(
-    raises=ZeroDivisionError, reason="scaling.current and scaling.temperature divide by what the hello says"
-)
 @pytest.mark.parametrize("field", ["current_uv_per_a", "ntc_r25_ohm", "ntc_beta_k"])
 def test_a_hello_with_a_zero_in_it_does_not_make_it_raise(field: str) -> None:
     zeroed = dataclasses.replace(Hello.decode(unseal(HELLO)), **{field: 0}).encode()
