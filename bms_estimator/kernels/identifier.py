@@ -19,11 +19,9 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.identifier_correction import correct
-from bms_estimator.kernels.identifier_guard import constrain, guard, keep
+from bms_estimator.kernels.identifier_guard import clear, constrain, guard, keep
 from bms_estimator.kernels.identifier_prediction import predict
 from bms_estimator.kernels.identifier_state import (
-    CORRELATED,
-    ELEMENTS,
     LN_R_S,
     LN_R_TL,
     LN_R_TS,
@@ -53,28 +51,8 @@ def identifier_init(s: Record, p: Record) -> None:
         for k in range(STATES):
             s.covariance[j, k] = 0.0
         s.covariance[j, j] = p.variance[j]
-        s.offset_sense[j] = 0.0
-        s.capacity_sense[j] = 0.0
-    for j in range(ELEMENTS):
-        s.excitation[j] = 0.0
+    clear(s)
     s.branch = 0.0
-    s.tau_ts_effect_v = 0.0
-    s.tau_tl_effect_v = 0.0
-    s.surprise = 0.0
-    s.misfit = 1.0
-    s.correlated = CORRELATED
-    s.believed_v = 0.0
-    s.unsettled_v2 = 0.0
-    s.offset_information = 0.0
-    s.capacity_information = 0.0
-    s.offset_score = 0.0
-    s.capacity_score = 0.0
-    s.suspects = 0
-    s.sign_evidence = 0.0
-    s.change_v_a = 0.0
-    s.change_a2 = 0.0
-    s.outliers = 0.0
-    s.breaks = 0.0
     s.gated_in_row = 0
     s.gated_s = 0.0
     s.started = 0
@@ -97,7 +75,6 @@ def identifier_step(s: Record, p: Record, dt_s: float, current_a: float, voltage
         return
     if s.started == 0:
         start(s, p, current_a)
-        s.slow_v, s.slow_a = voltage_v, current_a
         dt_s = FIRST_SAMPLE_S
     elif dt_s < SHORTEST_STEP_S:
         s.ignored += 1

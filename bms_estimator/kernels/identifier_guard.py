@@ -8,7 +8,7 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.identifier_correction import absorb
-from bms_estimator.kernels.identifier_state import ELEMENTS, LN_R_S, LN_TAU_TL, LN_TAU_TS, STATES
+from bms_estimator.kernels.identifier_state import CORRELATED, ELEMENTS, LN_R_S, LN_TAU_TL, LN_TAU_TS, STATES
 from bms_estimator.kernels.state import Record
 
 BOUND_STD = 0.05
@@ -49,7 +49,7 @@ def hold(s: Record, p: Record, j: int, less: int, value: float) -> None:
 @njit(cache=True)
 def guard(s: Record, p: Record, dt_s: float) -> None:
     """Back to the last good state when anything is not finite; else keep this one now and then."""
-    total = 0.0
+    total = s.misfit + s.correlated + s.surprise + s.offset_score + s.capacity_score + s.change_v_a
     for j in range(p.active):
         total += s.mean[j] + s.covariance[j, j] + s.gain[j]
     if not math.isfinite(total):
@@ -57,12 +57,29 @@ def guard(s: Record, p: Record, dt_s: float) -> None:
             s.mean[j] = s.good_mean[j]
             for k in range(STATES):
                 s.covariance[j, k] = s.good_covariance[j, k]
-        s.surprise = 0.0
+        clear(s)
         s.reset += 1
         return
     s.good_age_s += dt_s
     if s.good_age_s >= p.snapshot_s:
         keep(s)
+
+
+@njit(cache=True)
+def clear(s: Record) -> None:
+    """Start the statistics beside the state again; counters are kept."""
+    s.tau_ts_effect_v = s.tau_tl_effect_v = 0.0
+    s.surprise = 0.0
+    s.misfit, s.correlated, s.believed_v, s.unsettled_v2 = 1.0, CORRELATED, 0.0, 0.0
+    for j in range(STATES):
+        s.offset_sense[j] = s.capacity_sense[j] = 0.0
+    for j in range(ELEMENTS):
+        s.excitation[j] = 0.0
+    s.offset_information = s.capacity_information = s.offset_score = s.capacity_score = 0.0
+    s.slow_v = s.slow_a = 0.0
+    s.sign_evidence = s.change_v_a = s.change_a2 = 0.0
+    s.outliers = s.breaks = 0.0
+    s.suspects = 0
 
 
 @njit(cache=True)

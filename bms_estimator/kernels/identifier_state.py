@@ -287,7 +287,7 @@ def identifier_settings(
     p["model_v2"], p["model_s"] = t.model_error_v**2, t.model_error_s
     p["branch_v2"] = t.branch_error_v**2
     p["gate"] = t.gate_std**2
-    p["idle_current_a"] = capacity_ah / 20.0
+    p["idle_current_a"] = capacity_ah / 10.0
     p["tau_ratio"] = math.log(t.tau_ratio)
     for name in _SAME_NAME:
         p[name] = getattr(t, name)

@@ -62,7 +62,7 @@ def watch(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float)
 @njit(cache=True)
 def watch_sign(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
     """How fast changes of the voltage go with those of the current: by -R_s when the sign is right."""
-    if dt_s > p.gap_s:
+    if dt_s > p.gap_s or s.slow_v == 0.0:  # a gap, or the first sample
         s.slow_v, s.slow_a = voltage_v, current_a
         return
     ohm = math.exp(p.mean[LN_R_S]) + math.exp(p.mean[LN_R_TS]) + math.exp(p.mean[LN_R_TL])

@@ -11,10 +11,11 @@ import numpy as np
 from numba import njit
 
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.cell import c_tl, c_ts, r_s, r_tl, r_ts, simulate_cell
-from bms_estimator.kernels.identifier import element_ln_stds, element_values, identifier_init, identifier_step, nis
+from bms_estimator.kernels.cell import c_tl, c_ts, emf, r_s, r_tl, r_ts, simulate_cell
+from bms_estimator.kernels.identifier import identifier_init, identifier_step, nis, suspects
 from bms_estimator.kernels.identifier_state import IDENTIFIER_STATE, Tuning, identifier_settings
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.suspect import Suspect
 
 TRACE = np.dtype(
     [
@@ -23,7 +24,7 @@ TRACE = np.dtype(
         ("innovation_v", "f8"),
         ("nis", "f8"),
         ("misfit", "f8"),
-        ("ocv_error", "f8"),
+        ("suspects", "i8"),
         ("ln", "f8", 5),
         ("ln_std", "f8", 5),
     ]
@@ -73,6 +74,15 @@ class Run:
         """Share of samples whose true SOC is inside the 2-sigma band."""
         return float(np.mean(np.abs(self.error) <= 2.0 * self.trace["soc_std"]))
 
+    def element_errors(self, model: CellModel, samples: np.ndarray) -> np.ndarray:
+        """ln(estimated / true) of R_s, R_ts, tau_ts, R_tl, tau_tl at ``samples``; shape (n, 5)."""
+        true = np.array([elements(model, z) for z in self.soc[samples]])
+        return self.trace["ln"][samples] - np.log(true)
+
+    def suspected(self) -> Suspect:
+        """All that was suspected at any time."""
+        return Suspect(int(np.bitwise_or.reduce(self.trace["suspects"])))
+
     def innovation_rms_mv(self, start_s: float) -> float:
         return 1e3 * rms(self.trace["innovation_v"][self.after(start_s)])
 
@@ -81,9 +91,9 @@ def rms(x: np.ndarray) -> float:
     return math.sqrt(float(np.mean(np.square(x))))
 
 
-@njit(cache=True)
+@njit
 def loop(state, settings, time_s, current_a, voltage_v, trace):
-    """Every sample in turn; what was known after it goes to ``trace``. Returns the mean of |P - P'| over the run."""
+    """Every sample in turn; what was known after it goes to ``trace``."""
     s, p = state[0], settings[0]
     last = time_s[0]
     for j in range(len(time_s)):
@@ -95,22 +105,17 @@ def loop(state, settings, time_s, current_a, voltage_v, trace):
         row.innovation_v = s.innovation_v
         row.nis = nis(s)
         row.misfit = s.misfit
-        row.ocv_error = s.mean[8]
+        row.suspects = suspects(s)
         for k in range(5):
             row.ln[k] = s.mean[3 + k]
             row.ln_std[k] = math.sqrt(s.covariance[3 + k, 3 + k])
 
 
-@njit(cache=True)
+@njit
 def fast(state, settings, dt_s, current_a, voltage_v):
     """Samples at an even step, without a trace."""
     for j in range(len(current_a)):
         identifier_step(state[0], settings[0], dt_s, current_a[j], voltage_v[j])
-
-
-@njit(cache=True)
-def elements_of(state):
-    return element_values(state[0]), element_ln_stds(state[0])
 
 
 @cache
@@ -195,12 +200,15 @@ class Simulated:
     resolution_v: float
 
 
-def pulses(hours: float, rate_hz: float, amplitude_a: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def pulses(
+    hours: float, rate_hz: float, amplitude_a: float, *, both_ways: bool = False, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Five minutes of steps of random height 0..2 ``amplitude_a``, ten minutes of rest, over again."""
     time_s = np.arange(round(hours * 3600 * rate_hz)) / rate_hz
-    height = amplitude_a * rng.uniform(0.0, 2.0, int(time_s[-1] // 60) + 1)
+    height = amplitude_a * np.random.default_rng(seed).uniform(0.0, 2.0, int(time_s[-1] // 60) + 1)
     on = (time_s % 900.0 < 300.0) & (time_s >= 10.0)
-    return time_s, np.where(on, height[(time_s // 60.0).astype(int)], 0.0)
+    way = np.where(time_s // 900.0 % 2.0 == 1.0, -1.0, 1.0) if both_ways else 1.0
+    return time_s, np.where(on, way * height[(time_s // 60.0).astype(int)], 0.0)
 
 
 def convert(
@@ -211,21 +219,45 @@ def convert(
     return step_v * np.round(voltage_v / step_v + 0.5 * rng.standard_normal(len(voltage_v))), step_v
 
 
+@njit
+def simulate_ageing(time_s, current_a, capacity_as, soc, x, growth):
+    """Drop over R_s and branches [V] and SOC of constant elements ``x`` whose resistances grow by ``growth`` in all."""
+    n = len(time_s)
+    drop_v, truth = np.empty(n), np.empty(n)
+    v_ts = v_tl = 0.0
+    for j in range(n):
+        grown = 1.0 + growth * time_s[j] / time_s[-1]
+        if j > 0:
+            step_s, i = time_s[j] - time_s[j - 1], current_a[j - 1]
+            soc -= i * step_s / capacity_as
+            e_ts, e_tl = math.exp(-step_s / x[2]), math.exp(-step_s / x[4])
+            v_ts = e_ts * v_ts + (1.0 - e_ts) * x[1] * grown * i
+            v_tl = e_tl * v_tl + (1.0 - e_tl) * x[3] * grown * i
+        drop_v[j] = v_ts + v_tl + x[0] * grown * current_a[j]
+        truth[j] = soc
+    return drop_v, truth
+
+
 def simulate(
-    model: CellModel,
-    time_s: np.ndarray,
-    current_a: np.ndarray,
-    *,
-    bits: int = 16,
-    soc: float = 1.0,
-    a: np.ndarray | None = None,
-    seed: int = 0,
+    model: CellModel, time_s: np.ndarray, current_a: np.ndarray, *, bits: int = 16, soc: float = 1.0, seed: int = 0
 ) -> Simulated:
-    """Terminal voltage of a cell through a converter of 5 V."""
+    """Terminal voltage of a cell with (2.5)-(2.10), or its table OCV, through a converter of 5 V."""
+    a = model.a.copy()
+    table = bool(np.isnan(a[16]))
+    if table:
+        a[16:] = cell("chen_mora").a[16:]
     capacity_as = model.cell.capacity_ah * 3600.0
-    voltage_v, truth = simulate_cell((soc, 0.0, 0.0), time_s, current_a, capacity_as, model.a if a is None else a)
+    voltage_v, truth = simulate_cell((soc, 0.0, 0.0), time_s, current_a, capacity_as, a)
+    if table:
+        voltage_v += ocv(model, truth) - np.array([emf(z, a) for z in truth])
     seen_v, step_v = convert(voltage_v, bits, 5.0, np.random.default_rng(seed))
     return Simulated(time_s, current_a, seen_v, truth, 0.5 * step_v, step_v)
+
+
+def ocv(model: CellModel, soc: np.ndarray) -> np.ndarray:
+    """E_o of the grid that the identifier uses [V]."""
+    grid_v, _ = ocv_grid(model)
+    return np.interp(soc, np.linspace(0.0, 1.0, len(grid_v)), grid_v)
 
 
 def identify_simulated(model: CellModel, x: Simulated, factors=(1.0,) * 5, wrong_soc: float = -0.2, **kwargs) -> Run:
