@@ -89,7 +89,7 @@ async def _replay(settings: Settings, cell: CellModel, source: Replay, table: Ta
         wall_s = time.perf_counter() - started_s
         if publisher:
             publisher.publish_last()
-    return summary.result(estimator.state[0], source.samples, wall_s)
+    return summary.result(estimator.record[0], source.samples, wall_s)
 
 
 async def _publisher(
@@ -133,6 +133,8 @@ def result_table(capture: Path, result: Result) -> Table:
     }
     for name, value in rows.items():
         table.add_row(name, value)
+    for suspicion in result.suspects:
+        table.add_row("suspected", f"[yellow]{suspicion}[/]")
     return table
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.service.health import sample_counters
+from bms_estimator.service.health import sample_counters, suspicions
 from bms_estimator.service.report import finite
 
 
@@ -25,6 +25,8 @@ class Result:
     lock_lost: bool
     lock_losses: int
     k_final: float | None
+    suspects: list[str]
+    """What the identifier suspects of its input at the end."""
     gain_rearms: int
     dropped: dict[str, int]
     """Kind of fault -> samples that were not used."""
@@ -57,14 +59,15 @@ class Summary:
         difference = trace["soc"] - trace["soc_coulomb"]
         self._soc_difference += float(difference @ difference)
 
-    def result(self, state: np.void, read: int, wall_s: float) -> Result:
+    def result(self, record: np.void, read: int, wall_s: float) -> Result:
         """The outcome.
 
         Args:
-            state: Record of OBSERVER_STATE after the last sample.
+            record: Of dtype ESTIMATOR_STATE, after the last sample.
             read: How many samples the capture had.
             wall_s: How long it took [s].
         """
+        state = record["observer"]
         counters = sample_counters(state)
         return Result(
             samples=self._rows,
@@ -78,6 +81,7 @@ class Summary:
             lock_lost=bool(state["lock_losses"]),
             lock_losses=int(state["lock_losses"]),
             k_final=finite(state["k"]),
+            suspects=suspicions(record),
             gain_rearms=int(state["gain_rearms"]),
             dropped={
                 name.removeprefix("dropped_"): count for name, count in counters.items() if name.startswith("dropped_")

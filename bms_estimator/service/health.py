@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bms_estimator.model.estimate import Health
+from bms_estimator.model.suspect import Suspect
 from bms_estimator.service.clock import iso_utc
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
@@ -27,8 +28,14 @@ def sample_counters(state: np.void) -> dict[str, int]:
     return {name: int(state[name]) for name in names}
 
 
+def suspicions(record: np.void) -> list[str]:
+    """What the identifier suspects of its input, of a record of ESTIMATOR_STATE: one sentence each."""
+    suspects = Suspect(int(record["identifier"]["suspects"]))
+    return [suspect.text for suspect in Suspect if suspect in suspects]
+
+
 def health_report(
-    state: np.void,
+    record: np.void,
     line: Mapping[str, int],
     *,
     now_s: float,
@@ -40,7 +47,7 @@ def health_report(
     """Topic ``health``.
 
     Args:
-        state: Record of OBSERVER_STATE.
+        record: Of dtype ESTIMATOR_STATE.
         line: The source's counters.
         now_s: Wall clock [s since 1970].
         uptime_s: Since the service started [s].
@@ -48,6 +55,7 @@ def health_report(
         checkpoint: What became of the last checkpoint.
         sensor_message: Why values are not fresh; None when they are.
     """
+    state = record["observer"]
     return Health(
         publish_time=iso_utc(now_s),
         uptime_s=uptime_s,
@@ -58,6 +66,7 @@ def health_report(
         sensor_message=sensor_message,
         line={name: int(count) for name, count in line.items() if name != "reconnects"},
         samples=sample_counters(state),
+        suspects=suspicions(record),
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),
         publish_drops=0,

@@ -3,6 +3,8 @@
 import math
 from collections.abc import Sequence
 
+import structlog
+
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.cell import CellModel
@@ -16,6 +18,8 @@ from bms_estimator.service.report import estimate_report, info_report, publish_r
 from bms_estimator.service.source import Source
 from bms_estimator.service.window import Window, WindowSummary
 from bms_estimator.sinks import Sink
+
+log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
 """Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
@@ -112,7 +116,9 @@ class Publisher:
             self._slow_s = now_s
             parameters, info = parameter_report(self._estimator, wall_s), self._info()
         if old or health.sensor_online != (message is None):
-            health = self._health(now_s, message)
+            before, health = health, self._health(now_s, message)
+            if health.suspects != before.suspects:
+                log.warning("suspicion", suspects=health.suspects or "none any more")
         return Snapshot(estimate, parameters, health, info)
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
@@ -121,7 +127,7 @@ class Publisher:
 
     def _health(self, now_s: float, message: str | None) -> Health:
         return health_report(
-            self._estimator.state[0],
+            self._estimator.record[0],
             self._source.counters,
             now_s=self._clock.wall(),
             uptime_s=now_s - self._started_s,

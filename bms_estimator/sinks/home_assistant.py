@@ -151,4 +151,15 @@ def _components(info: Info, root: str) -> dict[str, Any]:
         device_class="problem",
         entity_category="diagnostic",
     )
+    add(
+        "suspicion",
+        "binary_sensor",
+        "Input suspected",
+        state_topic=f"{root}/health",
+        value_template="{{ 'ON' if value_json.suspects else 'OFF' }}",
+        json_attributes_topic=f"{root}/health",
+        availability=[{"topic": f"{root}/availability"}],
+        device_class="problem",
+        entity_category="diagnostic",
+    )
     return components

@@ -43,7 +43,7 @@ def snapshot(sensor_message: str | None = None) -> Snapshot:
         estimate_report(summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW),
         parameter_report(estimator, NOW),
         health_report(
-            estimator.state[0],
+            estimator.record[0],
             {"frames_received": 2},
             now_s=NOW,
             uptime_s=1.0,
