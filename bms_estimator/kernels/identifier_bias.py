@@ -43,7 +43,22 @@ def predict_biases(
     o_tl: float,
     moved: float,
 ) -> None:
-    """Both sensitivities through the step that ``predict`` makes, from its derivatives."""
+    """Both sensitivities through the step that ``predict`` makes.
+
+    Args:
+        s: Record of IDENTIFIER_STATE.
+        e_ts: Decay of v_ts over the step; also its derivative by itself.
+        e_tl: The same of v_tl.
+        r_ts: d v_ts / d ln R_ts [V].
+        r_tl: d v_tl / d ln R_tl [V].
+        t_ts: d v_ts / d ln tau_ts [V].
+        t_tl: d v_tl / d ln tau_tl [V].
+        fade: Decay of the OCV's error.
+        o_s: d soc / d offset [1/A].
+        o_ts: d v_ts / d offset [ohm].
+        o_tl: d v_tl / d offset [ohm].
+        moved: d soc / d ln(capacity): the charge moved, per unit of SOC.
+    """
     for z in (s.offset_sense, s.capacity_sense):
         z[V_TS] = e_ts * z[V_TS] + r_ts * z[LN_R_TS] + t_ts * z[LN_TAU_TS]
         z[V_TL] = e_tl * z[V_TL] + r_tl * z[LN_R_TL] + t_tl * z[LN_TAU_TL]
@@ -66,7 +81,19 @@ def correct_biases(
     innovation_v: float,
     total_v2: float,
 ) -> None:
-    """Take a believed innovation in: ``s.gain`` has been applied to the state."""
+    """Take a believed innovation in, after ``s.gain`` has been applied to the state.
+
+    Args:
+        s: Record of IDENTIFIER_STATE.
+        p: Record of IDENTIFIER_SETTINGS.
+        dt_s: Step [s].
+        slope: dE_o/dSOC [V].
+        ohm: R_s, the derivative of the voltage by the offset [ohm].
+        ohmic: -R_s i, the derivative by ln R_s [V].
+        scale_v: Size of the OCV's error [V].
+        innovation_v: Measured less predicted voltage [V].
+        total_v2: Its variance, errors that keep their sign included [V^2].
+    """
     a, b = s.offset_sense, s.capacity_sense
     effect_a = slope * a[SOC] - a[V_TS] - a[V_TL] + ohmic * a[LN_R_S] + scale_v * a[OCV_ERROR] + ohm
     effect_b = slope * b[SOC] - b[V_TS] - b[V_TL] + ohmic * b[LN_R_S] + scale_v * b[OCV_ERROR]

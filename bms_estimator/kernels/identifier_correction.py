@@ -121,7 +121,7 @@ def doubt_count(s: Record, p: Record, error: float) -> None:
     for k in range(p.active):
         cov[OCV_ERROR, k] = cov[k, OCV_ERROR] = 0.0
     cov[OCV_ERROR, OCV_ERROR] = p.variance[OCV_ERROR]
-    s.mean[OCV_ERROR] = 0.0
+    s.mean[OCV_ERROR] = s.offset_sense[OCV_ERROR] = s.capacity_sense[OCV_ERROR] = 0.0
     cov[SOC, SOC] += error * error
     s.doubted += 1
 
