@@ -7,7 +7,6 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.identifier_correction import absorb
 from bms_estimator.kernels.identifier_state import CORRELATED, ELEMENTS, LN_R_S, LN_TAU_TL, LN_TAU_TS, STATES
 from bms_estimator.kernels.state import Record
 
@@ -38,12 +37,17 @@ def constrain(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def hold(s: Record, p: Record, j: int, less: int, value: float) -> None:
-    """Correct as if x[j] - x[less] (``less`` < 0: x[j]) had been measured as ``value``."""
-    x, cov, g = s.mean, s.covariance, s.projected
+    """Move the mean to where x[j] - x[less] (``less`` < 0: x[j]) is ``value``, the others as they go with it.
+
+    The covariance stays: a bound says nothing new each time it is reached.
+    """
+    x, cov = s.mean, s.covariance
+    variance = cov[j, j]
+    if less >= 0:
+        variance += cov[less, less] - 2.0 * cov[j, less]
+    pull = (value - x[j] + (x[less] if less >= 0 else 0.0)) / (variance + BOUND_STD**2)
     for k in range(p.active):
-        g[k] = cov[j, k] - (cov[less, k] if less >= 0 else 0.0)
-    expected = g[j] - (g[less] if less >= 0 else 0.0)
-    absorb(s, p, value - x[j] + (x[less] if less >= 0 else 0.0), expected + BOUND_STD**2)
+        x[k] += pull * (cov[j, k] - (cov[less, k] if less >= 0 else 0.0))
 
 
 @njit(cache=True)
