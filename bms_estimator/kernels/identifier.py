@@ -29,6 +29,7 @@ from bms_estimator.kernels.identifier_state import (
     LN_TAU_TS,
     SOC,
     STATES,
+    V_SLOW,
     V_TL,
     V_TS,
 )
@@ -107,6 +108,7 @@ def start(s: Record, p: Record, current_a: float) -> None:
     s.current_a = current_a
     s.covariance[V_TS, V_TS] = p.variance[V_TS] + (math.exp(s.mean[LN_R_TS]) * current_a) ** 2
     s.covariance[V_TL, V_TL] = p.variance[V_TL] + (math.exp(s.mean[LN_R_TL]) * current_a) ** 2
+    s.covariance[V_SLOW, V_SLOW] = (p.slow_mean * (math.exp(s.mean[LN_R_TL]) * current_a)) ** 2
 
 
 @njit(cache=True)

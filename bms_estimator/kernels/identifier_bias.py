@@ -17,6 +17,7 @@ from bms_estimator.kernels.identifier_state import (
     LN_TAU_TS,
     OCV_ERROR,
     SOC,
+    V_SLOW,
     V_TL,
     V_TS,
 )
@@ -24,7 +25,7 @@ from bms_estimator.kernels.state import Record
 
 SIGNIFICANT = 12.0
 """Squared bias over its variance: below, it may be the error of the OCV curve."""
-SENSED = 9
+SENSED = 10
 """States that a bias works on: all but the optional ones."""
 
 
@@ -38,6 +39,7 @@ def predict_biases(
     t_ts: float,
     t_tl: float,
     fade: float,
+    e_slow: float,
     o_s: float,
     o_ts: float,
     o_tl: float,
@@ -54,6 +56,7 @@ def predict_biases(
         t_ts: d v_ts / d ln tau_ts [V].
         t_tl: d v_tl / d ln tau_tl [V].
         fade: Decay of the OCV's error.
+        e_slow: Decay of v_slow.
         o_s: d soc / d offset [1/A].
         o_ts: d v_ts / d offset [ohm].
         o_tl: d v_tl / d offset [ohm].
@@ -63,6 +66,7 @@ def predict_biases(
         z[V_TS] = e_ts * z[V_TS] + r_ts * z[LN_R_TS] + t_ts * z[LN_TAU_TS]
         z[V_TL] = e_tl * z[V_TL] + r_tl * z[LN_R_TL] + t_tl * z[LN_TAU_TL]
         z[OCV_ERROR] *= fade
+        z[V_SLOW] *= e_slow
     s.offset_sense[SOC] += o_s
     s.offset_sense[V_TS] += o_ts
     s.offset_sense[V_TL] += o_tl
@@ -95,8 +99,8 @@ def correct_biases(
         total_v2: Its variance, errors that keep their sign included [V^2].
     """
     a, b = s.offset_sense, s.capacity_sense
-    effect_a = slope * a[SOC] - a[V_TS] - a[V_TL] + ohmic * a[LN_R_S] + scale_v * a[OCV_ERROR] + ohm
-    effect_b = slope * b[SOC] - b[V_TS] - b[V_TL] + ohmic * b[LN_R_S] + scale_v * b[OCV_ERROR]
+    effect_a = slope * a[SOC] - a[V_TS] - a[V_TL] - a[V_SLOW] + ohmic * a[LN_R_S] + scale_v * a[OCV_ERROR] + ohm
+    effect_b = slope * b[SOC] - b[V_TS] - b[V_TL] - b[V_SLOW] + ohmic * b[LN_R_S] + scale_v * b[OCV_ERROR]
     for j in range(SENSED):
         a[j] -= s.gain[j] * effect_a
         b[j] -= s.gain[j] * effect_b

@@ -20,6 +20,7 @@ from bms_estimator.kernels.identifier_state import (
     LN_TAU_TS,
     OCV_ERROR,
     SOC,
+    V_SLOW,
     V_TL,
     V_TS,
 )
@@ -64,7 +65,7 @@ def correct(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: floa
     error_soc = p.ocv_error_soc + p.capacity_spread * (1.0 - x[SOC])
     error_v2 = p.ocv_error_v**2 + (error_soc * slope) ** 2 + (s.branch * p.hysteresis_error_v) ** 2
     scale_v = math.sqrt(error_v2)
-    s.voltage_v = e_o + hysteresis_v + scale_v * x[OCV_ERROR] - x[V_TS] - x[V_TL] - ohm * i  # (2.4)
+    s.voltage_v = e_o + hysteresis_v + scale_v * x[OCV_ERROR] - x[V_TS] - x[V_TL] - x[V_SLOW] - ohm * i  # (2.4)
     s.innovation_v = voltage_v - s.voltage_v
 
     drop = ohm * i
@@ -140,11 +141,12 @@ def project(s: Record, p: Record, slope: float, ohm: float, ohmic: float, scale_
     """
     cov, g, n = s.covariance, s.projected, p.active
     for k in range(n):
-        g[k] = slope * cov[SOC, k] - cov[V_TS, k] - cov[V_TL, k] + ohmic * cov[LN_R_S, k] + scale_v * cov[OCV_ERROR, k]
+        branches = cov[V_TS, k] + cov[V_TL, k] + cov[V_SLOW, k]
+        g[k] = slope * cov[SOC, k] - branches + ohmic * cov[LN_R_S, k] + scale_v * cov[OCV_ERROR, k]
     if n > CURRENT_OFFSET:
         for k in range(n):
             g[k] += ohm * cov[CURRENT_OFFSET, k]
-    total = slope * g[SOC] - g[V_TS] - g[V_TL] + ohmic * g[LN_R_S] + scale_v * g[OCV_ERROR]
+    total = slope * g[SOC] - g[V_TS] - g[V_TL] - g[V_SLOW] + ohmic * g[LN_R_S] + scale_v * g[OCV_ERROR]
     return total + ohm * g[CURRENT_OFFSET] if n > CURRENT_OFFSET else total
 
 

@@ -18,6 +18,7 @@ from bms_estimator.kernels.identifier_state import (
     LN_TAU_TS,
     OCV_ERROR,
     SOC,
+    V_SLOW,
     V_TL,
     V_TS,
 )
@@ -37,7 +38,7 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     i -= x[CURRENT_OFFSET]
     ohm_ts, ohm_tl = math.exp(x[LN_R_TS]), math.exp(x[LN_R_TL])
     x_ts, x_tl = dt_s * math.exp(-x[LN_TAU_TS]), dt_s * math.exp(-x[LN_TAU_TL])
-    e_ts, e_tl = math.exp(-x_ts), math.exp(-x_tl)
+    e_ts, e_tl, e_slow = math.exp(-x_ts), math.exp(-x_tl), math.exp(-dt_s / p.slow_s)
     capacity_as = p.capacity_as * math.exp(x[LN_CAPACITY]) if n > LN_CAPACITY else p.capacity_as
     moved = i * dt_s / capacity_as
     r_ts, r_tl = ohm_ts * (1.0 - e_ts) * i, ohm_tl * (1.0 - e_tl) * i  # dv/d ln R over the step
@@ -50,6 +51,7 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     x[V_TS] = e_ts * x[V_TS] + r_ts  # (2.2)
     x[V_TL] = e_tl * x[V_TL] + r_tl  # (2.3)
     x[OCV_ERROR] *= fade
+    x[V_SLOW] = e_slow * x[V_SLOW] + s.misfit * p.slow_mean * (ohm_ts + ohm_tl) * (1.0 - e_slow) * i
     s.tau_ts_effect_v = e_ts * s.tau_ts_effect_v + t_ts
     s.tau_tl_effect_v = e_tl * s.tau_tl_effect_v + t_tl
     turn = 1.0 - math.exp(-abs(moved) / p.hysteresis_soc)
@@ -60,11 +62,13 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
         cov[V_TS, k] = e_ts * cov[V_TS, k] + r_ts * cov[LN_R_TS, k] + t_ts * cov[LN_TAU_TS, k]
         cov[V_TL, k] = e_tl * cov[V_TL, k] + r_tl * cov[LN_R_TL, k] + t_tl * cov[LN_TAU_TL, k]
         cov[OCV_ERROR, k] *= fade
+        cov[V_SLOW, k] *= e_slow
     for k in range(n):  # columns: (F P) F'
         cov[k, V_TS] = e_ts * cov[k, V_TS] + r_ts * cov[k, LN_R_TS] + t_ts * cov[k, LN_TAU_TS]
         cov[k, V_TL] = e_tl * cov[k, V_TL] + r_tl * cov[k, LN_R_TL] + t_tl * cov[k, LN_TAU_TL]
         cov[k, OCV_ERROR] *= fade
-    predict_biases(s, e_ts, e_tl, r_ts, r_tl, t_ts, t_tl, fade, o_s, o_ts, o_tl, moved)
+        cov[k, V_SLOW] *= e_slow
+    predict_biases(s, e_ts, e_tl, r_ts, r_tl, t_ts, t_tl, fade, e_slow, o_s, o_ts, o_tl, moved)
     if n > CURRENT_OFFSET:
         spread_optional(s, n, o_s, o_ts, o_tl, moved)
 
@@ -72,6 +76,7 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     cov[OCV_ERROR, OCV_ERROR] += 1.0 - fade * fade
     cov[V_TS, V_TS] += widen * s.misfit * (p.branch_v2 + (p.branch_relative * ohm_ts * i) ** 2) * (1.0 - e_ts * e_ts)
     cov[V_TL, V_TL] += widen * s.misfit * (p.branch_v2 + (p.branch_relative * ohm_tl * i) ** 2) * (1.0 - e_tl * e_tl)
+    cov[V_SLOW, V_SLOW] += s.misfit * (p.slow_relative * (ohm_ts + ohm_tl) * i) ** 2 * (1.0 - e_slow * e_slow)
     unknown_a = p.timing * (current_a - s.current_a)
     if dt_s > p.gap_s:
         unknown_a = 0.5 * max(abs(current_a), abs(s.current_a)) + p.idle_current_a
