@@ -7,7 +7,7 @@ from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import estimate as kernel
 from bms_estimator.kernels.estimate import Verdict
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.identifier_state import SOC, V_TL, V_TS
+from bms_estimator.kernels.identifier_state import SOC, V_SLOW, V_TL, V_TS
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
@@ -115,5 +115,5 @@ class Estimator:
         self.state["time_s"] = np.inf
         x, p = self.record[0]["identifier"], self.settings_record[0]["identifier"]
         x["covariance"][SOC, SOC] += min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST) ** 2
-        for branch in (V_TS, V_TL):
+        for branch in (V_TS, V_TL, V_SLOW):
             x["covariance"][branch, branch] += p["variance"][branch]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.cell import soc_from_ocv
 from bms_estimator.kernels.identification import identify, start_identifier
 from bms_estimator.kernels.identifier import element_ln_stds, element_values, soc_std
-from bms_estimator.kernels.identifier_state import V_TL, V_TS
+from bms_estimator.kernels.identifier_state import V_SLOW, V_TL, V_TS
 from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
 
@@ -157,7 +157,7 @@ def write_identifier(row: Record, s: Record, p: Record) -> None:
     ohm_s, ohm_ts, tau_ts, _, ohm_tl, tau_tl, _ = element_values(x)
     std_s, std_ts, std_tau_ts, _, std_tl, std_tau_tl, _ = element_ln_stds(x)
     row.innovation_v = x.innovation_v
-    e_o = row.voltage_v + x.mean[V_TS] + x.mean[V_TL] + row.current_a * ohm_s  # (2.4) solved for E_o
+    e_o = row.voltage_v + x.mean[V_TS] + x.mean[V_TL] + x.mean[V_SLOW] + row.current_a * ohm_s  # (2.4) solved for E_o
     row.soc_ocv = soc_from_ocv(e_o, p.observer.ocv_v, p.observer.ocv_slope_v)
     row.soc_std = soc_std(x)
     row.r_s_ohm, row.r_s_std_ohm = ohm_s, ohm_s * std_s
