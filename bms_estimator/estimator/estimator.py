@@ -7,6 +7,7 @@ from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import estimate as kernel
 from bms_estimator.kernels.estimate import Verdict
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
+from bms_estimator.kernels.identifier import identifier_init
 from bms_estimator.kernels.identifier_state import SOC, V_SLOW, V_TL, V_TS
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
@@ -17,6 +18,8 @@ TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
 SET_SOC_STD = 0.01
 """How far an SOC that someone sets may be off."""
+SAME_ELEMENTS_S = 600.0
+"""After a pause no longer than this the elements are those of before [s]."""
 UNSEEN_PER_H, UNSEEN_MOST = 0.5, 0.3
 """How far the SOC may have gone while nobody measured: so much in an hour, and at most."""
 
@@ -107,13 +110,18 @@ class Estimator:
         """Prepare for samples of another clock, after a time in which nobody measured.
 
         Time begins with the next sample, which is taken as a clock set back. The SOC may have moved, and the branch
-        voltages are what they may be at a first sample.
+        voltages are what they may be at a first sample. After a long time the elements may belong to another SOC: they
+        are those of the cell file again. The map is kept.
 
         Args:
             unseen_s: How long nobody measured [s]; infinite when nobody knows.
         """
         self.state["time_s"] = np.inf
         x, p = self.record[0]["identifier"], self.settings_record[0]["identifier"]
-        x["covariance"][SOC, SOC] += min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST) ** 2
+        soc_variance = x["covariance"][SOC, SOC] + min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST) ** 2
+        if unseen_s > SAME_ELEMENTS_S:
+            identifier_init(x, p)
+            x["mean"][SOC] = self.state["soc"][0]
+        x["covariance"][SOC, SOC] = soc_variance
         for branch in (V_TS, V_TL, V_SLOW):
             x["covariance"][branch, branch] += p["variance"][branch]

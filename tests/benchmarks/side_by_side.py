@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.calibration.identify import identify
 from bms_estimator.calibration.prediction import open_circuit, predict
 from bms_estimator.calibration.relaxation import without_glitches
+from bms_estimator.calibration.validate import validate
 from bms_estimator.cli.captures import read_whole
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter
@@ -178,14 +180,14 @@ def pybop(trial: Trial) -> Outcome:
 
 
 def offline(trial: Trial) -> Outcome:
-    """bms-estimator identify."""
-    from bms_estimator.calibration.identify import identify  # noqa: PLC0415
-
-    result = identify(trial.cell, [trial.learn])
+    """bms-estimator identify; it corrects the OCV as well."""
+    capture = [(LEARN, trial.learn)]
+    identify(capture, trial.cell)
     start = time.perf_counter()
-    result = identify(trial.cell, [trial.learn])
+    found = identify(capture, trial.cell).cell
     seconds = time.perf_counter() - start
-    return Outcome("identify (offline)", trial.voltage_rms_mv(result.cell.a[:16]), None, seconds, "offline")
+    rms_mv = 1e3 * validate(HELD_BACK, trial.held_back, found).above.voltage_rms_v
+    return Outcome("identify (offline)", rms_mv, None, seconds, "offline; corrects the OCV")
 
 
 def evenly(samples: SampleBlock) -> Floats:
@@ -215,7 +217,7 @@ def timed(work: Callable[[], object]) -> float:
     return time.thread_time() - start
 
 
-METHODS = (observer_alone, observer_with_bounds, identifier, textbook_ekf, rls, pybop)
+METHODS = (observer_alone, observer_with_bounds, identifier, textbook_ekf, rls, offline, pybop)
 
 
 def outcomes(trial: Trial) -> Iterator[Outcome]:
