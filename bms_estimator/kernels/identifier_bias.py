@@ -23,7 +23,7 @@ from bms_estimator.kernels.identifier_state import (
 )
 from bms_estimator.kernels.state import Record
 
-SIGNIFICANT = 12.0
+SIGNIFICANT = 8.0
 """Squared bias over its variance: below, it may be the error of the OCV curve."""
 SENSED = 10
 """States that a bias works on: all but the optional ones."""

@@ -77,6 +77,28 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     cov[V_TS, V_TS] += widen * s.misfit * (p.branch_v2 + (p.branch_relative * ohm_ts * i) ** 2) * (1.0 - e_ts * e_ts)
     cov[V_TL, V_TL] += widen * s.misfit * (p.branch_v2 + (p.branch_relative * ohm_tl * i) ** 2) * (1.0 - e_tl * e_tl)
     cov[V_SLOW, V_SLOW] += s.misfit * (p.slow_relative * (ohm_ts + ohm_tl) * i) ** 2 * (1.0 - e_slow * e_slow)
+    doubt_current(s, p, dt_s, current_a, o_s, o_ts, o_tl, moved)
+    cov[CURRENT_OFFSET, CURRENT_OFFSET] += p.drift_per_s[CURRENT_OFFSET] * dt_s
+    drift(s, p, current_a, dt_s, abs(moved) * widen)
+
+
+@njit(cache=True)
+def doubt_current(
+    s: Record, p: Record, dt_s: float, current_a: float, o_s: float, o_ts: float, o_tl: float, moved: float
+) -> None:
+    """Variance from what is not known of the current: when it changed, its error, and what it was in a gap.
+
+    Args:
+        s: Record of IDENTIFIER_STATE.
+        p: Record of IDENTIFIER_SETTINGS.
+        dt_s: Step [s].
+        current_a: Current at its end [A].
+        o_s: d soc / d offset over the step [1/A].
+        o_ts: d v_ts / d offset [ohm].
+        o_tl: d v_tl / d offset [ohm].
+        moved: Charge moved, per unit of SOC.
+    """
+    cov = s.covariance
     unknown_a = p.timing * (current_a - s.current_a)
     if dt_s > p.gap_s:
         unknown_a = 0.5 * max(abs(current_a), abs(s.current_a)) + p.idle_current_a
@@ -85,8 +107,6 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     cov[SOC, SOC] += (wrong + 2.0 * math.sqrt(cov[SOC, SOC])) * wrong  # the error grows by so much, always the same way
     cov[V_TS, V_TS] += (unknown_a * o_ts) ** 2
     cov[V_TL, V_TL] += (unknown_a * o_tl) ** 2
-    cov[CURRENT_OFFSET, CURRENT_OFFSET] += p.drift_per_s[CURRENT_OFFSET] * dt_s
-    drift(s, p, current_a, dt_s, abs(moved) * widen)
 
 
 @njit(cache=True)

@@ -177,7 +177,7 @@ class Tuning:
     """... give or take as much."""
     timing: float = 0.3
     """Uniform over the interval: 1 / sqrt(12)."""
-    curvature: float = 0.15
+    curvature: float = 0.12
     curvature_s: float = 20.0
     ocv_error_v: float = 0.004
     """Spread of resting voltages from cell to cell of a type [V]."""

@@ -1,7 +1,7 @@
 """What the identifier suspects of its input: running statistics of a few nanoseconds a sample, and the bits they set.
 
 Each bit is set and taken back at levels of its own, apart enough that it does not flicker. The levels lie above what
-captures of healthy cells under loads of all kinds reach from starts wrong by a factor of two: squared biases of 15
+captures of healthy cells under loads of all kinds reach from starts wrong by a factor of two: squared biases of 5
 variances, 2 outliers in an hour, 1 break.
 
 ``s`` is a record of IDENTIFIER_STATE, ``p`` of IDENTIFIER_SETTINGS.
@@ -31,7 +31,7 @@ BREAKS_S = 20.0 * 3600.0
 """Memory of events that only a wrong OCV explains time after time [s]."""
 MANY_BREAKS = 1.6
 FEW_BREAKS = 0.5
-DRIFTING = 18.0
+DRIFTING = 10.0
 """Squared bias over its variance."""
 NOT_DRIFTING = 4.0
 ALIKE = 2.0

@@ -89,15 +89,16 @@ def test_a_passing_fault_is_named_and_then_forgotten(
 
 
 @pytest.mark.parametrize("name", ["cell5_random_steps", "cell1_dst", "cell1_hppc"])
-def test_an_offset_of_the_current_is_suspected(shared_data: Path, name: str) -> None:
-    """1 % of the 15 A that the cell may carry: 5 % of its charge in an hour."""
-    run = identify(shared_data, name, lambda t, i, v: (t, i + 0.15, v))
+@pytest.mark.parametrize("offset_a", [0.05, -0.05, 0.15])
+def test_an_offset_of_the_current_is_suspected(shared_data: Path, name: str, offset_a: float) -> None:
+    """1 % of a range of 5 A, and of the 15 A that the cell may carry: 5 % of its charge in an hour."""
+    run = identify(shared_data, name, lambda t, i, v: (t, i + offset_a, v))
     assert is_sane(run)
     assert Suspect.OFFSET in run.suspected()
     assert np.abs(run.error[run.after(3600.0)]).max() < 0.06
 
 
-@pytest.mark.parametrize("name", ["cell5_random_steps", "cell5_relaxation_c2", "cell1_dst"])
+@pytest.mark.parametrize("name", ["cell5_random_steps", "cell5_relaxation_c2", "cell1_dst", "cell1_hppc"])
 @pytest.mark.parametrize("factor", [0.8, 1.2])
 def test_a_wrong_capacity_is_suspected(shared_data: Path, name: str, factor: float) -> None:
     run = identify(shared_data, name, capacity_ah=factor * cases.PROTOCOL_CAPACITY_AH)
