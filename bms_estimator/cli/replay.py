@@ -71,7 +71,8 @@ def replay(
 
 async def _replay(settings: Settings, cell: CellModel, source: Replay, table: TableSink | None) -> Result:
     """Source -> estimator -> table, summary, broker."""
-    estimator, summary = new_estimator(settings, cell), Summary()
+    with Console(stderr=True).status("loading kernels; a first start compiles them"):
+        estimator, summary = new_estimator(settings, cell), Summary()
     async with AsyncExitStack() as stack:
         publisher = await _publisher(stack, settings, cell, estimator, source)
         stack.enter_context(table or nullcontext())
