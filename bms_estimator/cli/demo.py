@@ -71,7 +71,7 @@ async def _demo(
     _compile(console, cell)
     totals = Totals()
     async with DemoBroker(port) as broker, _board(build, cell, rate_hz) as board:
-        hint = f"{board.name}; the topics, in a second terminal: {broker.look_command}"
+        hint = f"{board.name}; in a second terminal: {broker.look_command}"
         if not console.is_terminal:
             console.print(hint, soft_wrap=True, highlight=False, markup=False)
         settings = _settings(board.path, broker.url, rate_hz)

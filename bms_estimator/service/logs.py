@@ -15,15 +15,16 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
         lines: Gets the lines in place of stderr: a live view hides what else is written on its terminal.
     """
     readable = lines is not None or (sys.stderr.isatty() and "JOURNAL_STREAM" not in os.environ)
+    wide = lines is None
     last: list[Any] = (
-        [structlog.dev.ConsoleRenderer(colors=lines is None)]
+        [structlog.dev.ConsoleRenderer(30 if wide else 0, colors=wide, pad_level=wide)]
         if readable
         else [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
     )
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.TimeStamper(fmt="iso" if wide else "%H:%M:%SZ", utc=True),
             *last,
         ],
         logger_factory=structlog.PrintLoggerFactory(file=sys.stderr) if lines is None else lambda *_: _Lines(lines),

@@ -12,6 +12,8 @@ from bms_estimator.model.estimate import Estimate, Health, Info, Parameter, Snap
 
 BAR_CELLS = 60
 SPARK_CELLS = 32
+VALUE_CELLS = 9
+"""Numbers change their length; columns must not dance."""
 SPARKS = "▁▂▃▄▅▆▇█"
 MESSAGE_LINES = 2
 NARROW_MARGIN = 0.05
@@ -117,7 +119,8 @@ def _charge(e: Estimate | None) -> Panel:
     marks = [d for d in (e.delta_1, e.delta_2) if d is not None] if e else []
     colour = "green" if soc is not None and soc > LOW_SOC else "yellow"
     narrow = margin is None or margin < NARROW_MARGIN
-    rows.add_row("SOC", gauge(soc or 0.0, BAR_CELLS, colour, marks), Text(_number(soc, ".2%"), style="bold"))
+    std = Text(f" ± {e.soc_std:.2%}", style="dim") if e and e.soc_std is not None else Text()
+    rows.add_row("SOC", gauge(soc or 0.0, BAR_CELLS, colour, marks), Text(_number(soc, ".2%"), style="bold") + std)
     rows.add_row(
         "margin",
         gauge(margin or 0.0, BAR_CELLS, "red" if narrow else "cyan"),
@@ -193,9 +196,10 @@ def _link(e: Estimate | None, health: Health) -> Panel:
 
 
 def _messages(health: Health, log: Iterable[str], hint: str) -> Text:
-    """Why values are stale, then the last of the log, then the hint."""
+    """Why values are stale or suspected, then the last of the log, then the hint."""
     why = [Text(f" {health.sensor_message}", style="bold red")] if health.sensor_message else []
-    lines = why + [Text.from_ansi(f" {entry}") for entry in list(log)[len(why) - MESSAGE_LINES :]]
+    why += [Text(f" suspected: {suspect}", style="bold yellow") for suspect in health.suspects]
+    lines = why + [Text.from_ansi(f" {entry}") for entry in list(log)[-max(MESSAGE_LINES - len(why), 1) :]]
     lines += [Text(f" {hint}", style="cyan")] if hint else []
     text = Text("\n").join(lines)
     text.no_wrap, text.overflow = True, "ellipsis"
@@ -205,7 +209,7 @@ def _messages(health: Health, log: Iterable[str], hint: str) -> Text:
 def _rows() -> Table:
     table = Table.grid(padding=(0, 1))
     table.add_column(style="dim", no_wrap=True)
-    table.add_column(justify="right", no_wrap=True)
+    table.add_column(justify="right", no_wrap=True, min_width=VALUE_CELLS)
     table.add_column(style="dim", no_wrap=True)
     return table
 
