@@ -55,9 +55,9 @@ def replay(
     if soc is not None:
         settings = with_pack(settings, initial_soc=soc)
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
+    source = open_capture(capture, settings.sensor if pack else None)
     if out is not None and out.exists() and out.samefile(capture):
         raise UserError(f"--out {out}: is the capture itself")
-    source = open_capture(capture, settings.sensor if pack else None)
     result = asyncio.run(_replay(settings, model, Replay(source, speed=speed), table_sink(out) if out else None))
     if isinstance(source, RawCapture) and source.damaged:
         typer.echo(

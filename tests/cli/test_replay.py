@@ -1,0 +1,192 @@
+"""``replay``: its summary, its table, and what it says of files that cannot be replayed."""
+
+import csv
+import gzip
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from bms_estimator.cli.main import main
+
+SUMMARY = {
+    "samples",
+    "duration_s",
+    "soc_initial",
+    "soc_final",
+    "soc_std_final",
+    "soc_rms_difference_to_coulomb",
+    "innovation_rms_v",
+    "voltage_rms_error_v",
+    "lock_lost",
+    "k_final",
+    "samples_per_s",
+    "wall_s",
+}
+COLUMNS = [
+    "time_s",
+    "voltage_v",
+    "current_a",
+    "soc",
+    "voltage_estimate_v",
+    "innovation_v",
+    "nussbaum_gain",
+    "k",
+    "soc_std",
+    "r_s_ohm",
+    "r_ts_ohm",
+    "tau_ts_s",
+    "r_tl_ohm",
+    "tau_tl_s",
+]
+SAMPLES = 600
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, stderr of the command line."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Ten minutes at rest and under 1 A in turns."""
+    path = tmp_path / "small.csv"
+    rows = [(t, 0.0, 3.9) if t // 60 % 2 == 0 else (t, 1.0, 3.82) for t in range(SAMPLES)]
+    lines = [f"{time},{current},{voltage}" for time, current, voltage in rows]
+    path.write_text("\n".join(["time_s,current_a,voltage_v", *lines]) + "\n")
+    return path
+
+
+def columns_of_csv(path):
+    data = path.read_bytes()
+    text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
+    header, *rows = csv.reader(text.splitlines())
+    values = np.array([[float(cell) for cell in row] for row in rows])
+    return dict(zip(header, values.T, strict=True))
+
+
+def columns_of_parquet(path):
+    table = parquet.read_table(path)
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def test_a_real_capture_comes_to_one_json_object(shared_data, capsys):
+    capture = shared_data / "ncr18650" / "cell5_random_steps.csv.gz"
+    code, out, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--json")
+    assert (code, err) == (0, "")
+    result = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} in the summary"))
+    assert out.count("\n") == 1
+    assert set(result) >= SUMMARY
+    assert result["lock_lost"] is False
+    assert result["suspects"] == []
+    with gzip.open(capture, "rt") as file:
+        times = [float(line.split(",")[0]) for line in file if line[0].isdigit()]
+    assert result["samples"] + sum(result["dropped"].values()) == len(times)
+    assert result["duration_s"] == pytest.approx(times[-1] - times[0])
+    assert result["soc_initial"] > 0.97
+    assert result["soc_final"] < 0.05
+    assert result["soc_rms_difference_to_coulomb"] < 0.005
+    assert result["innovation_rms_v"] < 0.005
+    assert result["voltage_rms_error_v"] < 0.005
+    assert 0.0 < result["soc_std_final"] < 0.05
+
+
+@pytest.mark.parametrize("name", ["out.csv", "out.csv.gz", "out.parquet"])
+def test_estimates_sample_by_sample_agree_with_the_summary(name, capture, tmp_path, capsys):
+    out = tmp_path / name
+    code, text, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--json")
+    assert (code, err) == (0, "")
+    columns = columns_of_parquet(out) if name.endswith(".parquet") else columns_of_csv(out)
+    assert set(columns) >= set(COLUMNS)
+    result = json.loads(text)
+    assert {len(values) for values in columns.values()} == {result["samples"]} == {SAMPLES}
+    assert np.array_equal(columns["time_s"], np.arange(SAMPLES))
+    assert np.array_equal(np.unique(columns["current_a"]), [0.0, 1.0])
+    assert columns["soc"][0] == result["soc_initial"]
+    assert columns["soc"][-1] == result["soc_final"]
+    assert columns["soc_std"][-1] == result["soc_std_final"]
+    assert columns["k"][-1] == result["k_final"]
+    assert math.sqrt(np.mean(columns["innovation_v"] ** 2)) == pytest.approx(result["innovation_rms_v"])
+
+
+def test_csv_and_parquet_hold_the_same_to_the_last_bit(capture, tmp_path, capsys):
+    for name in ("a.csv", "a.parquet"):
+        assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", tmp_path / name)[0] == 0
+    first, second = columns_of_csv(tmp_path / "a.csv"), columns_of_parquet(tmp_path / "a.parquet")
+    assert list(first) == list(second)
+    for name, values in first.items():
+        assert np.array_equal(values, second[name], equal_nan=True), name
+
+
+def test_the_given_soc_is_where_it_starts(capture, capsys):
+    started = []
+    for soc in ("0.3", "0.7"):
+        code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", soc, "--json")
+        assert code == 0
+        started.append(json.loads(out)["soc_initial"])
+    assert started == pytest.approx([0.3, 0.7], abs=0.02)
+    code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", "1.5")
+    assert code == 2
+    assert "'--soc'" in err
+
+
+def test_for_people(capture, capsys):
+    code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650")
+    assert code == 0
+    assert "small.csv" in out
+    assert f"{SAMPLES}" in out
+    assert "mV" in out
+    assert "kept" in out
+
+
+def test_what_a_person_can_mend_ends_with_code_2_and_names_it(capture, tmp_path, capsys):
+    wrong = tmp_path / "wrong.csv"
+    wrong.write_text(capture.read_text().replace("voltage_v", "volts"))
+    words = tmp_path / "words.csv"
+    words.write_text("time_s,current_a,voltage_v\n0,0,3.9\n1,none,3.9\n")
+    missing, other = tmp_path / "missing.csv", tmp_path / "other.csv"
+    other.write_text("kept as it is\n")
+    cell = ("--cell", "ncr18650")
+    for arguments, named in [
+        ((missing, *cell), ["missing.csv: no such file"]),
+        ((missing, *cell, "--out", other), ["missing.csv: no such file"]),
+        ((capture, "--cell", "nonsense"), ["nonsense", "ncr18650"]),
+        ((wrong, *cell), ["wrong.csv", "voltage_v"]),
+        ((words, *cell), ["words.csv", "line 3", "current_a", "none"]),
+        ((capture,), ["--cell", "--pack"]),
+        ((capture, *cell, "--out", tmp_path / "out.xlsx"), ["out.xlsx", ".csv", ".parquet"]),
+        ((capture, *cell, "--out", tmp_path / "no" / "out.csv"), ["out.csv", "No such file"]),
+        ((capture, *cell, "--mqtt", "nonsense"), ["--mqtt", "nonsense"]),
+    ]:
+        code, out, err = run(capsys, "replay", *arguments)
+        assert (code, out) == (2, ""), arguments
+        assert [name for name in named if name not in err] == [], err
+        assert "Traceback" not in err
+    assert other.read_text() == "kept as it is\n"
+
+
+def test_the_capture_is_never_written_over(capture, tmp_path, capsys):
+    before, link = capture.read_bytes(), tmp_path / "link.csv"
+    link.symlink_to(capture)
+    for out in (capture, link):
+        code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out)
+        assert code == 2
+        assert "is the capture itself" in err
+    assert capture.read_bytes() == before
+
+
+def test_a_cut_gzip_is_named(capture, tmp_path, capsys):
+    whole, cut = tmp_path / "whole.csv.gz", tmp_path / "cut.csv.gz"
+    with gzip.open(whole, "wb") as packed, capture.open("rb") as plain:
+        shutil.copyfileobj(plain, packed)
+    cut.write_bytes(whole.read_bytes()[:-20])
+    assert run(capsys, "replay", whole, "--cell", "ncr18650", "--json")[0] == 0
+    code, _, err = run(capsys, "replay", cut, "--cell", "ncr18650", "--json")
+    assert code == 2
+    assert "cut.csv.gz: gzip data damaged or cut short" in err
