@@ -1,0 +1,184 @@
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from bms_estimator.cli.main import main
+
+TABLES = [str(n) for n in range(2, 14)]
+FIGURES = [str(n) for n in (*range(3, 9), 10, *range(13, 18), *range(19, 24), *range(26, 40), 41, 42)]
+"""Figure 9 is a block diagram."""
+RELAXATION, SLOW, FAST, STEPS = (
+    "cell5_relaxation_c2.csv.gz",
+    "cell1_discharge_c4.csv.gz",
+    "cell1_discharge_1c5.csv.gz",
+    "cell5_random_steps.csv.gz",
+)
+NOT_REPRODUCED = "cannot be reproduced"
+
+
+class Page(HTMLParser):
+    """Articles of the report: verdict, headings of the table, number of drawn shapes, reason; and what a browser loads."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.articles, self.loads, self.unclosed = {}, [], []
+        self._here, self._field = None, None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        if tag in ("script", "img", "iframe", "link", "object", "embed", "image", "use"):
+            self.loads += [found[key] for key in ("src", "href", "xlink:href", "data") if found.get(key)]
+        if tag == "article":
+            fields = {"verdict": "", "reason": "", "heads": [], "rows": 0, "shapes": 0}
+            self._here = self.articles.setdefault(found["id"], fields)
+            assert self._here is fields, f"{found['id']} stands twice"
+        elif self._here is not None:
+            words = (found.get("class") or "").split()
+            if "badge" in words:
+                self._field = "verdict"
+            elif "reason" in words:
+                self._field = "reason"
+            elif tag == "th":
+                self._here["heads"].append("")
+                self._field = "heads"
+            self._here["rows"] += tag == "tr"
+            self._here["shapes"] += tag == "path"
+
+    def handle_endtag(self, tag):
+        if tag == "article":
+            self._here = None
+        if tag in ("span", "p", "th", "article"):
+            self._field = None
+
+    def handle_data(self, data):
+        if self._here is None or self._field is None:
+            return
+        if self._field == "heads":
+            self._here["heads"][-1] += data
+        else:
+            self._here[self._field] += data
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, stderr of the command line."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The whole report's text, written once."""
+    out = tmp_path_factory.mktemp("thesis")
+    with pytest.raises(SystemExit) as ended:
+        main(["thesis", "--out", str(out)])
+    assert not ended.value.code
+    assert [path.name for path in out.iterdir()] == ["index.html"]
+    return (out / "index.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def page(whole):
+    return Page(whole)
+
+
+def test_every_table_stands_printed_beside_recomputed(page):
+    for key in TABLES:
+        table = page.articles[f"table-{key}"]
+        heads = " | ".join(table["heads"])
+        assert "printed" in heads, key
+        assert re.search(r"recomputed|mean %|mean \(5\.1\)|mean over the loads", heads), (key, heads)
+        assert table["rows"] > 2, key
+
+
+def test_every_figure_is_drawn(page):
+    for key in FIGURES:
+        assert page.articles[f"figure-{key}"]["shapes"] > 5, key
+    assert page.articles["figure-9"]["verdict"] == "given"
+    assert "A block diagram" in page.articles["figure-9"]["reason"]
+
+
+def test_every_item_has_a_verdict_and_a_reason(page):
+    verdicts = {"reproduced", "reproduced after correction", NOT_REPRODUCED, "given", "added"}
+    for key, article in page.articles.items():
+        assert article["verdict"] in verdicts, key
+        assert len(article["reason"]) > 30, key
+    assert {article["verdict"] for article in page.articles.values()} == verdicts
+
+
+def test_nothing_is_called_reproduced_that_hangs_on_unpublished_recordings(page):
+    for key in ("8", "9", "11", "13"):
+        article = page.articles[f"table-{key}"]
+        assert article["verdict"] == NOT_REPRODUCED
+        assert "not published" in article["reason"]
+
+
+def test_page_loads_nothing(whole, page):
+    assert page.loads == [target for target in page.loads if target.startswith("#")]
+    assert not re.search(r"@import|url\(\s*[\"']?(?!#)", whole)
+    assert not re.search(r"(?:src|href)\s*=\s*[\"'](?:https?:)?//", whole)
+
+
+def test_closing_note_lists_every_item(whole, page):
+    note = whole.split('id="account"', 1)[1]
+    for key in page.articles:
+        assert f'href="#{key}"' in note
+
+
+def test_one_table(tmp_path, capsys):
+    code, out, err = run(capsys, "thesis", "--table", "5", "--out", tmp_path)
+    assert (code, err) == (0, "")
+    assert "Table 5" in out
+    assert "3666.67" in out  # a12, recomputed
+    page = Page((tmp_path / "index.html").read_text(encoding="utf-8"))
+    assert list(page.articles) == ["table-5"]
+
+
+def test_one_figure(tmp_path, capsys):
+    code, out, _ = run(capsys, "thesis", "--figure", "19", "--out", tmp_path)
+    assert code == 0
+    assert "Figure 19" in out
+    page = Page((tmp_path / "index.html").read_text(encoding="utf-8"))
+    assert list(page.articles) == ["figure-19"]
+    assert page.articles["figure-19"]["shapes"] > 5
+
+
+def test_what_a_person_can_mend_ends_with_code_2(tmp_path, capsys, shared_data):
+    captures = shared_data / "ncr18650"
+    for arguments, words in (
+        (("--table", "14"), "no table 14: tables are 1 to 13"),
+        (("--figure", "51"), "no figure 51"),
+        ((captures / RELAXATION,), "captures need --cell"),
+        ((captures / RELAXATION, "--cell", "ncr18650"), "the protocol needs a constant load"),
+        ((captures / FAST, "--cell", "ncr18650"), "the protocol needs a voltage relaxation test"),
+    ):
+        code, out, err = run(capsys, "thesis", *arguments, "--out", tmp_path / "none")
+        assert (code, out) == (2, "")
+        assert words in " ".join(err.split())
+        assert "Traceback" not in err
+        assert not (tmp_path / "none").exists()
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    code, _, err = run(capsys, "thesis", "--table", "1", "--out", blocked)
+    assert code == 2
+    assert "cannot be written" in err
+
+
+def test_real_captures_carry_chapter_5(tmp_path, capsys, shared_data):
+    captures = [shared_data / "ncr18650" / name for name in (RELAXATION, SLOW, FAST, STEPS)]
+    code, out, _ = run(capsys, "thesis", *captures, "--cell", "ncr18650", "--table", "11", "--out", tmp_path)
+    assert code == 0
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "4 captures of" in text
+    for name in ("cell1_discharge_c4", "cell1_discharge_1c5", "cell5_random_steps"):
+        assert name in out
+        row = next(line for line in out.splitlines() if name in line).split()
+        mean_percent, max_percent = float(row[-3]), float(row[-2])
+        assert 0.0 < mean_percent < max_percent
+    code, out, _ = run(capsys, "thesis", *captures, "--cell", "ncr18650", "--table", "8", "--out", tmp_path)
+    assert code == 0
+    residual_mv = float(re.search(r"joint fit ([\d.]+) \(", " ".join(out.split())).group(1))
+    assert residual_mv < 10.0
