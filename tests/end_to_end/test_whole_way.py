@@ -1,0 +1,233 @@
+"""The whole way: simulated cell -> board -> serial line -> the real program -> the real broker -> a subscriber."""
+
+import asyncio
+import contextlib
+import json
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from bms_estimator.cli.pack import load_pack
+from bms_estimator.model.cell import load_cell
+from bms_estimator.service.live import new_estimator
+from bms_estimator.sources.protocol import ResetCause
+from bms_estimator.sources.replay import RawCapture
+from bms_estimator.sources.simulated_pack import SimulatedPack, pulses
+from bms_estimator.sources.virtual_board import BoardFault, VirtualBoard
+from bms_estimator.sources.virtual_converter import Reading
+from tests.mosquitto import Broker, Listener
+from tests.simavr_board import SimavrBoard, write_readings
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+LONG_S = 60.0
+LSB_V, LSB_A = 25.0 / 1024.0, 5.0 / 1024.0 / 0.1
+START_SOC = 0.9
+LOAD_A = 0.3
+RUN_S = 14.0
+EDGE_S = 0.3
+"""How well the clocks of board and cell agree, and a publish window."""
+
+
+class Truth:
+    """The simulated cell's own run under pulses of 10 s, sampled at 50 Hz."""
+
+    def __init__(self) -> None:
+        pack = SimulatedPack(load_cell("chen_mora"), pulses(LOAD_A), soc=START_SOC)
+        self.time_s = np.arange(0.0, 60.0, 0.02)
+        self.readings: list[Reading] = []
+        socs = []
+        for at_s in self.time_s:
+            self.readings.append(pack(float(at_s)))
+            socs.append(pack.soc)
+        self.soc = np.array(socs)
+        self.current_a = np.array([r.current_a for r in self.readings])
+        self.voltage_v = np.array([r.voltage_v for r in self.readings])
+
+    def signal(self, at_s: float) -> Reading:
+        return self.readings[min(round(at_s / 0.02), len(self.readings) - 1)]
+
+    def at(self, values: np.ndarray, at_s: float) -> float:
+        return float(np.interp(at_s, self.time_s, values))
+
+    def steady(self, at_s: float) -> bool:
+        near = np.abs(self.time_s - at_s) < EDGE_S
+        return bool(np.ptp(self.current_a[near]) == 0.0)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return Truth()
+
+
+class Plug:
+    """The name under which the program knows the board; a board can be unplugged and another plugged in."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def into(self, pseudo_terminal: str) -> None:
+        self.path.unlink(missing_ok=True)
+        self.path.symlink_to(pseudo_terminal)
+
+
+@pytest.fixture
+def plug(tmp_path: Path) -> Iterator[Plug]:
+    return Plug(tmp_path / "board")
+
+
+def pack_file(folder: Path, plug: Plug, broker: Broker) -> Path:
+    path = folder / "pack.toml"
+    path.write_text(f"""
+[pack]
+cell = "chen_mora"
+initial_soc = {START_SOC}
+[sensor]
+port = "{plug.path}"
+[mqtt]
+url = "{broker.url}"
+publish_rate_hz = 10
+[state]
+folder = "{folder / "state"}"
+""")
+    return path
+
+
+@contextlib.asynccontextmanager
+async def program(pack: Path, *options: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    process = await asyncio.create_subprocess_exec(
+        str(PROGRAM), "run", "--pack", str(pack), *options, stdout=asyncio.subprocess.DEVNULL, stderr=None
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGTERM)
+        assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+
+
+class Board(NamedTuple):
+    """A board that measures the simulated cell, and what switches it on."""
+
+    path: str
+    power_up: Callable[[], None]
+
+
+@contextlib.asynccontextmanager
+async def a_board(kind: str, truth: Truth, folder: Path) -> AsyncIterator[Board]:
+    if kind == "python":
+        with VirtualBoard(truth.signal) as board, contextlib.ExitStack() as stack:
+            yield Board(board.path, lambda: stack.callback(asyncio.create_task(board.run()).cancel))
+    else:
+        rows = [(t, *r) for t, r in zip(truth.time_s, truth.readings, strict=True)]
+        with SimavrBoard(write_readings(folder / "readings.csv", rows)) as simulated:
+            yield Board(simulated.path, lambda: None)  # it powers up when its line is opened
+
+
+@pytest.fixture(params=["simavr", "python"])
+def kind(request: pytest.FixtureRequest) -> str:
+    if request.param == "simavr":
+        request.getfixturevalue("firmware")
+    return str(request.param)
+
+
+async def test_what_is_published_is_the_simulated_truth_within_the_converter_s_resolution(
+    kind: str, truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
+) -> None:
+    async with a_board(kind, truth, tmp_path) as board, Listener(broker, "bms/#") as listener:
+        plug.into(board.path)
+        async with program(pack_file(tmp_path, plug, broker)):
+            await listener.wait("bms/pack/availability", lambda p: p == b"online")
+            board.power_up()
+            await listener.wait_json("bms/pack/state")
+            await listener.wait_json("bms/pack/state", lambda s: s["board_time_s"] > RUN_S)
+    published = [json.loads(payload) for payload in listener.all("bms/pack/state")]
+    states = [s for s in published if truth.steady(s["board_time_s"])]
+    assert len(states) > 50
+    for state in states:
+        at_s = state["board_time_s"]
+        assert abs(state["voltage_v"] - truth.at(truth.voltage_v, at_s)) < LSB_V
+        assert abs(state["current_a"] - truth.at(truth.current_a, at_s)) < LSB_A
+        assert abs(state["soc_coulomb"] - truth.at(truth.soc, at_s)) < 0.001
+        assert abs(state["soc"] - truth.at(truth.soc, at_s)) < max(3.0 * state["soc_std"], 0.01)
+        assert abs(state["voltage_estimate_v"] - truth.at(truth.voltage_v, at_s)) < 2.0 * LSB_V
+    errors_v = [s["voltage_v"] - truth.at(truth.voltage_v, s["board_time_s"]) for s in states]
+    assert abs(np.mean(errors_v)) < 0.25 * LSB_V
+    last = states[-1]
+    assert last["lock"]
+    assert last["temperature_c"] == pytest.approx(25.0, abs=1.0)
+    assert (last["frames_lost"], last["crc_errors"]) == (0, 0)
+    assert last["sample_rate_hz"] == pytest.approx(100.0, rel=1e-3)
+    info = await listener.wait_json("bms/pack/info", lambda i: i["board"])
+    assert info["board"]["firmware"]
+
+
+async def test_the_loop_goes_on_when_the_board_is_unplugged_and_when_the_broker_dies(
+    kind: str, truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
+) -> None:
+    async with Listener(broker, "bms/#") as listener, contextlib.AsyncExitStack() as stack:
+        async with a_board(kind, truth, tmp_path) as board:
+            plug.into(board.path)
+            board.power_up()
+            await stack.enter_async_context(program(pack_file(tmp_path, plug, broker)))
+            before = await listener.wait_json("bms/pack/state", lambda s: s["frames_received"] > 100)
+        await listener.wait("bms/pack/sensor/availability", lambda p: p == b"offline")
+        async with a_board(kind, truth, tmp_path) as board:
+            plug.into(board.path)
+            board.power_up()
+            await listener.wait_json("bms/pack/health", lambda h: h["sensor_online"] and h["reconnects"] >= 1)
+            again = await listener.wait_json(
+                "bms/pack/state", lambda s: s["frames_received"] > before["frames_received"] + 100
+            )
+            assert again["lock"]
+            assert again["board_time_s"] > before["board_time_s"]
+            broker.stop()
+            await asyncio.sleep(1.0)
+            broker.start()
+            async with Listener(broker, "bms/#") as later:
+                after = await later.wait_json("bms/pack/state")
+                assert await later.wait("bms/pack/availability") == b"online"
+            assert after["frames_received"] > again["frames_received"] + 80, "samples went on while the broker was away"
+            assert after["frames_lost"] == again["frames_lost"]
+
+
+async def test_a_recorded_capture_gives_the_live_run_s_state_to_the_last_bit(
+    truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
+) -> None:
+    pack, capture = pack_file(tmp_path, plug, broker), tmp_path / "line.bms"
+    with VirtualBoard(truth.signal) as board:
+        plug.into(board.path)
+        running = asyncio.create_task(board.run())
+        async with Listener(broker, "bms/#") as listener, program(pack, "--record", str(capture)):
+            for number, event in enumerate(events(board), start=1):
+                await listener.wait_json("bms/pack/health", at_least(60 * number))
+                event()
+            await listener.wait_json("bms/pack/health", lambda h: h["line"]["resets"] and h["samples"]["samples"] > 450)
+        running.cancel()
+    live = np.load(tmp_path / "state" / "pack.npz")["state"]
+    settings, cell = load_pack(pack)
+    replayed = new_estimator(settings, cell)
+    recorded = RawCapture(capture)
+    for block in recorded:
+        replayed.run(block)
+    counters = recorded.decoder.counters
+    assert counters.frames_lost > 0
+    assert counters.crc_errors > 0
+    assert counters.resets == 1
+    assert live["observer"]["samples"][0] > 450
+    assert live.dtype == replayed.record.dtype
+    assert live.tobytes() == replayed.record.tobytes()
+
+
+def events(board: VirtualBoard) -> list[Callable[[], None]]:
+    """What happens to the line, one after the other."""
+    faults = [lambda f=f: board.inject(f, 3) for f in BoardFault]  # type: ignore[misc]
+    return [*faults, lambda: board.reset(ResetCause.BROWN_OUT)]
+
+
+def at_least(frames: int) -> Callable[[Any], bool]:
+    return lambda health: health["line"]["frames_received"] >= frames
