@@ -122,6 +122,8 @@ def build(
         UserError: No such table or figure, or captures that chapter 5 cannot be run on.
     """
     experiment = Experiment(recorded)
+    if recorded is not None:
+        _ = experiment.protocol.a  # captures that cannot serve are refused here, not after half a minute of simulations
     builders = _builders(Simulation(), experiment)
     wanted = _wanted(builders, table, figure)
     total, done = sum(len(marks) for _, marks in wanted), 0
