@@ -1,0 +1,104 @@
+"""``config``: what it writes it accepts, what is wrong it names, what it shows can be read."""
+
+import tomllib
+
+import pytest
+
+from bms_estimator.cli.main import main
+from bms_estimator.model.settings import Settings, load_settings
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, stderr of the command line."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+@pytest.fixture
+def pack(tmp_path):
+    return tmp_path / "pack.toml"
+
+
+def test_init_writes_a_file_of_the_defaults_that_check_accepts(pack, capsys):
+    code, out, err = run(capsys, "config", "init", pack)
+    assert (code, err) == (0, "")
+    assert f"{pack}: written" in out
+    code, out, err = run(capsys, "config", "check", pack)
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{pack}: good: pack: ncr18650, 1 in series")
+    assert load_settings(pack) == Settings()
+
+
+def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, capsys):
+    run(capsys, "config", "init", pack)
+    lines = pack.read_text().splitlines()
+    for name, field in Settings.model_fields.items():
+        assert f"[{name}]" in lines or f"#[{name}]" in lines, field
+    set_now = [line.removeprefix("#") for line in lines if not line.startswith("# ") and not line.endswith("= ")]
+    pack.write_text("\n".join(set_now))
+    written = tomllib.loads(pack.read_text())
+    assert written["sensor"]["baud"] == Settings().sensor.baud
+    assert set(written) == set(Settings.model_fields)
+    assert load_settings(pack).sensor == Settings().sensor
+
+
+def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
+    pack.write_text("mine\n")
+    code, out, err = run(capsys, "config", "init", pack)
+    assert (code, out) == (2, "")
+    assert f"{pack}: exists already" in err
+    assert pack.read_text() == "mine\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[pack]\nseries = 0\n", ["pack.series = 0", "greater than or equal to 1"]),
+        ("[pack]\nsereis = 2\n", ["pack.sereis", "unknown key"]),
+        ("[wrong]\na = 1\n", ["wrong", "unknown key"]),
+        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary' or 'text'"]),
+        ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "integer"]),
+        ("[observer]\nlambda = -1\n", ["observer.lambda = -1", "greater than 0"]),
+        ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),
+        ('[pack]\ncell = "nonsense"\n', ["nonsense", "ncr18650"]),
+    ],
+)
+def test_what_is_wrong_is_named_with_what_is_allowed(text, said, pack, capsys):
+    pack.write_text(text)
+    for command in ("check", "show"):
+        code, out, err = run(capsys, "config", command, pack)
+        assert (code, out) == (2, "")
+        assert [part for part in said if part not in err] == [], err
+        if "nonsense" not in text:
+            assert err.startswith(f"error: {pack}: ")
+
+
+def test_all_faults_of_a_file_are_named_at_once(pack, capsys):
+    pack.write_text("[pack]\nseries = 0\nparallel = -1\n[sensor]\nbaud = 1\n")
+    code, _, err = run(capsys, "config", "check", pack)
+    assert code == 2
+    assert [line.split(": ")[2] for line in err.splitlines()] == [
+        "pack.series = 0",
+        "pack.parallel = -1",
+        "sensor.baud = 1",
+    ]
+
+
+def test_show_prints_the_settings_in_effect_as_toml(pack, capsys):
+    pack.write_text('[pack]\ncell = "chen_mora"\nseries = 6\n[sensor]\nport = "/dev/ttyACM3"\n')
+    code, out, err = run(capsys, "config", "show", pack)
+    assert (code, err) == (0, "")
+    shown = tomllib.loads(out)
+    assert shown["pack"]["series"] == 6
+    assert shown["sensor"] == {**tomllib.loads(_shown(capsys))["sensor"], "port": "/dev/ttyACM3"}
+    assert Settings.model_validate(shown) == load_settings(pack)
+    assert "# pack.series_count = 6\n" in out
+
+
+def _shown(capsys):
+    """The defaults as shown without a file."""
+    code, out, _ = run(capsys, "config", "show")
+    assert code == 0
+    return out

@@ -1,0 +1,87 @@
+"""What ``run`` and the command line say when they cannot start: one line for each fault, code 2, no traceback."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bms_estimator import __version__
+from bms_estimator.cli.main import COMMANDS, main
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+LONG_S = 60.0
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, stderr of the command line."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+def program(*arguments):
+    """The real program, to its end."""
+    return subprocess.run([PROGRAM, *arguments], capture_output=True, text=True, timeout=LONG_S, check=False)
+
+
+def test_a_pack_file_that_is_not_there(tmp_path):
+    ended = program("run", "--pack", tmp_path / "none.toml")
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr == f"error: {tmp_path / 'none.toml'}: cannot be read: No such file or directory\n"
+
+
+def test_a_capture_that_exists_is_not_written_over(tmp_path):
+    pack, capture = tmp_path / "pack.toml", tmp_path / "kept.bms"
+    pack.write_text('[sensor]\nport = "/dev/none"\n')
+    capture.write_bytes(b"kept")
+    ended = program("run", "--pack", pack, "--record", capture)
+    assert ended.returncode == 2
+    assert ended.stderr == f"error: {capture}: exists already; a capture is never overwritten\n"
+    assert capture.read_bytes() == b"kept"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"[pack\n", "not valid TOML"),
+        (b"[pack]\nseries = 2\nseries = 3\n", "not valid TOML"),
+        (b"[pack]\nname = \xff\xfe\n", "not valid TOML"),
+        (b"[pack]\nseries = 0\n", "pack.series = 0"),
+        (b'[pack]\ncell = "none.toml"\n', "none.toml"),
+    ],
+)
+def test_a_pack_file_that_is_no_pack_file(content, said, tmp_path, capsys):
+    pack = tmp_path / "pack.toml"
+    pack.write_bytes(content)
+    code, out, err = run(capsys, "run", "--pack", pack)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert err.startswith("error: ")
+    assert said in err
+
+
+def test_a_broker_address_that_is_none(tmp_path, capsys):
+    pack = tmp_path / "pack.toml"
+    pack.write_text('[sensor]\nport = "/dev/none"\n')
+    code, _, err = run(capsys, "run", "--pack", pack, "--mqtt", "nonsense")
+    assert code == 2
+    assert "error: --mqtt nonsense: must be" in err
+
+
+def test_help_lists_every_command_and_the_version_is_the_packages(capsys):
+    code, out, _ = run(capsys, "--help")
+    assert code == 0
+    assert [name for name in COMMANDS if f" {name} " not in out] == []
+    assert run(capsys, "--version") == (0, f"bms-estimator {__version__}\n", "")
+    code, _, err = run(capsys, "nosuch")
+    assert code == 2
+    assert "No such command 'nosuch'" in err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_can_be_imported_and_has_help(command, capsys):
+    code, out, err = run(capsys, command, "--help")
+    assert (code, err) == (0, "")
+    assert f"bms-estimator {command} " in out
