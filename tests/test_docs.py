@@ -1,0 +1,90 @@
+"""What the documents point at exists, and what they say of the thesis is what the report says."""
+
+import ast
+import re
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.reports.items import Verdict
+from bms_estimator.reports.thesis import build
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+EQUATIONS = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
+THESIS = (ROOT / "docs" / "thesis.md").read_text(encoding="utf-8")
+
+NUMBERED = {"2": 13, "3": 19, "4": 2, "5": 2, "7": 1}
+"""Chapter: its last equation that there is code for; the rest of chapter 4 are steps of proofs."""
+
+
+def rows(text: str) -> list[list[str]]:
+    """Cells of all rows of all tables."""
+    return [
+        [cell.strip().replace("\\|", "|") for cell in line[1:-1].split(" | ")]
+        for line in text.splitlines()
+        if line.startswith("| ")
+    ]
+
+
+@cache
+def names(path: Path) -> set[str]:
+    """What a module defines: functions, classes, and methods as Class.method."""
+    found = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            found |= {f"{node.name}.{child.name}" for child in node.body if isinstance(child, ast.FunctionDef)}
+    return found
+
+
+def places() -> list[tuple[str, str]]:
+    """Path and name of each place that docs/equations.md gives: a name belongs to the path before it."""
+    found = []
+    for cells in rows(EQUATIONS):
+        path = ""
+        for word in re.findall(r"`([^`]+)`", cells[-1]):
+            if word.endswith(".py"):
+                path = word
+            else:
+                found.append((path, word))
+    return found
+
+
+@pytest.mark.parametrize(("path", "name"), sorted(set(places())))
+def test_place_of_an_equation_exists(path: str, name: str) -> None:
+    assert name in names(ROOT / path)
+
+
+def test_every_equation_has_its_row_and_place() -> None:
+    given = {cells[0]: cells[-1] for cells in rows(EQUATIONS)}
+    for chapter, last in NUMBERED.items():
+        for number in range(1, last + 1):
+            assert re.search(r"`[\w/]+\.py`: `\w+`", given[f"({chapter}.{number})"])
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_relative_links_lead_to_files(document: Path) -> None:
+    links = re.findall(r"\]\(([^)\s#]+)[^)]*\)", document.read_text(encoding="utf-8"))
+    relative = [link for link in links if not re.match(r"[a-z]+:", link)]
+    assert [link for link in relative if not (document.parent / link).exists()] == []
+
+
+def test_thesis_document_says_what_the_report_says() -> None:
+    """Every table and figure with its title and verdict, in the report's order, and their counts."""
+    items = [item for item in build().items if item.verdict is not Verdict.ADDED]
+    said = [tuple(cells[:3]) for cells in rows(THESIS) if cells[0].startswith(("Table ", "Figure "))]
+    assert said == [(f"{item.kind} {item.key}", item.title, item.verdict.value) for item in items]
+
+    summary = " ".join(THESIS.split())
+    for verdict, count in Counter(item.verdict.value for item in items).items():
+        assert f" {count} {verdict}" in summary
+
+
+def test_thesis_document_gives_a_reason_wherever_something_differs() -> None:
+    for cells in rows(THESIS):
+        if cells[0].startswith(("Table ", "Figure ")) and cells[2] != Verdict.REPRODUCED.value:
+            assert cells[3], cells[0]
