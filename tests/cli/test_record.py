@@ -1,0 +1,181 @@
+"""``record`` as a program: what the line brought is in the file, whatever ends the recorder."""
+
+import contextlib
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.cli.main import main
+from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES
+from bms_estimator.sources.frames import FrameDecoder
+from bms_estimator.sources.raw_capture import read_capture, read_header
+from tests.serial_line import Line, line  # noqa: F401
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+LONG_S = 30.0
+DATA_AT = 12
+"""In a record, after time and length [bytes]."""
+TEXT = b"3.900,1.000,25.0\r\n"
+
+
+@contextlib.contextmanager
+def program(*arguments, **options):
+    command = [PROGRAM, *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def board():
+    """Path of a simulated board of 500 samples per second."""
+    with program("simulate", "--rate-hz", "500", "--load", "constant") as process:
+        yield process.stdout.readline().strip()
+
+
+def until(condition, what):
+    end_s = time.monotonic() + LONG_S
+    while not condition():
+        assert time.monotonic() < end_s, f"{what} did not come"
+        time.sleep(0.02)
+
+
+def size(path):
+    return path.stat().st_size if path.exists() else 0
+
+
+def reads(path):
+    return [read for batch in read_capture(path) for read in batch]
+
+
+def samples(path):
+    """What a decoder that hears the whole reads makes of them."""
+    decoder = FrameDecoder()
+    return sum(decoder.feed(arrival_s, data).size for arrival_s, data in reads(path))
+
+
+def replayed(capsys, path):
+    """Exit code, summary, stderr of a replay."""
+    with pytest.raises(SystemExit) as ended:
+        main(["replay", str(path), "--cell", "chen_mora", "--json"])
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, json.loads(out), err
+
+
+def test_every_byte_of_the_line_is_in_the_file_and_ctrl_c_ends_it(line: Line, tmp_path, capsys):  # noqa: F811
+    out = tmp_path / "line.bms"
+    line.plug()
+    with program("record", out, "--port", line.path, "--text", "--baud", 115200) as process:
+        while "port opened" not in (said := process.stderr.readline()):
+            assert said, "the recorder has ended"
+        for _ in range(30):
+            line.write(TEXT[:7])
+            time.sleep(0.005)
+            line.write(TEXT[7:])
+        until(lambda: b"".join(data for _, data in reads(out)) == 30 * TEXT, "the last byte")
+        process.send_signal(signal.SIGINT)
+        said, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, said) == (0, "")
+    assert re.search(r"^\d+\.\d s, 540 bytes, 30 frames, 0 lost, 0 CRC errors, 0 other faults$", err, re.MULTILINE)
+    header = read_header(out)
+    assert (header.mode, header.port, header.baud) == ("text", str(line.path), 115200)
+    arrivals_s = [arrival_s for arrival_s, _ in reads(out)]
+    assert arrivals_s == sorted(arrivals_s)
+    code, result, err = replayed(capsys, out)
+    assert (code, err) == (0, "")
+    assert result["samples"] + sum(result["dropped"].values()) == 30
+
+
+def test_a_recorder_that_is_killed_leaves_all_to_the_last_whole_record(board, tmp_path, capsys):
+    out, cut = tmp_path / "killed.bms", tmp_path / "cut.bms"
+    with program("record", out, "--port", board, "--rate-hz", 500) as process:
+        until(lambda: size(out) > 20_000, "20 kB")
+        process.kill()
+        process.wait(LONG_S)
+    code, result, err = replayed(capsys, out)
+    assert (code, err) == (0, "")
+    assert result["samples"] == samples(out) > 500
+    assert result["gaps"] == 0
+
+    whole = reads(out)
+    for cut_bytes in (1, 3, len(whole[-1][1]) + 10):  # within the checksum, the data, the record's head
+        cut.write_bytes(out.read_bytes()[:-cut_bytes])
+        assert reads(cut) == whole[:-1]
+        code, result, err = replayed(capsys, cut)
+        assert (code, err) == (0, "")
+        assert result["samples"] == samples(cut) > 500
+
+
+def test_a_damaged_record_is_said_and_what_is_before_it_is_read(board, tmp_path, capsys):
+    out = tmp_path / "damaged.bms"
+    with program("record", out, "--port", board, "--rate-hz", 500, "--seconds", 1) as process:
+        assert process.wait(LONG_S) == 0
+    whole = reads(out)
+    middle = len(whole) // 2
+    data = bytearray(out.read_bytes())
+    data[-sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in whole[middle:]) + DATA_AT] ^= 0xFF
+    out.write_bytes(data)
+    assert reads(out) == whole[:middle]
+    code, result, err = replayed(capsys, out)
+    assert code == 0
+    assert f"warning: {out}: damaged after" in err
+    assert result["samples"] == samples(out) > 10
+
+
+def test_the_same_samples_as_the_board_sent(board, tmp_path, capsys):
+    out, table = tmp_path / "one.bms", tmp_path / "one.csv"
+    with program("record", out, "--port", board, "--rate-hz", 500, "--seconds", 1) as process:
+        said, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, said) == (0, "")
+    frames = int(
+        re.search(r" bytes, ([\d,]+) frames, 0 lost, 0 CRC errors, 0 other faults\n$", err)[1].replace(",", "")
+    )
+    assert frames == samples(out) > 300
+    with pytest.raises(SystemExit):
+        main(["replay", str(out), "--cell", "chen_mora", "--out", str(table)])
+    capsys.readouterr()
+    times = np.loadtxt(table, delimiter=",", skiprows=1, usecols=0)
+    assert np.allclose(np.diff(times), 1 / 500, rtol=0.0, atol=1e-5)
+
+
+def test_an_existing_file_is_left_as_it_is(tmp_path):
+    out = tmp_path / "kept.bms"
+    out.write_bytes(b"kept")
+    with program("record", out, "--port", "/dev/none") as process:
+        said, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, said) == (2, "")
+    assert err == f"error: {out}: exists already; a capture is never overwritten\n"
+    assert out.read_bytes() == b"kept"
+
+
+def test_a_disk_that_is_full_ends_it_and_what_is_there_can_be_replayed(board, tmp_path, capsys):
+    out = tmp_path / "full.bms"
+    limit = ["bash", "-c", 'ulimit -f 16; exec "$0" "$@"']  # 16 KiB
+    command = [*limit, PROGRAM, "record", out, "--port", board, "--rate-hz", "500"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
+    assert ended.returncode == 2
+    assert "error: recording ended: File too large\n" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert out.stat().st_size == 16 * 1024
+    code, result, err = replayed(capsys, out)
+    assert (code, err) == (0, "")
+    assert result["samples"] == samples(out) > 300
+
+
+def test_a_board_that_is_not_there_is_said(tmp_path):
+    with program("record", tmp_path / "none.bms", "--port", tmp_path / "none") as process:
+        assert f"waiting for {tmp_path / 'none'}: it does not exist" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=LONG_S)
+    assert process.returncode == 0
+    assert "0 bytes, 0 frames" in err
+    assert reads(tmp_path / "none.bms") == []

@@ -1,0 +1,111 @@
+"""``simulate`` as a program: a path, then a board's bytes on it, until it is interrupted."""
+
+import contextlib
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.cli.main import main
+from bms_estimator.sources.frames import FrameDecoder
+from bms_estimator.sources.protocol import set_rate_command
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+LONG_S = 30.0
+RATE_HZ = 200
+
+
+@contextlib.contextmanager
+def simulate(*arguments):
+    """The program, and the path that it printed."""
+    command = [PROGRAM, "simulate", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+@contextlib.contextmanager
+def opened(path):
+    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def read(descriptor, enough, data=b""):
+    """``data`` and all bytes after it, read by read, until ``enough`` of them says so."""
+    end_s = time.monotonic() + LONG_S
+    while not enough(data):
+        assert time.monotonic() < end_s, f"{len(data)} bytes are all that came"
+        if select.select([descriptor], [], [], 0.5)[0]:
+            data += os.read(descriptor, 4096)
+    return data
+
+
+def decoded(data):
+    decoder = FrameDecoder()
+    return decoder.feed(0.0, data), decoder
+
+
+def test_frames_of_the_pack_that_was_asked_for_until_ctrl_c():
+    arguments = ("--series", "6", "--load", "constant", "--current-a", "0.5", "--rate-hz", str(RATE_HZ))
+    with simulate(*arguments) as (process, path):
+        assert Path(path).is_char_device()
+        with opened(path) as line:
+            block, decoder = decoded(read(line, lambda data: decoded(data)[0].size >= RATE_HZ))
+        assert decoder.board["sample_rate_hz"] == str(RATE_HZ)
+        assert decoder.counters.crc_errors == 0
+        assert decoder.counters.frames_lost == 0
+        assert np.allclose(np.diff(block["time_s"]), 1.0 / RATE_HZ, rtol=0.0, atol=1e-5)
+        assert block["current_a"].mean() == pytest.approx(0.5, abs=0.05)
+        assert block["voltage_v"].mean() == pytest.approx(6 * 3.9, abs=1.0)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, out) == (0, "")
+    assert re.fullmatch(r"[\d,]+ samples in \d+\.\d s, SOC \d+\.\d\d%\n", err)
+
+
+def test_it_obeys_the_host():
+    with simulate("--rate-hz", "50") as (_, path), opened(path) as line:
+        data = read(line, lambda data: decoded(data)[0].size >= 5)
+        os.write(line, set_rate_command(RATE_HZ))
+        data = read(line, lambda data: decoded(data)[0].size >= RATE_HZ, data)
+    steps_s = np.diff(decoded(data)[0]["time_s"])
+    assert steps_s[0] == pytest.approx(1 / 50, rel=0.01)
+    assert steps_s[-1] == pytest.approx(1 / RATE_HZ, rel=0.01)
+
+
+def test_text_lines_as_a_hobby_sketch_prints_them():
+    with simulate("--text", "--current-a", "0.2", "--load", "constant") as (process, path):
+        with opened(path) as line:
+            lines = read(line, lambda data: data.count(b"\r\n") >= 20).split(b"\r\n")[:-1]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(LONG_S) == 0
+    assert [line for line in lines if not re.fullmatch(rb"\d\.\d{3},-?\d\.\d{3}(,-?\d+\.\d)?", line)] == []
+    assert np.mean([float(line.split(b",")[1]) for line in lines]) == pytest.approx(0.2, abs=0.05)
+
+
+def test_it_ends_by_itself_after_the_seconds_of_its_time():
+    with simulate("--seconds", "4", "--speed", "20", "--load", "constant", "--current-a", "0") as (process, _):
+        out, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, out) == (0, "")
+    assert re.fullmatch(r"40[01] samples in 4\.0 s, SOC 90\.00%\n", err)
+
+
+@pytest.mark.parametrize("arguments", [("--cell", "nonsense"), ("--load", "nonsense"), ("--rate-hz", "2000")])
+def test_what_there_is_not_is_named(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["simulate", *arguments])
+    out, err = capsys.readouterr()
+    assert (ended.value.code, out) == (2, "")
+    assert arguments[-1] in err or arguments[0] in err
