@@ -16,6 +16,8 @@ Floats = NDArray[np.float64]
 
 GLITCH_FRACTION = 0.5
 """A voltage off the median by more than this fraction is a fault of the instrument: no Li-ion cell swings so far."""
+LEAST_GOOD = 0.5
+"""With a smaller share of good voltages nobody knows which ones are the faults."""
 REST_CURRENT_C = 0.01
 """Below this C-rate a cell rests [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
 BLIP_CHARGE = 2e-5
@@ -31,6 +33,10 @@ SHORTEST_TAU, LONGEST_TAU, TAU_GRID = 0.05, 0.7, 40
 FORM_ERROR = 0.6
 """Part of the extrapolated voltage that is its standard deviation: relaxation is no pure exponential. Half-hour rests of
 a NCR18650 cut to a quarter of an hour miss their end by 2.7 mV RMS so extrapolated, and by 4.7 mV when not."""
+SLOWEST_S = 600.0
+"""Time constant of a slow branch [s]; a rest shorter than this takes it for a faster one, and is judged by both."""
+SLOW_PART = 0.4
+"""Part of the difference between the two that is the standard deviation of such a rest."""
 LEAST_STD_V = 5e-4
 """No point is better known: half a step of the usual converter, and temperature [V]."""
 NEAR_FULL, NEAR_EMPTY = 0.995, 0.02
@@ -115,17 +121,29 @@ class RelaxationTest:
 
 
 def without_glitches(samples: SampleBlock) -> SampleBlock:
-    """Samples that can be true: finite, time going on, voltage within half of the median.
+    """Samples that can be true: finite, time going on, voltage within half of the median of those above 0 V.
 
     Raises:
-        UserError: Nothing is left.
+        UserError: Nothing is left, or most voltages are glitches.
     """
     finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
     good = samples[finite]
     if good.size == 0:
         raise UserError(f"none of {samples.size} samples has finite time, current and voltage")
-    middle = float(np.median(good["voltage_v"]))
-    good = good[np.abs(good["voltage_v"] - middle) <= GLITCH_FRACTION * abs(middle)]
+    alive_v = good["voltage_v"][good["voltage_v"] > 0.0]
+    if alive_v.size == 0:
+        raise UserError(
+            f"none of {samples.size} samples has a voltage above 0 V, the largest is {good['voltage_v'].max():g} V"
+        )
+    middle = float(np.median(alive_v))
+    off = np.abs(good["voltage_v"] - middle) > GLITCH_FRACTION * middle
+    if off.mean() > 1.0 - LEAST_GOOD:
+        first = good[int(np.argmax(off))]
+        raise UserError(
+            f"{off.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
+            f"{first['voltage_v']:.3f} V where the median is {middle:.3f} V: look at the sensor's wiring"
+        )
+    good = good[~off]
     latest = np.maximum.accumulate(good["time_s"])
     later = np.r_[True, good["time_s"][1:] > latest[:-1]]
     kept: SampleBlock = good[later]
@@ -254,13 +272,15 @@ def _relaxed(rest: SampleBlock, soc: float) -> Rest:
     late = time_s >= LATE_FROM * duration_s
     ocv_v, tau_s, spread_v = _extrapolate(time_s[late], rest["voltage_v"][late], duration_s)
     voltage_v = float(rest["voltage_v"][time_s >= 0.98 * duration_s].mean())
+    slow, _, _ = _with_tau(time_s[late], rest["voltage_v"][late], SLOWEST_S)  # what a short rest cannot rule out
+    unseen_v = SLOW_PART * (float(slow[0]) - ocv_v) if duration_s < SLOWEST_S else 0.0
     return Rest(
         start_s=float(rest["time_s"][0]),
         duration_s=duration_s,
         soc=soc,
         voltage_v=voltage_v,
         ocv_v=ocv_v,
-        std_v=float(np.sqrt(spread_v**2 + (FORM_ERROR * (ocv_v - voltage_v)) ** 2 + LEAST_STD_V**2)),
+        std_v=float(np.sqrt(spread_v**2 + unseen_v**2 + (FORM_ERROR * (ocv_v - voltage_v)) ** 2 + LEAST_STD_V**2)),
         tau_s=tau_s,
     )
 

@@ -1,0 +1,71 @@
+"""Captures of simulated voltage relaxation tests, good and bad."""
+
+import numpy as np
+
+from tests.calibration.simulated_load import capture
+
+LOAD_A, LOAD_S, REST_S, FIRST_REST_S = 1.5, 360, 900, 60
+
+
+def schedule(*, load_a=LOAD_A, load_s=LOAD_S, rest_s=REST_S, rounds=30):
+    """A short rest, then loads with a rest after each: 19 rounds empty the cell."""
+    return np.r_[np.zeros(FIRST_REST_S), np.tile(np.r_[np.full(load_s, load_a), np.zeros(rest_s)], rounds)]
+
+
+def relaxation(**options):
+    """A full cell through a relaxation test, 1 Hz, noise of 0.5 mV."""
+    noise = {key: options.pop(key) for key in ("noise_v", "seed") if key in options}
+    return capture(schedule(**options), soc=1.0, **noise)
+
+
+def without_rests():
+    return capture(np.full(7200, LOAD_A), soc=1.0)
+
+
+def rests_too_short():
+    return relaxation(rest_s=20)
+
+
+def charging_inside():
+    current_a = schedule(rounds=12)
+    current_a[8000:8400] = -LOAD_A
+    return capture(current_a, soc=1.0)
+
+
+def glitched(share, seed=5):
+    """Samples at 0 V, as a loose wire gives them."""
+    samples = relaxation()
+    hit = np.random.default_rng(seed).random(samples.size) < share
+    samples["voltage_v"][hit] = 0.0
+    return samples
+
+
+def mostly_zero():
+    return glitched(0.7)
+
+
+def wrong_sign():
+    samples = relaxation()
+    samples["current_a"] *= -1.0
+    return samples
+
+
+def too_few_rests():
+    return relaxation(rounds=4)
+
+
+def small_span():
+    return relaxation(load_s=60, rounds=8)
+
+
+BAD = {
+    "no rests": (without_rests, 3.0, "no rests in 1.94 h: the current never falls below 1.500 A"),
+    "short rests": (rests_too_short, 3.0, "1 usable rests, at least 6 are needed; 19 others were too short"),
+    "charging": (charging_inside, 3.0, "charges inside, 0.167 Ah from 8000 s on"),
+    "wrong sign": (wrong_sign, 3.0, "current has the wrong sign or the capture charges: 0.000 Ah out, 2.9"),
+    "capacity": (relaxation, 2.0, "SOC runs from 1.000 to -0.4"),
+    "few rests": (too_few_rests, 3.0, "5 usable rests, at least 6 are needed"),
+    "span": (small_span, 3.0, "points span SOC 0.93 to 1.00 only"),
+    "0 V": (mostly_zero, 3.0, "of 24144 samples are glitches, the first at 2 s with 0.000 V where the median is 3.6"),
+}
+"""Capture, capacity it is counted against [Ah], what the message must hold."""
