@@ -1,0 +1,143 @@
+"""(2.10) and the monotone table through points whose curve is known."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.ocv import (
+    Points,
+    average,
+    chen_mora,
+    fit_chen_mora,
+    fit_table,
+    max_v,
+    pooled,
+    rms_v,
+)
+from bms_estimator.calibration.relaxation import relaxation_test
+from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports.printed import TABLE_1, TABLE_8
+from tests.calibration.simulated_load import TRUTH
+from tests.calibration.simulated_relaxation import relaxation
+
+GRID = np.linspace(0.0, 1.0, 501)
+
+
+def points(soc, ocv_v, std_v=1e-3, **ends):
+    soc = np.asarray(soc, dtype=float)
+    return Points(soc, np.asarray(ocv_v, dtype=float), np.full(soc.size, std_v), **ends)
+
+
+@pytest.mark.parametrize("a", [TABLE_1, TABLE_8], ids=["Table 1", "Table 8"])
+def test_exact_points_give_the_parameters_back(a):
+    soc = np.linspace(0.005, 1.0, 60)
+    fit = fit_chen_mora(points(soc, chen_mora(np.array(a), soc)))
+    assert fit.a == pytest.approx(a, rel=1e-4)
+    assert max_v(fit.residual_v) < 1e-7
+
+
+def test_shipped_cell_is_the_same_curve():
+    ocv = load_cell("chen_mora").ocv
+    assert ocv.a == pytest.approx(TABLE_1)
+    x = 0.37
+    by_hand = -1.031 * np.exp(-35.0 * x) + 3.685 + 0.2156 * x - 0.1178 * x**2 + 0.3201 * x**3
+    assert chen_mora(np.array(TABLE_1), np.array([x]))[0] == pytest.approx(by_hand, rel=1e-15)
+
+
+def test_standard_errors_are_those_of_the_scatter():
+    """Forty noisy sets: the fits scatter as each says it does."""
+    rng, soc = np.random.default_rng(0), np.linspace(0.01, 1.0, 80)
+    exact = chen_mora(np.array(TABLE_1), soc)
+    fits = [fit_chen_mora(points(soc, exact + 1e-3 * rng.standard_normal(soc.size))) for _ in range(40)]
+    scatter = np.std([fit.a for fit in fits], axis=0, ddof=1)
+    claimed = np.mean([fit.std for fit in fits], axis=0)
+    assert scatter == pytest.approx(claimed, rel=0.4)
+    assert np.mean([rms_v(fit.residual_v) for fit in fits]) == pytest.approx(1e-3, rel=0.1)
+
+
+def test_a_parameter_at_its_bound_has_no_standard_error():
+    soc = np.linspace(0.0, 1.0, 40)
+    fit = fit_chen_mora(points(soc, 3.5 + 0.6 * soc))  # no exponential in it
+    assert np.isnan(fit.std[0])
+    assert np.isfinite(fit.std[2:]).all()
+    assert max_v(fit.residual_v) < 1e-5
+
+
+def test_joint_fit_of_several_runs_beats_the_mean_of_their_parameters():
+    """(5.1)-(5.2) average parameters that lean on each other."""
+    rng, exact = np.random.default_rng(4), np.array(TABLE_1)
+    runs = []
+    for count in (9, 10, 12):
+        soc = np.linspace(0.2 / count, 1.0, count)
+        runs.append(points(soc, chen_mora(exact, soc) + 2e-3 * rng.standard_normal(count)))
+    fits = [fit_chen_mora(run) for run in runs]
+    mean = average(fits)
+    assert mean == pytest.approx(sum(fit.a for fit in fits) / 3)  # (5.1), (5.2)
+    order = np.argsort(np.concatenate([run.soc for run in runs]))
+    joint = fit_chen_mora(
+        points(np.concatenate([run.soc for run in runs])[order], np.concatenate([run.ocv_v for run in runs])[order])
+    )
+    inside = GRID[GRID > 0.05]
+    true_v = chen_mora(exact, inside)
+    assert rms_v(joint(inside) - true_v) < rms_v(chen_mora(mean, inside) - true_v)
+    assert rms_v(joint(inside) - true_v) < 2e-3
+
+
+def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
+    tests = [relaxation_test(relaxation(rounds=10, seed=seed), TRUTH.cell.capacity_ah) for seed in (0, 1)]
+    both = pooled(tests)
+    assert both.soc.size == len(tests[0].rests) + len(tests[1].rests)
+    assert (np.diff(both.soc) >= 0.0).all()
+    assert both.full_v == pytest.approx(0.5 * (tests[0].full_v + tests[1].full_v))
+    assert np.isnan(both.empty_v)  # neither runs empty
+
+
+@pytest.mark.parametrize("noise_v", [0.0, 3e-3])
+def test_table_is_monotone_invertible_and_near_its_points(noise_v):
+    rng, soc = np.random.default_rng(6), np.linspace(0.02, 0.99, 40)
+    fit = fit_table(points(soc, chen_mora(np.array(TABLE_1), soc) + noise_v * rng.standard_normal(40), noise_v + 1e-4))
+    assert (fit.soc[0], fit.soc[-1]) == (0.0, 1.0)
+    assert (np.diff(fit.ocv_v) > 0.0).all()
+    assert (np.diff(fit(GRID)) > 0.0).all()
+    assert max_v(fit.residual_v) <= 1e-9 + 3.0 * noise_v
+    assert isinstance(fit.ocv, TableOcv)
+    assert np.interp(fit(np.array([0.4])), fit(GRID), GRID)[0] == pytest.approx(0.4, abs=1e-3)
+
+
+def test_table_levels_a_falling_stretch():
+    soc = np.linspace(0.0, 1.0, 11)
+    ocv_v = 3.4 + 0.7 * soc
+    ocv_v[5] = ocv_v[4] - 0.02
+    fit = fit_table(points(soc, ocv_v))
+    assert (np.diff(fit.ocv_v) > 0.0).all()
+    assert fit.residual_v[[0, 1, 2, 3, 6, 7, 8, 9, 10]] == pytest.approx(np.zeros(9), abs=1e-12)
+    assert fit.residual_v[4] == pytest.approx(0.01, abs=1e-4)  # both move by half
+    assert fit.residual_v[5] == pytest.approx(-0.01, abs=1e-4)
+
+
+def test_table_merges_points_that_share_their_soc_by_their_certainty():
+    soc = np.r_[np.linspace(0.0, 1.0, 11), 0.5005]
+    ocv_v = 3.4 + 0.7 * soc
+    ocv_v[-1] += 0.03
+    std_v = np.full(12, 1e-3)
+    std_v[-1] = 5e-3
+    order = np.argsort(soc)
+    fit = fit_table(Points(soc[order], ocv_v[order], std_v[order]))
+    assert fit.soc.size == 11
+    assert fit(np.array([0.5]))[0] == pytest.approx(3.75 + 0.03 / 26.0, abs=5e-4)
+
+
+def test_table_reaches_its_ends_by_what_is_known_else_by_a_line():
+    soc = np.linspace(0.1, 0.9, 9)
+    known = fit_table(points(soc, 3.4 + 0.7 * soc, empty_v=3.0, full_v=4.2))
+    assert known.ocv_v[[0, -1]] == pytest.approx([3.0, 4.2])
+    line = fit_table(points(soc, 3.4 + 0.7 * soc))
+    assert line.ocv_v[[0, -1]] == pytest.approx([3.4, 4.1], abs=1e-9)
+
+
+@pytest.mark.parametrize("fit", [fit_chen_mora, fit_table])
+def test_too_few_points_or_too_small_a_span_are_refused_with_their_numbers(fit):
+    with pytest.raises(UserError, match=r"5 points of the open-circuit voltage; \(2.10\) has 6 parameters"):
+        fit(points(np.linspace(0.0, 1.0, 5), np.linspace(3.4, 4.1, 5)))
+    with pytest.raises(UserError, match=r"points span SOC 0.50 to 0.70 only"):
+        fit(points(np.linspace(0.5, 0.7, 12), np.linspace(3.4, 4.1, 12)))
