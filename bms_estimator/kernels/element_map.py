@@ -17,12 +17,12 @@ BINS = 25
 ELEMENT_NAMES = ("r_ts_ohm", "r_tl_ohm", "c_ts_farad", "c_tl_farad", "r_s_ohm")
 """In the order of their parameters: a1..a3, a4..a6, a7..a9, a10..a12, a13..a15."""
 ELEMENTS = len(ELEMENT_NAMES)
-LEARNED_VARIANCE = 0.3**2
-"""A logarithm known worse than this (30 %) adds nothing to the map."""
+LEARNED_VARIANCE = 0.5**2
+"""A logarithm known worse than this (50 %) adds nothing to the map."""
 MODEL_ERROR = 0.02
 """An element is no closer to (2.5)-(2.9) than this, relative."""
 PRIOR_ERROR = 0.7
-"""How far the configured function may be off in a bin that was never visited, relative."""
+"""How far the configured function, brought to the level of the visited bins, may be off in others, relative."""
 EXPONENT_MIN, EXPONENT_MAX = 0.5, 300.0
 SEARCH_POINTS = 24
 REFINEMENTS = 12
@@ -103,21 +103,28 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
 def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: Floats, y: Floats, w: Floats) -> int:
     """SOC, value and weight of the element in each bin; returns how many bins were visited."""
     visited = 0
+    ratios = weights = 0.0
     for b in range(BINS):
         x[b] = (b + 0.5) / BINS
         if m.weight[e, b] > 0.0:
             x[b] = m.soc_moment[e, b] / m.weight[e, b]
-        configured = max(
-            prior[base + 2] + sign * prior[base] * math.exp(-prior[base + 1] * x[b]), 0.05 * prior[base + 2]
-        )
-        y[b] = configured
-        w[b] = 1.0 / (PRIOR_ERROR * configured) ** 2
+        configured = prior[base + 2] + sign * prior[base] * math.exp(-prior[base + 1] * x[b])
+        y[b] = max(configured, 0.05 * prior[base + 2])
+        w[b] = 0.0
         if m.weight[e, b] > 0.0:
             visited += 1
-            y[b] = math.exp(m.moment[e, b] / m.weight[e, b])
             # samples of one pass are no independent witnesses: the mean variance stands, not the variance of the mean
-            variance = m.dwell_s[e, b] / m.weight[e, b] + MODEL_ERROR**2
-            w[b] = 1.0 / (variance * y[b] * y[b])
+            w[b] = 1.0 / (m.dwell_s[e, b] / m.weight[e, b] + MODEL_ERROR**2)
+            ratios += w[b] * (m.moment[e, b] / m.weight[e, b] - math.log(y[b]))
+            weights += w[b]
+    level = math.exp(ratios / weights) if visited > 0 else 1.0
+    for b in range(BINS):
+        if m.weight[e, b] > 0.0:
+            y[b] = math.exp(m.moment[e, b] / m.weight[e, b])
+            w[b] /= y[b] * y[b]
+        else:
+            y[b] *= level
+            w[b] = 1.0 / (PRIOR_ERROR * y[b]) ** 2
     return visited
 
 
