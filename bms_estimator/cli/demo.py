@@ -29,14 +29,14 @@ from bms_estimator.sources.virtual_board import VirtualBoard
 
 FIRMWARE_BUILD = Path(bms_estimator.__file__).parents[1] / "firmware" / "build"
 CELL = "chen_mora"
-LOAD_A = 2.0
-"""Steps up to seven times the capacity per hour: SOC falls by a percent in some fifteen seconds [A]."""
+LOAD_A = 1.0
+"""Steps up to four times the capacity per hour: SOC falls by a percent in half a minute [A]."""
 START_SOC = 0.9
 RESOLUTION_V = 5e-3
 """Of a mean of many noisy conversions, a fifth of the converter's step [V]."""
 PUBLISH_RATE_HZ = 4.0
-LAMBDA = 1e6
-"""Of the gain (3.10): what takes k hours with the usual 1 is to be seen within a minute."""
+LAMBDA = 1e4
+"""Of the gain (3.10): what takes k hours with the usual 1 is to be seen within minutes."""
 
 
 def demo(
