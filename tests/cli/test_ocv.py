@@ -1,0 +1,145 @@
+import json
+
+import numpy as np
+import pytest
+
+from bms_estimator.cli.main import main
+from bms_estimator.model.cell import ChenMoraOcv, TableOcv, load_cell
+from tests.calibration.simulated_relaxation import BAD, relaxation
+
+REAL = "cell5_relaxation_c2.csv.gz"
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, stderr of the command line."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+def save(path, samples):
+    rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
+    np.savetxt(path, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
+    return path
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    """Two relaxation tests of a simulated cell, as files."""
+    folder = tmp_path_factory.mktemp("relaxation")
+    return [save(folder / f"run{seed}.csv", relaxation(seed=seed)) for seed in (0, 1)]
+
+
+@pytest.mark.parametrize(("form", "limit_mv"), [("chen-mora", 10.0), ("table", 2.0)])
+def test_real_cell(tmp_path, capsys, shared_data, form, limit_mv):
+    out = tmp_path / "cell5.toml"
+    capture = shared_data / "ncr18650" / REAL
+    code, text, err = run(capsys, "ocv", capture, "--capacity-ah", "3.0", "--form", form, "--out", out, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(text)
+    assert found["form"] == form
+    assert found["points"] == len(found["soc"]) == len(found["ocv_v"]) == len(found["std_v"]) >= 18
+    assert found["soc"] == sorted(found["soc"])
+    assert found["soc"][0] < 0.1
+    assert found["soc"][-1] > 0.9
+    assert 0.0 <= found["rms_mv"] <= limit_mv
+    assert found["rms_mv"] <= found["max_mv"]
+    assert max(found["std_v"]) < 0.01
+
+    cell = load_cell(out)
+    assert cell.cell.name == "cell5"
+    assert cell.cell.capacity_ah == 3.0
+    soc, ocv_v = np.array(found["soc"]), np.array(found["ocv_v"])
+    if form == "chen-mora":
+        assert list(found["parameters"]) == ["a16", "a17", "a18", "a19", "a20", "a21"]
+        assert all(set(parameter) == {"value", "std"} for parameter in found["parameters"].values())
+        assert isinstance(cell.ocv, ChenMoraOcv)
+        a16, a17, a18, a19, a20, a21 = (found["parameters"][f"a{i}"]["value"] for i in range(16, 22))
+        assert cell.ocv.a == pytest.approx((a16, a17, a18, a19, a20, a21), rel=1e-6)
+        by_hand = -a16 * np.exp(-a17 * soc) + a18 + a19 * soc - a20 * soc**2 + a21 * soc**3  # (2.10)
+        assert 1e3 * np.sqrt(np.mean((ocv_v - by_hand) ** 2)) == pytest.approx(found["rms_mv"], rel=1e-6)
+        assert 1e3 * np.abs(ocv_v - by_hand).max() == pytest.approx(found["max_mv"], rel=1e-6)
+    else:
+        assert found["parameters"] == {}
+        assert isinstance(cell.ocv, TableOcv)
+        assert np.interp(soc, cell.ocv.soc, cell.ocv.ocv_v) == pytest.approx(ocv_v, abs=2e-3)
+        assert (np.diff(cell.ocv.ocv_v) > 0.0).all()
+
+
+def test_several_captures_are_fitted_jointly(captures, tmp_path, capsys):
+    out = tmp_path / "both.toml"
+    code, text, _ = run(capsys, "ocv", *captures, "--capacity-ah", "3", "--form", "table", "--out", out, "--json")
+    assert code == 0
+    found = json.loads(text)
+    assert found["points"] == 40
+    assert {name: one["rests"] for name, one in found["captures"].items()} == {"run0.csv": 20, "run1.csv": 20}
+    cell = load_cell(out)
+    assert cell.cell.series_count == 1
+    assert "OCV: 40 rests of run0.csv, run1.csv" in out.read_text()
+    # elements: a first idea from the rests, 0.0861 ohm and some 20 mohm in the middle of the true cell
+    assert cell.r_s.offset_ohm == pytest.approx(0.0861, rel=0.15)
+    assert 0.01 < cell.r_tl.offset_ohm < 0.05
+
+
+def test_for_people(captures, tmp_path, capsys):
+    out = tmp_path / "c.toml"
+    code, text, _ = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", out)
+    assert code == 0
+    for words in ("points", "SOC 0.050 to 1.000", "left to relax at a rest's end", "mV RMS", "a16", "a21"):
+        assert words in text
+
+
+def test_cells_in_series_are_counted_by_their_voltage(tmp_path, capsys):
+    samples = relaxation()
+    samples["voltage_v"] *= 6.0
+    code, text, _ = run(
+        capsys,
+        "ocv",
+        save(tmp_path / "pack.csv", samples),
+        "--capacity-ah",
+        "3",
+        "--out",
+        tmp_path / "p.toml",
+        "--json",
+    )
+    assert code == 0
+    assert json.loads(text)["series_count"] == 6
+    assert load_cell(tmp_path / "p.toml").cell.series_count == 6
+
+
+@pytest.mark.parametrize("why", BAD)
+def test_bad_input_ends_with_code_2_and_the_numbers_that_show_it(tmp_path, capsys, why):
+    make, capacity_ah, message = BAD[why]
+    capture, out = save(tmp_path / "bad.csv", make()), tmp_path / "c.toml"
+    code, text, err = run(capsys, "ocv", capture, "--capacity-ah", capacity_ah, "--out", out)
+    assert (code, text) == (2, "")
+    assert " ".join(message.split()) in " ".join(err.split())
+    assert "Traceback" not in err
+    assert not out.exists()
+
+
+def test_a_capture_is_not_overwritten(captures, capsys):
+    before = captures[0].read_bytes()
+    code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0])
+    assert code == 2
+    assert "is a capture itself" in err
+    assert captures[0].read_bytes() == before
+
+
+def test_a_folder_that_does_not_exist(captures, tmp_path, capsys):
+    code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", tmp_path / "no" / "c.toml")
+    assert code == 2
+    assert "Traceback" not in err
+    code, _, err = run(capsys, "ocv", tmp_path / "absent.csv", "--capacity-ah", "3", "--out", tmp_path / "c.toml")
+    assert code == 2
+    assert "absent.csv" in err
+
+
+def test_an_empty_capture(tmp_path, capsys):
+    empty = tmp_path / "empty.csv"
+    empty.write_text("time_s,current_a,voltage_v\n")
+    code, _, err = run(capsys, "ocv", empty, "--capacity-ah", "3", "--out", tmp_path / "c.toml")
+    assert code == 2
+    assert "Traceback" not in err
+    assert "empty.csv" in err
