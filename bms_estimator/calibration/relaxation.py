@@ -120,7 +120,7 @@ class RelaxationTest:
         return np.array([rest.std_v for rest in self.rests])
 
 
-def without_glitches(samples: SampleBlock) -> SampleBlock:
+def without_glitches(samples: SampleBlock, name: str = "capture") -> SampleBlock:
     """Samples that can be true: finite, time going on, voltage within half of the median of those above 0 V.
 
     Raises:
@@ -129,18 +129,18 @@ def without_glitches(samples: SampleBlock) -> SampleBlock:
     finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
     good = samples[finite]
     if good.size == 0:
-        raise UserError(f"none of {samples.size} samples has finite time, current and voltage")
+        raise UserError(f"{name}: none of {samples.size} samples has finite time, current and voltage")
     alive_v = good["voltage_v"][good["voltage_v"] > 0.0]
     if alive_v.size == 0:
         raise UserError(
-            f"none of {samples.size} samples has a voltage above 0 V, the largest is {good['voltage_v'].max():g} V"
+            f"{name}: none of {samples.size} samples has a voltage above 0 V, the largest is {good['voltage_v'].max():g} V"
         )
     middle = float(np.median(alive_v))
     off = np.abs(good["voltage_v"] - middle) > GLITCH_FRACTION * middle
     if off.mean() > 1.0 - LEAST_GOOD:
         first = good[int(np.argmax(off))]
         raise UserError(
-            f"{off.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
+            f"{name}: {off.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
             f"{first['voltage_v']:.3f} V where the median is {middle:.3f} V: look at the sensor's wiring"
         )
     good = good[~off]
@@ -180,7 +180,7 @@ def relaxation_test(
     Raises:
         UserError: No relaxation test: no rests, too short ones, charging inside, wrong sign or capacity.
     """
-    good = without_glitches(samples)
+    good = without_glitches(samples, name)
     soc = soc_by_counting(good, capacity_ah, initial_soc)
     _check_charge(name, good, soc, capacity_ah)
     resting = _resting(good, capacity_ah)

@@ -116,6 +116,7 @@ def test_bad_input_ends_with_code_2_and_the_numbers_that_show_it(tmp_path, capsy
     assert (code, text) == (2, "")
     assert " ".join(message.split()) in " ".join(err.split())
     assert "Traceback" not in err
+    assert why == "span" or "bad.csv: " in err  # the span is that of all captures together
     assert not out.exists()
 
 
