@@ -19,7 +19,8 @@ from bms_estimator.sources.raw_capture import read_capture, read_header
 from tests.serial_line import Line, line  # noqa: F401
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 30.0
+LONG_S = 120.0
+"""Kernels may have to be compiled first [s]."""
 DATA_AT = 12
 """In a record, after time and length [bytes]."""
 TEXT = b"3.900,1.000,25.0\r\n"

@@ -10,7 +10,8 @@ from bms_estimator import __version__
 from bms_estimator.cli.main import COMMANDS, main
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 60.0
+LONG_S = 240.0
+"""Kernels may have to be compiled first [s]."""
 
 
 def run(capsys, *arguments):

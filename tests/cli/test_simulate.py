@@ -18,7 +18,8 @@ from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.protocol import set_rate_command
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 30.0
+LONG_S = 120.0
+"""Kernels may have to be compiled first [s]."""
 RATE_HZ = 200
 
 

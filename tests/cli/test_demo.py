@@ -1,0 +1,85 @@
+"""``demo`` as a program: what a client of its broker sees, from the first state to offline."""
+
+import asyncio
+import contextlib
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import aiomqtt
+import pytest
+
+from bms_estimator.cli.demo import FIRMWARE_BUILD
+from bms_estimator.sources.firmware_board import FirmwareBoard
+from tests.mosquitto import Listener, free_port
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+LONG_S = 240.0
+"""Kernels may have to be compiled first [s]."""
+
+
+@contextlib.asynccontextmanager
+async def demo(*arguments):
+    process = await asyncio.create_subprocess_exec(
+        PROGRAM, "demo", *map(str, arguments), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+
+
+async def listening(port):
+    """A listener, once the broker is there."""
+    async with asyncio.timeout(LONG_S):
+        while True:
+            listener = Listener(SimpleNamespace(port=port))
+            with contextlib.suppress(aiomqtt.MqttError):
+                return await listener.__aenter__()
+            await asyncio.sleep(0.1)
+
+
+@pytest.mark.parametrize("board", ["firmware", "python"])
+async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
+    if board == "firmware" and not FirmwareBoard.is_built(FIRMWARE_BUILD):
+        pytest.skip("the firmware is not built (make firmware)")
+    port = free_port()
+    async with demo("--seconds", 4, "--port", port, *(["--python-board"] if board == "python" else [])) as process:
+        listener = await listening(port)
+        try:
+            assert await listener.wait("bms/demo/availability") == b"online"
+            state = await listener.wait_json("bms/demo/state", lambda s: s["frames_received"] > 100)
+            parameters = await listener.wait_json("bms/demo/parameters")
+            info = await listener.wait_json("bms/demo/info", lambda i: i.get("board"))
+            assert await listener.wait("bms/demo/sensor/availability", lambda p: p == b"online")
+            health = await listener.wait_json("bms/demo/health")
+            assert await listener.wait("bms/demo/availability", lambda p: p == b"offline")
+        finally:
+            await listener.__aexit__(None, None, None)
+        async with asyncio.timeout(LONG_S):
+            out, err = (text.decode() for text in await process.communicate())
+    assert process.returncode == 0
+    assert 0.8 < state["soc"] < 0.95
+    assert state["voltage_v"] == pytest.approx(3.9, abs=0.2)
+    assert state["lock"] is True
+    assert state["frames_lost"] == state["crc_errors"] == 0
+    assert set(parameters["a"]) == {f"a{i}" for i in range(1, 22)}
+    assert (info["device"], info["cell"], info["board"]["sample_rate_hz"]) == ("demo", "chen_mora", "100")
+    assert health["line"]
+    assert f"mosquitto_sub -p {port} -t 'bms/#' -v" in out
+    assert ("firmware in simavr" if board == "firmware" else "board in Python") in out
+    assert re.search(r"\d+\.\d s: \d+ frames, 0 lost, 0 CRC errors; SOC .*, lock\n$", out)
+    assert "Traceback" not in err
+
+
+async def test_a_port_that_is_taken_is_said():
+    server = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    async with server, demo("--seconds", 1, "--port", port) as process:
+        async with asyncio.timeout(LONG_S):
+            _, err = await process.communicate()
+    assert process.returncode == 2
+    assert err.decode().splitlines()[-1].startswith(f"error: port {port}: taken by another program")

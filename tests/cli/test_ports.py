@@ -1,0 +1,84 @@
+"""``ports``: the ports that are there, who holds them, and what answers on them."""
+
+import contextlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from serial.tools import list_ports
+
+from bms_estimator.cli.main import main
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+
+
+@pytest.fixture(autouse=True)
+def wide(monkeypatch):
+    """So that no cell of the table is broken."""
+    monkeypatch.setenv("COLUMNS", "240")
+
+
+def ports(capsys, *arguments):
+    """Exit code, stdout of the command."""
+    with pytest.raises(SystemExit) as ended:
+        main(["ports", *arguments])
+    out, err = capsys.readouterr()
+    assert err == ""
+    return ended.value.code or 0, out
+
+
+@contextlib.contextmanager
+def simulated(*arguments):
+    """Path of a simulated board, and its process."""
+    with subprocess.Popen([PROGRAM, "simulate", *arguments], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process.stdout.readline().strip(), process
+        finally:
+            process.kill()
+
+
+def test_it_names_the_ports_that_are_there_and_no_others(capsys):
+    there = [port.device for port in list_ports.comports()]
+    code, out = ports(capsys)
+    assert code == 0
+    if there:
+        assert len(re.findall(r"^ *(/dev/\S+)", out, re.MULTILINE)) == len(there)
+        assert "board" not in out.splitlines()[1]
+    else:
+        assert out == "no serial port is there; is the board plugged in?\n"
+
+
+def test_a_board_answers_the_probe_and_goes_on(capsys):
+    with simulated("--rate-hz", "50") as (path, process):
+        for _ in range(2):
+            code, out = ports(capsys, "--probe", path)
+            assert code == 0
+            assert re.search(rf"^ *{path} .* board, firmware 0\.1\.0, serial 0*1, 50 Hz *$", out, re.MULTILINE)
+            assert f"(pid {process.pid})" in out
+        assert process.poll() is None
+
+
+def test_what_is_no_board_is_not_called_one(capsys, tmp_path):
+    master, slave = os.openpty()
+    try:
+        silent = os.ttyname(slave)
+        code, out = ports(capsys, "--probe", silent, str(tmp_path / "none"))
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert code == 0
+    rows = {line.split()[0]: line for line in out.splitlines() if line.strip().startswith("/")}
+    assert set(rows) == {silent, str(tmp_path / "none")}
+    assert "firmware" not in out
+    assert re.search(r"silent|no board answers", rows[silent])
+    assert "cannot be opened" in rows[str(tmp_path / "none")]
+
+
+def test_without_probe_nothing_is_opened(capsys, tmp_path):
+    code, out = ports(capsys, str(tmp_path / "none"))
+    assert code == 0
+    assert "cannot be opened" not in out
+    assert str(tmp_path / "none") in out
