@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.kernels.cell import OCV_POINTS, emf
@@ -33,6 +32,8 @@ def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]
         a = cell.a
         slope = a[16] * a[17] * np.exp(-a[17] * soc) + a[19] - 2.0 * a[20] * soc + 3.0 * a[21] * soc**2
         return np.array([emf(x, a) for x in soc]), slope
+    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - half a second that a start without table saves
+
     curve = PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v, extrapolate=True)
     return curve(soc), curve.derivative()(soc)
 
