@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 NAMES = ("a16", "a17", "a18", "a19", "a20", "a21")
 LOWER = np.array([1e-6, 5.0, 1e-6, -np.inf, -np.inf, -np.inf])
 """Least a16..a21. The thesis has all positive; the cubic of a real cell may want another sign of a19..a21, so those are
-free: the NCR18650 points fit to 9.5 mV RMS, with all positive to 10.6. Below an exponent of 5 the exponential reaches
+free: the NCR18650 points fit to 9.6 mV RMS, with all positive to 10.6. Below an exponent of 5 the exponential reaches
 over all SOC, and nothing tells it from the cubic."""
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
 """Above an exponent of 300 the exponential is gone at SOC 0.01."""

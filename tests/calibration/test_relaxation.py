@@ -5,6 +5,7 @@ import pytest
 
 from bms_estimator.calibration.ocv import fit_chen_mora, pooled
 from bms_estimator.calibration.relaxation import relaxation_test, soc_by_counting, without_glitches
+from bms_estimator.cli.captures import read_whole
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv
 from bms_estimator.model.errors import UserError
@@ -83,6 +84,45 @@ def test_rests_of_any_length(rest_s):
 def test_a_longer_rest_is_more_certain():
     stds = [np.median(relaxation_test(relaxation(rest_s=s, rounds=8), CAPACITY_AH).std_v) for s in (240, 900, 3600)]
     assert stds[0] > stds[1] > stds[2]
+
+
+@pytest.mark.parametrize("noise_v", [1e-3, 2e-3, 5e-3])
+def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
+    """Noise that hides the time constant: up to five times what is left to relax at a rest's end."""
+    score, error_v = [], []
+    for seed in range(3):
+        found = relaxation_test(relaxation(noise_v=noise_v, seed=seed), CAPACITY_AH)
+        assert len(found.rests) >= ROUNDS  # the minute before the first load may be too short
+        error_v.append(found.ocv_v - true_ocv(found.soc))
+        score.append(error_v[-1] / found.std_v)
+    assert np.sqrt(np.mean(np.square(score))) < 1.2
+    assert np.sqrt(np.mean(np.square(error_v))) < 1.5e-3
+
+
+@pytest.mark.parametrize("every", [10, 30])
+def test_slow_sampling(every):
+    found = relaxation_test(relaxation()[::every], CAPACITY_AH)
+    assert len(found.rests) >= ROUNDS
+    error_v = found.ocv_v - true_ocv(found.soc)
+    assert np.sqrt(np.mean((error_v / found.std_v) ** 2)) < 1.0
+    assert np.sqrt(np.mean(error_v**2)) < 1.5e-3
+
+
+def test_real_rests_cut_in_half_are_extrapolated_towards_their_end(shared_data):
+    """Half-hour rests of an NCR18650, of which the first quarter of an hour is shown."""
+    samples = read_whole(shared_data / "ncr18650" / "cell1_dst.csv.gz")
+    whole = relaxation_test(samples, 3.1, initial_soc=1.0)
+    cut = np.zeros(samples.size, dtype=bool)
+    long = [rest for rest in whole.rests if 1700.0 < rest.duration_s < 3000.0 and rest.soc < 0.99]
+    assert len(long) >= 15
+    for rest in long:
+        cut |= (samples["time_s"] > rest.start_s + 900.0) & (samples["time_s"] <= rest.start_s + rest.duration_s)
+    half = {rest.start_s: rest for rest in relaxation_test(samples[~cut], 3.1, initial_soc=1.0).rests}
+    left = np.array([half[rest.start_s].ocv_v - rest.voltage_v for rest in long])
+    unextrapolated = np.array([half[rest.start_s].voltage_v - rest.voltage_v for rest in long])
+    std_v = np.array([half[rest.start_s].std_v for rest in long])
+    assert np.sqrt(np.mean(left**2)) < 0.6 * np.sqrt(np.mean(unextrapolated**2))
+    assert np.sqrt(np.mean((left / std_v) ** 2)) < 1.5
 
 
 def test_blips_of_the_current_sensor_do_not_end_a_rest():
