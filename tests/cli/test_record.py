@@ -99,12 +99,12 @@ def test_every_byte_of_the_line_is_in_the_file_and_ctrl_c_ends_it(line: Line, tm
 def test_a_recorder_that_is_killed_leaves_all_to_the_last_whole_record(board, tmp_path, capsys):
     out, cut = tmp_path / "killed.bms", tmp_path / "cut.bms"
     with program("record", out, "--port", board, "--rate-hz", 500) as process:
-        until(lambda: size(out) > 20_000, "20 kB")
+        until(lambda: size(out) > 10_000, "10 kB")
         process.kill()
         process.wait(LONG_S)
     code, result, err = replayed(capsys, out)
     assert (code, err) == (0, "")
-    assert result["samples"] == samples(out) > 500
+    assert result["samples"] == samples(out) > 100
     assert result["gaps"] == 0
 
     whole = reads(out)
@@ -113,39 +113,43 @@ def test_a_recorder_that_is_killed_leaves_all_to_the_last_whole_record(board, tm
         assert reads(cut) == whole[:-1]
         code, result, err = replayed(capsys, cut)
         assert (code, err) == (0, "")
-        assert result["samples"] == samples(cut) > 500
+        assert result["samples"] == samples(cut) > 100
 
 
-def test_a_damaged_record_is_said_and_what_is_before_it_is_read(board, tmp_path, capsys):
-    out = tmp_path / "damaged.bms"
-    with program("record", out, "--port", board, "--rate-hz", 500, "--seconds", 1) as process:
-        assert process.wait(LONG_S) == 0
-    whole = reads(out)
-    middle = len(whole) // 2
-    data = bytearray(out.read_bytes())
-    data[-sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in whole[middle:]) + DATA_AT] ^= 0xFF
-    out.write_bytes(data)
-    assert reads(out) == whole[:middle]
-    code, result, err = replayed(capsys, out)
-    assert code == 0
-    assert f"warning: {out}: damaged after" in err
-    assert result["samples"] == samples(out) > 10
-
-
-def test_the_same_samples_as_the_board_sent(board, tmp_path, capsys):
-    out, table = tmp_path / "one.bms", tmp_path / "one.csv"
+@pytest.fixture(scope="module")
+def recorded(board, tmp_path_factory):
+    """A capture of one second."""
+    out = tmp_path_factory.mktemp("recorded") / "one.bms"
     with program("record", out, "--port", board, "--rate-hz", 500, "--seconds", 1) as process:
         said, err = process.communicate(timeout=LONG_S)
     assert (process.returncode, said) == (0, "")
-    frames = int(
-        re.search(r" bytes, ([\d,]+) frames, 0 lost, 0 CRC errors, 0 other faults\n$", err)[1].replace(",", "")
-    )
-    assert frames == samples(out) > 300
+    counts = re.search(r" bytes, ([\d,]+) frames, 0 lost, 0 CRC errors, 0 other faults\n$", err)
+    assert counts
+    assert int(counts[1].replace(",", "")) == samples(out) > 100
+    return out
+
+
+def test_the_samples_are_those_the_board_sent(recorded, tmp_path, capsys):
+    table = tmp_path / "one.csv"
     with pytest.raises(SystemExit):
-        main(["replay", str(out), "--cell", "chen_mora", "--out", str(table)])
+        main(["replay", str(recorded), "--cell", "chen_mora", "--out", str(table)])
     capsys.readouterr()
     times = np.loadtxt(table, delimiter=",", skiprows=1, usecols=0)
+    assert times.size == samples(recorded)
     assert np.allclose(np.diff(times), 1 / 500, rtol=0.0, atol=1e-5)
+
+
+def test_a_damaged_record_is_said_and_what_is_before_it_is_read(recorded, tmp_path, capsys):
+    damaged, whole = tmp_path / "damaged.bms", reads(recorded)
+    middle = len(whole) // 2
+    data = bytearray(recorded.read_bytes())
+    data[-sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in whole[middle:]) + DATA_AT] ^= 0xFF
+    damaged.write_bytes(data)
+    assert reads(damaged) == whole[:middle]
+    code, result, err = replayed(capsys, damaged)
+    assert code == 0
+    assert f"warning: {damaged}: damaged after" in err
+    assert result["samples"] == samples(damaged) > 10
 
 
 def test_an_existing_file_is_left_as_it_is(tmp_path):
@@ -169,7 +173,7 @@ def test_a_disk_that_is_full_ends_it_and_what_is_there_can_be_replayed(board, tm
     assert out.stat().st_size == 16 * 1024
     code, result, err = replayed(capsys, out)
     assert (code, err) == (0, "")
-    assert result["samples"] == samples(out) > 300
+    assert result["samples"] == samples(out) > 100
 
 
 def test_a_board_that_is_not_there_is_said(tmp_path):
