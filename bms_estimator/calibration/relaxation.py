@@ -20,6 +20,9 @@ LEAST_GOOD = 0.5
 """With a smaller share of good voltages nobody knows which ones are the faults."""
 REST_CURRENT_C = 0.01
 """Below this C-rate a cell rests [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
+NOISE_STDS, NOISE_STEP_C = 6.0, 0.1
+"""A current within so many standard deviations of its noise is none; noise is what changes by less than this C-rate from
+sample to sample [1/h]."""
 BLIP_CHARGE = 2e-5
 """Charge, in capacities, below which a current within a rest is a glitch of the sensor, not a load."""
 SHORTEST_REST_S = 30.0
@@ -184,8 +187,8 @@ def relaxation_test(
     """
     good = without_glitches(samples, name)
     soc = soc_by_counting(good, capacity_ah, initial_soc)
-    _check_charge(name, good, soc, capacity_ah)
     resting = _resting(good, capacity_ah)
+    _check_charge(name, good, soc, resting, capacity_ah)
     rests, rejected = [], []
     for first, last in _runs(resting):
         duration_s = float(good["time_s"][last - 1] - good["time_s"][first])
@@ -225,10 +228,11 @@ def _empty_v(good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], rests: 
     return min(float(good["voltage_v"][-1]) + hidden_v, rests[-1].ocv_v)
 
 
-def _check_charge(name: str, good: SampleBlock, soc: Floats, capacity_ah: float) -> None:
+def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], capacity_ah: float) -> None:
     """Sign of the current, charging inside, capacity."""
-    given = np.maximum(-np.diff(soc), 0.0).sum()
-    taken = np.maximum(np.diff(soc), 0.0).sum()
+    change = np.where(resting[:-1], 0.0, np.diff(soc))  # noise at rest goes both ways
+    given = np.maximum(-change, 0.0).sum()
+    taken = np.maximum(change, 0.0).sum()
     if taken > max(given, CHARGING_AH):
         raise UserError(
             f"{name}: current has the wrong sign or the capture charges: {given * capacity_ah:.3f} Ah out, "
@@ -236,7 +240,7 @@ def _check_charge(name: str, good: SampleBlock, soc: Floats, capacity_ah: float)
             f"{good['voltage_v'][-1]:.3f} V; discharge must be positive"
         )
     if taken > CHARGING_AH:
-        start_s = good["time_s"][int(np.argmax(np.diff(soc) > 0.0))]
+        start_s = good["time_s"][int(np.argmax(change > 0.0))]
         raise UserError(
             f"{name}: charges inside, {taken * capacity_ah:.3f} Ah from {start_s:.0f} s on: "
             "a relaxation test by discharge has none; cut the capture there"
@@ -251,7 +255,7 @@ def _check_charge(name: str, good: SampleBlock, soc: Floats, capacity_ah: float)
 
 def _resting(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     """Which samples belong to a rest; blips of the current sensor do not end one."""
-    resting: NDArray[np.bool_] = np.abs(good["current_a"]) < REST_CURRENT_C * capacity_ah
+    resting: NDArray[np.bool_] = np.abs(good["current_a"]) < _rest_current_a(good["current_a"], capacity_ah)
     time_s = good["time_s"]
     for first, last in _runs(~resting):
         until_s = time_s[min(last, good.size - 1)]
@@ -259,6 +263,15 @@ def _resting(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
         if charge_ah < BLIP_CHARGE * capacity_ah:
             resting[first:last] = True
     return resting
+
+
+def _rest_current_a(current_a: Floats, capacity_ah: float) -> float:
+    """Below this a cell rests: a small C-rate, or what the sensor's noise reaches, but never half a load [A]."""
+    change_a = np.diff(current_a)
+    small_a = change_a[np.abs(change_a) < NOISE_STEP_C * capacity_ah]
+    noise_a = float(np.sqrt(np.mean(small_a**2) / 2.0)) if small_a.size else 0.0
+    half_load_a = 0.5 * float(np.quantile(np.abs(current_a), 0.95))
+    return max(REST_CURRENT_C * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -134,6 +134,18 @@ def test_blips_of_the_current_sensor_do_not_end_a_rest():
     assert len(found.rests) == 1 + ROUNDS
 
 
+@pytest.mark.parametrize(("noise_a", "step_a"), [(0.02, 1e-4), (0.05, 1e-4), (0.1, 1e-4), (0.025, 0.05), (0.002, 0.05)])
+def test_noise_and_rounding_of_the_current_sensor(noisy, noise_a, step_a):
+    """Up to seven times the current that counts as rest, and steps of a common ten-bit sensor."""
+    samples = relaxation()
+    noise = noise_a * np.random.default_rng(8).standard_normal(samples.size)
+    samples["current_a"] = np.rint((samples["current_a"] + noise) / step_a) * step_a
+    found = relaxation_test(samples, CAPACITY_AH)
+    assert len(found.rests) == 1 + ROUNDS
+    assert [rest.start_s for rest in found.rests] == pytest.approx([rest.start_s for rest in noisy.rests], abs=2.0)
+    assert found.soc == pytest.approx(noisy.soc, abs=5e-3)
+
+
 @pytest.mark.parametrize("share", [0.001, 0.02, 0.4])
 def test_glitches_to_0_v_are_dropped_and_counted(noisy, share):
     samples = glitched(share)
