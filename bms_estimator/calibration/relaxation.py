@@ -255,7 +255,7 @@ def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: NDArray[np
 
 def _resting(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     """Which samples belong to a rest; blips of the current sensor do not end one."""
-    resting: NDArray[np.bool_] = np.abs(good["current_a"]) < _rest_current_a(good["current_a"], capacity_ah)
+    resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
     time_s = good["time_s"]
     for first, last in _runs(~resting):
         until_s = time_s[min(last, good.size - 1)]
@@ -265,7 +265,7 @@ def _resting(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     return resting
 
 
-def _rest_current_a(current_a: Floats, capacity_ah: float) -> float:
+def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
     """Below this a cell rests: a small C-rate, or what the sensor's noise reaches, but never half a load [A]."""
     change_a = np.diff(current_a)
     small_a = change_a[np.abs(change_a) < NOISE_STEP_C * capacity_ah]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.adaptive import AdaptiveRun, adaptive_run
 from bms_estimator.calibration.ocv import ChenMoraFit, TableFit, fit_chen_mora, fit_table, pooled
 from bms_estimator.calibration.prediction import Prediction, predict, static_elements
-from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, without_glitches
+from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, rest_current_a, without_glitches
 from bms_estimator.calibration.series_resistance import (
     SeriesResistance,
     SeriesResistanceFit,
@@ -68,11 +68,12 @@ def kind_of(samples: SampleBlock, capacity_ah: float) -> Kind:
     """What a capture is good for, by its current."""
     good = without_glitches(samples)
     current_a = good["current_a"]
-    resting = np.abs(current_a) < 0.01 * capacity_ah
+    rest_a = rest_current_a(current_a, capacity_ah)
+    resting = np.abs(current_a) < rest_a
     if resting.mean() < REST_SHARE:
         loaded = current_a[~resting]
         return Kind.CONSTANT if loaded.std() < STEADY * abs(loaded.mean()) else Kind.STEPS
-    loaded = current_a[~resting & (np.r_[0.0, np.abs(np.diff(current_a))] < 0.01 * capacity_ah)]
+    loaded = current_a[~resting & (np.r_[0.0, np.abs(np.diff(current_a))] < rest_a)]
     if loaded.size and loaded.std() < STEADY * abs(loaded.mean()):
         return Kind.RELAXATION
     return Kind.STEPS
