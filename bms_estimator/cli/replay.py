@@ -59,14 +59,21 @@ def replay(
     if out is not None and out.exists() and out.samefile(capture):
         raise UserError(f"--out {out}: is the capture itself")
     result = asyncio.run(_replay(settings, model, Replay(source, speed=speed), table_sink(out) if out else None))
-    if isinstance(source, RawCapture) and source.damaged:
-        typer.echo(
-            f"warning: {capture}: damaged after {result.duration_s or 0.0:.1f} s; the rest was not read", err=True
-        )
+    if isinstance(source, RawCapture):
+        for warning in _unread(source, result.duration_s or 0.0):
+            typer.echo(f"warning: {capture}: {warning}", err=True)
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
         Console().print(result_table(capture, result))
+
+
+def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
+    """What of a capture could not be read."""
+    if source.damaged:
+        yield f"damaged after {duration_s:.1f} s; the rest was not read"
+    if source.unread_bytes:
+        yield f"its last {source.unread_bytes:,} bytes are no whole record: cut off there, or a length is damaged"
 
 
 async def _replay(settings: Settings, cell: CellModel, source: Replay, table: TableSink | None) -> Result:

@@ -24,7 +24,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -79,6 +79,8 @@ class CaptureBatch:
     data: NDArray[np.uint8]
     damaged: bool
     """The file has no readable record behind these although it has not ended."""
+    unread_bytes: int = 0
+    """At the end of the file: what is no whole record."""
 
     def __iter__(self) -> Iterator[tuple[float, bytes]]:
         """Each read: arrival [s], bytes."""
@@ -199,6 +201,8 @@ def read_capture(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture
                 yield batch
             if batch.damaged:
                 return
+        if rest:
+            yield replace(_split(np.frombuffer(b"", dtype=np.uint8))[0], unread_bytes=len(rest))
 
 
 def _split(raw: NDArray[np.uint8]) -> tuple[CaptureBatch, int]:

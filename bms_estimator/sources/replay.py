@@ -49,6 +49,7 @@ class RawCapture:
     Attributes:
         decoder: What the bytes have gone through so far.
         damaged: The file has no readable record behind those that were read although it has not ended.
+        unread_bytes: So many at its end are no whole record: it was cut off there, or a length is damaged.
 
     Raises:
         UserError: No capture, or one of a later version.
@@ -59,7 +60,7 @@ class RawCapture:
         text = (sensor.protocol if sensor else header.mode) == "text"
         sign = sensor.current_sign if sensor else header.current_sign
         self.decoder = TextDecoder(current_sign=sign) if text else FrameDecoder(current_sign=sign)
-        self.damaged = False
+        self.damaged, self.unread_bytes = False, 0
         self._path = path
         self._read, self._size = 0, path.stat().st_size
 
@@ -72,7 +73,7 @@ class RawCapture:
         """Blocks of samples, as ``Capture`` says."""
         for batch in read_capture(self._path):
             self._read += batch.data.size + RECORD_OVERHEAD_BYTES * batch.ends.size
-            self.damaged = batch.damaged
+            self.damaged, self.unread_bytes = batch.damaged, batch.unread_bytes
             block = self.decoder.feed_reads(batch.arrivals_s, batch.ends, batch.data)
             if block.size:
                 yield block
