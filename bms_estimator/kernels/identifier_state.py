@@ -190,7 +190,7 @@ class Tuning:
     hysteresis_discharge_v: float = 0.0
     hysteresis_charge_v: float = 0.0
     hysteresis_soc: float = 0.05
-    hysteresis_error_v: float = 0.03
+    hysteresis_error_v: float = 0.045
     """OCV after charge less that after discharge, of a layered-oxide cell [V]."""
     hysteresis_error_length: float = 0.5
     """It keeps its sign over much of the range."""
