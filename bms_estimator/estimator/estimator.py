@@ -1,5 +1,7 @@
 """The estimator: kernel settings and state behind ``step`` and ``run``."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,7 @@ from bms_estimator.kernels import estimate as kernel
 from bms_estimator.kernels.estimate import Verdict
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
 from bms_estimator.kernels.identifier import identifier_init
+from bms_estimator.kernels.identifier_guard import keep
 from bms_estimator.kernels.identifier_state import SOC, V_SLOW, V_TL, V_TS
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
@@ -99,12 +102,19 @@ class Estimator:
         return bool(self.settings_record["identify"][0])
 
     def set_soc(self, soc: float) -> None:
-        """Take ``soc`` (0..1) as the state of charge from now on, known to ``SET_SOC_STD``."""
+        """Take ``soc`` as the state of charge from now on, known to ``SET_SOC_STD``.
+
+        Raises:
+            ValueError: It is outside 0..1.
+        """
+        if not 0.0 <= soc <= 1.0:
+            raise ValueError(f"SOC {soc} is outside 0..1")
         self.state["soc"] = self.state["soc_coulomb"] = soc
         x = self.record[0]["identifier"]
         x["mean"][SOC] = soc
         x["covariance"][SOC, :] = x["covariance"][:, SOC] = 0.0
         x["covariance"][SOC, SOC] = SET_SOC_STD**2
+        keep(x)
 
     def resume(self, unseen_s: float) -> None:
         """Prepare for samples of another clock, after a time in which nobody measured.
@@ -125,3 +135,6 @@ class Estimator:
         x["covariance"][SOC, SOC] = soc_variance
         for branch in (V_TS, V_TL, V_SLOW):
             x["covariance"][branch, branch] += p["variance"][branch]
+        keep(x)
+        if math.isfinite(unseen_s):
+            self.record["unlearned_s"] += unseen_s

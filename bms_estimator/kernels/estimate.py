@@ -84,7 +84,7 @@ def step(state: Records, settings: Records, time_s: float, current_a: float, vol
     dt_s = time_s - s.time_s
     s.time_s = time_s
     if dt_s < 0.0:  # the clock was set back: go on from here
-        s.time_steps_back += 1
+        s.time_steps_back += 1 if math.isfinite(dt_s) else 0  # infinite: a new clock after a restart
         s.current_a = state[0].identifier.current_a = current_a
         return verdict
     if dt_s > p.gap_s:

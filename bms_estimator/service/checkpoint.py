@@ -147,8 +147,10 @@ def _insane(state: NDArray[np.void], cell: CellModel) -> str:
     for name, (low, high) in ranges.items():
         if not low <= s[name] <= high:
             return f"{name} = {s[name]} is outside {low}..{high}"
-    if not (s["a"][1:16] > 0.0).all():
-        return "a parameter a1..a15 is not positive"
+    variances = np.diagonal(state[0]["identifier"]["covariance"])
+    for name, good in (("a parameter a1..a15", s["a"][1:16] > 0.0), ("a variance", variances >= 0.0)):
+        if not good.all():
+            return f"{name} is not positive"
     return ""
 
 

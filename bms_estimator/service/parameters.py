@@ -93,7 +93,7 @@ def _parameter(held: float, fit: Learned | None, now_s: float) -> Parameter:
 def _identified(learned: Learned, configured: Parameter, limit: float, now_s: float) -> Parameter:
     """What was learned where that is known well enough, else the configured value and how far learning has come."""
     if learned.relative_std < limit:
-        updated = iso_utc(now_s - learned.unlearned_s)
+        updated = iso_utc(max(now_s - learned.unlearned_s, 0.0))
         return Parameter(
             value=finite(learned.value), std=finite(learned.std), valid=True, source="identified", updated=updated
         )

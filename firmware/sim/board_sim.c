@@ -11,6 +11,7 @@
 #include <simavr/sim_avr.h>
 #include <simavr/sim_elf.h>
 #include <simavr/sim_time.h>
+#include <sys/prctl.h>
 #include <time.h>
 
 #include "line.h"
@@ -181,6 +182,7 @@ int main(int argc, char **argv) {
         return 2;
     }
     if (!readings_open(o.readings, o.loop)) return 2;
+    prctl(PR_SET_PDEATHSIG, SIGTERM);  // a board does not outlive whoever plugged it in
     avr_t *avr = power_up(&o);
     const char *path = avr ? line_open() : NULL;
     if (!path) return 2;

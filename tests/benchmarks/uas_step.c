@@ -279,7 +279,7 @@ static enum verdict step(state_t *s, const settings_t *p, const sample_t *x)
     double dt_s = x->time_s - s->time_s;
     s->time_s = x->time_s;
     if (dt_s < 0.0) {
-        s->time_steps_back++;
+        s->time_steps_back += isfinite(dt_s) ? 1 : 0;
         s->current_a = x->current_a;
         return verdict;
     }

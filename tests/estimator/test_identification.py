@@ -161,3 +161,20 @@ def test_a_clock_set_back_and_repeated_stamps_harm_nothing(load) -> None:
 def test_the_map_holds_nothing_before_its_first_sample() -> None:
     estimator = Estimator(TRUTH, identifier=ON)
     assert [fitted_parameter(estimator.record[0], 3 * e + 1) for e in range(ELEMENTS)] == [None] * ELEMENTS
+
+
+@pytest.mark.parametrize("soc", [-0.1, 1.5, float("nan")])
+def test_a_soc_outside_0_to_1_is_refused(soc: float) -> None:
+    with pytest.raises(ValueError, match="is outside"):
+        Estimator(TRUTH, identifier=ON).set_soc(soc)
+
+
+def test_a_reset_after_a_pause_goes_back_to_the_soc_of_the_pause(load) -> None:
+    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
+    estimator.run(load[0][:5000])
+    estimator.set_soc(0.7)
+    estimator.resume(1e4)
+    identifier = estimator.record["identifier"]
+    assert identifier["good_mean"][0, 0] == identifier["mean"][0, 0] == 0.7
+    estimator.run(load[0][5000:5002])
+    assert estimator.state["time_steps_back"][0] == 0
