@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from bms_estimator.cli.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.cli.pack import load_pack, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import SensorSettings, Settings
+from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.service.logs import configure_logs
 from bms_estimator.sources.raw_capture import CaptureWriter, header_of
 from bms_estimator.sources.serial_board import SerialBoard

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.model.cell import load_cell
+from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.sources.simulated_pack import LOADS, LoadName, SimulatedPack
 from bms_estimator.sources.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 

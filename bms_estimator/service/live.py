@@ -15,6 +15,7 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import CheckpointFile, resume
 from bms_estimator.service.clock import Clock
+from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.requests import Requests, number
@@ -75,7 +76,7 @@ async def run_live(
         tasks = [_estimate(source, estimator, publisher), _keep_alive(publisher, notifier)]
         if checkpoint:
             tasks.append(_save_often(checkpoint, estimator, publisher, settings.state.checkpoint_s, restarts))
-        await _until_first_ends([*tasks, stop.wait()])
+        await until_first_ends(*tasks, stop.wait())
         notifier.send("STOPPING=1")
         publisher.publish_last()
     if checkpoint:
@@ -114,20 +115,6 @@ async def _keep_alive(publisher: Publisher, notifier: Notifier) -> None:
         await asyncio.sleep(min(max(publisher.wait_s, 0.01), longest_s))
         if publisher.wait_s == 0.0:
             publisher.publish()
-
-
-async def _until_first_ends(coroutines: Sequence[Any]) -> None:
-    """Run all until one ends, end the others, raise what one raised."""
-    tasks = [asyncio.ensure_future(coroutine) for coroutine in coroutines]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in tasks:
-            task.cancel()
-        results = await asyncio.gather(*tasks, return_exceptions=True)
-    for result in results:
-        if isinstance(result, Exception):
-            raise result
 
 
 def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, cell: CellModel) -> tuple[int, str]:

@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
+from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import run_live
 from bms_estimator.service.requests import Requests
 from bms_estimator.sinks import Sink
@@ -42,9 +42,7 @@ async def serve(
     Raises:
         UserError: A setting that cannot be used.
     """
-    stop = stop or asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop = stop_on_signal(stop)
     requests = Requests()
     board = SerialBoard(settings.sensor, tap=tap)
 

@@ -15,7 +15,6 @@ PROTOCOL_VERSION = 1
 BAUD = 500_000
 RATE_HZ = range(1, 1001)
 DELIMITER = b"\0"
-NO_SERIAL = 0
 MODULUS = 1 << 32
 """Sequence and microseconds count up to here and begin at 0 again."""
 

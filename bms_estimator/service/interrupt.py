@@ -1,4 +1,4 @@
-"""How long-running commands end: by a signal, or by the first of their tasks."""
+"""How what runs long ends: by a signal, or by the first of their tasks."""
 
 import asyncio
 import signal
@@ -6,9 +6,9 @@ from collections.abc import Coroutine
 from typing import Any
 
 
-def stop_on_signal() -> asyncio.Event:
-    """An event that SIGINT and SIGTERM set, in place of ending the process."""
-    stop = asyncio.Event()
+def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
+    """An event, ``stop`` where it is given, that SIGINT and SIGTERM set in place of ending the process."""
+    stop = stop or asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     return stop
