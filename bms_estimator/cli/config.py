@@ -51,7 +51,9 @@ def check(file: PackFile = Path("pack.toml")) -> None:
 def show(file: Annotated[Path | None, typer.Argument(help="settings of the pack; else the defaults")] = None) -> None:
     """Print the settings in effect, and what follows from them, as TOML."""
     settings, cell = load_pack(file) if file else (Settings(), load_cell(Settings().pack.cell))
-    typer.echo(tomlkit.dumps(settings.model_dump(mode="json", by_alias=True, exclude_none=True)))
+    shown = settings.model_dump(mode="json", by_alias=True, exclude_none=True)
+    shown["observer"].setdefault("rearm_gain", "never")  # the one None that is not the default
+    typer.echo(tomlkit.dumps(shown))
     typer.echo("# What follows from them:")
     for name, value in derived(settings, cell).items():
         typer.echo(f"# {name} = {value:.6g}")

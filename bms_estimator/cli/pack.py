@@ -37,7 +37,7 @@ def pack_or_cell(pack: Path | None, cell: str | None) -> tuple[Settings, CellMod
     if cell is None and pack is not None:
         return load_pack(pack)
     settings = load_settings(pack) if pack else Settings(sensor=SensorSettings(voltage_resolution_v=TABLE_RESOLUTION_V))
-    model = load_cell(cell or settings.pack.cell).pack(settings.pack.series, settings.pack.parallel)
+    model = load_cell(settings.pack.cell if cell is None else cell).pack(settings.pack.series, settings.pack.parallel)
     return with_pack(settings, cell=cell), model
 
 

@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-UNITS = {"v": "V", "a": "A", "s": "s", "hz": "Hz", "ah": "Ah", "ohm": "ohm", "c": "°C"}
+UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": "ohm", "c": "°C"}
 """Last part of a key -> the unit it stands for."""
 WIDTH = 110
 HEAD = """\
@@ -73,7 +73,7 @@ def _constraints(annotation: Any) -> tuple[list[str], list[str]]:
 
 def _limit(constraint: Any) -> str:
     attribute, words = _SIGNS[type(constraint)]
-    return f"{words} {getattr(constraint, attribute):g}"
+    return f"{words} {getattr(constraint, attribute):.10g}"
 
 
 def _model(annotation: Any) -> type[BaseModel]:

@@ -228,6 +228,8 @@ def load_cell(name_or_path: str | Path) -> CellModel:
         with resources.as_file(resources.files("bms_estimator.model") / "cells" / f"{text}.toml") as path:
             return read_toml(path, CellModel)
     path = Path(text)
-    if not path.exists():
-        raise UserError(f"{text}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())})")
+    if not text or not path.exists():
+        raise UserError(
+            f"{text or 'a cell of no name'}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())})"
+        )
     return read_toml(path, CellModel)

@@ -17,9 +17,11 @@ class PackSettings(Strict):
     """Which cells, how many, and where to begin."""
 
     name: DeviceName = Field(default="pack", description="device in topic names: letters, digits, _ and -")
-    cell: str = Field(default="ncr18650", description="a shipped cell's name or the path of a cell file")
-    series: Annotated[int, Field(ge=1)] = Field(default=1, description="cell-file objects in series")
-    parallel: Annotated[int, Field(ge=1)] = Field(default=1, description="cell-file objects in parallel")
+    cell: Annotated[str, Field(min_length=1)] = Field(
+        default="ncr18650", description="a shipped cell's name or the path of a cell file"
+    )
+    series: Annotated[int, Field(ge=1, le=10_000)] = Field(default=1, description="cell-file objects in series")
+    parallel: Annotated[int, Field(ge=1, le=10_000)] = Field(default=1, description="cell-file objects in parallel")
     initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
 
 
@@ -30,7 +32,7 @@ class SensorSettings(Strict):
         default="auto", description="device path, best under /dev/serial/by-id; auto: the only board found"
     )
     protocol: Literal["binary", "text"] = Field(default="binary", description="frames of the firmware, or text lines")
-    baud: Annotated[int, Field(ge=1200)] = Field(default=500_000)
+    baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(default=500_000)
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
         default="discharge_positive", description="what the board calls positive; inside, discharge is"
@@ -62,7 +64,7 @@ class ObserverSettings(Strict):
     gain_limit: Positive = Field(default=1e3, description="clamp of |N|")
     rearm_gain: float | None = Field(
         default=0.5,
-        description="below this N, in lock, k starts again; none (omit with law = scheme-N): the printed law",
+        description='below this N, in lock, k starts again; "never": the printed law',
     )
     lock_error_v: Positive | None = Field(
         default=None, description="an error beyond it for lock_time_s is a loss of lock"
@@ -87,7 +89,9 @@ class IdentifierSettings(Strict):
     enabled: bool = Field(
         default=True, description="false: SOC by coulomb counting, parameters as the observer's bounds have them"
     )
-    map_memory_h: Positive = Field(default=336.0, description="time constant with which learned elements are forgotten")
+    map_memory_h: Annotated[float, Field(ge=1)] = Field(
+        default=336.0, description="time constant with which learned elements are forgotten"
+    )
     current_offset_std_a: NotNegative = Field(
         default=0.0, description="how wrong the current sensor's zero may be; 0: it is taken as right"
     )
@@ -110,7 +114,9 @@ class MqttSettings(Strict):
     username: str | None = None
     password_file: Path | None = Field(default=None, description="file that holds the password, read at start")
     ca_file: Path | None = Field(default=None, description="certificate authority for mqtts, else the system's")
-    base_topic: Annotated[str, Field(pattern=r"^[^+#\s]+$")] = "bms"
+    base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
+        default="bms", description="first part of all topics: no +, # or spaces, no / at either end"
+    )
     publish_rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="of the state topic")
 
 
@@ -120,7 +126,7 @@ class StateSettings(Strict):
     folder: Path | None = Field(
         default=None, description="where checkpoints go; systemd's StateDirectory when left out"
     )
-    checkpoint_s: Positive = 60.0
+    checkpoint_s: Annotated[float, Field(ge=1)] = 60.0
 
 
 class Settings(Strict):

@@ -62,6 +62,13 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "integer"]),
         ("[observer]\nlambda = -1\n", ["observer.lambda = -1", "greater than 0"]),
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),
+        ('[pack]\ncell = ""\n', ["pack.cell = ''", "at least 1 character", "shipped cell's name"]),
+        ("[pack]\nparallel = 20000\n", ["pack.parallel = 20000", "less than or equal to 10000"]),
+        ("[sensor]\nbaud = 20_000_000\n", ["sensor.baud = 20000000", "less than or equal to 10000000"]),
+        ("[state]\ncheckpoint_s = 0.1\n", ["state.checkpoint_s = 0.1", "greater than or equal to 1"]),
+        ("[identifier]\nmap_memory_h = 0.5\n", ["identifier.map_memory_h = 0.5", "greater than or equal to 1"]),
+        ('[mqtt]\nbase_topic = "/bms"\n', ["mqtt.base_topic = '/bms'", "no / at either end"]),
+        ('[mqtt]\nbase_topic = "home/bms/"\n', ["mqtt.base_topic = 'home/bms/'", "no / at either end"]),
         ('[pack]\ncell = "nonsense"\n', ["nonsense", "ncr18650"]),
     ],
 )
@@ -95,6 +102,24 @@ def test_show_prints_the_settings_in_effect_as_toml(pack, capsys):
     assert shown["sensor"] == {**tomllib.loads(_shown(capsys))["sensor"], "port": "/dev/ttyACM3"}
     assert Settings.model_validate(shown) == load_settings(pack)
     assert "# pack.series_count = 6\n" in out
+
+
+@pytest.mark.parametrize("gain", ['"never"', "-2.0"])
+def test_what_show_prints_is_read_back_as_the_same_settings(gain, pack, tmp_path, capsys):
+    pack.write_text(f'[observer]\nrearm_gain = {gain}\n[mqtt]\nbase_topic = "home/b"\n[state]\nfolder = "kept"\n')
+    code, out, _ = run(capsys, "config", "show", pack)
+    assert code == 0
+    assert f"rearm_gain = {gain}\n" in out
+    again = tmp_path / "again.toml"
+    again.write_text(out)
+    assert load_settings(again) == load_settings(pack) != Settings()
+
+
+def test_units_and_limits_are_written_in_full(pack, capsys):
+    run(capsys, "config", "init", pack)
+    text = pack.read_text()
+    assert "[h, at least 1]\n#map_memory_h = 336.0\n" in text
+    assert "at most 10000000]\n#baud = 500000\n" in text
 
 
 def _shown(capsys):
