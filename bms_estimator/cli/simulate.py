@@ -15,20 +15,28 @@ DEFAULT_LOAD_C = 3.0
 """A load of so many times the capacity per hour moves SOC while one looks."""
 
 
+def _finite(value: float | None) -> float | None:
+    """Neither nan nor inf, which the options' limits let pass."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number")
+    return value
+
+
 def simulate(
     cell: Annotated[str, typer.Option(help="shipped cell's name or a cell file")] = "chen_mora",
     series: Annotated[int, typer.Option(min=1, help="of them in series")] = 1,
     load: Annotated[LoadName, typer.Option(help="what it is under")] = LoadName.RANDOM,
     current_a: Annotated[
-        float | None, typer.Option(help="of the load, positive on discharge; else 3C", show_default=False)
+        float | None,
+        typer.Option(callback=_finite, help="of the load, positive on discharge; else 3C", show_default=False),
     ] = None,
-    soc: Annotated[float, typer.Option(min=0.0, max=1.0, help="at the start")] = 0.9,
+    soc: Annotated[float, typer.Option(min=0.0, max=1.0, callback=_finite, help="at the start")] = 0.9,
     rate_hz: Annotated[
         int, typer.Option(min=1, max=1000, help="samples per second until the host asks for others")
     ] = RATE_HZ_AT_RESET,
     text: Annotated[bool, typer.Option("--text", help="print text lines, as hobby sketches do")] = False,
-    noise_lsb: Annotated[float, typer.Option(min=0.0, help="of its converter, in steps")] = 0.5,
-    speed: Annotated[float, typer.Option(min=1e-3, help="its seconds per second")] = 1.0,
+    noise_lsb: Annotated[float, typer.Option(min=0.0, callback=_finite, help="of its converter, in steps")] = 0.5,
+    speed: Annotated[float, typer.Option(min=1e-3, callback=_finite, help="its seconds per second")] = 1.0,
     seconds: Annotated[
         float, typer.Option(min=0.0, help="of its time; else until Ctrl-C", show_default=False)
     ] = math.inf,

@@ -102,7 +102,18 @@ def test_it_ends_by_itself_after_the_seconds_of_its_time():
     assert re.fullmatch(r"40[01] samples in 4\.0 s, SOC 90\.00%\n", err)
 
 
-@pytest.mark.parametrize("arguments", [("--cell", "nonsense"), ("--load", "nonsense"), ("--rate-hz", "2000")])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--cell", "nonsense"),
+        ("--load", "nonsense"),
+        ("--rate-hz", "2000"),
+        ("--current-a", "nan"),
+        ("--current-a", "inf"),
+        ("--soc", "nan"),
+        ("--speed", "inf"),
+    ],
+)
 def test_what_there_is_not_is_named(arguments, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["simulate", *arguments])
