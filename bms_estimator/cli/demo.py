@@ -14,6 +14,7 @@ from rich.console import Console
 import bms_estimator
 from bms_estimator.cli.run import LOG_LINES
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.model.settings import MqttSettings, ObserverSettings, PackSettings, SensorSettings, Settings
 from bms_estimator.service.demo_broker import DemoBroker
@@ -46,8 +47,8 @@ def demo(
     ] = None,
     rate_hz: Annotated[int, typer.Option(min=1, max=1000, help="samples per second")] = 100,
     firmware: Annotated[
-        Path, typer.Option(help="folder of the built firmware and its simulator", show_default=False)
-    ] = FIRMWARE_BUILD,
+        Path | None, typer.Option(help="folder of the built firmware and its simulator", show_default=False)
+    ] = None,
     python_board: Annotated[bool, typer.Option("--python-board", help="the firmware's stand-in in Python")] = False,
 ) -> None:
     """Broker, board and service in one terminal, until Ctrl-C.
@@ -56,10 +57,24 @@ def demo(
     built (make firmware), else its stand-in in Python. The real service reads it from a pseudo-terminal and publishes
     to a broker of its own on the loopback.
     """
-    build = None if python_board or not FirmwareBoard.is_built(firmware) else firmware
+    build = None if python_board else _build(firmware)
     console, log = Console(), deque[str](maxlen=LOG_LINES)
     configure_logs(log if console.is_terminal else None)
     typer.echo(asyncio.run(_demo(console, log, build, rate_hz=rate_hz, port=port, seconds=seconds)))
+
+
+def _build(given: Path | None) -> Path | None:
+    """Folder of the built firmware; None where it is not built and none was asked for.
+
+    Raises:
+        UserError: Nothing is built in the folder that was given.
+    """
+    folder = FIRMWARE_BUILD if given is None else given
+    if FirmwareBoard.is_built(folder):
+        return folder
+    if given is not None:
+        raise UserError(f"--firmware {given}: no built firmware and simulator there; make firmware, or --python-board")
+    return None
 
 
 async def _demo(

@@ -11,6 +11,7 @@ import aiomqtt
 import pytest
 
 from bms_estimator.cli.demo import FIRMWARE_BUILD
+from bms_estimator.cli.main import main
 from bms_estimator.sources.firmware_board import FirmwareBoard
 from tests.mosquitto import Listener, free_port
 
@@ -83,3 +84,11 @@ async def test_a_port_that_is_taken_is_said():
             _, err = await process.communicate()
     assert process.returncode == 2
     assert err.decode().splitlines()[-1].startswith(f"error: port {port}: taken by another program")
+
+
+def test_a_folder_without_firmware_is_said(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["demo", "--seconds", "1", "--firmware", str(tmp_path)])
+    out, err = capsys.readouterr()
+    assert (ended.value.code, out) == (2, "")
+    assert err.startswith(f"error: --firmware {tmp_path}: no built firmware")
