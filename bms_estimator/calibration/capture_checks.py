@@ -48,6 +48,18 @@ def step_resistance(load: Load) -> float | None:
     return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
 
 
+def soc_outside(load: Load, capacity_ah: float, start: float) -> str | None:
+    """How far SOC, counted from ``start``, leaves 0..1; None where it does not."""
+    soc = start - load.discharged_ah / capacity_ah
+    if soc.min() >= -2.0 * SOC_SLACK and soc.max() <= 1.0 + 2.0 * SOC_SLACK:
+        return None
+    return (
+        f"SOC runs from {soc.min():.3f} to {soc.max():.3f}, outside 0..1: from {start:.3f} at the start "
+        f"({load.start_v:.3f} V), {np.ptp(load.discharged_ah):.3f} Ah were moved with a capacity of "
+        f"{capacity_ah:g} Ah; give the right capacity, or the OCV of this cell"
+    )
+
+
 def _no_excitation(load: Load, cell: CellModel) -> str | None:
     largest_a = float(np.abs(load.current_a).max())
     least_a = LEAST_CURRENT_C * cell.cell.capacity_ah
@@ -92,13 +104,10 @@ def _capacity(load: Load, cell: CellModel) -> str | None:
     capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
     start_a = 0.0 if load.resting_samples else float(load.current_a[0])
     start = soc_from_ocv(load.start_v + start_a * r_s(0.5, cell.a), *grid)
+    outside = soc_outside(load, capacity_ah, start)
+    if outside:
+        return outside
     soc = start - load.discharged_ah / capacity_ah
-    if soc.min() < -2.0 * SOC_SLACK or soc.max() > 1.0 + 2.0 * SOC_SLACK:
-        return (
-            f"SOC runs from {soc.min():.3f} to {soc.max():.3f}, outside 0..1: from {start:.3f} at the start "
-            f"({load.start_v:.3f} V), {np.ptp(load.discharged_ah):.3f} Ah were moved with a capacity of "
-            f"{capacity_ah:g} Ah; give the right capacity, or the OCV of this cell"
-        )
     for j in _ends_of_long_rests(load, capacity_ah):
         rested_v = float(load.voltage_v[j])
         expected_v, seen = ocv(soc[j], *grid), soc_from_ocv(rested_v, *grid)

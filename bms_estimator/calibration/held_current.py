@@ -28,6 +28,8 @@ LARGEST_DROP = 1e-3
 """Nor moves SOC by more than this, so that the elements held at mid-step are right."""
 NEIGHBOURS = 2
 """Samples on either side that a glitch is told by."""
+LEAST_SAMPLES = 2 * NEIGHBOURS + 1
+"""A capture with fewer good samples says nothing."""
 SPIKE_V = 0.03
 """A voltage off its neighbours' median by more than this, per cell, and more than the current explains, is a glitch [V]."""
 SPIKE_C = 0.1
@@ -72,9 +74,9 @@ def whole_load(name: str, samples: SampleBlock, cell: CellModel) -> Load:
     """All good samples of a capture.
 
     Raises:
-        UserError: Fewer than two good samples.
+        UserError: No, too few or mostly samples that cannot be this cell's.
     """
-    good = _without_spikes(_within_limits(name, without_glitches(samples), cell), cell)
+    good = _without_spikes(_within_limits(name, without_glitches(samples, name), cell), cell)
     time_s = np.ascontiguousarray(good["time_s"] - good["time_s"][0])
     current_a = np.ascontiguousarray(good["current_a"])
     resting = np.abs(current_a) < REST_CURRENT_C * cell.cell.capacity_ah
@@ -138,12 +140,14 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
         & (voltage_v <= limits.voltage_max_v)
         & (np.abs(current_a) <= limits.current_max_a)
     ]
-    if good.size < 0.5 * samples.size or good.size < 2 * NEIGHBOURS + 1:
+    if good.size < 0.5 * samples.size:
         raise UserError(
             f"{name}: {good.size} of {samples.size} samples lie within the cell's limits ({limits.voltage_min_v:g} to "
             f"{limits.voltage_max_v:g} V, {limits.current_max_a:g} A); the capture runs from {voltage_v.min():.3f} to "
             f"{voltage_v.max():.3f} V and {current_a.min():.3f} to {current_a.max():.3f} A: is it this cell's?"
         )
+    if good.size < LEAST_SAMPLES:
+        raise UserError(f"{name}: {good.size} good samples are too few, at least {LEAST_SAMPLES} are needed")
     return good
 
 

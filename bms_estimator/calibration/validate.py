@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.capture_checks import contradictions
+from bms_estimator.calibration.capture_checks import contradictions, soc_outside
 from bms_estimator.calibration.held_current import whole_load
 from bms_estimator.calibration.identify import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.relaxation import REST_CURRENT_C
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.sensitivity import sensitivities
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 Floats = NDArray[np.float64]
@@ -88,10 +89,14 @@ def validate(name: str, samples: SampleBlock, cell: CellModel, initial_soc: floa
         initial_soc: SOC 0..1 at the first good sample; None: from the voltage of the first rest.
 
     Raises:
-        UserError: Most samples lie outside the cell's limits.
+        UserError: Most samples lie outside the cell's limits, or SOC runs outside 0..1.
     """
     load = whole_load(name, samples, cell)
     start = soc_of_first_rest(load, cell) if initial_soc is None else initial_soc
+    warnings = contradictions(load, cell)
+    outside = soc_outside(load, cell.cell.capacity_ah, start)
+    if outside:
+        raise UserError("\n".join(dict.fromkeys([*warnings, f"{name}: {outside}"])))
     simulated_v = np.empty(load.time_s.size)
     sensitivities(
         load.time_s,
@@ -125,7 +130,7 @@ def validate(name: str, samples: SampleBlock, cell: CellModel, initial_soc: floa
         loaded=_errors(error_v[above & ~resting], load.voltage_v[above & ~resting]),
         extra_ohm=extra_ohm,
         without_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, load.voltage_v[above]),
-        warnings=tuple(contradictions(load, cell)),
+        warnings=tuple(warnings),
         time_s=load.time_s,
         error_v=error_v,
         soc=soc,

@@ -4,6 +4,7 @@ import pytest
 from bms_estimator.calibration.validate import validate
 from bms_estimator.cli.captures import read_whole
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
 
 
@@ -57,8 +58,22 @@ def test_glitches_are_left_out_and_counted():
     assert found.above.voltage_rms_v < 1e-3
 
 
+def test_a_capture_of_another_cell_is_refused_with_the_numbers():
+    table = TRUTH.model_dump()
+    table["cell"]["capacity_ah"] = 0.5
+    with pytest.raises(UserError, match=r"steps: SOC runs from -\d\.\d+ to 0\.98\d, outside 0\.\.1.* of 0\.5 Ah"):
+        validate("steps", capture(steps()), CellModel.model_validate(table))
+    with pytest.raises(UserError, match=r"SOC runs from -0\.\d+ to 0\.600, outside"):
+        validate("steps", capture(steps()), TRUTH, 0.6)
+
+
+def test_too_few_samples_are_not_blamed_on_the_cell():
+    with pytest.raises(UserError, match=r"^steps: 3 good samples are too few, at least 5 are needed$"):
+        validate("steps", capture(steps())[:3], TRUTH)
+
+
 def test_wrong_sign_is_measured_and_warned_of():
-    samples = capture(steps())
+    samples = capture(steps(duration_s=6000), soc=0.5)
     samples["current_a"] *= -1.0
     found = validate("steps", samples, TRUTH)
     assert "sign is wrong" in found.warnings[0]

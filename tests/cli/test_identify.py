@@ -91,9 +91,10 @@ def test_what_a_person_can_mend_ends_with_code_2_and_its_numbers(tables, tmp_pat
     assert (code, text) == (2, "")
     assert "flipped.csv: the current's sign is wrong" in err
     assert not (tmp_path / "c.toml").exists()
-    code, _, err = run(capsys, "validate", flipped, "--cell", "ncr18650", "--json")
-    assert code == 0
-    assert "warning: flipped.csv: the current's sign is wrong" in err
+    code, text, err = run(capsys, "validate", flipped, "--cell", "ncr18650", "--json")
+    assert (code, text) == (2, "")
+    assert "error: flipped.csv: the current's sign is wrong" in err
+    assert "error: flipped.csv: SOC runs from 0.98" in err
     code, _, err = run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", flipped)
     assert code == 2
     assert "is a capture itself" in err
