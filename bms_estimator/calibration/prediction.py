@@ -74,7 +74,7 @@ def predict(
         a: a1..a15 at index 1..15, to take in place of the cell's.
         lowest_soc: The prediction ends where SOC falls below it; the model's delta1, delta2 end it as well.
     """
-    good = without_glitches(samples)
+    good = without_glitches(samples, f"capture for {cell.cell.name}")
     elements = np.zeros(22)
     elements[1:16] = (cell.a if a is None else a)[1:16]
     floor = max(lowest_soc, _unstable_below(elements))

@@ -125,7 +125,7 @@ class RelaxationTest:
         return np.array([rest.std_v for rest in self.rests])
 
 
-def without_glitches(samples: SampleBlock, name: str = "capture") -> SampleBlock:
+def without_glitches(samples: SampleBlock, name: str) -> SampleBlock:
     """Samples that can be true: finite, time going on, voltage within half of the median of those above 0 V.
 
     Raises:
@@ -169,18 +169,18 @@ def relaxation_test(
     samples: SampleBlock,
     capacity_ah: float,
     *,
+    name: str,
     initial_soc: float = 1.0,
     series_count: int = 1,
-    name: str = "capture",
 ) -> RelaxationTest:
     """Points of the open-circuit voltage from a capture of loads and rests.
 
     Args:
         samples: Dtype ``SAMPLE``, raw: glitches are dropped here.
         capacity_ah: Capacity that SOC is counted against [Ah].
+        name: What to call the capture in messages.
         initial_soc: SOC at the first sample, 0..1.
         series_count: Cells in series, for limits that are given per cell.
-        name: What to call the capture in messages.
 
     Raises:
         UserError: No relaxation test: no rests, too short ones, charging inside, wrong sign or capacity.

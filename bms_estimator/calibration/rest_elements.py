@@ -70,7 +70,7 @@ def rest_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: float
     Raises:
         UserError: No rest follows a load.
     """
-    good = without_glitches(samples)
+    good = without_glitches(samples, test.name)
     found = []
     soc = test.start_soc
     for rest in test.rests:

@@ -24,7 +24,7 @@ from bms_estimator.calibration.ocv import (
     pooled,
     rms_v,
 )
-from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test
+from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, without_glitches
 from bms_estimator.calibration.rest_elements import rest_elements
 from bms_estimator.cli.captures import name_of, read_whole
 from bms_estimator.model.cell import Cell, CellModel
@@ -90,7 +90,8 @@ def ocv(
         if out.exists() and path.exists() and out.samefile(path):
             raise UserError(f"--out {out}: is a capture itself")
     samples = [read_whole(path) for path in captures]
-    middle_v = float(np.median(np.concatenate([s["voltage_v"] for s in samples])))
+    good = [without_glitches(s, path.name) for s, path in zip(samples, captures, strict=True)]
+    middle_v = float(np.median(np.concatenate([s["voltage_v"] for s in good])))
     count = series or max(round(middle_v / CELL_VOLTAGE_V), 1)
     tests = [
         relaxation_test(s, capacity_ah, initial_soc=soc, series_count=count, name=path.name)
@@ -99,7 +100,7 @@ def ocv(
     points = pooled(tests)
     fit = fit_table(points) if form is Form.TABLE else fit_chen_mora(points)
     result = _result(form, capacity_ah, count, points, fit, tests)
-    cell = _cell(name_of(out), capacity_ah, count, fit, tests[0], samples)
+    cell = _cell(name_of(out), capacity_ah, count, fit, tests[0], good)
     write_cell(out, cell, _remarks(captures, result))
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
@@ -148,7 +149,7 @@ def _cell(
 ) -> CellModel:
     """The cell with its open-circuit voltage, and limits of what a good sample is."""
     middle_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
-    largest_a = max(float(np.nanmax(np.abs(s["current_a"]))) for s in samples)
+    largest_a = max(float(np.max(np.abs(s["current_a"]))) for s in samples)
     cell = Cell(
         name=name,
         capacity_ah=capacity_ah,

@@ -52,7 +52,7 @@ class Experiment:
         if self.recorded is None:
             return Protocol(pack(), captures(self._true, FINE), FINE.voltage_step_v)
         cell = self.recorded.cell
-        found = [Capture(name, kind_of(s, cell.cell.capacity_ah), s) for name, s in self.recorded.samples]
+        found = [Capture(name, kind_of(name, s, cell.cell.capacity_ah), s) for name, s in self.recorded.samples]
         return Protocol(cell, found, self.recorded.voltage_step_v)
 
     @cached_property

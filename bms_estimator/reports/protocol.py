@@ -64,9 +64,9 @@ class Capture:
     samples: SampleBlock
 
 
-def kind_of(samples: SampleBlock, capacity_ah: float) -> Kind:
+def kind_of(name: str, samples: SampleBlock, capacity_ah: float) -> Kind:
     """What a capture is good for, by its current."""
-    good = without_glitches(samples)
+    good = without_glitches(samples, name)
     current_a = good["current_a"]
     rest_a = rest_current_a(current_a, capacity_ah)
     resting = np.abs(current_a) < rest_a
@@ -141,7 +141,7 @@ class Protocol:
 
     def initial_soc(self, capture: Capture) -> float:
         """1 when the capture begins as full as the relaxation tests do, else from its first voltage at rest."""
-        first = without_glitches(capture.samples)[0]
+        first = without_glitches(capture.samples, capture.name)[0]
         full_v = float(self.table.ocv_v[-1])
         if capture.kind is Kind.RELAXATION or abs(first["current_a"]) > 0.01 * self.cell.cell.capacity_ah:
             return 1.0
@@ -166,7 +166,7 @@ class Protocol:
             voltage_resolution_v=self.voltage_step_v,
             initial_soc=self.initial_soc(self.smallest),
         )
-        return adaptive_run(estimator, without_glitches(self.smallest.samples))
+        return adaptive_run(estimator, without_glitches(self.smallest.samples, self.smallest.name))
 
     # Step 3 -----------------------------------------------------------------------------------------------------
 

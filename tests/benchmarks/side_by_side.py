@@ -64,7 +64,7 @@ class Trial:
 
     def __init__(self) -> None:
         self.cell = wrong(load_cell("ncr18650"))
-        self.learn, self.held_back = (without_glitches(read_whole(DATA / f"{n}.csv.gz")) for n in (LEARN, HELD_BACK))
+        self.learn, self.held_back = (without_glitches(read_whole(DATA / f"{n}.csv.gz"), n) for n in (LEARN, HELD_BACK))
         self.grid = np.array(ocv_grid(self.cell))
         self.initial_soc = chen_mora.soc_from_ocv(float(self.held_back["voltage_v"][0]), *self.grid)
         time_s, current_a = (np.ascontiguousarray(self.held_back[n]) for n in ("time_s", "current_a"))

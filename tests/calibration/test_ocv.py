@@ -84,7 +84,7 @@ def test_joint_fit_of_several_runs_beats_the_mean_of_their_parameters():
 
 
 def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
-    tests = [relaxation_test(relaxation(rounds=10, seed=seed), TRUTH.cell.capacity_ah) for seed in (0, 1)]
+    tests = [relaxation_test(relaxation(rounds=10, seed=seed), TRUTH.cell.capacity_ah, name="mine") for seed in (0, 1)]
     both = pooled(tests)
     assert both.soc.size == len(tests[0].rests) + len(tests[1].rests)
     assert (np.diff(both.soc) >= 0.0).all()

@@ -49,7 +49,7 @@ def test_points_lie_on_the_open_circuit_voltage(noisy):
 def test_extrapolation_to_infinite_rest_is_nearer_than_the_end_and_knows_how_near():
     seen, at_end, within = [], [], []
     for seed in range(4):
-        found = relaxation_test(relaxation(seed=seed), CAPACITY_AH)
+        found = relaxation_test(relaxation(seed=seed), CAPACITY_AH, name="mine")
         loaded = [rest for rest in found.rests if rest.soc < 0.99]
         true_v = true_ocv([rest.soc for rest in loaded])
         seen.append(found.ocv_v[1:] - true_v)
@@ -64,7 +64,7 @@ def test_extrapolation_to_infinite_rest_is_nearer_than_the_end_and_knows_how_nea
 
 
 def test_without_noise_a_long_rest_is_extrapolated_to_a_fifth_of_a_millivolt():
-    found = relaxation_test(relaxation(noise_v=0.0), CAPACITY_AH)
+    found = relaxation_test(relaxation(noise_v=0.0), CAPACITY_AH, name="mine")
     assert np.abs(found.ocv_v - true_ocv(found.soc)).max() < 2e-4
     late = [rest.tau_s for rest in found.rests if 0.2 < rest.soc < 0.96]
     assert min(late) > 350.0  # the long branch's, 380 to 440 s
@@ -73,7 +73,7 @@ def test_without_noise_a_long_rest_is_extrapolated_to_a_fifth_of_a_millivolt():
 
 @pytest.mark.parametrize("rest_s", [240, 400, 3600])
 def test_rests_of_any_length(rest_s):
-    found = relaxation_test(relaxation(rest_s=rest_s, rounds=ROUNDS), CAPACITY_AH)
+    found = relaxation_test(relaxation(rest_s=rest_s, rounds=ROUNDS), CAPACITY_AH, name="mine")
     assert len(found.rests) + len(found.rejected) == 1 + ROUNDS
     assert len(found.rejected) <= (rest_s < 400)  # the last, where the elements rise
     error_v = np.abs(found.ocv_v - true_ocv(found.soc))
@@ -82,7 +82,10 @@ def test_rests_of_any_length(rest_s):
 
 
 def test_a_longer_rest_is_more_certain():
-    stds = [np.median(relaxation_test(relaxation(rest_s=s, rounds=8), CAPACITY_AH).std_v) for s in (240, 900, 3600)]
+    stds = [
+        np.median(relaxation_test(relaxation(rest_s=s, rounds=8), CAPACITY_AH, name="mine").std_v)
+        for s in (240, 900, 3600)
+    ]
     assert stds[0] > stds[1] > stds[2]
 
 
@@ -91,7 +94,7 @@ def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
     """Noise that hides the time constant: up to five times what is left to relax at a rest's end."""
     score, error_v = [], []
     for seed in range(3):
-        found = relaxation_test(relaxation(noise_v=noise_v, seed=seed), CAPACITY_AH)
+        found = relaxation_test(relaxation(noise_v=noise_v, seed=seed), CAPACITY_AH, name="mine")
         assert len(found.rests) >= ROUNDS  # the minute before the first load may be too short
         error_v.append(found.ocv_v - true_ocv(found.soc))
         score.append(error_v[-1] / found.std_v)
@@ -101,7 +104,7 @@ def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
 
 @pytest.mark.parametrize("every", [10, 30])
 def test_slow_sampling(every):
-    found = relaxation_test(relaxation()[::every], CAPACITY_AH)
+    found = relaxation_test(relaxation()[::every], CAPACITY_AH, name="mine")
     assert len(found.rests) >= ROUNDS
     error_v = found.ocv_v - true_ocv(found.soc)
     assert np.sqrt(np.mean((error_v / found.std_v) ** 2)) < 1.0
@@ -111,13 +114,13 @@ def test_slow_sampling(every):
 def test_real_rests_cut_in_half_are_extrapolated_towards_their_end(shared_data):
     """Half-hour rests of an NCR18650, of which the first quarter of an hour is shown."""
     samples = read_whole(shared_data / "ncr18650" / "cell1_dst.csv.gz")
-    whole = relaxation_test(samples, 3.1, initial_soc=1.0)
+    whole = relaxation_test(samples, 3.1, initial_soc=1.0, name="mine")
     cut = np.zeros(samples.size, dtype=bool)
     long = [rest for rest in whole.rests if 1700.0 < rest.duration_s < 3000.0 and rest.soc < 0.99]
     assert len(long) >= 15
     for rest in long:
         cut |= (samples["time_s"] > rest.start_s + 900.0) & (samples["time_s"] <= rest.start_s + rest.duration_s)
-    half = {rest.start_s: rest for rest in relaxation_test(samples[~cut], 3.1, initial_soc=1.0).rests}
+    half = {rest.start_s: rest for rest in relaxation_test(samples[~cut], 3.1, initial_soc=1.0, name="mine").rests}
     left = np.array([half[rest.start_s].ocv_v - rest.voltage_v for rest in long])
     unextrapolated = np.array([half[rest.start_s].voltage_v - rest.voltage_v for rest in long])
     std_v = np.array([half[rest.start_s].std_v for rest in long])
@@ -130,7 +133,7 @@ def test_blips_of_the_current_sensor_do_not_end_a_rest():
     inside = FIRST_REST_S + LOAD_S + 300
     samples["current_a"][inside] = 0.05
     samples["current_a"] += 0.005 * np.random.default_rng(2).standard_normal(samples.size)
-    found = relaxation_test(samples, CAPACITY_AH)
+    found = relaxation_test(samples, CAPACITY_AH, name="mine")
     assert len(found.rests) == 1 + ROUNDS
 
 
@@ -140,7 +143,7 @@ def test_noise_and_rounding_of_the_current_sensor(noisy, noise_a, step_a):
     samples = relaxation()
     noise = noise_a * np.random.default_rng(8).standard_normal(samples.size)
     samples["current_a"] = np.rint((samples["current_a"] + noise) / step_a) * step_a
-    found = relaxation_test(samples, CAPACITY_AH)
+    found = relaxation_test(samples, CAPACITY_AH, name="mine")
     assert len(found.rests) == 1 + ROUNDS
     assert [rest.start_s for rest in found.rests] == pytest.approx([rest.start_s for rest in noisy.rests], abs=2.0)
     assert found.soc == pytest.approx(noisy.soc, abs=5e-3)
@@ -149,7 +152,7 @@ def test_noise_and_rounding_of_the_current_sensor(noisy, noise_a, step_a):
 @pytest.mark.parametrize("share", [0.001, 0.02, 0.4])
 def test_glitches_to_0_v_are_dropped_and_counted(noisy, share):
     samples = glitched(share)
-    found = relaxation_test(samples, CAPACITY_AH)
+    found = relaxation_test(samples, CAPACITY_AH, name="mine")
     assert found.glitches == (samples["voltage_v"] == 0.0).sum()
     assert found.soc == pytest.approx(noisy.soc, abs=1e-3)
     assert found.ocv_v == pytest.approx(noisy.ocv_v, abs=4e-3)
@@ -160,7 +163,7 @@ def test_nan_and_repeated_time_stamps_are_dropped():
     samples["voltage_v"][10] = np.nan
     samples["time_s"][20] = samples["time_s"][19]
     samples["time_s"][30] = 0.0
-    kept = without_glitches(samples)
+    kept = without_glitches(samples, "mine")
     assert kept.size == samples.size - 3
     assert (np.diff(kept["time_s"]) > 0.0).all()
 
@@ -184,15 +187,15 @@ def test_bad_input_is_refused_with_its_numbers(why):
 def test_short_rests_are_listed_with_their_lengths():
     make, capacity_ah, _ = BAD["short rests"]
     with pytest.raises(UserError, match="rest at 420 s: 19 s long, shorter than 30 s"):
-        relaxation_test(make(), capacity_ah)
+        relaxation_test(make(), capacity_ah, name="mine")
 
 
 @pytest.mark.parametrize(
     ("voltage_v", "message"),
-    [(0.0, "none of 900 samples has a voltage above 0 V"), (np.nan, "none of 900 samples has finite")],
+    [(0.0, "mine: none of 900 samples has a voltage above 0 V"), (np.nan, "mine: none of 900 samples has finite")],
 )
 def test_a_dead_instrument(voltage_v, message):
     samples = relaxation(rounds=1)[:900]
     samples["voltage_v"] = voltage_v
     with pytest.raises(UserError, match=message):
-        relaxation_test(samples, CAPACITY_AH)
+        relaxation_test(samples, CAPACITY_AH, name="mine")

@@ -144,3 +144,12 @@ def test_an_empty_capture(tmp_path, capsys):
     assert code == 2
     assert "Traceback" not in err
     assert "empty.csv" in err
+
+
+def test_a_capture_without_a_number_in_it(tmp_path, capsys):
+    samples = relaxation(rounds=1)
+    samples["voltage_v"] = np.nan
+    capture = save(tmp_path / "nan.csv", samples)
+    code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "3", "--out", tmp_path / "c.toml")
+    assert code == 2
+    assert err == f"error: nan.csv: none of {samples.size} samples has finite time, current and voltage\n"

@@ -23,7 +23,7 @@ def samples():
 
 @pytest.fixture(scope="module")
 def protocol(samples):
-    captures = [Capture(name, kind_of(block, CAPACITY_AH), block) for name, block in samples.items()]
+    captures = [Capture(name, kind_of(name, block, CAPACITY_AH), block) for name, block in samples.items()]
     return Protocol(TRUTH, captures, 1e-3)
 
 
@@ -32,7 +32,7 @@ def protocol(samples):
 def test_kind_of_a_capture(samples, name, noise_a):
     block = samples[name].copy()
     block["current_a"] += noise_a * np.random.default_rng(0).standard_normal(block.size)
-    assert kind_of(block, CAPACITY_AH) is SERVES[name]
+    assert kind_of(name, block, CAPACITY_AH) is SERVES[name]
 
 
 def test_start_of_each_capture(protocol):
