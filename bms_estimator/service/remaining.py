@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import present_elements, relative_capacity
@@ -39,11 +40,16 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
         capacity_ah *= relative_capacity(estimator.record[0]).value
     charge_ah = soc * capacity_ah
     usable_ah = max(soc - max(state["delta_1"], state["delta_2"]), 0.0) * capacity_ah
-    path, grid = np.linspace(0.0, soc, 101), np.linspace(0.0, 1.0, settings["ocv_v"].size)
-    open_circuit_wh = float(np.trapezoid(np.interp(path, grid, settings["ocv_v"]), path)) * capacity_ah
+    open_circuit_wh = _mean_ocv(settings["ocv_v"], soc) * charge_ah
     lost_wh = load_a * _resistance(estimator, soc) * charge_ah
     hours = charge_ah / load_a if load_a * LONGEST_H > capacity_ah else math.nan
     return RemainingCharge(charge_ah, usable_ah, max(open_circuit_wh - lost_wh, 0.0), 3600.0 * hours)
+
+
+def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:
+    """Mean of the open-circuit voltage between empty and ``soc`` [V], to a node of its grid."""
+    below = ocv_v[: max(round(soc * (ocv_v.size - 1)), 1) + 1]
+    return float((below.sum() - 0.5 * (below[0] + below[-1])) / (below.size - 1))
 
 
 def _resistance(estimator: Estimator, soc: float) -> float:

@@ -1,0 +1,100 @@
+"""What is left in the pack, state of health, what is suspected: from the estimator to what is published."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.settings import IdentifierSettings
+from bms_estimator.service.health import suspicions
+from bms_estimator.service.parameters import parameter_report
+from bms_estimator.service.remaining import remaining_charge
+
+CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})  # starts at its own values
+Q_AH = CELL.cell.capacity_ah
+NOW_S = 1.7e9
+
+
+def at(soc: float) -> Estimator:
+    estimator = Estimator(CELL, initial_soc=soc)
+    estimator.step(0.0, 0.0, chen_mora.emf(soc, CELL.a))
+    return estimator
+
+
+def pulses(current_a: float, hours: float) -> np.ndarray:
+    """The cell's voltage under pulses of a minute at 10 Hz."""
+    block = np.zeros(int(36_000 * hours), dtype=SAMPLE)
+    block["time_s"] = 0.1 * np.arange(block.size)
+    block["current_a"] = np.where(np.arange(block.size) // 600 % 2 == 0, current_a, 0.0)
+    block["voltage_v"], _ = chen_mora.simulate_cell(
+        (1.0, 0.0, 0.0), block["time_s"].copy(), block["current_a"].copy(), Q_AH * 3600.0, CELL.a
+    )
+    return block
+
+
+def test_charge_energy_and_time_at_a_load() -> None:
+    left = remaining_charge(at(0.5), 0.055)
+    assert left.capacity_ah == pytest.approx(0.5 * Q_AH)
+    assert left.time_to_empty_s == pytest.approx(0.5 * Q_AH / 0.055 * 3600.0)
+    energy_wh = Q_AH * quad(chen_mora.emf, 0.0, 0.5, args=(CELL.a,))[0]
+    assert remaining_charge(at(0.5), 0.0).energy_wh == pytest.approx(energy_wh, rel=1e-4)
+    assert remaining_charge(at(0.5), 0.0).energy_wh - left.energy_wh == pytest.approx(
+        0.055 * 0.5 * Q_AH * sum(f(0.5, at(0.5).state[0]["a"]) for f in (chen_mora.r_s, chen_mora.r_ts, chen_mora.r_tl))
+    )
+
+
+def test_usable_charge_ends_at_the_margins() -> None:
+    estimator = at(0.5)
+    state = estimator.state[0]
+    usable_ah = remaining_charge(estimator, 0.0).usable_ah
+    assert usable_ah == pytest.approx((0.5 - max(state["delta_1"], state["delta_2"])) * Q_AH)
+    assert remaining_charge(at(0.001), 0.0).usable_ah == 0.0
+
+
+@pytest.mark.parametrize("current_a", [0.0, -1.0, 1e-5])
+def test_a_pack_that_does_not_discharge_has_no_time_to_empty(current_a: float) -> None:
+    assert math.isnan(remaining_charge(at(0.5), current_a).time_to_empty_s)
+
+
+def test_nothing_is_known_before_the_first_sample() -> None:
+    estimator = Estimator(CELL, initial_soc=0.5)
+    assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)
+    assert parameter_report(estimator, NOW_S).elements == {}
+
+
+def test_identified_elements_and_state_of_health_are_published_with_their_errors() -> None:
+    estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
+    before = estimator.run(pulses(0.2, 0.01)).copy()
+    assert before["soc_std"][-1] > 0.0
+    estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
+    estimator.run(pulses(0.2, 1.0))
+    report = parameter_report(estimator, NOW_S)
+    r_s = report.elements["r_s_ohm"]
+    assert (r_s.source, r_s.valid, r_s.reason) == ("identified", True, None)
+    assert r_s.updated is not None
+    assert r_s.value is not None
+    assert r_s.std is not None
+    truth = chen_mora.r_s(float(estimator.state[0]["soc"]), CELL.a)
+    assert abs(r_s.value - truth) < max(3.0 * r_s.std, 0.02 * truth)
+    health = report.state_of_health
+    assert health["r_s"].value == pytest.approx(1.0, abs=0.03)
+    assert (health["capacity"].valid, health["capacity"].value) == (False, 1.0)
+    assert "taken as declared" in (health["capacity"].reason or "")
+    assert report.a["a15"].std is not None
+    assert report.elements["e_o_v"].source == "configured"
+
+
+def test_a_current_of_the_wrong_sign_is_named() -> None:
+    estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
+    block = pulses(0.2, 1.0)
+    block["current_a"] *= -1.0
+    estimator.run(block)
+    assert any("check the sign of the current" in text for text in suspicions(estimator.record[0]))
+    good = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
+    good.run(pulses(0.2, 1.0))
+    assert suspicions(good.record[0]) == []
