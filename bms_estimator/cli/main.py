@@ -4,9 +4,12 @@ A command's module is imported when the command runs: ``--help`` stays fast, and
 hurts only the command that needs it.
 """
 
+import errno
 import importlib
+import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import typer
@@ -42,6 +45,8 @@ COMMANDS = {
 
 EXTRAS = {"pyarrow": "parquet", "amqtt": "demo", "matplotlib": "report"}
 """Optional package -> the extra that brings it."""
+CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""What a disk that is full or broken says, whichever file it is."""
 
 
 class LazyGroup(TyperGroup):
@@ -94,13 +99,14 @@ def _root(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process.
 
-    Exit codes: 0 done, 1 a fault of ours (with its traceback), 2 something a person can mend, 130 interrupted.
+    Exit codes: 0 done, 1 a fault of ours (with its traceback) or nobody reads stdout any more (without), 2 something a
+    person can mend, 130 interrupted.
 
     Args:
         arguments: Without the program's name; None: the process's.
     """
     try:
-        app(None if arguments is None else list(arguments), prog_name="bms-estimator")
+        _run(arguments)
     except UserError as error:
         _end(str(error))
     except ModuleNotFoundError as error:
@@ -108,8 +114,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if package not in EXTRAS:
             raise
         _end(f"this needs {package}: pip install 'bms_estimator[{EXTRAS[package]}]'")
+    except BrokenPipeError:
+        _leave_stdout()
+        sys.exit(1)
+    except OSError as error:
+        if error.errno not in CANNOT_WRITE:
+            raise
+        _leave_stdout()
+        _end(f"the output cannot be written: {error.strerror}")
     except KeyboardInterrupt:  # while a command was imported
         sys.exit(130)
+
+
+def _run(arguments: Sequence[str] | None) -> None:
+    """Run the command line; what is left of its output goes out here, where a fault of stdout can still be said."""
+    try:
+        app(None if arguments is None else list(arguments), prog_name="bms-estimator")
+    except SystemExit:
+        if sys.stdout:
+            sys.stdout.flush()
+        raise
+
+
+def _leave_stdout() -> None:
+    """Let nothing more fail: the interpreter flushes stdout once again as it ends."""
+    if not sys.stdout:
+        return
+    with Path(os.devnull).open("wb") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def _end(message: str) -> None:

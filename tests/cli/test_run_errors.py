@@ -1,5 +1,6 @@
 """What ``run`` and the command line say when they cannot start: one line for each fault, code 2, no traceback."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -86,3 +87,28 @@ def test_every_command_can_be_imported_and_has_help(command, capsys):
     code, out, err = run(capsys, command, "--help")
     assert (code, err) == (0, "")
     assert f"bms-estimator {command} " in out
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", [("config", "show"), ("--version",), ("ports", "/dev/null")])
+def test_an_output_that_cannot_be_written(arguments, unbuffered):
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [PROGRAM, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False
+        )
+    assert ended.stderr == "error: the output cannot be written: No space left on device\n"
+    assert ended.returncode == 2
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", [("config", "show"), ("--version",), ("ports", "/dev/null")])
+def test_an_output_that_nobody_reads(arguments, unbuffered):
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    read, write = os.pipe()
+    os.close(read)
+    ended = subprocess.run(
+        [PROGRAM, *arguments], stdout=write, stderr=subprocess.PIPE, text=True, env=environment, check=False
+    )
+    os.close(write)
+    assert (ended.returncode, ended.stderr) == (1, "")
