@@ -1,7 +1,6 @@
 """A simulated board does not outlive the program that started it, however that ends."""
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -10,17 +9,27 @@ from pathlib import Path
 from tests.simavr_board import ELF, SIMULATOR, write_readings
 
 LONG_S = 20.0
-START = "import subprocess, sys; p = subprocess.Popen(sys.argv[1:]); print(p.pid, flush=True); p.wait()"
+# Pid and terminal go to two pipes: on one, either line may come first.
+START = """
+import subprocess, sys
+board = subprocess.Popen(sys.argv[1:], stdout=sys.stderr)
+print(board.pid, flush=True)
+board.wait()
+"""
 
 
 def test_it_ends_with_a_parent_that_is_killed(firmware: None, tmp_path: Path) -> None:
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 0.1, 3.8)])
     command = [sys.executable, "-c", START, SIMULATOR, ELF, "--readings", readings]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **pipes) as parent:
         assert parent.stdout
-        board = int(parent.stdout.readline())
-        assert parent.stdout.readline().startswith("/dev/pts/")
-        parent.send_signal(signal.SIGKILL)
+        assert parent.stderr
+        try:
+            board = int(parent.stdout.readline())
+            assert parent.stderr.readline().startswith("/dev/pts/")
+        finally:
+            parent.kill()
     deadline = time.monotonic() + LONG_S
     while alive(board):
         assert time.monotonic() < deadline
