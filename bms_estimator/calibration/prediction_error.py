@@ -33,8 +33,11 @@ SETTLED = 0.2
 PASSES = 4
 HUBER = 0.3
 """Prediction errors beyond this many of the standard deviations counted with count by their magnitude only."""
-LOW_SOC, LEAST_WEIGHT = 0.1, 0.01
-"""Below this SOC the form of the elements fails: errors count in proportion to SOC there, down to this weight."""
+LOW_SOC = 0.1
+"""Below it the form of the elements fails."""
+FULL_SOC, LEAST_WEIGHT = 0.12, 0.01
+"""Errors count in proportion to the square of SOC below FULL_SOC, down to this weight: in the plain proportion, heavy
+pulses near empty bend the elements for all that is just above."""
 
 THETA_STD = 0.7
 """The cell file's elements are right within a factor of 2, where a load says nothing (log parameters)."""
@@ -145,10 +148,9 @@ class Problem:
         )
         self._centre[layout.soc] = soc
         self._prior = self._prior_information(scale_ohm, refine_ocv)
-        self._weights = [
-            np.clip((start - load.discharged_ah / cell.cell.capacity_ah) / LOW_SOC, LEAST_WEIGHT, 1.0)
-            for start, load in zip(soc, loads, strict=True)
-        ]
+        counted = [start - load.discharged_ah / cell.cell.capacity_ah for start, load in zip(soc, loads, strict=True)]
+        self._above = [soc > LOW_SOC for soc in counted]
+        self._weights = [np.clip(soc / FULL_SOC, LEAST_WEIGHT**0.5, 1.0) ** 2 for soc in counted]
 
     def solve(self) -> Solution:
         """Passes of Levenberg-Marquardt, each with the noise that the one before left."""
@@ -167,7 +169,7 @@ class Problem:
         """RMS of measured less fitted voltage at SOC above ``LOW_SOC``, each second weighing the same [V]."""
         load = self.loads[capture]
         error_v, _ = self._simulate(z, capture, jacobian=False)
-        duration_s = np.r_[np.diff(load.time_s), 0.0] * (self._weights[capture] >= 1.0)
+        duration_s = np.r_[np.diff(load.time_s), 0.0] * self._above[capture]
         return float(np.sqrt(duration_s @ error_v**2 / max(duration_s.sum(), 1e-9)))
 
     def _prior_information(self, scale_ohm: float, refine_ocv: bool) -> Floats:
