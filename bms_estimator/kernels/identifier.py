@@ -157,9 +157,3 @@ def element_ln_stds(s: Record) -> Elements:
 def _ratio_std(s: Record, j: int, k: int) -> float:
     """Standard deviation of x[j] - x[k]."""
     return math.sqrt(max(s.covariance[j, j] + s.covariance[k, k] - 2.0 * s.covariance[j, k], 0.0))
-
-
-@njit(cache=True)
-def nis(s: Record) -> float:
-    """Innovation squared over its variance: about 1 for a cell that is as the model says, NaN before a sample."""
-    return s.innovation_v**2 / s.innovation_variance if s.innovation_variance > 0.0 else math.nan

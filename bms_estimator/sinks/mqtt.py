@@ -260,11 +260,14 @@ def _connection(settings: MqttSettings) -> dict[str, Any]:
     if not host or url.username is not None:
         raise UserError(f"mqtt.url = {settings.url}: must be mqtt://host:port; the name goes to mqtt.username")
     connection: dict[str, Any] = {"hostname": host, "port": port, "username": settings.username}
-    try:
-        if settings.password_file is not None:
+    if settings.password_file is not None:
+        try:
             connection["password"] = settings.password_file.read_text(encoding="utf-8").rstrip("\r\n")
-        if url.scheme == "mqtts":
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: {error}") from None
+    if url.scheme == "mqtts":
+        try:
             connection["tls_context"] = ssl.create_default_context(cafile=settings.ca_file)
-    except OSError as error:  # ssl.SSLError is one
-        raise UserError(f"mqtt: password_file or ca_file cannot be used: {error}") from None
+        except OSError as error:  # ssl.SSLError is one
+            raise UserError(f"mqtt.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     return connection

@@ -20,14 +20,13 @@ GZIP_LEVEL = 3
 
 
 class TableSink(Protocol):
-    """A file that grows by trace blocks. Entering opens it, replacing an older one; leaving completes it."""
+    """A file that grows by trace blocks; leaving completes it.
+
+    The first block replaces an older file: work that fails before it leaves that one as it was.
+    """
 
     def __enter__(self) -> Self:
-        """Open the file.
-
-        Raises:
-            UserError: It cannot be written.
-        """
+        """Nothing to open yet."""
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -35,7 +34,11 @@ class TableSink(Protocol):
         """Complete the file."""
 
     def write(self, trace: NDArray[np.void]) -> None:
-        """Append a row for each of ``trace``, a structured array of one dtype for all calls."""
+        """Append a row for each of ``trace``, a structured array of one dtype for all calls.
+
+        Raises:
+            UserError: The file cannot be written.
+        """
 
 
 class CsvSink:
@@ -50,16 +53,9 @@ class CsvSink:
         self._files = ExitStack()
         self._file: IO[bytes] | None = None
         self._lines = _csv_writer()
-        self._header_written = False
 
     def __enter__(self) -> Self:
-        """Open the file."""
-        file = self._files.enter_context(_create(self._path))
-        if self._path.suffix.lower() == ".gz":
-            file = self._files.enter_context(
-                cast("IO[bytes]", gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=GZIP_LEVEL))
-            )
-        self._file = file
+        """Nothing to open yet."""
         return self
 
     def __exit__(
@@ -71,12 +67,17 @@ class CsvSink:
     def write(self, trace: NDArray[np.void]) -> None:
         """Append rows."""
         if self._file is None:
-            raise ValueError(f"{self._path} is not open")
-        if not self._header_written:
+            self._file = self._open()
             self._file.write((",".join(trace.dtype.names or ()) + "\n").encode())
-            self._header_written = True
         if trace.size:
             self._file.write(self._lines(trace))
+
+    def _open(self) -> IO[bytes]:
+        file = self._files.enter_context(_create(self._path))
+        if self._path.suffix.lower() != ".gz":
+            return file
+        packed = gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=GZIP_LEVEL)
+        return self._files.enter_context(cast("IO[bytes]", packed))
 
 
 class ParquetSink:
@@ -91,12 +92,10 @@ class ParquetSink:
 
         self._path = path
         self._files = ExitStack()
-        self._file: IO[bytes] | None = None
         self._writer: Any = None
 
     def __enter__(self) -> Self:
-        """Open the file."""
-        self._file = self._files.enter_context(_create(self._path))
+        """Nothing to open yet."""
         return self
 
     def __exit__(
@@ -111,7 +110,8 @@ class ParquetSink:
 
         batch = _arrow_batch(trace)
         if self._writer is None:
-            self._writer = self._files.enter_context(parquet.ParquetWriter(self._file, batch.schema))
+            file = self._files.enter_context(_create(self._path))
+            self._writer = self._files.enter_context(parquet.ParquetWriter(file, batch.schema))
         self._writer.write_batch(batch)
 
 

@@ -191,3 +191,12 @@ def test_a_cut_gzip_is_named(capture, tmp_path, capsys):
     code, _, err = run(capsys, "replay", cut, "--cell", "ncr18650", "--json")
     assert code == 2
     assert "cut.csv.gz: gzip data damaged or cut short" in err
+
+
+def test_estimates_from_before_outlive_a_capture_that_cannot_be_read(capture, tmp_path, capsys):
+    out, wrong = tmp_path / "out.csv", tmp_path / "wrong.csv"
+    assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out)[0] == 0
+    before = out.read_bytes()
+    wrong.write_text("time_s,voltage_v\n0,3.7\n")
+    assert run(capsys, "replay", wrong, "--cell", "ncr18650", "--out", out)[0] == 2
+    assert out.read_bytes() == before

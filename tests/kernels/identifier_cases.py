@@ -12,7 +12,7 @@ from numba import njit
 
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import c_tl, c_ts, emf, r_s, r_tl, r_ts, simulate_cell
-from bms_estimator.kernels.identifier import identifier_init, identifier_step, nis, suspects
+from bms_estimator.kernels.identifier import identifier_init, identifier_step, suspects
 from bms_estimator.kernels.identifier_state import IDENTIFIER_STATE, Tuning, identifier_settings
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.suspect import Suspect
@@ -103,7 +103,7 @@ def loop(state, settings, time_s, current_a, voltage_v, trace):
         row.soc = s.mean[0]
         row.soc_std = math.sqrt(s.covariance[0, 0])
         row.innovation_v = s.innovation_v
-        row.nis = nis(s)
+        row.nis = s.innovation_v**2 / s.innovation_variance if s.innovation_variance > 0.0 else np.nan
         row.misfit = s.misfit
         row.suspects = suspects(s)
         for k in range(5):

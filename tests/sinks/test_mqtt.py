@@ -247,8 +247,8 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
     [
         ({"url": "mqtt://me:secret@host:1883"}, "mqtt.username"),
         ({"url": "mqtt://host:99999"}, "mqtt.url"),
-        ({"password_file": Path("/nonexistent/password")}, "/nonexistent/password"),
-        ({"url": "mqtts://host", "ca_file": Path("/nonexistent/ca.pem")}, "ca_file"),
+        ({"password_file": Path("/nonexistent/password")}, "mqtt.password_file = /nonexistent/password"),
+        ({"url": "mqtts://host", "ca_file": Path("/nonexistent/ca.pem")}, "mqtt.ca_file = /nonexistent/ca.pem"),
     ],
 )
 def test_settings_that_cannot_reach_a_broker_are_named(changes: dict[str, Any], named: str) -> None:
