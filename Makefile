@@ -8,7 +8,7 @@ COMPARE := .venv-compare
 ARGS    ?=
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
-APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container udev
 
 .DEFAULT_GOAL := help
 .PHONY: help venv apt check test demo benchmark compare firmware lock

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from typing import Self
 
 from bms_estimator.model.estimate import Snapshot
-
-LONG_S = 20.0
+from tests.patience import LONG_S
 
 
 class Collector:

@@ -15,9 +15,9 @@ from typing import Any, Self
 import aiomqtt
 import pytest
 
+from tests.patience import LONG_S
+
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
-LONG_S = 20.0
-"""Anything that takes longer will not come."""
 
 
 def free_port() -> int:

@@ -14,10 +14,9 @@ from bms_estimator.cli.demo import FIRMWARE_BUILD
 from bms_estimator.cli.main import main
 from bms_estimator.sources.firmware_board import FirmwareBoard
 from tests.mosquitto import Listener, free_port
+from tests.patience import LONG_S
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 240.0
-"""Kernels may have to be compiled first [s]."""
 
 
 @contextlib.asynccontextmanager

@@ -16,11 +16,10 @@ from bms_estimator.cli.main import main
 from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.raw_capture import read_capture, read_header
+from tests.patience import LONG_S
 from tests.serial_line import Line, line  # noqa: F401
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 120.0
-"""Kernels may have to be compiled first [s]."""
 LENGTH_AT = 8
 DATA_AT = 12
 """In a record, after time and length [bytes]."""

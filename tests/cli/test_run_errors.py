@@ -9,10 +9,9 @@ import pytest
 
 from bms_estimator import __version__
 from bms_estimator.cli.main import COMMANDS, main
+from tests.patience import LONG_S
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 240.0
-"""Kernels may have to be compiled first [s]."""
 
 
 def run(capsys, *arguments):

@@ -16,10 +16,9 @@ import pytest
 from bms_estimator.cli.main import main
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.protocol import set_rate_command
+from tests.patience import LONG_S
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 120.0
-"""Kernels may have to be compiled first [s]."""
 RATE_HZ = 200
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.service.demo_broker import DemoBroker
+from tests.patience import LONG_S
 
-PATIENCE_S = 10.0
 RETAINED = ["bms/p/availability", "bms/p/sensor/availability", "bms/p/info", "homeassistant/device/p/config"]
 
 # A client with a last will that ends without a word once it is connected
@@ -36,7 +36,7 @@ def free_port() -> int:
 
 
 async def next_message(client: aiomqtt.Client) -> tuple[str, bytes, bool]:
-    async with asyncio.timeout(PATIENCE_S):
+    async with asyncio.timeout(LONG_S):
         message = await anext(aiter(client.messages))
     return message.topic.value, message.payload, message.retain
 
@@ -124,6 +124,6 @@ async def test_the_printed_command_shows_the_topics(free_port):
     async with DemoBroker(free_port) as broker, aiomqtt.Client("127.0.0.1", free_port) as service:
         await publish_all(service)
         process = await asyncio.create_subprocess_shell(f"{broker.look_command} -C 3", stdout=asyncio.subprocess.PIPE)
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(LONG_S):
             shown, _ = await process.communicate()
         assert sorted(shown.decode().split()[::2]) == sorted(RETAINED[:3])

@@ -6,8 +6,7 @@ import re
 import pytest
 
 from tests.deploy.boot import boot, make_root
-
-LONGEST_S = 120.0
+from tests.patience import LONG_S
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +19,7 @@ def report(tmp_path_factory) -> str:
         pytest.skip("only root can boot a container")
     root = tmp_path_factory.mktemp("boot") / "root"
     make_root(root)
-    text = boot(root, systemd_nspawn, LONGEST_S)
+    text = boot(root, systemd_nspawn, LONG_S)
     if "ActiveState" not in text:
         pytest.skip(f"no container boots on this machine: {text[-300:]}")
     return text

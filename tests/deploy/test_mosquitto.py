@@ -10,6 +10,8 @@ from collections.abc import Iterator
 import aiomqtt
 import pytest
 
+from tests.patience import LONG_S
+
 PASSWORDS = {"bms-estimator": "one", "dashboard": "two", "homeassistant": "three"}
 LAST = {
     "bms/#": ("bms-estimator", "bms/pack/last"),
@@ -44,7 +46,7 @@ def broker(program, deploy, free_port, tmp_path) -> Iterator[int]:
 
 
 def wait_for_port(process: "subprocess.Popen[str]", port: int) -> None:
-    until = time.monotonic() + 10.0
+    until = time.monotonic() + LONG_S
     while time.monotonic() < until:
         assert process.poll() is None, process.stderr.read() if process.stderr else ""
         with socket.socket() as probe:
@@ -55,7 +57,7 @@ def wait_for_port(process: "subprocess.Popen[str]", port: int) -> None:
 
 
 def client(port: int, user: str) -> aiomqtt.Client:
-    return aiomqtt.Client("127.0.0.1", port, username=user, password=PASSWORDS[user], timeout=5)
+    return aiomqtt.Client("127.0.0.1", port, username=user, password=PASSWORDS[user], timeout=LONG_S)
 
 
 async def arrived(port: int, sender: str, topics: list[str], *, reader: str, subscription: str) -> list[str]:
@@ -67,7 +69,7 @@ async def arrived(port: int, sender: str, topics: list[str], *, reader: str, sub
             await sending.publish(topic, b"x", qos=1)
         await ending.publish(last, b"x", qos=1)
         seen: list[str] = []
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(LONG_S):
             async for message in listening.messages:
                 if message.topic.value == last:
                     break
@@ -77,13 +79,13 @@ async def arrived(port: int, sender: str, topics: list[str], *, reader: str, sub
 
 async def test_an_anonymous_client_is_refused(broker):
     with pytest.raises(aiomqtt.MqttError):
-        async with aiomqtt.Client("127.0.0.1", broker, timeout=5):
+        async with aiomqtt.Client("127.0.0.1", broker, timeout=LONG_S):
             pass
 
 
 async def test_a_wrong_password_is_refused(broker):
     with pytest.raises(aiomqtt.MqttError):
-        async with aiomqtt.Client("127.0.0.1", broker, username="bms-estimator", password="two", timeout=5):
+        async with aiomqtt.Client("127.0.0.1", broker, username="bms-estimator", password="two", timeout=LONG_S):
             pass
 
 

@@ -10,8 +10,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from tests.patience import LONG_S
+
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-PATIENCE_S = 60.0
 PACK = '[pack]\ncell = "chen_mora"\n[sensor]\nport = "/dev/bms/absent"\n'
 
 
@@ -21,7 +22,7 @@ class Systemd:
     def __init__(self, folder: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(folder / "notify"))
-        self._socket.settimeout(PATIENCE_S)
+        self._socket.settimeout(LONG_S)
         (folder / "pack.toml").write_text(PACK)
         self.cache, self.state = folder / "cache", folder / "state"
         environment = {
@@ -46,14 +47,14 @@ class Systemd:
 
     def until(self, notice: str) -> None:
         """Wait until a notice comes; others may come before."""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + LONG_S
         while notice not in self.next_notice().split("\n"):
             assert time.monotonic() < deadline, f"{notice} did not come"
 
     def stop(self) -> tuple[int, str]:
         """End as systemd ends a service. Returns its exit code and what it logged."""
         self.process.send_signal(signal.SIGTERM)
-        _, logged = self.process.communicate(timeout=PATIENCE_S)
+        _, logged = self.process.communicate(timeout=LONG_S)
         return self.process.returncode, logged
 
     def close(self) -> None:
@@ -106,7 +107,7 @@ def test_a_second_start_takes_the_kernels_from_the_cache(tmp_path):
 def test_a_wrong_setting_ends_with_code_2_which_systemd_does_not_restart(tmp_path, deploy):
     (tmp_path / "pack.toml").write_text("[pack]\nseries = 0\n")
     command = [PROGRAM, "run", "--pack", tmp_path / "pack.toml"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert done.returncode == 2
     assert "pack.series = 0" in done.stderr
     assert "Traceback" not in done.stderr

@@ -21,10 +21,10 @@ from bms_estimator.sources.simulated_pack import SimulatedPack, pulses
 from bms_estimator.sources.virtual_board import BoardFault, VirtualBoard
 from bms_estimator.sources.virtual_converter import Reading
 from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
 from tests.simavr_board import SimavrBoard, write_readings
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 60.0
 LSB_V, LSB_A = 25.0 / 1024.0, 5.0 / 1024.0 / 0.1
 START_SOC = 0.9
 LOAD_A = 0.3

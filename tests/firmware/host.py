@@ -15,9 +15,7 @@ from bms_estimator.sources.protocol import (
     SampleMessage,
     unseal,
 )
-
-LONG_S = 30.0
-"""What has not come by then will not come."""
+from tests.patience import LONG_S
 
 
 class Host:

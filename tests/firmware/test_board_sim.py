@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 from tests.firmware.host import Host
+from tests.patience import LONG_S
 from tests.simavr_board import ELF, SIMULATOR, SimavrBoard, write_readings
 
 pytestmark = pytest.mark.usefixtures("firmware")
-
-LONG_S = 30.0
 
 
 def run(*arguments: str | Path, text: str = "") -> subprocess.CompletedProcess[str]:

@@ -6,9 +6,9 @@ import sys
 import time
 from pathlib import Path
 
+from tests.patience import LONG_S
 from tests.simavr_board import ELF, SIMULATOR, write_readings
 
-LONG_S = 20.0
 # Pid and terminal go to two pipes: on one, either line may come first.
 START = """
 import subprocess, sys

@@ -45,6 +45,15 @@ def test_real_cells_from_a_wrong_start(shared_data: Path, name: str, factors: tu
     assert run.suspected() == 0
 
 
+@pytest.mark.parametrize("name", cases.ROUND_SOC)
+def test_the_shipped_cell_knows_the_soc_of_real_cells(shared_data: Path, name: str) -> None:
+    """SOC wrong by 0.20, against what is known of the captures' first SOC without the estimator."""
+    run = cases.identify_capture(shared_data, name)
+    off = cases.ROUND_SOC[name] - cases.INITIAL_SOC[name]
+    judged = run.after(3600.0)
+    assert 100.0 * cases.rms(run.error[judged] - off) <= 0.35
+
+
 @pytest.mark.parametrize(("rate_hz", "hours"), [(0.1, 8.0), (1.0, 6.0), (10.0, 6.0), (100.0, 2.5)])
 @pytest.mark.parametrize("factors", [TWICE, HALF])
 def test_a_simulated_cell_is_identified_at_any_rate(rate_hz: float, hours: float, factors: tuple[float, ...]) -> None:

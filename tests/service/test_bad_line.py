@@ -16,9 +16,9 @@ from bms_estimator.service.live import run_live
 from bms_estimator.sources.protocol import MODULUS, Hello, SampleMessage
 from bms_estimator.sources.serial_board import SerialBoard
 from tests.collector import Collector
+from tests.patience import LONG_S
 from tests.serial_line import Line
 
-LONG_S = 20.0
 CELL = load_cell("chen_mora")
 RATE_HZ = 100
 PERIOD_US = 1_000_000 // RATE_HZ

@@ -21,11 +21,11 @@ from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.requests import Requests
 from tests.collector import Collector
+from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
 SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), mqtt=MqttSettings(publish_rate_hz=10.0))
-LONG_S = 20.0
 
 
 @dataclass

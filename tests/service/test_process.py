@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
 from tests.serial_line import Line
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-LONG_S = 30.0
 
 
 def pack_file(folder: Path, line: Line, broker: Broker) -> Path:

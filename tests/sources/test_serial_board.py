@@ -11,9 +11,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.serial_board import SerialBoard
+from tests.patience import LONG_S
 from tests.serial_line import Line
-
-LONG_S = 20.0
 
 
 def board(line: Line, **options: Any) -> SerialBoard:

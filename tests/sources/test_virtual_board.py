@@ -26,9 +26,9 @@ from bms_estimator.sources.protocol import (
 )
 from bms_estimator.sources.virtual_board import BoardFault, VirtualBoard
 from bms_estimator.sources.virtual_converter import BoardParts, Reading, window_of
+from tests.patience import LONG_S
 
 STEADY = Reading(2.5, 22.2, 25.0)
-LONG_S = 20.0
 
 Event = Callable[[VirtualBoard], None]
 
