@@ -11,7 +11,7 @@ from bms_estimator.kernels.estimate import Verdict
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
 from bms_estimator.kernels.identifier import identifier_init
 from bms_estimator.kernels.identifier_guard import keep
-from bms_estimator.kernels.identifier_state import SOC, V_SLOW, V_TL, V_TS
+from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, LN_CAPACITY, SOC, V_SLOW, V_TL, V_TS
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
@@ -102,7 +102,7 @@ class Estimator:
         return bool(self.settings_record["identify"][0])
 
     def set_soc(self, soc: float) -> None:
-        """Take ``soc`` as the state of charge from now on, known to ``SET_SOC_STD``.
+        """Take ``soc`` as the state of charge from now on, known to ``SET_SOC_STD``; after the first sample.
 
         Raises:
             ValueError: It is outside 0..1.
@@ -114,6 +114,7 @@ class Estimator:
         x["mean"][SOC] = soc
         x["covariance"][SOC, :] = x["covariance"][:, SOC] = 0.0
         x["covariance"][SOC, SOC] = SET_SOC_STD**2
+        x["offset_sense"][SOC] = x["capacity_sense"][SOC] = 0.0
         keep(x)
 
     def resume(self, unseen_s: float) -> None:
@@ -121,7 +122,7 @@ class Estimator:
 
         Time begins with the next sample, which is taken as a clock set back. The SOC may have moved, and the branch
         voltages are what they may be at a first sample. After a long time the elements may belong to another SOC: they
-        are those of the cell file again. The map is kept.
+        are those of the cell file again. The map is kept, and what was learned of capacity and current offset.
 
         Args:
             unseen_s: How long nobody measured [s]; infinite when nobody knows.
@@ -130,8 +131,12 @@ class Estimator:
         x, p = self.record[0]["identifier"], self.settings_record[0]["identifier"]
         soc_variance = x["covariance"][SOC, SOC] + min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST) ** 2
         if unseen_s > SAME_ELEMENTS_S:
+            sensor_and_cell = [(j, x["mean"][j], x["covariance"][j, j]) for j in (CURRENT_OFFSET, LN_CAPACITY)]
+            branch = x["branch"]
             identifier_init(x, p)
-            x["mean"][SOC] = self.state["soc"][0]
+            x["mean"][SOC], x["branch"] = self.state["soc"][0], branch
+            for j, mean, variance in sensor_and_cell:
+                x["mean"][j], x["covariance"][j, j] = mean, variance
         x["covariance"][SOC, SOC] = soc_variance
         for branch in (V_TS, V_TL, V_SLOW):
             x["covariance"][branch, branch] += p["variance"][branch]

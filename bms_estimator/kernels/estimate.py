@@ -32,7 +32,7 @@ _NOT_FINITE = int(Verdict.NOT_FINITE)
 _OUT_OF_RANGE = int(Verdict.OUT_OF_RANGE)
 _REPEATED = int(Verdict.REPEATED)
 _SATURATED = int(Verdict.SATURATED)
-_VOLTAGE_SATURATED_BIT = 1  # SampleStatus.VOLTAGE_SATURATED
+_SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED
 
 
 @njit(cache=True)
@@ -44,7 +44,7 @@ def judge(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
     if not (math.isfinite(time_s) and math.isfinite(current_a) and math.isfinite(voltage_v)):
         s.dropped_not_finite += 1
         return _NOT_FINITE
-    if status & _VOLTAGE_SATURATED_BIT:
+    if status & _SATURATED_BITS:
         s.dropped_saturated += 1
         return _SATURATED
     if not (p.voltage_min_v <= voltage_v <= p.voltage_max_v and abs(current_a) <= p.current_max_a):

@@ -7,15 +7,19 @@ import math
 
 from numba import njit
 
+from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.element_map import ELEMENTS, age, fit_element, learn
 from bms_estimator.kernels.identifier import identifier_init, identifier_step, soc
 from bms_estimator.kernels.identifier_state import LN_R_S, LN_R_TL, LN_R_TS, LN_TAU_TL, LN_TAU_TS, SOC
+from bms_estimator.kernels.margins import delta
 from bms_estimator.kernels.state import Record
 
 FIT_EVERY_S = 10.0
 """One element is fitted this often, each in its turn [s of samples]."""
 LEAST_BINS = 3
 """Three parameters of an element need so many bins of SOC."""
+CAPACITANCES = (2, 3)
+"""C_ts, C_tl among the elements."""
 
 
 @njit(cache=True)
@@ -31,11 +35,13 @@ def identify(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: flo
     """Take one sample: SOC for the observer, elements for the map, every now and then a fit for (3.18)."""
     identifier_step(s.identifier, p.identifier, dt_s, current_a, voltage_v)
     s.observer.soc = soc(s.identifier)
-    learn_elements(s, dt_s)
+    if dt_s <= UNMEASURED_S:
+        learn_elements(s, dt_s)
     s.fit_age_s += dt_s
     if s.fit_age_s >= FIT_EVERY_S:
         e = s.next_element
-        age(s.map, e, math.exp(-ELEMENTS * s.fit_age_s / p.map_memory_s))
+        for row in range(ELEMENTS):
+            age(s.map, row, math.exp(-s.fit_age_s / p.map_memory_s))
         fit_element(s.map, e, p.configured, s.fit)
         hand_over(s, p, e)
         s.next_element = (e + 1) % ELEMENTS
@@ -68,11 +74,28 @@ def hand_over(s: Record, p: Record, e: int) -> None:
 
     By Lemma 4.1.3 the limit is all that (3.18) takes of its bounds: it is set, in place of two bounds around it.
     Parameters that no law adapts (a13..a15 of the improved method) take the fitted values at once.
+    A capacitance that is negative at the present SOC is no limit to strive for: it would end the adaptation (E14).
     """
     if p.hand_over == 0 or s.fit.bins[e] < LEAST_BINS:
         return
-    for i in range(3 * e + 1, 3 * e + 4):
-        value = min(max(s.fit.a[i], p.lower[i]), p.upper[i])
-        s.observer.target[i] = value
-        if p.observer.drive[i] == 0.0:
-            s.observer.a[i] = value
+    i = 3 * e + 1
+    amplitude, exponent, offset = bounded(s, p, i), bounded(s, p, i + 1), bounded(s, p, i + 2)
+    if e in CAPACITANCES and delta(exponent, offset, amplitude) + p.observer.margin_guard >= s.observer.soc:
+        return
+    aim(s.observer, p.observer, i, amplitude)
+    aim(s.observer, p.observer, i + 1, exponent)
+    aim(s.observer, p.observer, i + 2, offset)
+
+
+@njit(cache=True)
+def bounded(s: Record, p: Record, i: int) -> float:
+    """Fitted a_i within the configured bounds."""
+    return min(max(s.fit.a[i], p.lower[i]), p.upper[i])
+
+
+@njit(cache=True)
+def aim(s: Record, p: Record, i: int, value: float) -> None:
+    """Let ``value`` be the limit of a_i, of the observer's records."""
+    s.target[i] = value
+    if p.drive[i] == 0.0:
+        s.a[i] = value

@@ -112,12 +112,6 @@ def start(s: Record, p: Record, current_a: float) -> None:
 
 
 @njit(cache=True)
-def suspects(s: Record) -> int:
-    """Bits of ``model.suspect.Suspect``."""
-    return s.suspects
-
-
-@njit(cache=True)
 def soc(s: Record) -> float:
     """State of charge, 0..1."""
     return min(max(s.mean[SOC], 0.0), 1.0)

@@ -77,8 +77,6 @@ def clear(s: Record) -> None:
     s.misfit, s.correlated, s.believed_v, s.unsettled_v2 = 1.0, CORRELATED, 0.0, 0.0
     for j in range(STATES):
         s.offset_sense[j] = s.capacity_sense[j] = 0.0
-    for j in range(ELEMENTS):
-        s.excitation[j] = 0.0
     s.offset_information = s.capacity_information = s.offset_score = s.capacity_score = 0.0
     s.slow_v = s.slow_a = 0.0
     s.sign_evidence = s.change_v_a = s.change_a2 = 0.0

@@ -7,6 +7,7 @@ import math
 
 from numba import njit
 
+from bms_estimator.kernels.charge import LONGEST_FLOW_S, UNMEASURED_S, held_current
 from bms_estimator.kernels.identifier_bias import bias, predict_biases
 from bms_estimator.kernels.identifier_state import (
     CURRENT_OFFSET,
@@ -32,15 +33,12 @@ SIGN_OF_CURRENT = int(Suspect.SIGN_OF_CURRENT)
 def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     """State and covariance at the new sample, before its voltage is looked at."""
     x, cov, n = s.mean, s.covariance, p.active
-    i = 0.5 * (current_a + s.current_a)
-    if dt_s > p.gap_s:  # what both ends agree on
-        i = 0.0 if current_a * s.current_a <= 0.0 else math.copysign(min(abs(current_a), abs(s.current_a)), current_a)
-    i -= x[CURRENT_OFFSET]
+    i = held_current(dt_s, s.current_a, current_a) - x[CURRENT_OFFSET]
     ohm_ts, ohm_tl = math.exp(x[LN_R_TS]), math.exp(x[LN_R_TL])
     x_ts, x_tl = dt_s * math.exp(-x[LN_TAU_TS]), dt_s * math.exp(-x[LN_TAU_TL])
     e_ts, e_tl, e_slow = math.exp(-x_ts), math.exp(-x_tl), math.exp(-dt_s / p.slow_s)
     capacity_as = p.capacity_as * math.exp(x[LN_CAPACITY]) if n > LN_CAPACITY else p.capacity_as
-    moved = i * dt_s / capacity_as
+    moved = i * min(dt_s, LONGEST_FLOW_S) / capacity_as
     r_ts, r_tl = ohm_ts * (1.0 - e_ts) * i, ohm_tl * (1.0 - e_tl) * i  # dv/d ln R over the step
     t_ts, t_tl = (x[V_TS] - ohm_ts * i) * e_ts * x_ts, (x[V_TL] - ohm_tl * i) * e_tl * x_tl  # dv/d ln tau
     length = p.ocv_error_length + s.branch * (p.hysteresis_error_length - p.ocv_error_length)
@@ -78,7 +76,6 @@ def predict(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     cov[V_TL, V_TL] += widen * s.misfit * (p.branch_v2 + (p.branch_relative * ohm_tl * i) ** 2) * (1.0 - e_tl * e_tl)
     cov[V_SLOW, V_SLOW] += s.misfit * (p.slow_relative * (ohm_ts + ohm_tl) * i) ** 2 * (1.0 - e_slow * e_slow)
     doubt_current(s, p, dt_s, current_a, o_s, o_ts, o_tl, moved)
-    cov[CURRENT_OFFSET, CURRENT_OFFSET] += p.drift_per_s[CURRENT_OFFSET] * dt_s
     drift(s, p, current_a, dt_s, abs(moved) * widen)
 
 
@@ -100,7 +97,7 @@ def doubt_current(
     """
     cov = s.covariance
     unknown_a = p.timing * (current_a - s.current_a)
-    if dt_s > p.gap_s:
+    if dt_s > UNMEASURED_S:
         unknown_a = 0.5 * max(abs(current_a), abs(s.current_a)) + p.idle_current_a
     wrong = miscount(s, o_s, moved)
     cov[SOC, SOC] += p.drift_per_soc[SOC] * abs(moved) + (unknown_a * o_s) ** 2
@@ -151,7 +148,7 @@ def spread_optional(s: Record, n: int, o_s: float, o_ts: float, o_tl: float, mov
 
 @njit(cache=True)
 def drift(s: Record, p: Record, current_a: float, dt_s: float, swept: float) -> None:
-    """Variance that the elements gain, and what the load tells of them.
+    """Variance that the elements gain.
 
     Args:
         s: Record of IDENTIFIER_STATE.
@@ -182,6 +179,3 @@ def drift_one(s: Record, p: Record, j: int, effect_v: float, dt_s: float, swept:
     """
     visible = min(1.0, (effect_v / p.excited_v) ** 2)
     s.covariance[j, j] += p.drift_per_s[j] * dt_s * visible + p.drift_per_soc[j] * swept
-    info = p.noise_v2 + p.model_v2 * (1.0 + 2.0 * p.model_s / dt_s)
-    e = j - LN_R_S
-    s.excitation[e] += effect_v * effect_v / info - s.excitation[e] * min(1.0, dt_s / p.excitation_s)

@@ -74,7 +74,6 @@ IDENTIFIER_SETTINGS = np.dtype(
         ("hysteresis_error_v", "f8"),  # std of the OCV after charge, beyond ocv_error_v [V]
         ("hysteresis_error_length", "f8"),  # SOC over which that changes
         ("excited_v", "f8"),  # a parameter whose effect on the voltage is below this is hardly excited [V]
-        ("excitation_s", "f8"),  # memory of the excitation [s]
         ("misfit_s", "f8"),  # memory of the model's error, counted while the branches are out of balance [s]
         ("surprise_s", "f8"),  # memory of the squared normalised innovation that widens the drift [s]
         ("surprise_gain", "f8"),
@@ -82,7 +81,6 @@ IDENTIFIER_SETTINGS = np.dtype(
         ("gate", "f8"),  # squared normalised innovation beyond which a sample is not believed
         ("gate_samples", "i8"),  # as many in a row, ...
         ("gate_s", "f8"),  # ... lasting as long [s], and the world has changed, not the sample
-        ("gap_s", "f8"),  # over a longer step the current is not known [s]
         ("idle_current_a", "f8"),  # std of a current that nobody measured [A]
         ("tau_ratio", "f8"),  # least ln(tau_tl / tau_ts)
         ("bias_s", "f8"),  # memory of offset and capacity [s]
@@ -105,7 +103,6 @@ IDENTIFIER_STATE = np.dtype(
         ("innovation_variance", "f8"),  # what it should be [V^2]
         ("voltage_v", "f8"),  # predicted, before the sample corrected the state [V]
         ("surprise", "f8"),  # running mean of the squared normalised innovation
-        ("excitation", "f8", ELEMENTS),  # information on LN_R_S .. LN_TAU_TL in the last ``excitation_s``
         ("misfit", "f8"),  # size of the model's error as a variance, LEAST_MISFIT..1 of what the settings say
         ("correlated", "f8"),  # running mean of an innovation times the one before, as a share of its variance
         ("believed_v", "f8"),  # the innovation before, 0 when it was not believed [V]
@@ -143,6 +140,9 @@ IDENTIFIER_STATE = np.dtype(
     ],
     align=True,
 )
+
+IDENTIFIER_COUNTERS = ("gated", "asynchronous", "reopened", "doubted", "reset", "ignored")
+"""Fields of the state that count."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,6 @@ class Tuning:
     charge_error: float = 0.002
     """Std of SOC gained over the whole range: linearity of the current sensor."""
     excited_v: float = 0.003
-    excitation_s: float = 1200.0
     misfit_s: float = 200.0
     surprise_s: float = 20.0
     surprise_gain: float = 20.0
@@ -213,7 +212,6 @@ class Tuning:
     gate_std: float = 5.0
     gate_samples: int = 5
     gate_s: float = 5.0
-    gap_s: float = 60.0
     tau_ratio: float = 5.0
     """tau_tl is at least so many times tau_ts: 5 to 14 in cells known, and closer ones are one branch to any load."""
     r_span: float = 20.0
@@ -222,8 +220,6 @@ class Tuning:
     """Time constants stay within this factor of the configured ones."""
     current_offset_std_a: float = 0.0
     """Initial offset of the current sensor, std [A]; 0 leaves the state out."""
-    current_offset_drift_per_h: float = 0.0
-    """Std gained by the offset in an hour [A]."""
     capacity_std: float = 0.0
     """Initial relative error of the capacity, std; 0 leaves the state out."""
     bias_s: float = 36000.0
@@ -288,9 +284,7 @@ def identifier_settings(
     swing = (ocv_v[-1] - ocv_v[0]) ** 2
     p["variance_ceiling"] = [0.09, swing, swing, *[1.0] * 5, 1.0, swing, 4.0 * offset, 4.0 * capacity]
     r_s, r, tau = t.r_s_drift_per_h**2, t.r_drift_per_h**2, t.tau_drift_per_h**2
-    p["drift_per_s"] = (
-        np.array([0.0, 0.0, 0.0, r_s, r, tau, r, tau, 0.0, 0.0, t.current_offset_drift_per_h**2, 0.0]) / 3600.0
-    )
+    p["drift_per_s"] = np.array([0.0, 0.0, 0.0, r_s, r, tau, r, tau, 0.0, 0.0, 0.0, 0.0]) / 3600.0
     r_s, r, tau = t.r_s_drift_over_soc**2, t.r_drift_over_soc**2, t.tau_drift_over_soc**2
     p["drift_per_soc"] = [t.charge_error**2, 0.0, 0.0, r_s, r, tau, r, tau, 0.0, 0.0, 0.0, 0.0]
     p["noise_v2"] = noise_v**2

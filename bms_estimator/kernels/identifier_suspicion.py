@@ -11,6 +11,7 @@ import math
 
 from numba import njit
 
+from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.identifier_bias import significance
 from bms_estimator.kernels.identifier_state import LN_R_S, LN_R_TL, LN_R_TS
 from bms_estimator.kernels.state import Record
@@ -63,7 +64,7 @@ def watch(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float)
 @njit(cache=True)
 def watch_sign(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
     """How fast changes of the voltage go with those of the current: by -R_s when the sign is right."""
-    if dt_s > p.gap_s or s.slow_v == 0.0:  # a gap, or the first sample
+    if dt_s > UNMEASURED_S or s.slow_v == 0.0:  # a gap, or the first sample
         s.slow_v, s.slow_a = voltage_v, current_a
         return
     ohm = math.exp(p.mean[LN_R_S]) + math.exp(p.mean[LN_R_TS]) + math.exp(p.mean[LN_R_TL])

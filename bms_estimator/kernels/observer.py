@@ -10,6 +10,7 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.cell import c_tl, c_ts, ocv, r_s, r_tl, r_ts, soc_from_ocv
+from bms_estimator.kernels.charge import LONGEST_FLOW_S, held_current
 from bms_estimator.kernels.margins import delta
 from bms_estimator.kernels.nussbaum import nussbaum_gain
 from bms_estimator.kernels.state import Record
@@ -43,8 +44,8 @@ def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
 
 @njit(cache=True)
 def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
-    """SOC by coulomb counting (3.1), the current being straight between samples."""
-    charge_as = 0.5 * (s.current_a + current_a) * dt_s
+    """SOC by coulomb counting (3.1)."""
+    charge_as = held_current(dt_s, s.current_a, current_a) * min(dt_s, LONGEST_FLOW_S)
     s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
 
@@ -54,10 +55,8 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     """Advance the observer by one sample at the SOC it finds: Algorithm 1, lines 2 to 7."""
     e_o = ocv(s.soc, p.ocv_v, p.ocv_slope_v)
 
-    floor = max(s.delta_1, s.delta_2) + p.margin_guard
-    s.adapting = 1 if s.soc > floor else 0
-    soc = max(s.soc, floor)  # E14: below it a capacitance may be negative
-
+    s.adapting = 1 if s.soc > floor(s, p) else 0
+    soc = max(s.soc, floor(s, p))
     ohm_s = p.output_r_s * r_s(soc, s.a) if p.output_r_s > 0.0 else 0.0
     loop = max(1.0 + s.gain * ohm_s, SMALLEST_LOOP)
     e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop  # (3.15) with (3.14) or (4.1)
@@ -66,6 +65,7 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     if s.adapting:
         adapt(s, p, dt_s, e * e)
         update_margins(s)
+        soc = max(s.soc, floor(s, p))
 
     ohm_ts, ohm_tl = r_ts(soc, s.a), r_tl(soc, s.a)
     rate_e = states_step(s, s.gain / loop, voltage_v - e_o, ohm_ts * c_ts(soc, s.a), ohm_tl * c_tl(soc, s.a), dt_s)
@@ -97,6 +97,12 @@ def update_margins(s: Record) -> None:
     """delta1 (2.11) and delta2 (2.12) of the present parameters."""
     s.delta_1 = delta(s.a[8], s.a[9], s.a[7])
     s.delta_2 = delta(s.a[11], s.a[12], s.a[10])
+
+
+@njit(cache=True)
+def floor(s: Record, p: Record) -> float:
+    """SOC down to which the elements are evaluated: below it a capacitance may be negative (E14)."""
+    return max(s.delta_1, s.delta_2) + p.margin_guard
 
 
 @njit(cache=True)
@@ -138,7 +144,8 @@ def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) 
 
     Lost is lock when the error stays beyond ``lock_error_v`` for ``lock_time_s``, or gets there under a gain whose
     sign has turned, or when the gain overflows. It is back when the error has been within for ``lock_time_s``.
-    In lock, a gain that falls below ``rearm_gain`` starts again from k0 before its sign turns.
+    In lock, a gain that falls below ``rearm_gain`` starts again from k0 before its sign turns, where it is above
+    ``rearm_gain`` at k0: N1 to N3 begin at or near 0.
     """
     beyond = not abs(s.innovation_v) <= p.lock_error_v
     if beyond == (s.lock == 1):
@@ -156,7 +163,7 @@ def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) 
     elif expired:
         s.lock = 1
         s.unlocked_s = 0.0
-    elif s.gain < p.rearm_gain and not beyond:
+    elif s.gain < p.rearm_gain and not beyond and nussbaum_gain(p.k0, p) > p.rearm_gain:
         s.k = p.k0
         s.gain = nussbaum_gain(s.k, p)
         s.gain_rearms += 1

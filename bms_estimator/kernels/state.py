@@ -34,7 +34,7 @@ OBSERVER_SETTINGS = np.dtype(
         ("ml_decay_slope", "f8", TABLE_POINTS),
         ("k0", "f8"),  # k(t0) [V^2 s]
         ("gain_limit", "f8"),  # clamp of |N|
-        ("rearm_gain", "f8"),  # below this N, in lock, k starts again from k0; -inf: never
+        ("rearm_gain", "f8"),  # below this N, in lock, k starts again from k0; -inf, or above N(k0): never
         ("dead_zone_v", "f8"),  # e_dead of E2 [V]; 0 gives the printed (3.13)
         ("epsilon_v", "f8"),  # eps2 of Algorithm 1 [V]
         ("lock_error_v", "f8"),  # |e| beyond which the observer does not track [V]
@@ -76,7 +76,7 @@ OBSERVER_STATE = np.dtype(
         ("dropped_not_finite", "i8"),
         ("dropped_range", "i8"),
         ("dropped_repeated", "i8"),  # time stamp of the sample before
-        ("dropped_saturated", "i8"),  # voltage at the end of the converter's range
+        ("dropped_saturated", "i8"),  # voltage or current at the end of the converter's range
         ("time_steps_back", "i8"),  # the clock went back; the sample is taken, its step is not
         ("gaps", "i8"),  # steps longer than ``gap_s``
         ("lock_losses", "i8"),

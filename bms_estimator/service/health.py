@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bms_estimator.kernels.identifier_state import IDENTIFIER_COUNTERS
 from bms_estimator.model.estimate import Health
 from bms_estimator.model.suspect import Suspect
 from bms_estimator.service.clock import iso_utc
@@ -26,6 +27,11 @@ def sample_counters(state: np.void) -> dict[str, int]:
     """Samples accepted and dropped by kind, of a record of OBSERVER_STATE."""
     names = [name for name in state.dtype.names or () if name.startswith("dropped_") or name in _SAMPLE_COUNTERS]
     return {name: int(state[name]) for name in names}
+
+
+def identifier_counters(record: np.void) -> dict[str, int]:
+    """How often the identifier did not believe its input or itself, of a record of ESTIMATOR_STATE."""
+    return {name: int(record["identifier"][name]) for name in IDENTIFIER_COUNTERS}
 
 
 def suspicions(record: np.void) -> list[str]:
@@ -66,6 +72,7 @@ def health_report(
         sensor_message=sensor_message,
         line={name: int(count) for name, count in line.items() if name != "reconnects"},
         samples=sample_counters(state),
+        identifier=identifier_counters(record),
         suspects=suspicions(record),
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),

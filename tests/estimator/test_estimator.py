@@ -55,6 +55,7 @@ def test_saved_state_goes_on_where_it_was() -> None:
         (2.0, 400.0, 3.7, 0, Verdict.OUT_OF_RANGE, "dropped_range"),
         (1.0, 0.1, 3.7, 0, Verdict.REPEATED, "dropped_repeated"),
         (2.0, 0.1, 3.7, SampleStatus.VOLTAGE_SATURATED, Verdict.SATURATED, "dropped_saturated"),
+        (2.0, 0.1, 3.7, SampleStatus.CURRENT_SATURATED, Verdict.SATURATED, "dropped_saturated"),
     ],
 )
 def test_a_bad_sample_is_dropped_counted_and_changes_nothing_else(
@@ -83,6 +84,20 @@ def test_charge_flows_on_over_a_gap() -> None:
     estimator.step(10.0, 1.0, 3.7)
     assert estimator.state["gaps"][0] == 1
     assert estimator.state["soc"][0] == pytest.approx(0.5 - 10.0 / (3.0 * 3600))
+
+
+def test_over_an_unmeasured_hour_flows_what_both_ends_agree_on() -> None:
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    for time_s, current_a in ((0.0, 1.0), (1800.0, 0.2), (3600.0, -1.0)):
+        estimator.step(time_s, current_a, 3.7)
+    assert estimator.state["soc"][0] == pytest.approx(0.5 - 0.2 * 0.5 / 3.0)
+
+
+def test_one_wrong_time_stamp_does_not_empty_the_cell() -> None:
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    for time_s in (0.0, 1.0, 1e9, 2.0, 3.0):
+        estimator.step(time_s, 0.3, 3.7)
+    assert estimator.state["soc_coulomb"][0] == pytest.approx(0.4, abs=1e-3)  # an hour's charge
 
 
 def test_soc_starts_from_the_open_circuit_voltage_when_not_given() -> None:

@@ -8,6 +8,8 @@ from bms_estimator.estimator.learned import fitted_parameter, present_elements
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.kernels.element_map import ELEMENTS
+from bms_estimator.kernels.identification import CAPACITANCES, hand_over
+from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, LN_CAPACITY, LN_R_S
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
@@ -99,6 +101,41 @@ def test_the_configured_bounds_stay_the_guard(load) -> None:
     estimator.run(load[0])
     assert fitted_parameter(estimator.record[0], 3).value > 0.01
     assert estimator.state[0]["a"][3] == pytest.approx(0.01, rel=1e-3)
+
+
+def test_a_fit_that_is_negative_at_the_present_soc_is_not_handed_over(load) -> None:
+    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
+    estimator.run(load[0])
+    record, soc = estimator.record[0], float(estimator.state["soc"][0])
+    targets = record["observer"]["target"].copy()
+    estimator.settings_record["upper"][0, 7:13] = np.inf
+    record["fit"]["a"][7:13] = [2e5, 1.0, 1e3, 1e6, 1.0, 1e4]  # delta = 5.3 and 4.6
+    for e in CAPACITANCES:
+        hand_over(record, estimator.settings_record[0], e)
+    assert soc < 4.6
+    assert np.array_equal(record["observer"]["target"], targets)
+
+
+def test_time_that_nobody_measured_teaches_the_map_nothing(load) -> None:
+    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
+    estimator.run(load[0][:5000])
+    before = estimator.record[0]["map"]["weight"].copy()
+    last = load[0][5000:5001].copy()
+    last["time_s"] += 36000.0
+    estimator.run(last)
+    assert (estimator.record[0]["map"]["weight"] <= before).all()  # it forgets meanwhile
+
+
+def test_a_long_pause_leaves_what_was_learned_of_sensor_and_capacity(load) -> None:
+    on = IdentifierSettings(current_offset_std_a=0.05, capacity_std=0.05)
+    estimator = Estimator(TRUTH, identifier=on, initial_soc=1.0)
+    estimator.run(load[0])
+    x = estimator.record["identifier"]
+    learned = x["mean"][0, [CURRENT_OFFSET, LN_CAPACITY]].copy()
+    estimator.resume(86400.0)
+    assert np.array_equal(x["mean"][0, [CURRENT_OFFSET, LN_CAPACITY]], learned)
+    assert x["covariance"][0, LN_CAPACITY, LN_CAPACITY] < 0.05**2
+    assert x["mean"][0, LN_R_S] == estimator.settings_record["identifier"]["mean"][0, LN_R_S]
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2"])

@@ -12,7 +12,7 @@ from numba import njit
 
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import c_tl, c_ts, emf, r_s, r_tl, r_ts, simulate_cell
-from bms_estimator.kernels.identifier import identifier_init, identifier_step, suspects
+from bms_estimator.kernels.identifier import identifier_init, identifier_step
 from bms_estimator.kernels.identifier_state import IDENTIFIER_STATE, Tuning, identifier_settings
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.suspect import Suspect
@@ -115,7 +115,7 @@ def loop(state, settings, time_s, current_a, voltage_v, trace):
         row.innovation_v = s.innovation_v
         row.nis = s.innovation_v**2 / s.innovation_variance if s.innovation_variance > 0.0 else np.nan
         row.misfit = s.misfit
-        row.suspects = suspects(s)
+        row.suspects = s.suspects
         for k in range(5):
             row.ln[k] = s.mean[3 + k]
             row.ln_std[k] = math.sqrt(s.covariance[3 + k, 3 + k])

@@ -127,6 +127,28 @@ def test_gain_is_rearmed_before_its_sign_turns() -> None:
     assert trace["lock"].all()
 
 
+@pytest.mark.parametrize("nussbaum", ["k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"])
+def test_a_gain_that_begins_at_zero_is_left_to_rise(nussbaum: str) -> None:
+    cell = load_cell("chen_mora")
+    estimator = Estimator(cell, ObserverSettings(nussbaum=nussbaum), initial_soc=0.9)
+    estimator.run(discharge(cell, 0.1, 10.0, 0.275))
+    assert estimator.state["gain_rearms"][0] == 0
+    assert estimator.state["k"][0] > 0.0
+
+
+def test_a_capacitance_is_never_evaluated_where_it_is_negative() -> None:
+    """A limit that moves delta1 above the SOC within one sample: the margins move first, then the states."""
+    cell = load_cell("chen_mora")
+    estimator = Estimator(cell, initial_soc=0.5)
+    samples = discharge(cell, 0.02, 1.0, 0.0)
+    estimator.run(samples[:5])
+    estimator.state["target"][0, 7] = 1e3 * estimator.state["a"][0, 9]
+    trace = estimator.run(samples[5:])
+    assert trace["delta_1"].max() > 0.5
+    assert np.abs(trace["voltage_estimate_v"] - samples["voltage_v"][5:]).max() < 0.5
+    assert np.isfinite(trace["voltage_estimate_v"]).all()
+
+
 def test_adaptation_stops_above_the_margin_and_says_so() -> None:
     cell = load_cell("chen_mora")
     trace = Estimator(cell, initial_soc=1.0)
