@@ -40,13 +40,18 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
             publish_time=iso_utc(now_s), soc=None, a=_of_cell_file(a), elements={}, state_of_health={}
         )
     a[1:16] = state["a"][1:16]
-    parameters, elements = _of_cell_file(a), _configured_elements(estimator, a)
+    parameters, elements = _of_cell_file(a), _elements_of(estimator, a)
     health: dict[str, Parameter] = {}
     if estimator.identifying:
         record = estimator.record[0]
-        parameters |= {f"a{i}": _parameter(a[i], fitted_parameter(record, i), now_s) for i in range(1, 16)}
+        led = state["target"] != estimator.settings["target"][0]  # by the fit, away from where (3.18) leads by itself
+        for i in range(1, 16):
+            held = _of_source(parameters[f"a{i}"], led[i])
+            parameters[f"a{i}"] = _parameter(held, fitted_parameter(record, i), now_s)
         present = present_elements(record)
-        elements |= {name: _identified(one, elements[name], VALID_STD, now_s) for name, one in present.items()}
+        for e, (name, one) in enumerate(present.items()):
+            held = _of_source(elements[name], led[3 * e + 1 : 3 * e + 4].any())
+            elements[name] = _identified(one, held, VALID_STD, now_s)
         health = _state_of_health(estimator, present["r_s_ohm"], now_s)
     return ParameterReport(
         publish_time=iso_utc(now_s), soc=finite(state["soc"]), a=parameters, elements=elements, state_of_health=health
@@ -57,7 +62,7 @@ def _of_cell_file(a: np.ndarray) -> dict[str, Parameter]:
     return {f"a{i}": _configured(a[i], "the OCV is a table: (2.10) does not apply") for i in range(1, 22)}
 
 
-def _configured_elements(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
+def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
     """(2.5)-(2.10) at the present SOC; below delta1 (delta2) the capacitance is not positive and is left out."""
     state, ocv = estimator.state[0], estimator.settings[0]
     soc = float(state["soc"])
@@ -82,25 +87,29 @@ def _state_of_health(estimator: Estimator, r_s: Learned, now_s: float) -> dict[s
     return {"capacity": capacity, "r_s": _identified(ratio, _configured(1.0, ""), VALID_STD, now_s)}
 
 
-def _parameter(held: float, fit: Learned | None, now_s: float) -> Parameter:
+def _of_source(held: Parameter, led: np.bool_) -> Parameter:
+    """What the observer holds, said to be from the fit where that leads."""
+    return held.model_copy(update={"source": "identified" if led else "configured"})
+
+
+def _parameter(held: Parameter, fit: Learned | None, now_s: float) -> Parameter:
     """a_i as the observer holds it, with the error that the fit has."""
-    configured = _configured(held, "")
-    if fit is None:
-        return configured
-    return _identified(fit, configured, VALID_FIT_STD, now_s).model_copy(update={"value": finite(held)})
+    if fit is None or held.source == "configured":
+        return held
+    return _identified(fit, held, VALID_FIT_STD, now_s).model_copy(update={"value": held.value})
 
 
-def _identified(learned: Learned, configured: Parameter, limit: float, now_s: float) -> Parameter:
-    """What was learned where that is known well enough, else the configured value and how far learning has come."""
+def _identified(learned: Learned, held: Parameter, limit: float, now_s: float) -> Parameter:
+    """What was learned where that is known well enough, else what the observer holds and how far learning has come."""
     if learned.relative_std < limit:
         updated = iso_utc(max(now_s - learned.unlearned_s, 0.0))
         return Parameter(
             value=finite(learned.value), std=finite(learned.std), valid=True, source="identified", updated=updated
         )
-    if configured.value is None:
-        return configured
-    why = f"configured value: identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
-    return configured.model_copy(update={"reason": why})
+    if held.value is None:
+        return held
+    why = f"identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
+    return held.model_copy(update={"reason": why})
 
 
 def _configured(value: float, why_missing: str) -> Parameter:

@@ -11,7 +11,8 @@ from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import IdentifierSettings
-from bms_estimator.service.health import suspicions
+from bms_estimator.service.checkpoint import resume
+from bms_estimator.service.health import identifier_counters, suspicions
 from bms_estimator.service.parameters import parameter_report
 from bms_estimator.service.remaining import remaining_charge
 
@@ -87,6 +88,22 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert "taken as declared" in (health["capacity"].reason or "")
     assert report.a["a15"].std is not None
     assert report.elements["e_o_v"].source == "configured"
+    a1, target = report.a["a1"], float(estimator.state["target"][0, 1])
+    assert target != estimator.settings["target"][0, 1]
+    assert (a1.value, a1.source, a1.valid) == (pytest.approx(target, rel=1e-3), "identified", False)  # SOC was swept little
+    assert "identified to" in (a1.reason or "")
+    assert "configured" not in (a1.reason or "")
+
+
+def test_what_the_identifier_did_not_believe_is_counted_since_the_start() -> None:
+    estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
+    block = pulses(0.2, 0.1)
+    block["voltage_v"][3000:3003] = 2.9
+    estimator.run(block)
+    assert identifier_counters(estimator.record[0])["gated"] == 3
+    resume(estimator, estimator.record.copy(), 1.0)
+    assert set(identifier_counters(estimator.record[0]).values()) == {0}
+    assert suspicions(estimator.record[0]) == []
 
 
 def test_a_current_of_the_wrong_sign_is_named() -> None:
