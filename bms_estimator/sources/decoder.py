@@ -29,6 +29,9 @@ class Decoder(Protocol):
     def fault(self) -> FrameFault | None:
         """What is wrong with the line as a whole."""
 
+    def forget_hello(self) -> None:
+        """There is none until the next comes; samples keep the scaling of the last."""
+
     def take_acks(self) -> list[Ack]:
         """Answers to commands that came since the last call."""
 

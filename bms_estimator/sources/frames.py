@@ -136,6 +136,10 @@ class FrameDecoder:
             return FrameFault.NO_HELLO
         return None
 
+    def forget_hello(self) -> None:
+        """There is none until the next comes; samples keep the scaling of the last."""
+        self._hello = None
+
     def take_acks(self) -> list[Ack]:
         """Answers to commands that came since the last call."""
         acks, self._acks = self._acks, []

@@ -17,7 +17,14 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.decoder import make_decoder
 from bms_estimator.sources.ports import NoPortError, holder, resolve_port
-from bms_estimator.sources.protocol import AckResult, MessageType, hello_command, set_rate_command, zero_current_command
+from bms_estimator.sources.protocol import (
+    Ack,
+    AckResult,
+    MessageType,
+    hello_command,
+    set_rate_command,
+    zero_current_command,
+)
 
 FIRST_RETRY_S = 0.5
 """Before a missing or lost port is tried again; doubles with each attempt [s]."""
@@ -81,7 +88,8 @@ class SerialBoard:
         self._opened = 0
         self._logged_s = -math.inf
         self._logged_faults = 0
-        self._zeroed: asyncio.Future[AckResult] | None = None
+        self._zeroed: asyncio.Future[Ack] | None = None
+        self._decoded = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -136,11 +144,14 @@ class SerialBoard:
         block = self._decoder.feed(arrival_s, data)
         for ack in self._decoder.take_acks():
             if ack.command == MessageType.COMMAND_ZERO_CURRENT and self._zeroed and not self._zeroed.done():
-                self._zeroed.set_result(ack.result)
+                self._zeroed.set_result(ack)
+        self._decoded.set()
         return block
 
     async def current_zero(self) -> None:
         """Have the board take the present current as zero, for good: nothing may flow meanwhile.
+
+        Samples after it are decoded with the new zero. Somebody must iterate over the blocks meanwhile.
 
         Raises:
             UserError: The board is not connected, does not answer, or refuses.
@@ -152,11 +163,22 @@ class SerialBoard:
         self._zeroed = asyncio.get_running_loop().create_future()
         self._send(zero_current_command())
         try:
-            result = await asyncio.wait_for(self._zeroed, ZERO_S)
+            async with asyncio.timeout(ZERO_S):
+                ack = await self._zeroed
+                if ack.result == AckResult.OK:
+                    await self._learn_zero(ack.value)
         except TimeoutError:
             raise UserError(f"the board has not answered within {ZERO_S:.0f} s") from None
-        if result != AckResult.OK:
-            raise UserError(f"the board refuses: {result.name.lower().replace('_', ' ')}; is the sensor connected?")
+        if ack.result != AckResult.OK:
+            raise UserError(f"the board refuses: {ack.result.name.lower().replace('_', ' ')}; is the sensor connected?")
+
+    async def _learn_zero(self, zero_ppm: int) -> None:
+        """Until the hello that holds the board's new zero has come: the decoder knows no other way to it."""
+        self._decoder.forget_hello()  # one that is lost is asked for again
+        self._send(hello_command())
+        while self._decoder.hello is None or self._decoder.hello.current_zero_ppm != zero_ppm:
+            self._decoded.clear()
+            await self._decoded.wait()
 
     async def _stay_open(self) -> None:
         """Open, attend until lost, and again after a pause that doubles."""

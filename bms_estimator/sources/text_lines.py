@@ -57,6 +57,9 @@ class TextDecoder:
             return FrameFault.BINARY if self._binary else FrameFault.WRONG_BAUD
         return None
 
+    def forget_hello(self) -> None:
+        """Text has none."""
+
     def take_acks(self) -> list[Ack]:
         """Text boards take no commands."""
         return []

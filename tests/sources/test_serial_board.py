@@ -1,7 +1,8 @@
 import asyncio
+import contextlib
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.sources.virtual_board import VirtualBoard
+from bms_estimator.sources.virtual_converter import Reading
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
@@ -39,6 +42,27 @@ async def take(source: SerialBoard, samples: int) -> SampleBlock:
 async def drain(source: SerialBoard) -> None:
     async for _ in source:
         pass
+
+
+@contextlib.asynccontextmanager
+async def at_work(*tasks: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    """All of them go on beside the test."""
+    running = [asyncio.create_task(task) for task in tasks]
+    try:
+        yield
+    finally:
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+
+
+async def keep(source: SerialBoard, blocks: list[SampleBlock]) -> None:
+    async for block in source:
+        blocks.append(block.copy())  # noqa: PERF401 - others read the list meanwhile
+
+
+def count(blocks: list[SampleBlock]) -> int:
+    return sum(block.size for block in blocks)
 
 
 async def test_a_missing_port_is_waited_for_and_said(line: Line) -> None:
@@ -134,3 +158,18 @@ async def test_a_text_board_takes_no_commands(line: Line) -> None:
     async with board(line) as source:
         with pytest.raises(UserError, match="takes no commands"):
             await source.current_zero()
+
+
+async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> None:
+    blocks: list[SampleBlock] = []
+    with VirtualBoard(lambda _: Reading(0.5, 22.2, 25.0)) as virtual:
+        async with (
+            SerialBoard(SensorSettings(port=virtual.path)) as source,
+            at_work(virtual.run(), keep(source, blocks)),
+        ):
+            await until(lambda: count(blocks) >= 20)
+            assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.5, abs=0.03)
+            await source.current_zero()
+            blocks.clear()
+            await until(lambda: count(blocks) >= 20)
+            assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.0, abs=0.03)
