@@ -42,6 +42,9 @@ ELEMENT_FIT = np.dtype(
         ("a", "f8", PARAMETERS),  # a1..a15 at their own index
         ("std", "f8", PARAMETERS),  # standard errors, NaN where nothing was learned
         ("bins", "i8", ELEMENTS),  # bins that the element was seen in
+        ("soc", "f8", BINS),  # what the last fit was made to: SOC,
+        ("value", "f8", BINS),  # the element there
+        ("weight", "f8", BINS),  # and one over its variance
     ],
     align=True,
 )
@@ -84,7 +87,7 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
         prior: Configured a1..a15 at index 1..15: stands in, weakly, where the map is empty.
         fit: Record of ELEMENT_FIT, written.
     """
-    x, y, w = np.empty(BINS), np.empty(BINS), np.empty(BINS)
+    x, y, w = fit.soc, fit.value, fit.weight
     base = 3 * e + 1
     sign = -1.0 if e in (2, 3) else 1.0  # capacitances rise with SOC: (2.7), (2.8)
     fit.bins[e] = _observations(m, e, prior, base, sign, x, y, w)
@@ -132,13 +135,15 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
 def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -> float:
     """The exponent of least cost: a logarithmic search, then golden sections around its best point."""
     ratio = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
-    best, least = math.log(start), _linear_part(start, sign, x, y, w)[2]
+    lowest, highest = math.log(EXPONENT_MIN), math.log(EXPONENT_MAX)
+    best = min(max(math.log(start), lowest), highest)
+    least = _linear_part(math.exp(best), sign, x, y, w)[2]
     for j in range(SEARCH_POINTS):
-        candidate = math.log(EXPONENT_MIN) + ratio * j
+        candidate = lowest + ratio * j
         cost = _linear_part(math.exp(candidate), sign, x, y, w)[2]
         if cost < least:
             best, least = candidate, cost
-    low, high = best - ratio, best + ratio
+    low, high = max(best - ratio, lowest), min(best + ratio, highest)
     golden = 0.5 * (math.sqrt(5.0) - 1.0)
     left, right = high - golden * (high - low), low + golden * (high - low)
     cost_left = _linear_part(math.exp(left), sign, x, y, w)[2]
@@ -181,20 +186,32 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
 
 @njit(cache=True)
 def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats) -> None:
-    """Square roots of the diagonal of (J' W J)^-1."""
-    amplitude, exponent = fit.a[base], fit.a[base + 1]
-    h = np.zeros((3, 3))
-    j = np.empty(3)
+    """Square roots of the diagonal of (J' W J)^-1, by elimination; NaN where that matrix is singular."""
+    amplitude, exponent, offset = fit.a[base], fit.a[base + 1], fit.a[base + 2]
+    # a parameter that the map says nothing of is known to a factor e^3, not less
+    h00, h11, h22 = (3.0 * amplitude) ** -2, (3.0 * exponent) ** -2, (3.0 * offset) ** -2
+    h01 = h02 = h12 = 0.0
     for b in range(BINS):
-        j[0] = sign * math.exp(-exponent * x[b])
-        j[1] = -x[b] * amplitude * j[0]
-        j[2] = 1.0
-        for p in range(3):
-            for q in range(3):
-                h[p, q] += w[b] * j[p] * j[q]
-    for p in range(3):  # a parameter that the map says nothing of is known to a factor e^3, not less
-        value = fit.a[base + p]
-        h[p, p] += 1.0 / (3.0 * value) ** 2
-    inverse = np.linalg.inv(h)
-    for p in range(3):
-        fit.std[base + p] = math.sqrt(max(inverse[p, p], 0.0))
+        by_amplitude = sign * math.exp(-exponent * x[b])
+        by_exponent = -x[b] * amplitude * by_amplitude
+        h00 += w[b] * by_amplitude * by_amplitude
+        h01 += w[b] * by_amplitude * by_exponent
+        h02 += w[b] * by_amplitude
+        h11 += w[b] * by_exponent * by_exponent
+        h12 += w[b] * by_exponent
+        h22 += w[b]
+    for i in range(base, base + 3):
+        fit.std[i] = math.nan
+    if not h00 > 0.0:
+        return
+    l10, l20 = h01 / h00, h02 / h00
+    d1 = h11 - l10 * h01
+    if not d1 > 0.0:
+        return
+    l21 = (h12 - l10 * h02) / d1
+    d2 = h22 - l20 * h02 - l21 * l21 * d1
+    if not d2 > 0.0:
+        return
+    fit.std[base] = math.sqrt(1.0 / h00 + l10 * l10 / d1 + (l10 * l21 - l20) ** 2 / d2)
+    fit.std[base + 1] = math.sqrt(1.0 / d1 + l21 * l21 / d2)
+    fit.std[base + 2] = math.sqrt(1.0 / d2)

@@ -4,9 +4,19 @@ import math
 
 import numpy as np
 import pytest
+from numba.core.runtime import _nrt_python, rtsys
 
 from bms_estimator.kernels import cell
-from bms_estimator.kernels.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS, age, fit_element, learn
+from bms_estimator.kernels.element_map import (
+    ELEMENT_FIT,
+    ELEMENT_MAP,
+    ELEMENTS,
+    EXPONENT_MAX,
+    EXPONENT_MIN,
+    age,
+    fit_element,
+    learn,
+)
 from bms_estimator.model.cell import load_cell
 
 TRUTH = load_cell("chen_mora").a
@@ -53,6 +63,35 @@ def test_empty_map_leaves_the_configured_values_and_says_nothing_of_their_error(
 def test_exponents_are_uncertain_when_only_high_soc_was_seen() -> None:
     narrow, wide = fitted(filled(0.6, 1.0), TRUTH), fitted(filled(0.02, 1.0), TRUTH)
     assert narrow["std"][2] > 3 * wide["std"][2]
+
+
+@pytest.mark.parametrize(("exponent", "end"), [(1e4, EXPONENT_MAX), (1e-3, EXPONENT_MIN)])
+def test_an_exponent_beyond_the_searched_range_is_taken_at_its_end(exponent: float, end: float) -> None:
+    prior = TRUTH.copy()
+    prior[[2, 5, 8, 11, 14]] = exponent
+    fit = fitted(filled(0.6, 0.61), prior)  # nothing seen where the exponent shows: the configured one draws
+    found = fit["a"][[2, 5, 8, 11, 14]]
+    assert (found >= EXPONENT_MIN).all()
+    assert (found <= EXPONENT_MAX).all()
+    assert np.abs(np.log(found / end)).min() < 0.05
+
+
+def test_a_singular_fit_says_nothing_of_its_error() -> None:
+    table = np.zeros(1, dtype=ELEMENT_MAP)
+    learn(table[0], 0, 0.5, -3.0, 0.1**2, 10.0)
+    table["moment"][0, 0, 12] = math.nan
+    fit = fitted(table, TRUTH)
+    assert np.isnan(fit["std"][1:4]).all()
+
+
+def test_a_fit_takes_no_memory() -> None:
+    table, fit = filled(0.02, 1.0), np.zeros(1, dtype=ELEMENT_FIT)
+    fit_element(table[0], 0, TRUTH, fit[0])
+    _nrt_python.memsys_enable_stats()
+    before = rtsys.get_allocation_stats().alloc
+    for _ in range(100):
+        fit_element(table[0], 0, TRUTH, fit[0])
+    assert rtsys.get_allocation_stats().alloc - before <= 100  # one a call, to hand the prior over from Python
 
 
 def test_a_value_that_is_not_known_adds_nothing() -> None:
