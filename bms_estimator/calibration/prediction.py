@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.relaxation import soc_by_counting, without_glitches
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.cell import OCV_POINTS, c_tl, c_ts, r_s, r_tl, r_ts, simulate_cell
+from bms_estimator.kernels.cell import c_tl, c_ts, ocv, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.kernels.margins import delta
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 Floats = NDArray[np.float64]
@@ -73,13 +74,19 @@ def predict(
         initial_soc: SOC 0..1 at the first sample.
         a: a1..a15 at index 1..15, to take in place of the cell's.
         lowest_soc: The prediction ends where SOC falls below it; the model's delta1, delta2 end it as well.
+
+    Raises:
+        UserError: No sample is good, or SOC is too low from the first one on.
     """
-    good = without_glitches(samples, f"capture for {cell.cell.name}")
+    name = f"capture for {cell.cell.name}"
+    good = without_glitches(samples, name)
     elements = np.zeros(22)
     elements[1:16] = (cell.a if a is None else a)[1:16]
     floor = max(lowest_soc, _unstable_below(elements))
     soc = soc_by_counting(good, cell.cell.capacity_ah, initial_soc)
     below = np.flatnonzero(soc < floor)
+    if below.size and below[0] == 0:
+        raise UserError(f"{name}: SOC is {soc[0]:.3f} at the first sample, and the prediction ends below {floor:.3f}")
     good = good[: below[0] if below.size else good.size]
     time_s, current_a = (np.ascontiguousarray(good[name]) for name in ("time_s", "current_a"))
     capacity_as = cell.cell.capacity_ah * 3600.0
@@ -99,18 +106,9 @@ def predict(
 
 
 def open_circuit(cell: CellModel, soc: Floats) -> Floats:
-    """E_o(SOC) of the cell [V], linear on the kernel's grid refined tenfold."""
-    grid_v, slope_v = ocv_grid(cell)
-    nodes = np.linspace(0.0, 1.0, OCV_POINTS)
-    i = np.clip((np.asarray(soc) * (OCV_POINTS - 1)).astype(int), 0, OCV_POINTS - 2)
-    step = nodes[1]
-    t = np.clip((soc - nodes[i]) / step, 0.0, 1.0)
-    w = t * t * (3.0 - 2.0 * t)
-    bend = t * (1.0 - t) * step
-    return np.asarray(
-        grid_v[i] + w * (grid_v[i + 1] - grid_v[i]) + bend * ((1.0 - t) * slope_v[i] - t * slope_v[i + 1]),
-        dtype=np.float64,
-    )
+    """E_o(SOC) of the cell [V], on the kernels' curve."""
+    grid = ocv_grid(cell)
+    return np.array([ocv(x, *grid) for x in soc])
 
 
 def static_elements(a: Floats, soc: float) -> Floats:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from bms_estimator.calibration import elements
 from bms_estimator.calibration.held_current import Load
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.cell import ocv
-from bms_estimator.kernels.sensitivity import ocv_slope, sensitivities, spline_weights, whiten
+from bms_estimator.kernels.cell import ocv_and_slope
+from bms_estimator.kernels.sensitivity import sensitivities, spline_weights, whiten
 from bms_estimator.model.cell import CellModel
 
 Floats = NDArray[np.float64]
@@ -114,10 +114,10 @@ class Solution:
 
 @dataclass(frozen=True)
 class _Cost:
-    """Cost at a point; gradient and Gauss-Newton matrix where they were asked for."""
+    """Cost at a point; its negative gradient and the Gauss-Newton matrix where they were asked for."""
 
     value: float
-    gradient: Floats
+    descent: Floats
     normal: Floats
 
 
@@ -223,7 +223,7 @@ class Problem:
         """Negative log likelihood and prior."""
         off = z - self._centre
         pull = self._prior @ off
-        value, gradient, normal = 0.5 * float(off @ pull), -pull, self._prior.copy()
+        value, descent, normal = 0.5 * float(off @ pull), -pull, self._prior.copy()
         for k in range(len(self.loads)):
             rows = self._prediction_errors(z, k, jacobian=jacobian) / scale_v
             size = np.abs(rows[:, 0])
@@ -232,13 +232,13 @@ class Problem:
                 rows *= np.sqrt(HUBER / np.maximum(size, HUBER))[:, None]
                 products = rows.T @ rows
                 places = self.layout.of(k)
-                gradient[places] += products[1:, 0]
+                descent[places] += products[1:, 0]
                 normal[np.ix_(places, places)] += products[1:, 1:]
             rest, slope = self._first_rest(z, k)
             value += 0.5 * rest**2
-            gradient += rest * slope
+            descent += rest * slope
             normal += np.outer(slope, slope)
-        return _Cost(value, gradient, normal)
+        return _Cost(value, descent, normal)
 
     def _first_rest(self, z: Floats, capture: int) -> tuple[float, Floats]:
         """First rest's voltage less the OCV there, in standard deviations, and the OCV's derivatives."""
@@ -251,9 +251,10 @@ class Problem:
         first = layout.ocv.start + spline_weights(soc, COEFFICIENTS, w)
         near = z[first : first + 4]
         slope[first : first + 4] = w[:4]
-        slope[layout.soc.start + capture] = ocv_slope(soc, *self._grid) + w[4:] @ near
+        e_o, bare_slope = ocv_and_slope(soc, *self._grid)
+        slope[layout.soc.start + capture] = bare_slope + w[4:] @ near
         std_v = REST_STD_V * self._series
-        return float(load.start_v - ocv(soc, *self._grid) - w[:4] @ near) / std_v, slope / std_v
+        return float(load.start_v - e_o - w[:4] @ near) / std_v, slope / std_v
 
     def _search(self, z: Floats, scale_v: float) -> tuple[Floats, int]:
         """Levenberg-Marquardt with limits on theta."""
@@ -279,12 +280,12 @@ class Problem:
     def _step(self, z: Floats, here: _Cost, damping: float) -> Floats:
         """The next point: theta within its limits and within reach of the last."""
         held = np.zeros(z.size, dtype=np.bool_)
-        theta, downhill = z[self.layout.theta], here.gradient[self.layout.theta]
+        theta, downhill = z[self.layout.theta], here.descent[self.layout.theta]
         held[self.layout.theta] = ((theta <= self._lower) & (downhill < 0)) | ((theta >= self._upper) & (downhill > 0))
         free = ~held
         matrix = here.normal[np.ix_(free, free)]
         step = np.zeros(z.size)
-        step[free] = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), here.gradient[free])
+        step[free] = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), here.descent[free])
         reach = np.full(elements.SIZE, LONGEST_LOG_STEP)
         reach[list(elements.DELTAS)] = LONGEST_DELTA_STEP
         trial = z + step

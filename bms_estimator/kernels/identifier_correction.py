@@ -7,7 +7,7 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.cell import Floats
+from bms_estimator.kernels.cell import ocv_and_slope
 from bms_estimator.kernels.identifier_bias import correct_biases
 from bms_estimator.kernels.identifier_gate import reopen
 from bms_estimator.kernels.identifier_misfit import learn_misfit
@@ -34,24 +34,6 @@ LARGE_SOC_STEP = 0.01
 """A correction of the SOC beyond this is iterated: the OCV's slope changes."""
 CURVED_SOC_VARIANCE = 0.01**2
 """Below this variance of the SOC the OCV is straight enough."""
-
-
-@njit(cache=True)
-def ocv_and_slope(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> tuple[float, float]:
-    """Open-circuit voltage [V] and dOCV/dSOC [V] of the grid (cubic Hermite); beyond 0..1 the end slope goes on."""
-    last = ocv_v.shape[0] - 1
-    if soc <= 0.0:
-        return ocv_v[0] + soc * ocv_slope_v[0], ocv_slope_v[0]
-    if soc >= 1.0:
-        return ocv_v[last] + (soc - 1.0) * ocv_slope_v[last], ocv_slope_v[last]
-    position = soc * last
-    j = min(int(position), last - 1)
-    t = position - j
-    rise = ocv_v[j + 1] - ocv_v[j]
-    left, right = ocv_slope_v[j], ocv_slope_v[j + 1]
-    value = ocv_v[j] + t * t * (3.0 - 2.0 * t) * rise + t * (1.0 - t) / last * ((1.0 - t) * left - t * right)
-    slope = 6.0 * t * (1.0 - t) * rise * last + (1.0 - 4.0 * t + 3.0 * t * t) * left + (3.0 * t * t - 2.0 * t) * right
-    return value, slope
 
 
 @njit(cache=True)
@@ -175,13 +157,18 @@ def branch_second_order(s: Record) -> float:
 
 @njit(cache=True)
 def absorb(s: Record, p: Record, innovation_v: float, total_v2: float) -> None:
-    """Correct mean and covariance along ``s.projected``, Joseph form, both triangles from one."""
+    """Correct mean and covariance for g = P h in ``s.projected`` and the gain K = g / S, both triangles from one.
+
+    Joseph's form (I - K h') P (I - K h')' + K R K', multiplied out with S = h' P h + R: P - K g' - g K' + S K K'.
+    So the rounding of K changes P in second order only. Multiplied out it is no sum of positive terms any more: that the
+    variances stay positive is seen to by ``constrain``.
+    """
     x, cov, g, gain, n = s.mean, s.covariance, s.projected, s.gain, p.active
     for j in range(n):
         gain[j] = g[j] / total_v2
     for j in range(n):
         x[j] += gain[j] * innovation_v
-        rest = g[j] - total_v2 * gain[j]
+        rest = g[j] - total_v2 * gain[j]  # 0 but for the rounding of K
         for k in range(j, n):
             cov[j, k] -= gain[j] * g[k] + gain[k] * rest
             cov[k, j] = cov[j, k]

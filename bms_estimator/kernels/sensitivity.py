@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import ocv
+from bms_estimator.kernels.cell import ocv_and_slope
 
 Floats = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ def sensitivities(
         extra_ohm: Series resistance of this capture on top of R_s [ohm].
         capacity_as: Capacity C_c [A s].
         x: a1..a15 at index 1..15.
-        ocv_v: Open-circuit voltage on the grid of ``kernels.cell.ocv`` [V].
+        ocv_v: Open-circuit voltage on the grid of ``kernels.cell.ocv_and_slope`` [V].
         ocv_slope_v: Its slope on the same grid [V].
         correction_v: Shape (m,), coefficients of the B-spline added to it [V].
         voltage_v: Shape (n,), overwritten [V].
@@ -152,7 +152,8 @@ def sensitivities(
             added += w[k] * correction_v[first + k]
         es = math.exp(-x[14] * max(soc, 0.0))
         r_s = x[13] * es + x[15] + extra_ohm  # (2.9)
-        voltage_v[j] = ocv(soc, ocv_v, ocv_slope_v) + added - v_ts - v_tl - i * r_s  # (2.4)
+        e_o, slope = ocv_and_slope(soc, ocv_v, ocv_slope_v)
+        voltage_v[j] = e_o + added - v_ts - v_tl - i * r_s  # (2.4)
         if wanted > 0.0:
             row = jacobian[j]
             row[:] = 0.0
@@ -164,29 +165,11 @@ def sensitivities(
             row[12] = -i * es
             row[13] = i * x[13] * max(soc, 0.0) * es
             row[14] = -i
-            slope = ocv_slope(soc, ocv_v, ocv_slope_v)
             for k in range(4):
                 row[ELEMENTS + first + k] = w[k]
                 slope += w[4 + k] * correction_v[first + k]
             row[ELEMENTS + m] = slope + (i * x[13] * x[14] * es if soc > 0.0 else 0.0) - d_ts[6] - d_tl[6]
             row[ELEMENTS + m + 1] = -i
-
-
-@njit(cache=True)
-def ocv_slope(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
-    """DOCV/dSOC [V] of ``kernels.cell.ocv``."""
-    last = ocv_v.shape[0] - 1
-    if soc <= 0.0:
-        return ocv_slope_v[0]
-    if soc >= 1.0:
-        return ocv_slope_v[last]
-    i = min(int(soc * last), last - 1)
-    t = soc * last - i
-    return (
-        6.0 * t * (1.0 - t) * (ocv_v[i + 1] - ocv_v[i]) * last
-        + (1.0 - t) * (1.0 - 3.0 * t) * ocv_slope_v[i]
-        + t * (3.0 * t - 2.0) * ocv_slope_v[i + 1]
-    )
 
 
 @njit(cache=True)

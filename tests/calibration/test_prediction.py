@@ -11,6 +11,7 @@ from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import c_tl, c_ts, ocv, r_s, r_tl, r_ts
 from bms_estimator.kernels.margins import delta
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
 from bms_estimator.reports.simulation import discharge
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps, wrong_start
 
@@ -88,6 +89,14 @@ def test_prediction_ends_before_a_capacitance_turns_negative():
     assert predict(CELL, samples, 1.0, lowest_soc=0.2).soc[-1] == pytest.approx(0.2, abs=1e-3)
 
 
+@pytest.mark.parametrize(("lowest_soc", "floor"), [(0.02, "0.020"), (0.0, "0.012")])  # delta2 is 0.011, E13
+def test_a_start_below_the_lowest_soc_is_refused(lowest_soc, floor):
+    samples = discharge(CELL, 0.275, 1.0)
+    message = rf"{CELL.cell.name}: SOC is 0\.010 at the first sample, and the prediction ends below {floor}"
+    with pytest.raises(UserError, match=message):
+        predict(CELL, samples, 0.01, lowest_soc=lowest_soc)
+
+
 def test_glitches_and_lost_samples_are_left_out():
     samples = capture(LOADS["variable steps"])
     samples["voltage_v"][[100, 5000, 9000]] = 0.0
@@ -98,7 +107,7 @@ def test_glitches_and_lost_samples_are_left_out():
 
 
 def test_open_circuit_is_the_kernels_curve():
-    soc = np.random.default_rng(0).uniform(0.0, 1.0, 500)
+    soc = np.random.default_rng(0).uniform(-0.02, 1.02, 500)
     grid = ocv_grid(TRUTH)
     assert open_circuit(TRUTH, soc) == pytest.approx([ocv(x, *grid) for x in soc], abs=1e-9)
 

@@ -3,7 +3,7 @@ import pytest
 
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv, simulate_cell
-from bms_estimator.kernels.sensitivity import ocv_slope, sensitivities, spline_weights, whiten
+from bms_estimator.kernels.sensitivity import sensitivities, spline_weights, whiten
 from bms_estimator.model.cell import load_cell
 
 CELL = load_cell("ncr18650")
@@ -76,13 +76,6 @@ def test_spline_weights_add_up_to_one_and_their_slopes_to_none(soc):
     assert 0 <= first <= COEFFICIENTS - 4
     assert w[:4].sum() == pytest.approx(1.0)
     assert w[4:].sum() == pytest.approx(0.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("soc", [-0.1, 0.0013, 0.42371, 0.9991, 1.1])
-def test_slope_of_the_open_circuit_voltage(soc):
-    h = 1e-6
-    expected = (ocv(soc + h, *GRID) - ocv(soc - h, *GRID)) / (2.0 * h)
-    assert ocv_slope(soc, *GRID) == pytest.approx(expected, rel=1e-6)
 
 
 def test_whitening_makes_coloured_noise_white():
