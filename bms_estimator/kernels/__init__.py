@@ -1,7 +1,8 @@
 """Pure numerical kernels (numba): no I/O, no clock, no Python objects.
 
-numba's disk cache notices a change in a function's own file only, not in the files of the functions it calls, and
-would go on running the old ones. So the cache lives in a folder named by the content of all kernels.
+numba's disk cache notices a change in a function's own file only, not in the files of the functions it calls, nor in
+those of the constants it compiles in, and would go on running the old ones. So the cache lives in a folder named by the
+content of all of them.
 """
 
 import hashlib
@@ -11,11 +12,15 @@ from pathlib import Path
 
 import numba
 
+_HERE = Path(__file__).parent
+COMPILED_IN = (*sorted(_HERE.glob("*.py")), _HERE.parent / "model" / "suspect.py")
+"""Files that compiled code is made of."""
+
 
 def _cache_folder() -> Path:
     """Where compiled kernels go: NUMBA_CACHE_DIR, systemd's CacheDirectory, or the user's cache."""
     digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    for source in COMPILED_IN:
         digest.update(source.read_bytes())
     home_cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
     candidates = [
