@@ -101,7 +101,7 @@ def adaptive_run(
         t_unst_s: As above.
 
     Raises:
-        UserError: No sample was accepted.
+        UserError: No sample was accepted, or t_int or t_unst lies outside the run.
     """
     edges = np.unique(
         np.r_[
@@ -119,7 +119,8 @@ def adaptive_run(
             continue
         for name in names:
             columns[name].append(float(rows[name][-1]))
-        error_v.append(float(rows["innovation_v"][int(np.argmax(np.abs(rows["innovation_v"])))]))
+        tracking_v = rows["tracking_error_v"]
+        error_v.append(float(tracking_v[int(np.argmax(np.abs(tracking_v)))]))
         a.append(estimator.state["a"][0].copy())
     if not a:
         raise UserError(f"none of {samples.size} samples is within the cell's limits")

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.errors import UserError
+
 Floats = NDArray[np.float64]
 
 SETTLED_SHARE = 0.99
@@ -60,9 +62,15 @@ def settled(
         epsilon_v: What counts as settled [V].
         t_int_s: Given by the user instead [s].
         t_unst_s: Given by the user instead [s].
+
+    Raises:
+        UserError: One that is given lies outside the run, or t_int after t_unst.
     """
+    if t_unst_s is not None:
+        _check_inside("t_unst", t_unst_s, time_s[0], time_s[-1])
     end_s, end_reason = _unstable_from(time_s, voltage_v, margin) if t_unst_s is None else (t_unst_s, "given")
     if t_int_s is not None:
+        _check_inside("t_int", t_int_s, time_s[0], end_s)
         return Settled(t_int_s, end_s, "given", end_reason)
     inside = time_s <= end_s
     beyond = np.abs(error_v[inside]) > epsilon_v
@@ -79,6 +87,12 @@ def settled(
         return Settled(float(time_s[inside][a_from]), end_s, reason, end_reason)
     reason = f"99 % of the errors from here on are within {1e3 * epsilon_v:.2f} mV"
     return Settled(float(time_s[inside][error_from]), end_s, reason, end_reason)
+
+
+def _check_inside(name: str, given_s: float, first_s: float, last_s: float) -> None:
+    """Refuse a time that leaves (3.19) nothing to average."""
+    if not first_s <= given_s <= last_s:
+        raise UserError(f"{name} = {given_s:g} s: must lie within {first_s:g} to {last_s:g} s of the run")
 
 
 def _settled_from(a: Floats) -> int:

@@ -10,7 +10,7 @@ from bms_estimator.kernels.cell import ocv, r_s
 from bms_estimator.kernels.margins import delta
 from bms_estimator.model.cell import Bounds, load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import ObserverSettings
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 from bms_estimator.reports.simulation import discharge, with_bounds
 
 CELL = load_cell("chen_mora")
@@ -154,6 +154,16 @@ def test_algorithm_1_says_why_it_did_not_converge():
     assert outcome(noisy, epsilon_v=1e-3).startswith("not converged: the error never settles within 1.00 mV")
     assert outcome(noisy[:2], epsilon_v=1e-3).startswith("not converged")
     assert outcome(noisy, epsilon_v=0.2) == "converged"
+
+
+def test_error_of_a_run_is_that_of_the_observer_while_the_identifier_runs_too():
+    samples = discharge(CELL, 0.055, 1.0)[:150]  # every sample is a snapshot
+    once, again = (
+        Estimator(CELL, settings("improved"), identifier=IdentifierSettings(), initial_soc=0.9) for _ in range(2)
+    )
+    trace = again.run(samples)
+    assert np.abs(trace["tracking_error_v"] - trace["innovation_v"]).max() > 1e-3
+    assert adaptive_run(once, samples).error_v.tolist() == trace["tracking_error_v"].tolist()  # (3.15)
 
 
 def test_a_capture_outside_the_limits_is_refused():

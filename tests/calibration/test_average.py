@@ -7,6 +7,7 @@ from bms_estimator.calibration.adaptive import adaptive_run
 from bms_estimator.calibration.average import Settled, averaged, settled
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import ObserverSettings
 from bms_estimator.reports.simulation import discharge
 
@@ -68,6 +69,21 @@ def test_override_of_one_end_leaves_the_other_found(samples):
     earlier = run(samples, t_unst_s=5000.0).window
     assert (earlier.t_unst_s, earlier.end_reason) == (5000.0, "given")
     assert earlier.t_int_s == pytest.approx(automatic.t_int_s, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"t_unst_s": -1.0}, "t_unst = -1 s: must lie within 0 to 999 s of the run"),
+        ({"t_unst_s": 2000.0}, "t_unst = 2000 s: must lie within 0 to 999 s of the run"),
+        ({"t_int_s": -5.0}, "t_int = -5 s: must lie within 0 to 999 s of the run"),
+        ({"t_int_s": float("nan")}, "t_int = nan s: must lie within 0 to 999 s of the run"),
+        ({"t_int_s": 500.0, "t_unst_s": 400.0}, "t_int = 500 s: must lie within 0 to 400 s of the run"),
+    ],
+)
+def test_override_outside_the_run_is_refused(given, message):
+    with pytest.raises(UserError, match=message):
+        find(**given)
 
 
 def test_t_int_is_where_the_error_has_settled():
