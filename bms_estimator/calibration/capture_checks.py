@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.held_current import Load
-from bms_estimator.calibration.relaxation import REST_CURRENT_C, SOC_SLACK
+from bms_estimator.calibration.relaxation import REST_CURRENT_C, SOC_SLACK, runs
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv, r_s, soc_from_ocv
 from bms_estimator.model.cell import CellModel
@@ -13,8 +13,8 @@ Floats = NDArray[np.float64]
 
 LEAST_CURRENT_C = 0.02
 """A capture whose current never exceeds this C-rate says nothing of the elements [1/h]."""
-STEP_C = 0.1
-"""Change of current between two samples that counts as a step [1/h]."""
+STEP_SHARE = 0.1
+"""Change of current between two samples that counts as a step, of the capture's largest current."""
 STEP_S = 3.0
 """Two samples further apart do not show the ohmic step [s]."""
 LEAST_STEPS = 5
@@ -42,7 +42,7 @@ def step_resistance(load: Load) -> float | None:
     """Median of -dV/dI over the steps of current [ohm], negative under a wrong sign; None with too few steps."""
     change_a = np.diff(load.current_a)
     largest_a = float(np.abs(load.current_a).max(initial=0.0))
-    steps = (np.abs(change_a) > STEP_C * largest_a) & (np.diff(load.time_s) <= STEP_S)
+    steps = (np.abs(change_a) > STEP_SHARE * largest_a) & (np.diff(load.time_s) <= STEP_S)
     if steps.sum() < LEAST_STEPS:
         return None
     return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
@@ -120,9 +120,7 @@ def _capacity(load: Load, cell: CellModel) -> str | None:
     return None
 
 
-def _ends_of_long_rests(load: Load, capacity_ah: float) -> NDArray[np.intp]:
+def _ends_of_long_rests(load: Load, capacity_ah: float) -> list[int]:
     """Last sample of each rest longer than ``LONG_REST_S``."""
     resting = np.abs(load.current_a) < REST_CURRENT_C * capacity_ah
-    edges = np.flatnonzero(np.diff(np.r_[False, resting, False].astype(np.int8)))
-    first, last = edges[::2], edges[1::2] - 1
-    return np.asarray(last[load.time_s[last] - load.time_s[first] > LONG_REST_S], dtype=np.intp)
+    return [end - 1 for first, end in runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]

@@ -48,7 +48,7 @@ NEAR_FULL, NEAR_EMPTY = 0.995, 0.02
 """SOC from which a first sample counts as full, below which a last one counts as empty."""
 LEAST_POINTS = 6
 """As many as (2.10) has parameters."""
-CHARGING_AH = 0.005
+TAKEN_IN = 0.005
 """Charge taken in, in capacities, from which a capture is no relaxation test by discharge."""
 SOC_SLACK = 0.03
 """How far SOC may leave 0..1 before the capacity is called wrong: cells of one type differ by as much."""
@@ -190,7 +190,7 @@ def relaxation_test(
     resting = _resting(good, capacity_ah)
     _check_charge(name, good, soc, resting, capacity_ah)
     rests, rejected = [], []
-    for first, last in _runs(resting):
+    for first, last in runs(resting):
         duration_s = float(good["time_s"][last - 1] - good["time_s"][first])
         if duration_s < SHORTEST_REST_S:
             rejected.append(
@@ -233,13 +233,13 @@ def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: NDArray[np
     change = np.where(resting[:-1], 0.0, np.diff(soc))  # noise at rest goes both ways
     given = np.maximum(-change, 0.0).sum()
     taken = np.maximum(change, 0.0).sum()
-    if taken > max(given, CHARGING_AH):
+    if taken > max(given, TAKEN_IN):
         raise UserError(
             f"{name}: current has the wrong sign or the capture charges: {given * capacity_ah:.3f} Ah out, "
             f"{taken * capacity_ah:.3f} Ah in while the voltage went from {good['voltage_v'][0]:.3f} to "
             f"{good['voltage_v'][-1]:.3f} V; discharge must be positive"
         )
-    if taken > CHARGING_AH:
+    if taken > TAKEN_IN:
         start_s = good["time_s"][int(np.argmax(change > 0.0))]
         raise UserError(
             f"{name}: charges inside, {taken * capacity_ah:.3f} Ah from {start_s:.0f} s on: "
@@ -257,7 +257,7 @@ def _resting(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     """Which samples belong to a rest; blips of the current sensor do not end one."""
     resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
     time_s = good["time_s"]
-    for first, last in _runs(~resting):
+    for first, last in runs(~resting):
         until_s = time_s[min(last, good.size - 1)]
         charge_ah = abs(float(good["current_a"][first:last].mean())) * (until_s - time_s[first]) / 3600.0
         if charge_ah < BLIP_CHARGE * capacity_ah:
@@ -274,7 +274,7 @@ def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
     return max(REST_CURRENT_C * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Stretches where ``mask`` holds, each as first and one past its last index."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -32,7 +32,7 @@ class SeriesResistance:
     """R_s over SOC.
 
     Attributes:
-        soc: Centres of the bins that hold data, 0..1.
+        soc: Mean SOC in each bin that holds data, 0..1.
         r_s_ohm: Mean of (4.2) in each bin [ohm].
     """
 

@@ -1,4 +1,4 @@
-"""Where the model stays stable: delta1, delta2 and the conditions of Lemma 4.1.1."""
+"""Where the model stays stable: delta1, delta2, and the bound that a8 and a11 must exceed."""
 
 import math
 
