@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from serial.tools import list_ports
 
-from bms_estimator.sources.ports import BY_ID, holder
+from bms_estimator.sources.ports import holder, stable_names
 from bms_estimator.sources.probe import probe as ask
 from bms_estimator.sources.protocol import BAUD
 
@@ -29,7 +29,7 @@ def ports(
     if not shown:
         typer.echo("no serial port is there; is the board plugged in?")
         return
-    names = {str(name.resolve()): str(name) for name in BY_ID.iterdir()} if BY_ID.is_dir() else {}
+    names = {str(name.resolve()): str(name) for name in stable_names()}
     table = Table(box=box.SIMPLE_HEAD)
     for title in ("port", "what it says of itself", "held by", *(["board"] if probe else [])):
         table.add_column(title, overflow="fold")

@@ -1,22 +1,32 @@
-"""Which serial ports there are, which of them is the board's, and who holds one."""
+"""Which serial ports there are, which of them is the board's, how one is opened, and who holds one."""
 
+import errno
 import os
+import termios
 from pathlib import Path
 
+import serial
 from serial.tools import list_ports
 
 BY_ID = Path("/dev/serial/by-id")
 
 
 class NoPortError(Exception):
-    """The board's port cannot be told; the message says what was found. It may come yet."""
+    """The board's port cannot be told or opened; the message says what was found. It may come yet."""
+
+
+def stable_names() -> list[Path]:
+    """Names under /dev/serial/by-id; none where no USB serial port is there."""
+    try:
+        return sorted(BY_ID.iterdir())
+    except OSError:  # the folder comes with the first port and goes with the last
+        return []
 
 
 def board_ports() -> list[str]:
-    """Ports that may be a board: the stable names under /dev/serial/by-id, else USB serial devices."""
-    if BY_ID.is_dir():
-        return sorted(str(path) for path in BY_ID.iterdir())
-    return sorted(port.device for port in list_ports.comports() if port.vid is not None)
+    """Ports that may be a board: the stable names, else USB serial devices."""
+    names = [str(path) for path in stable_names()]
+    return names or sorted(port.device for port in list_ports.comports() if port.vid is not None)
 
 
 def resolve_port(port: str) -> str:
@@ -35,6 +45,25 @@ def resolve_port(port: str) -> str:
     if len(found) > 1:
         raise NoPortError(f"{len(found)} serial ports are there; set sensor.port to one of {', '.join(found)}")
     return found[0]
+
+
+def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
+    """Open a port for ourselves alone.
+
+    Args:
+        path: Of the device.
+        baud: [1/s].
+        timeout_s: How long a read waits [s].
+
+    Raises:
+        NoPortError: It cannot be opened; the message says who holds it if that is why and can be seen.
+    """
+    try:
+        return serial.Serial(path, baud, timeout=timeout_s, exclusive=True)
+    except (OSError, termios.error, ValueError, OverflowError) as error:  # a port may die while it is opened
+        if isinstance(error, OSError) and error.errno in (errno.EBUSY, errno.EAGAIN):
+            raise NoPortError(f"{path}: held by {holder(path) or 'another process'}") from None
+        raise NoPortError(f"{path}: cannot be opened: {error}") from None
 
 
 def holder(port: str) -> str | None:

@@ -5,7 +5,7 @@ import time
 import serial
 
 from bms_estimator.sources.frames import FrameDecoder
-from bms_estimator.sources.ports import holder
+from bms_estimator.sources.ports import NoPortError, open_port
 from bms_estimator.sources.protocol import BAUD, hello_command
 
 PATIENCE_S = 3.0
@@ -22,11 +22,12 @@ def probe(port: str, baud: int = BAUD) -> str:
         baud: Of the board [1/s].
     """
     try:
-        with serial.Serial(port, baud, timeout=ASK_S, exclusive=True) as line:
+        with open_port(port, baud, ASK_S) as line:
             return _ask(line)
-    except serial.SerialException as error:
-        who = holder(port)
-        return f"held by {who}" if who else f"cannot be opened: {error}"
+    except NoPortError as error:
+        return str(error).removeprefix(f"{port}: ")
+    except OSError as error:
+        return f"lost: {error}"
 
 
 def _ask(line: serial.Serial) -> str:

@@ -1,7 +1,6 @@
 """The board on a serial port: opened with pyserial, read when the descriptor has bytes, opened again when it is lost."""
 
 import asyncio
-import errno
 import math
 import os
 import time
@@ -9,14 +8,13 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from types import TracebackType
 from typing import Protocol, Self
 
-import serial
 import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.decoder import make_decoder
-from bms_estimator.sources.ports import NoPortError, holder, resolve_port
+from bms_estimator.sources.ports import NoPortError, open_port, resolve_port
 from bms_estimator.sources.protocol import (
     Ack,
     AckResult,
@@ -83,7 +81,7 @@ class SerialBoard:
         self._decoder = make_decoder(settings)
         self._reads: asyncio.Queue[tuple[float, bytes] | None] = asyncio.Queue()
         self._message: str | None = "not opened yet"
-        self._line: serial.Serial | None = None
+        self._descriptor: int | None = None
         self._lost = asyncio.Event()
         self._opened = 0
         self._logged_s = -math.inf
@@ -158,7 +156,7 @@ class SerialBoard:
         """
         if self._settings.protocol == "text":
             raise UserError("a board that prints text takes no commands")
-        if self._line is None:
+        if self._descriptor is None:
             raise UserError(f"the board is not connected: {self._message}")
         self._zeroed = asyncio.get_running_loop().create_future()
         self._send(zero_current_command())
@@ -186,19 +184,20 @@ class SerialBoard:
         while True:
             try:
                 path = resolve_port(self._settings.port)
-                self._line = _open(path, self._settings.baud)
-            except (NoPortError, serial.SerialException) as error:
+                line = open_port(path, self._settings.baud)
+            except (NoPortError, OSError) as error:
                 self._say(str(error))
                 await asyncio.sleep(retry_s)
                 retry_s = min(2.0 * retry_s, LONGEST_RETRY_S)
                 continue
             retry_s = self._first_retry_s
+            self._descriptor = line.fileno()
             try:
-                await self._attend(path, self._line.fileno())
+                await self._attend(path, self._descriptor)
             finally:
-                asyncio.get_running_loop().remove_reader(self._line.fileno())
-                self._line.close()
-                self._line = None
+                asyncio.get_running_loop().remove_reader(self._descriptor)
+                self._descriptor = None
+                line.close()
             self._say(f"{path}: lost, opening it again")
             await asyncio.sleep(retry_s)
 
@@ -259,10 +258,10 @@ class SerialBoard:
 
     def _send(self, frame: bytes) -> None:
         """Write a command. One that a dying port does not take is asked again after it is back."""
-        if self._line is None:
+        if self._descriptor is None:
             return
         try:
-            os.write(self._line.fileno(), frame)
+            os.write(self._descriptor, frame)
         except OSError as error:
             log.warning("command not sent", reason=str(error))
 
@@ -280,17 +279,3 @@ class SerialBoard:
         if faults != self._logged_faults and now_s - self._logged_s >= JUNK_LOG_S:
             self._logged_faults, self._logged_s = faults, now_s
             log.warning("faults on the line", **counted)
-
-
-def _open(path: str, baud: int) -> serial.Serial:
-    """Open a port for ourselves alone.
-
-    Raises:
-        SerialException: It cannot be opened; the message says who holds it if that is why and can be seen.
-    """
-    try:
-        return serial.Serial(path, baud, timeout=0, exclusive=True)
-    except serial.SerialException as error:
-        if error.errno in (errno.EBUSY, errno.EAGAIN):
-            raise serial.SerialException(f"{path}: held by {holder(path) or 'another process'}") from None
-        raise

@@ -1,16 +1,24 @@
 import asyncio
 import contextlib
+import errno
+import os
 import subprocess
 import sys
+import termios
 from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import serial
+from serial.tools import list_ports
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources import ports
+from bms_estimator.sources.probe import probe
 from bms_estimator.sources.serial_board import SerialBoard
 from bms_estimator.sources.virtual_board import VirtualBoard
 from bms_estimator.sources.virtual_converter import Reading
@@ -111,6 +119,43 @@ async def test_a_port_held_by_another_process_names_the_process(line: Line) -> N
             await until(lambda: source.message and "no frame yet" in source.message)
     finally:
         other.communicate()
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "error"),
+    [
+        (termios, "tcsetattr", termios.error(errno.EIO, "Input/output error")),
+        (termios, "tcflush", termios.error(errno.EIO, "Input/output error")),
+        (serial.Serial, "_update_dtr_state", OSError(errno.EIO, "Input/output error")),
+        (serial.Serial, "_reconfigure_port", ValueError("Failed to set custom baud rate")),
+        (os, "open", OSError(errno.ENODEV, "No such device")),
+    ],
+)
+async def test_a_port_that_dies_while_it_is_opened_is_opened_again(
+    line: Line, part: object, name: str, error: Exception
+) -> None:
+    def die(*_: object, **__: object) -> None:
+        raise error
+
+    line.plug()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(part, name, die)
+        async with board(line) as source:
+            await until(lambda: source.message and f"{line.path}: cannot be opened" in source.message)
+            said, probed = source.message, probe(str(line.path))
+            patch.undo()
+            await until(lambda: source.message and "no frame yet" in source.message)
+    assert str(error.args[-1]) in (said or "")
+    assert probed.startswith("cannot be opened")
+
+
+async def test_ports_that_all_go_while_they_are_listed_are_waited_for(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ports, "BY_ID", tmp_path / "by-id")
+        patch.setattr(Path, "is_dir", lambda _: True)  # it was there a moment ago
+        patch.setattr(list_ports, "comports", list)
+        async with SerialBoard(SensorSettings(port="auto")) as source:
+            await until(lambda: source.message == "waiting for a board: no USB serial port is there")
 
 
 async def test_a_silent_board_and_one_at_another_baud_rate_are_told_apart(line: Line) -> None:
