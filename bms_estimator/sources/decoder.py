@@ -15,7 +15,7 @@ class Decoder(Protocol):
 
     @property
     def hello(self) -> Hello | None:
-        """The board's last; None when there was none, or it prints text."""
+        """The board's last; None when there was none since its reset, or it prints text."""
 
     @property
     def board(self) -> Mapping[str, str]:

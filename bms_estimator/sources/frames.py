@@ -98,15 +98,15 @@ class FrameDecoder:
 
     @property
     def hello(self) -> Hello | None:
-        """The board's last."""
-        return self._hello
+        """The board's last; None before it, and after a reset whose hello was lost."""
+        return self._hello if self._state["boot_id"][0] >= 0 else None
 
     @property
     def board(self) -> Mapping[str, str]:
         """What the board said of itself, for people; empty before its hello."""
-        if self._hello is None:
+        hello = self.hello
+        if hello is None:
             return {}
-        hello = self._hello
         return {
             "firmware": hello.firmware,
             "serial": f"{hello.serial:08x}" if hello.serial else "",

@@ -205,6 +205,7 @@ class SerialBoard:
         """Read until the port is lost; meanwhile ask for what the board has not said."""
         self._opened += 1
         self._lost.clear()
+        self._decoder.forget_hello()  # it may be another board, or the same one after a reset
         self._message = f"{path}: open, no frame yet"
         log.info("port opened", port=path, baud=self._settings.baud)
         asyncio.get_running_loop().add_reader(descriptor, self._read, descriptor)

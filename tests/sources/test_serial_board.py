@@ -19,11 +19,14 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources import ports
 from bms_estimator.sources.probe import probe
+from bms_estimator.sources.protocol import ResetCause
 from bms_estimator.sources.serial_board import SerialBoard
 from bms_estimator.sources.virtual_board import VirtualBoard
 from bms_estimator.sources.virtual_converter import Reading
 from tests.patience import LONG_S
 from tests.serial_line import Line
+
+STEADY = Reading(0.5, 22.2, 25.0)
 
 
 def board(line: Line, **options: Any) -> SerialBoard:
@@ -207,7 +210,7 @@ async def test_a_text_board_takes_no_commands(line: Line) -> None:
 
 async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> None:
     blocks: list[SampleBlock] = []
-    with VirtualBoard(lambda _: Reading(0.5, 22.2, 25.0)) as virtual:
+    with VirtualBoard(lambda _: STEADY) as virtual:
         async with (
             SerialBoard(SensorSettings(port=virtual.path)) as source,
             at_work(virtual.run(), keep(source, blocks)),
@@ -218,3 +221,33 @@ async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> Non
             blocks.clear()
             await until(lambda: count(blocks) >= 20)
             assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.0, abs=0.03)
+
+
+async def test_the_rate_is_set_again_after_a_reset_whose_hello_was_damaged() -> None:
+    blocks: list[SampleBlock] = []
+    with VirtualBoard(lambda _: STEADY) as virtual:
+        source = SerialBoard(SensorSettings(port=virtual.path, sample_rate_hz=250))
+        async with source, at_work(virtual.run(), keep(source, blocks)):
+            await until(lambda: source.board.get("sample_rate_hz") == "250" and count(blocks) >= 200)
+            virtual.send(b"half a frame, which runs into the hello")
+            virtual.reset(ResetCause.BROWN_OUT)
+            await until(lambda: source.counters["resets"] == 1)
+            await until(lambda: source.board.get("sample_rate_hz") == "250")
+            blocks.clear()
+            await until(lambda: count(blocks) >= 20)
+    assert np.diff(np.concatenate(blocks)["time_s"]) == pytest.approx(0.004)
+    assert source.counters["resets"] == 1
+
+
+async def test_a_board_plugged_in_for_another_tells_of_itself_and_gets_its_rate(tmp_path: Path) -> None:
+    path, blocks = tmp_path / "board", list[SampleBlock]()
+    source = SerialBoard(SensorSettings(port=str(path), sample_rate_hz=50), first_retry_s=0.05)
+    async with source, at_work(keep(source, blocks)):
+        for serial_number in (1, 2):
+            with VirtualBoard(lambda _: STEADY, serial=serial_number) as virtual:
+                async with at_work(virtual.run()):
+                    await asyncio.sleep(0.1)  # its first hello is gone by the time at which the port is opened
+                    path.symlink_to(virtual.path)
+                    said = {"serial": f"{serial_number:08x}", "sample_rate_hz": "50"}
+                    await until(lambda said=said: source.board.items() >= said.items())
+                path.unlink()
