@@ -26,6 +26,8 @@ PRIOR_ERROR = 0.7
 EXPONENT_MIN, EXPONENT_MAX = 0.5, 300.0
 SEARCH_POINTS = 24
 REFINEMENTS = 12
+ALTERNATIONS = 12
+"""Amplitude and offset within bounds, each in its turn."""
 
 ELEMENT_MAP = np.dtype(
     [
@@ -89,7 +91,7 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
     """
     x, y, w = fit.soc, fit.value, fit.weight
     base = 3 * e + 1
-    sign = -1.0 if e in (2, 3) else 1.0  # capacitances rise with SOC: (2.7), (2.8)
+    sign = _sign(e)
     fit.bins[e] = _observations(m, e, prior, base, sign, x, y, w)
     if fit.bins[e] == 0:
         for i in range(base, base + 3):
@@ -100,6 +102,47 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
     amplitude, offset, _ = _linear_part(exponent, sign, x, y, w)
     fit.a[base], fit.a[base + 1], fit.a[base + 2] = amplitude, exponent, offset
     _standard_errors(fit, base, sign, x, w)
+
+
+@njit(cache=True)
+def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float, float, float]:
+    """Amplitude, exponent and offset of the element fitted last, within bounds.
+
+    Where a bound holds one of them, the others are fitted anew: each clipped by itself would be another function.
+
+    Args:
+        fit: Record of ELEMENT_FIT, as ``fit_element`` left it for this element.
+        e: Row of the map, 0..4.
+        lower: Bounds of a1..a15 at index 1..15.
+        upper: The same.
+    """
+    i = 3 * e + 1
+    amplitude, exponent, offset = fit.a[i], fit.a[i + 1], fit.a[i + 2]
+    if (
+        lower[i] <= amplitude <= upper[i]
+        and lower[i + 1] <= exponent <= upper[i + 1]
+        and lower[i + 2] <= offset <= upper[i + 2]
+    ):
+        return amplitude, exponent, offset
+    exponent = min(max(exponent, lower[i + 1]), upper[i + 1])
+    sw = sg = sgg = sy = sgy = 0.0
+    for b in range(BINS):
+        g = _sign(e) * math.exp(-exponent * fit.soc[b])
+        sw += fit.weight[b]
+        sg += fit.weight[b] * g
+        sgg += fit.weight[b] * g * g
+        sy += fit.weight[b] * fit.value[b]
+        sgy += fit.weight[b] * g * fit.value[b]
+    for _ in range(ALTERNATIONS):
+        amplitude = min(max((sgy - sg * offset) / sgg, lower[i]), upper[i])
+        offset = min(max((sy - sg * amplitude) / sw, lower[i + 2]), upper[i + 2])
+    return amplitude, exponent, offset
+
+
+@njit(cache=True)
+def _sign(e: int) -> float:
+    """Capacitances rise with SOC, (2.7), (2.8): theirs is -1."""
+    return -1.0 if e in (2, 3) else 1.0
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.charge import UNMEASURED_S
-from bms_estimator.kernels.element_map import ELEMENTS, age, fit_element, learn
+from bms_estimator.kernels.element_map import ELEMENTS, age, fit_element, fit_within, learn
 from bms_estimator.kernels.identifier import identifier_init, identifier_step, soc
 from bms_estimator.kernels.identifier_state import LN_R_S, LN_R_TL, LN_R_TS, LN_TAU_TL, LN_TAU_TS, SOC
 from bms_estimator.kernels.margins import delta
@@ -79,18 +79,12 @@ def hand_over(s: Record, p: Record, e: int) -> None:
     if p.hand_over == 0 or s.fit.bins[e] < LEAST_BINS:
         return
     i = 3 * e + 1
-    amplitude, exponent, offset = bounded(s, p, i), bounded(s, p, i + 1), bounded(s, p, i + 2)
+    amplitude, exponent, offset = fit_within(s.fit, e, p.lower, p.upper)
     if e in CAPACITANCES and delta(exponent, offset, amplitude) + p.observer.margin_guard >= s.observer.soc:
         return
     aim(s.observer, p.observer, i, amplitude)
     aim(s.observer, p.observer, i + 1, exponent)
     aim(s.observer, p.observer, i + 2, offset)
-
-
-@njit(cache=True)
-def bounded(s: Record, p: Record, i: int) -> float:
-    """Fitted a_i within the configured bounds."""
-    return min(max(s.fit.a[i], p.lower[i]), p.upper[i])
 
 
 @njit(cache=True)

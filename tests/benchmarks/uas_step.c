@@ -1,6 +1,6 @@
 /* One sample's way through the adaptive observer, the yardstick for the kernel that does the same:
  * judge, Algorithm 1 with (3.12), (3.13), (3.18), (4.1), loss of lock, a row of trace.
- * Line by line bms_estimator/kernels/{estimate,observer,nussbaum,mittag_leffler,margins,cell}.py;
+ * Line by line bms_estimator/kernels/{estimate,observer,nussbaum,mittag_leffler,margins,cell,charge}.py;
  * records.h is made from their record types. */
 
 #include <math.h>
@@ -9,7 +9,9 @@
 #include "records.h"
 
 #define SMALLEST_LOOP 0.1
-#define VOLTAGE_SATURATED 1u
+#define UNMEASURED_S 60.0
+#define LONGEST_FLOW_S 3600.0
+#define SATURATED_BITS 3u
 
 enum verdict { ACCEPTED, NOT_FINITE, OUT_OF_RANGE, REPEATED, SATURATED };
 enum nussbaum { MITTAG_LEFFLER, K2_COS, K_COS_SQRT, LN_COS_SQRT_LN };
@@ -200,23 +202,37 @@ static void watch_lock(state_t *s, const settings_t *p, double dt_s, double volt
     } else if (expired) {
         s->lock = 1;
         s->unlocked_s = 0.0;
-    } else if (s->gain < p->rearm_gain && !beyond) {
+    } else if (s->gain < p->rearm_gain && !beyond && nussbaum_gain(p->k0, p) > p->rearm_gain) {
         s->k = p->k0;
         s->gain = nussbaum_gain(s->k, p);
         s->gain_rearms++;
     }
 }
 
+static double held_current(double dt_s, double before_a, double now_a)
+{
+    if (dt_s <= UNMEASURED_S)
+        return 0.5 * (before_a + now_a);
+    if (before_a * now_a <= 0.0)
+        return 0.0;
+    return now_a > 0.0 ? fmin(before_a, now_a) : fmax(before_a, now_a);
+}
+
+/* SOC down to which the elements are evaluated (E14) */
+static double lowest(const state_t *s, const settings_t *p)
+{
+    return fmax(s->delta_1, s->delta_2) + p->margin_guard;
+}
+
 static void observer_step(state_t *s, const settings_t *p, double dt_s, double current_a, double voltage_v)
 {
-    double charge_as = 0.5 * (s->current_a + current_a) * dt_s;
+    double charge_as = held_current(dt_s, s->current_a, current_a) * fmin(dt_s, LONGEST_FLOW_S);
     s->soc = s->soc_coulomb = fmin(fmax(s->soc_coulomb - charge_as / p->capacity_as, 0.0), 1.0); /* (3.1) */
     s->current_a = current_a;
     double e_o = ocv(s->soc, p);
 
-    double lowest = fmax(s->delta_1, s->delta_2) + p->margin_guard;
-    s->adapting = s->soc > lowest;
-    double soc = fmax(s->soc, lowest);
+    s->adapting = s->soc > lowest(s, p);
+    double soc = fmax(s->soc, lowest(s, p));
 
     const double *a = s->a;
     double ohm_s = p->output_r_s > 0.0 ? p->output_r_s * element(a[13], a[14], a[15], soc) : 0.0;
@@ -227,6 +243,7 @@ static void observer_step(state_t *s, const settings_t *p, double dt_s, double c
     if (s->adapting) {
         adapt(s, p, dt_s, e * e);
         update_margins(s);
+        soc = fmax(s->soc, lowest(s, p));
     }
 
     double tau_ts = element(a[1], a[2], a[3], soc) * element(-a[7], a[8], a[9], soc);
@@ -250,7 +267,7 @@ static enum verdict judge(state_t *s, const settings_t *p, const sample_t *x)
         s->dropped_not_finite++;
         return NOT_FINITE;
     }
-    if (x->status & VOLTAGE_SATURATED) {
+    if (x->status & SATURATED_BITS) {
         s->dropped_saturated++;
         return SATURATED;
     }

@@ -103,12 +103,22 @@ def test_the_configured_bounds_stay_the_guard(load) -> None:
     assert estimator.state[0]["a"][3] == pytest.approx(0.01, rel=1e-3)
 
 
+def test_a_bound_that_holds_one_parameter_leaves_the_element_where_the_data_are(load) -> None:
+    """R_s with an amplitude far too small for the truth: exponent and offset make up for it where the cell has been."""
+    bound = TRUTH.bounds(15).model_copy(update={"upper": 0.08, "lower": 0.07})
+    estimator = Estimator(TRUTH.model_copy(update={"adaptation": {"a15": bound}}), identifier=ON, initial_soc=1.0)
+    estimator.run(load[0])
+    a, soc = estimator.state[0]["a"], float(estimator.state["soc"][0])
+    assert a[15] <= 0.08
+    assert chen_mora.r_s(soc, a) > 0.08
+
+
 def test_a_fit_that_is_negative_at_the_present_soc_is_not_handed_over(load) -> None:
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     estimator.run(load[0])
     record, soc = estimator.record[0], float(estimator.state["soc"][0])
     targets = record["observer"]["target"].copy()
-    estimator.settings_record["upper"][0, 7:13] = np.inf
+    estimator.settings_record["lower"][0, 7:13], estimator.settings_record["upper"][0, 7:13] = 0.0, np.inf
     record["fit"]["a"][7:13] = [2e5, 1.0, 1e3, 1e6, 1.0, 1e4]  # delta = 5.3 and 4.6
     for e in CAPACITANCES:
         hand_over(record, estimator.settings_record[0], e)
