@@ -7,6 +7,7 @@ never waits, and what the broker could not take in time is counted.
 import asyncio
 import contextlib
 import json
+import math
 import secrets
 import socket
 import ssl
@@ -149,10 +150,17 @@ class MqttSink:
         """Send and receive until the connection is lost or the sink closes."""
         await client.subscribe([(f"{self._root}/request/+", 1), (BIRTH_TOPIC, 1)])
         self._wake.set()
-        async with asyncio.TaskGroup() as tasks:
-            receiving = tasks.create_task(self._receive(client))
-            await self._send(client)
-            receiving.cancel()
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                receiving = tasks.create_task(self._receive(client))
+                await self._send(client)
+                receiving.cancel()
+        except* aiomqtt.MqttError:
+            raise  # the broker publishes the will
+        except* Exception:  # a fault of ours: the client parts in good order, which withholds the will
+            with contextlib.suppress(aiomqtt.MqttError):
+                await self._say_offline(client)
+            raise
 
     async def _send(self, client: aiomqtt.Client) -> None:
         while True:
@@ -166,9 +174,12 @@ class MqttSink:
             if snapshot is not None:
                 await self._send_snapshot(client, snapshot)
             if self._closing:
-                await self._retain(client, "sensor/availability", b"offline")
-                await self._retain(client, "availability", b"offline")
+                await self._say_offline(client)
                 return
+
+    async def _say_offline(self, client: aiomqtt.Client) -> None:
+        await self._retain(client, "sensor/availability", b"offline")
+        await self._retain(client, "availability", b"offline")
 
     async def _send_snapshot(self, client: aiomqtt.Client, snapshot: Snapshot) -> None:
         """State first, for it is in a hurry; of the rest, what has changed since the last time."""
@@ -218,7 +229,7 @@ async def _respond(answer: Answer, name: str, payload: object) -> dict[str, Any]
     transaction = None
     try:
         arguments = _arguments(payload)
-        transaction = arguments.get("transaction")
+        transaction = _transaction(arguments)
         data = await answer(name, arguments)
     except UserError as error:
         return {"status": "error", "data": None, "error": str(error), "transaction": transaction}
@@ -226,7 +237,7 @@ async def _respond(answer: Answer, name: str, payload: object) -> dict[str, Any]
 
 
 def _arguments(payload: object) -> Mapping[str, Any]:
-    """A request's payload: a JSON object, or nothing.
+    """A request's payload: a JSON object of finite numbers, or nothing.
 
     Raises:
         UserError: It is something else.
@@ -234,12 +245,37 @@ def _arguments(payload: object) -> Mapping[str, Any]:
     if not payload:
         return {}
     try:
-        arguments = json.loads(payload if isinstance(payload, str | bytes) else str(payload))
+        text = payload if isinstance(payload, str | bytes) else str(payload)
+        arguments = json.loads(text, parse_float=_finite, parse_constant=_finite)
     except (ValueError, RecursionError):
         raise UserError("a request's payload must be a JSON object or empty") from None
     if not isinstance(arguments, dict):
         raise UserError("a request's payload must be a JSON object or empty")
     return arguments
+
+
+def _finite(token: str) -> float:
+    """A number of a request; Python's JSON knows NaN, and takes 1e999 for infinity.
+
+    Raises:
+        UserError: It is not finite.
+    """
+    number = float(token)
+    if not math.isfinite(number):
+        raise UserError(f"{token}: numbers of a request must be finite")
+    return number
+
+
+def _transaction(arguments: Mapping[str, Any]) -> str | int | None:
+    """What the response repeats, so that who asked knows it again.
+
+    Raises:
+        UserError: It is neither a string nor an integer.
+    """
+    transaction = arguments.get("transaction")
+    if transaction is not None and (isinstance(transaction, bool) or not isinstance(transaction, str | int)):
+        raise UserError("transaction: must be a string or an integer")
+    return transaction
 
 
 def _json(value: Mapping[str, Any]) -> bytes:

@@ -169,6 +169,12 @@ async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_
         (b"[1, 2]", "error", None),
         (b"\xff\xfe not json", "error", None),
         (b"[" * 5000, "error", None),
+        (b'{"transaction": NaN}', "error", None),
+        (b'{"transaction": [1e999], "x": 1}', "error", None),
+        (b'{"transaction": "t2", "x": -Infinity}', "error", None),
+        (b'{"transaction": 1.5}', "error", None),
+        (b'{"transaction": true}', "error", None),
+        (b'{"transaction": {"a": 1}}', "error", None),
     ],
 )
 async def test_a_request_is_answered(broker: Broker, payload: bytes, status: str, transaction: object) -> None:
@@ -186,6 +192,21 @@ async def test_a_request_is_answered(broker: Broker, payload: bytes, status: str
     assert (response["status"], response["transaction"]) == (status, transaction)
     assert (response["data"] is None) == (status == "error")
     assert (response["error"] is None) == (status == "ok")
+
+
+async def test_a_fault_of_ours_is_offline_for_the_broker_and_raised(broker: Broker) -> None:
+    async def break_down(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        raise ZeroDivisionError
+
+    async with Listener(broker) as live:
+        mqtt = await sink(broker, answer=break_down).__aenter__()
+        mqtt.publish(ONE)
+        await live.wait("bms/pack/availability")
+        await live.publish("bms/pack/request/any", qos=1)
+        await live.wait("bms/pack/availability", lambda p: p == b"offline")
+        with pytest.raises(ExceptionGroup) as fault:
+            await mqtt.__aexit__(None, None, None)
+    assert fault.value.split(ZeroDivisionError)[1] is None
 
 
 async def test_a_retained_request_is_not_granted_again_with_every_connection(broker: Broker) -> None:
