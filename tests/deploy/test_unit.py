@@ -35,6 +35,14 @@ def test_systemd_would_find_a_misspelled_key(program, unit):
     assert "ProtectHomes" in verify(program("systemd-analyze", "systemd"), unit)
 
 
+@pytest.mark.parametrize(("kind", "driver"), [("char-ttyACM", "cdc_acm"), ("char-ttyUSB", "usbserial")])
+def test_the_driver_of_each_kind_of_usb_line_is_loaded_before_its_device_is_allowed(deploy, kind, driver):
+    settings = [line.partition("=")[::2] for line in (deploy / "bms-estimator.service").read_text().splitlines()]
+    assert f"{kind} rw" in [value for key, value in settings if key == "DeviceAllow"]
+    for relation in ("Wants", "After"):
+        assert f"modprobe@{driver}.service" in " ".join(value for key, value in settings if key == relation).split()
+
+
 def test_exposure_is_at_most_2_5(program, unit):
     command = [program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
