@@ -43,6 +43,11 @@ class SensorSettings(Strict):
     )
     current_resolution_a: Positive = Field(default=0.05, description="one step of the current converter")
 
+    @property
+    def sample_period_s(self) -> float:
+        """Between two samples [s]. A text board prints at its own pace: taken as once a second."""
+        return 1.0 if self.protocol == "text" else 1.0 / self.sample_rate_hz
+
 
 class ObserverSettings(Strict):
     """The adaptive observer, Algorithm 1."""

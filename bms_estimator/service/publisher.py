@@ -17,14 +17,12 @@ from bms_estimator.service.remaining import remaining_charge
 from bms_estimator.service.report import estimate_report, info_report, publish_rate_hz
 from bms_estimator.service.source import Source
 from bms_estimator.service.window import Window, WindowSummary
-from bms_estimator.sinks import Sink
+from bms_estimator.sinks import FRESH_PERIODS, Sink
 
 log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
 """Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
-FRESH_PERIODS = 3
-"""Values are stale when no sample was accepted for so many publish periods."""
 
 
 class Publisher:
@@ -63,6 +61,7 @@ class Publisher:
         self._restarts = restarts
         self.checkpoint = checkpoint
         self.period_s = 1.0 / publish_rate_hz(settings)
+        self._fresh_s = FRESH_PERIODS * max(self.period_s, settings.sensor.sample_period_s)
         self._window = Window()
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
@@ -142,7 +141,7 @@ class Publisher:
     def _sensor_message(self, now_s: float) -> str | None:
         """Why values are not fresh, None when they are."""
         silent_s = now_s - self._sample_s
-        if silent_s <= FRESH_PERIODS * self.period_s:
+        if silent_s <= self._fresh_s:
             return None
         if self._source.message:
             return self._source.message

@@ -53,7 +53,8 @@ async def serve(
     requests.offer("current_zero", current_zero)
     all_sinks = list(sinks)
     if settings.mqtt is not None:
-        all_sinks.append(MqttSink(settings.mqtt, settings.pack.name, requests.answer))
+        sample_period_s = settings.sensor.sample_period_s
+        all_sinks.append(MqttSink(settings.mqtt, settings.pack.name, requests.answer, sample_period_s=sample_period_s))
     return await run_live(
         settings,
         cell,

@@ -9,6 +9,9 @@ from typing import Any, Protocol, Self
 
 from bms_estimator.model.estimate import Snapshot
 
+FRESH_PERIODS = 3
+"""Values are stale when no sample was accepted for so many periods of publishing or of sampling, whichever are longer."""
+
 Answer = Callable[[str, Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
 """Answers a request by name and arguments with data. Raises UserError when it cannot be granted."""
 

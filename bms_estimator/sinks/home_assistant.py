@@ -4,11 +4,12 @@ import math
 from typing import Any
 
 from bms_estimator.model.estimate import Info
+from bms_estimator.sinks import FRESH_PERIODS
 
 BIRTH_TOPIC = "homeassistant/status"
 """Home Assistant says ``online`` here when it has started."""
-STALE_PERIODS = 3
-"""Home Assistant calls a value unavailable when it is older than so many publish periods."""
+LEAST_EXPIRY_S = 3
+"""Home Assistant calls no value unavailable that is younger than this: parameters come but once a second [s]."""
 
 _ESTIMATE = {
     # field of topic state: (name, unit, device class, decimals)
@@ -53,12 +54,13 @@ def discovery_topic(device: str) -> str:
     return f"homeassistant/device/{device_id(device)}/config"
 
 
-def discovery(info: Info, root: str) -> dict[str, Any]:
+def discovery(info: Info, root: str, sample_period_s: float) -> dict[str, Any]:
     """The discovery message.
 
     Args:
         info: Of the pack.
         root: Topic of the device, ``bms/<device>``.
+        sample_period_s: Between two samples [s].
     """
     device = {
         "identifiers": [device_id(info.device)],
@@ -74,12 +76,13 @@ def discovery(info: Info, root: str) -> dict[str, Any]:
         "origin": {"name": "bms_estimator", "sw_version": info.version},
         "availability": [{"topic": f"{root}/availability"}, {"topic": f"{root}/sensor/availability"}],
         "availability_mode": "all",
-        "components": _components(info, root),
+        "components": _components(info, root, sample_period_s),
     }
 
 
-def _components(info: Info, root: str) -> dict[str, Any]:
-    stale_s = max(1, math.ceil(STALE_PERIODS / info.publish_rate_hz))
+def _components(info: Info, root: str, sample_period_s: float) -> dict[str, Any]:
+    fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
+    stale_s = max(LEAST_EXPIRY_S, math.ceil(fresh_s))
     components: dict[str, Any] = {}
 
     def add(key: str, platform: str, name: str, **options: Any) -> None:
@@ -117,7 +120,7 @@ def _components(info: Info, root: str) -> dict[str, Any]:
             state_class="measurement",
             suggested_display_precision=decimals,
             entity_category="diagnostic",
-            expire_after=max(stale_s, STALE_PERIODS),
+            expire_after=stale_s,
         )
     for key, name in _FAULTS.items():
         add(

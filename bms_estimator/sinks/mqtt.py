@@ -50,6 +50,7 @@ class MqttSink:
         settings: The broker.
         device: Name of the pack in the topics.
         answer: Answers requests.
+        sample_period_s: Between two samples, where that may be longer than the publish period [s].
         first_delay_s: Before the first attempt to reach a lost broker again [s].
         birth_delay_s: From Home Assistant's birth message to the retained messages [s].
 
@@ -63,10 +64,12 @@ class MqttSink:
         device: str,
         answer: Answer,
         *,
+        sample_period_s: float = 0.0,
         first_delay_s: float = FIRST_DELAY_S,
         birth_delay_s: float = BIRTH_DELAY_S,
     ) -> None:
         self._settings, self._device, self._answer = settings, device, answer
+        self._sample_period_s = sample_period_s
         self._first_delay_s, self._birth_delay_s = first_delay_s, birth_delay_s
         self._root = f"{settings.base_topic}/{device}"
         self._connection = _connection(settings)
@@ -196,7 +199,7 @@ class MqttSink:
             await self._retain(client, "health", counted.model_dump_json().encode())
         if sent is None or sent.info != info:
             await self._retain(client, "info", info.model_dump_json().encode())
-            found = _json(discovery(info, self._root))
+            found = _json(discovery(info, self._root, self._sample_period_s))
             await client.publish(discovery_topic(self._device), found, qos=1, retain=True)
 
     async def _retain(self, client: aiomqtt.Client, topic: str, payload: bytes) -> None:

@@ -14,7 +14,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
-from bms_estimator.model.settings import MqttSettings, PackSettings, Settings
+from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings
 from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
 from bms_estimator.service.clock import Clock
 from bms_estimator.service.live import new_estimator, run_live
@@ -123,6 +123,23 @@ async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> Non
         seen = len(run.sink.snapshots)
         run.source.give((1.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.health.sensor_online, skip=seen)
+
+
+@pytest.mark.parametrize("sensor", [SensorSettings(sample_rate_hz=1), SensorSettings(protocol="text")])
+async def test_a_board_slower_than_the_publications_stays_online(sensor: SensorSettings) -> None:
+    slow = SETTINGS.model_copy(update={"sensor": sensor})
+    now_s = 0.0
+    async with running(slow, clock=Clock(monotonic=lambda: now_s)) as run:
+        for tick in range(60):
+            if tick % 20 == 0:  # once a second, for ten publications
+                run.source.give((now_s, 0.1, 3.8))
+            now_s += 0.05
+            await asyncio.sleep(0.015)
+        online = [s.health.sensor_online for s in run.sink.snapshots]
+        assert len(online) > 5
+        assert all(online[online.index(True) :])
+        now_s += 3.0
+        await run.sink.until(lambda s: not s.health.sensor_online, skip=len(online))
 
 
 async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> None:

@@ -21,6 +21,7 @@ from bms_estimator.service.parameters import parameter_report
 from bms_estimator.service.remaining import remaining_charge
 from bms_estimator.service.report import estimate_report, info_report
 from bms_estimator.service.window import Window
+from bms_estimator.sinks.home_assistant import discovery
 from bms_estimator.sinks.mqtt import MqttSink
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 
@@ -116,6 +117,15 @@ async def test_discovery_describes_every_entity_with_both_availabilities(broker:
     for key, component in components.items():
         if component["state_topic"] == "bms/pack/state" and key != "lock_lost":
             assert key in state
+
+
+@pytest.mark.parametrize(("rate_hz", "sample_period_s", "expire_s"), [(0.1, 1.0, 30), (10.0, 1.0, 3), (1.0, 2.5, 8)])
+def test_a_value_expires_after_three_periods_of_publishing_or_of_sampling(
+    rate_hz: float, sample_period_s: float, expire_s: int
+) -> None:
+    info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
+    components = discovery(info, "bms/pack", sample_period_s)["components"].values()
+    assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
 
 
 async def test_retained_messages_are_sent_again_when_home_assistant_is_born(broker: Broker) -> None:
