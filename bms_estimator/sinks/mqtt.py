@@ -190,7 +190,8 @@ class MqttSink:
         if estimate is not None:
             await client.publish(f"{self._root}/state", estimate.model_dump_json(), qos=0)
         sent, self._sent = self._sent, snapshot
-        if sent is None or sent.parameters is not parameters:
+        known = bool(parameters.elements)  # not before the first sample, and Home Assistant's templates need them
+        if known and (sent is None or sent.parameters is not parameters):
             await client.publish(f"{self._root}/parameters", parameters.model_dump_json(), qos=0)
         if sent is None or sent.health.sensor_online != health.sensor_online:
             await self._retain(client, "sensor/availability", b"online" if health.sensor_online else b"offline")

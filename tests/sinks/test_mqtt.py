@@ -83,6 +83,17 @@ async def test_topics_and_retained_flags_are_as_documented(broker: Broker) -> No
     assert {"bms/pack/state", "bms/pack/parameters"} <= {name for name, _, _ in live.messages}
 
 
+async def test_parameters_come_not_before_the_first_sample(broker: Broker) -> None:
+    cell = load_cell("chen_mora")
+    nothing_yet = ONE._replace(estimate=None, parameters=parameter_report(Estimator(cell), NOW))
+    async with Listener(broker) as live, sink(broker) as mqtt:
+        mqtt.publish(nothing_yet)
+        await live.wait("homeassistant/device/bms_pack/config")
+        assert live.all("bms/pack/parameters") == []
+        mqtt.publish(ONE)
+        assert (await live.wait_json("bms/pack/parameters"))["elements"]
+
+
 async def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missing(broker: Broker) -> None:
     async with Listener(broker) as live, sink(broker) as mqtt:
         mqtt.publish(snapshot())
