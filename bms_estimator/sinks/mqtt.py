@@ -292,10 +292,11 @@ def _connection(settings: MqttSettings) -> dict[str, Any]:
     Raises:
         UserError: The URL, the password file or the certificates cannot be used.
     """
-    url = urlsplit(settings.url)
     try:
+        url = urlsplit(settings.url)
         host, port = url.hostname, url.port or PORTS[url.scheme]
-    except ValueError as error:
+        (host or "").encode("idna")  # as the resolver will
+    except ValueError as error:  # UnicodeError is one
         raise UserError(f"mqtt.url = {settings.url}: {error}") from None
     if not host or url.username is not None:
         raise UserError(f"mqtt.url = {settings.url}: must be mqtt://host:port; the name goes to mqtt.username")

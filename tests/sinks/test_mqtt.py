@@ -289,6 +289,9 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
     [
         ({"url": "mqtt://me:secret@host:1883"}, "mqtt.username"),
         ({"url": "mqtt://host:99999"}, "mqtt.url"),
+        ({"url": f"mqtt://{'a' * 64}.local"}, "mqtt.url = mqtt://a+.local: .*too long"),
+        ({"url": "mqtt://broker..local"}, r"mqtt.url = mqtt://broker\.\.local: .*empty"),
+        ({"url": "mqtt://[::1"}, r"mqtt.url = mqtt://\[::1: "),
         ({"password_file": Path("/nonexistent/password")}, "mqtt.password_file = /nonexistent/password"),
         ({"url": "mqtts://host", "ca_file": Path("/nonexistent/ca.pem")}, "mqtt.ca_file = /nonexistent/ca.pem"),
     ],
