@@ -90,7 +90,8 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert report.elements["e_o_v"].source == "configured"
     a1, target = report.a["a1"], float(estimator.state["target"][0, 1])
     assert target != estimator.settings["target"][0, 1]
-    assert (a1.value, a1.source, a1.valid) == (pytest.approx(target, rel=1e-3), "identified", False)  # SOC was swept little
+    # not valid, for the SOC was swept little
+    assert (a1.value, a1.source, a1.valid) == (pytest.approx(target, rel=1e-3), "identified", False)
     assert "identified to" in (a1.reason or "")
     assert "configured" not in (a1.reason or "")
 
