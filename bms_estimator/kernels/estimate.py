@@ -32,6 +32,8 @@ _NOT_FINITE = int(Verdict.NOT_FINITE)
 _OUT_OF_RANGE = int(Verdict.OUT_OF_RANGE)
 _REPEATED = int(Verdict.REPEATED)
 _SATURATED = int(Verdict.SATURATED)
+GAP_RATIO = 3.0
+"""A step this many times as long as the one before may be a gap: slow sampling is none."""
 _SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED
 
 
@@ -87,8 +89,9 @@ def step(state: Records, settings: Records, time_s: float, current_a: float, vol
         s.time_steps_back += 1 if math.isfinite(dt_s) else 0  # infinite: a new clock after a restart
         s.current_a = state[0].identifier.current_a = current_a
         return verdict
-    if dt_s > p.gap_s:
+    if dt_s > max(p.gap_s, GAP_RATIO * s.step_s):
         s.gaps += 1
+    s.step_s = dt_s
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
         identify(state[0], settings[0], dt_s, current_a, voltage_v)

@@ -44,7 +44,7 @@ OBSERVER_SETTINGS = np.dtype(
         ("voltage_min_v", "f8"),  # what a sample may hold
         ("voltage_max_v", "f8"),
         ("current_max_a", "f8"),  # magnitude
-        ("gap_s", "f8"),  # a longer step counts as a gap [s]
+        ("gap_s", "f8"),  # a longer step counts as a gap, unless the one before was about as long [s]
     ],
     align=True,
 )
@@ -53,6 +53,7 @@ OBSERVER_STATE = np.dtype(
     [
         ("time_s", "f8"),  # of the last accepted sample
         ("current_a", "f8"),  # of the last accepted sample
+        ("step_s", "f8"),  # to it from the one before [s]
         ("soc", "f8"),  # x1, 0..1: the identifier's, else by coulomb counting
         ("soc_coulomb", "f8"),  # by coulomb counting alone (3.1), 0..1
         ("v_ts", "f8"),  # x2 [V]
@@ -78,7 +79,7 @@ OBSERVER_STATE = np.dtype(
         ("dropped_repeated", "i8"),  # time stamp of the sample before
         ("dropped_saturated", "i8"),  # voltage or current at the end of the converter's range
         ("time_steps_back", "i8"),  # the clock went back; the sample is taken, its step is not
-        ("gaps", "i8"),  # steps longer than ``gap_s``
+        ("gaps", "i8"),  # steps longer than ``gap_s`` and than those before
         ("lock_losses", "i8"),
         ("gain_rearms", "i8"),
     ],

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
+from bms_estimator.kernels.identifier_state import IDENTIFIER_COUNTERS, IDENTIFIER_STATE
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.settings import Settings
 
-FORMAT = 2
+FORMAT = 3
 """Raise it to make all older checkpoints invalid."""
 LONGEST_FILE = 1 << 20
 """A checkpoint has some kilobytes; a longer file is none [bytes]."""
@@ -26,6 +27,7 @@ LONGEST_FILE = 1 << 20
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
 COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the state that count since start."""
+_SEEN = tuple(name for name in IDENTIFIER_STATE.names or () if name.startswith("seen_"))
 
 
 def pack_identity(settings: Settings, cell: CellModel) -> str:
@@ -160,3 +162,5 @@ def resume(estimator: Estimator, state: NDArray[np.void], unseen_s: float) -> No
     estimator.resume(unseen_s)
     for name in COUNTERS:
         estimator.state[name] = 0
+    for name in (*IDENTIFIER_COUNTERS, *_SEEN):
+        estimator.record["identifier"][name] = 0

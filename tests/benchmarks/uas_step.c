@@ -9,6 +9,7 @@
 #include "records.h"
 
 #define SMALLEST_LOOP 0.1
+#define GAP_RATIO 3.0
 #define UNMEASURED_S 60.0
 #define LONGEST_FLOW_S 3600.0
 #define SATURATED_BITS 3u
@@ -300,8 +301,9 @@ static enum verdict step(state_t *s, const settings_t *p, const sample_t *x)
         s->current_a = x->current_a;
         return verdict;
     }
-    if (dt_s > p->gap_s)
+    if (dt_s > fmax(p->gap_s, GAP_RATIO * s->step_s))
         s->gaps++;
+    s->step_s = dt_s;
     observer_step(s, p, dt_s, x->current_a, x->voltage_v);
     return verdict;
 }

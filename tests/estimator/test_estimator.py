@@ -86,6 +86,13 @@ def test_charge_flows_on_over_a_gap() -> None:
     assert estimator.state["soc"][0] == pytest.approx(0.5 - 10.0 / (3.0 * 3600))
 
 
+def test_slow_sampling_is_no_row_of_gaps() -> None:
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    for time_s in (0.0, 10.0, 20.0, 30.0, 90.0, 100.0):
+        estimator.step(time_s, 1.0, 3.7)
+    assert estimator.state["gaps"][0] == 2  # the first step, which nothing tells from a gap, and the long one
+
+
 def test_over_an_unmeasured_hour_flows_what_both_ends_agree_on() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
     for time_s, current_a in ((0.0, 1.0), (1800.0, 0.2), (3600.0, -1.0)):

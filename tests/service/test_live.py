@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings
-from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
+from bms_estimator.service.checkpoint import FORMAT, CheckpointFile, pack_identity
 from bms_estimator.service.clock import Clock
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.notify import Notifier
@@ -257,8 +257,8 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
         file.write_bytes(content)
         reason = "refused: unreadable"
     if damage == "format":
-        monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", 3)
-        reason = "refused: format 2, this version reads 3"
+        monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", FORMAT + 1)
+        reason = f"refused: format {FORMAT}, this version reads {FORMAT + 1}"
     async with running(settings, cell, checkpoint=checkpoint(file, settings, cell)) as run:
         snapshot = await run.sink.until(lambda _: True)
         run.source.give((0.0, 0.0, 3.8 * cell.cell.series_count))
