@@ -43,7 +43,7 @@ def correct(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: floa
     i = current_a - x[CURRENT_OFFSET]
     ohm = math.exp(x[LN_R_S])
     e_o, slope = ocv_and_slope(x[SOC], p.ocv_v, p.ocv_slope_v)
-    hysteresis_v = p.hysteresis_discharge_v + s.branch * (p.hysteresis_charge_v - p.hysteresis_discharge_v)
+    hysteresis_v = s.branch * p.hysteresis_charge_v
     error_soc = p.ocv_error_soc + p.capacity_spread * (1.0 - x[SOC])
     error_v2 = p.ocv_error_v**2 + (error_soc * slope) ** 2 + (s.branch * p.hysteresis_error_v) ** 2
     scale_v = math.sqrt(error_v2)

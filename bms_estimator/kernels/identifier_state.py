@@ -68,8 +68,7 @@ IDENTIFIER_SETTINGS = np.dtype(
         ("ocv_error_soc", "f8"),  # std of the OCV curve's error along SOC
         ("capacity_spread", "f8"),  # what is added to it at SOC 0: captures are anchored at full
         ("ocv_error_length", "f8"),  # SOC over which the curve's error changes
-        ("hysteresis_discharge_v", "f8"),  # offset of the OCV from the grid after discharge [V]
-        ("hysteresis_charge_v", "f8"),  # the same after charge [V]
+        ("hysteresis_charge_v", "f8"),  # offset of the OCV after charge from that after discharge, the grid's [V]
         ("hysteresis_soc", "f8"),  # charge that leads from one branch to the other, per unit of SOC
         ("hysteresis_error_v", "f8"),  # std of the OCV after charge, beyond ocv_error_v [V]
         ("hysteresis_error_length", "f8"),  # SOC over which that changes
@@ -187,7 +186,6 @@ class Tuning:
     """Relative spread of capacity from cell to cell of a type: the curve's error grows from full to empty."""
     ocv_error_length: float = 0.15
     """Stages of graphite are that wide."""
-    hysteresis_discharge_v: float = 0.0
     hysteresis_charge_v: float = 0.0
     hysteresis_soc: float = 0.05
     hysteresis_error_v: float = 0.045
@@ -233,7 +231,6 @@ class Tuning:
             model_error_v=self.model_error_v * series,
             branch_error_v=self.branch_error_v * series,
             ocv_error_v=self.ocv_error_v * series,
-            hysteresis_discharge_v=self.hysteresis_discharge_v * series,
             hysteresis_charge_v=self.hysteresis_charge_v * series,
             hysteresis_error_v=self.hysteresis_error_v * series,
             excited_v=self.excited_v * series,
