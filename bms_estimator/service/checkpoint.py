@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,6 +70,8 @@ class CheckpointFile:
     def __init__(self, path: Path, identity: str) -> None:
         self.path = path
         self._identity = identity
+        self.thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
+        """Where to call ``save``: a call that nobody waits for any more still ends before the next one begins."""
 
     def save(self, state: NDArray[np.void], restarts: int) -> None:
         """Write atomically: after a power cut there is the old file or the new one.

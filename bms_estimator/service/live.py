@@ -141,7 +141,8 @@ async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Pub
     if not (estimator.state["started"][0] and estimator.state["samples"][0]):
         return
     try:
-        await asyncio.to_thread(checkpoint.save, estimator.record.copy(), restarts)
+        state = estimator.record.copy()
+        await asyncio.get_running_loop().run_in_executor(checkpoint.thread, checkpoint.save, state, restarts)
         publisher.checkpoint = "saved"
     except OSError as error:
         publisher.checkpoint = f"cannot be saved: {error}"

@@ -1,5 +1,6 @@
 import asyncio
 import socket
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -265,6 +266,36 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
         estimator = await run.end()
     assert snapshot.health.checkpoint.startswith(reason)
     assert estimator.state["soc_coulomb"][0] == 0.5
+
+
+async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_path: Path) -> None:
+    slow, began, release, saves = threading.Lock(), threading.Event(), threading.Event(), []
+
+    class SlowDisk(CheckpointFile):
+        def save(self, state: Any, restarts: int) -> None:
+            assert slow.acquire(blocking=False), "two saves at once"
+            began.set()
+            assert release.wait(LONG_S)
+            super().save(state, restarts)
+            saves.append(int(state["observer"]["samples"][0]))
+            slow.release()
+
+    often = SETTINGS.model_copy(update={"state": SETTINGS.state.model_copy(update={"checkpoint_s": 0.02})})
+    file = SlowDisk(tmp_path / "pack.npz", pack_identity(often, CELL))
+    async with running(often, checkpoint=file) as run:
+        run.source.give((0.0, 0.1, 3.8))
+        assert await asyncio.to_thread(began.wait, LONG_S)
+        run.source.give((1.0, 0.1, 3.8))
+        await run.sink.until(lambda s: s.health.samples["samples"] == 2)
+        run.source.finish()
+        await asyncio.sleep(0.1)
+        assert not run.task.done()
+        release.set()
+        last = await asyncio.wait_for(run.task, LONG_S)
+    assert saves == [1, 2]
+    state = file.load(CELL).state
+    assert state is not None
+    assert state.tobytes() == last.record.tobytes()
 
 
 async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes_on(tmp_path: Path) -> None:
