@@ -41,7 +41,6 @@ class SensorSettings(Strict):
     voltage_noise_v: NotNegative | None = Field(
         default=None, description="standard deviation of one voltage sample; half a step when left out"
     )
-    current_resolution_a: Positive = Field(default=0.05, description="one step of the current converter")
 
     @property
     def sample_period_s(self) -> float:

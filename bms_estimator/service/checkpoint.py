@@ -34,7 +34,7 @@ _SEEN = tuple(name for name in IDENTIFIER_STATE.names or () if name.startswith("
 def pack_identity(settings: Settings, cell: CellModel) -> str:
     """Hash of all that gives the state its meaning: pack, cell, sensor, observer, identifier, the record's layout."""
     digest = hashlib.sha256()
-    sensor = {"current_sign", "voltage_resolution_v", "voltage_noise_v", "current_resolution_a"}
+    sensor = {"current_sign", "voltage_resolution_v", "voltage_noise_v"}
     digest.update(
         settings.model_dump_json(
             include={"pack": True, "sensor": sensor, "observer": True, "identifier": True}
