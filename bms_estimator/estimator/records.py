@@ -1,5 +1,7 @@
 """From typed settings to the kernels' records."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,8 @@ LOCK_FRACTION = 0.02
 """An error of this fraction of the nominal voltage is no tracking."""
 GAP_S = 5.0
 """A step longer than this counts as a gap [s]."""
+HYSTERESIS_ERROR = 0.2
+"""A hysteresis that is told is right within this, relative."""
 ELEMENTS_AT_SOC = 0.5
 """The identifier starts from the configured elements at this SOC, where they are flat."""
 IMPROVED = range(1, 13)
@@ -77,13 +81,17 @@ def estimator_settings(
         _elements(cell),
         noise_v=0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v,
         resolution_v=voltage_resolution_v,
-        tuning=Tuning(
-            current_offset_std_a=identifier.current_offset_std_a,
-            capacity_std=identifier.capacity_std,
-            hysteresis_charge_v=identifier.hysteresis_v,
-        ).pack(cell.cell.series_count),
+        tuning=_tuning(identifier).pack(cell.cell.series_count),
     )[0]
     return record
+
+
+def _tuning(identifier: IdentifierSettings) -> Tuning:
+    tuning = Tuning(current_offset_std_a=identifier.current_offset_std_a, capacity_std=identifier.capacity_std)
+    if identifier.hysteresis_v == 0.0:
+        return tuning
+    known_v = HYSTERESIS_ERROR * identifier.hysteresis_v
+    return replace(tuning, hysteresis_charge_v=identifier.hysteresis_v, hysteresis_error_v=known_v)
 
 
 def _elements(cell: CellModel) -> tuple[float, float, float, float, float]:
