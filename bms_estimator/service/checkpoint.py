@@ -2,13 +2,12 @@
 
 import hashlib
 import io
-import math
 import os
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,9 @@ from bms_estimator.kernels.identifier_state import IDENTIFIER_COUNTERS, IDENTIFI
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.service.clock import Moment, moment
 
-FORMAT = 3
+FORMAT = 4
 """Raise it to make all older checkpoints invalid."""
 LONGEST_FILE = 1 << 20
 """A checkpoint has some kilobytes; a longer file is none [bytes]."""
@@ -52,7 +52,7 @@ class Restored:
     state: NDArray[np.void] | None
     """Shape (1,), dtype ESTIMATOR_STATE; None when it was refused."""
     unseen_s: float
-    """Since it was saved [s]; infinite when the wall clock says it lies ahead."""
+    """Since it was saved [s]; infinite when nobody knows."""
     restarts: int
     """Starts that found a checkpoint, this one included."""
     reason: str
@@ -65,11 +65,12 @@ class CheckpointFile:
     Args:
         path: The file; its folder must exist.
         identity: ``pack_identity``.
+        now: The present moment.
     """
 
-    def __init__(self, path: Path, identity: str) -> None:
+    def __init__(self, path: Path, identity: str, now: Callable[[], Moment] = moment) -> None:
         self.path = path
-        self._identity = identity
+        self._identity, self._now = identity, now
         self.thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
         """Where to call ``save``: a call that nobody waits for any more still ends before the next one begins."""
 
@@ -80,7 +81,8 @@ class CheckpointFile:
             OSError: The file cannot be written.
         """
         content = io.BytesIO()
-        np.savez(content, format=FORMAT, identity=self._identity, restarts=restarts, state=state, saved_s=time.time())
+        fields: dict[str, Any] = asdict(self._now()) | {"identity": self._identity, "restarts": restarts}
+        np.savez(content, format=FORMAT, state=state, **fields)
         new = self.path.with_suffix(".new")
         with new.open("wb") as file:
             file.write(content.getvalue())
@@ -119,10 +121,10 @@ class CheckpointFile:
         insane = _insane(state, cell)
         if insane:
             return Restored(None, 0.0, restarts, f"refused: {insane}")
-        unseen_s = time.time() - float(file["saved_s"])
+        saved = Moment(float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"]))
         return Restored(
             state,
-            unseen_s if unseen_s >= 0.0 else math.inf,
+            self._now().since(saved),
             restarts,
             f"restored: SOC {float(state['observer']['soc'][0]):.4f}",
         )

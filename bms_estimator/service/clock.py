@@ -1,9 +1,16 @@
 """The clocks, taken as a value so that tests can step them."""
 
+import math
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
+
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
+"""Is there once systemd-timesyncd has set the wall clock."""
 
 
 @dataclass(frozen=True)
@@ -16,6 +23,41 @@ class Clock:
     def utc(self) -> str:
         """Wall clock now, ISO 8601."""
         return iso_utc(self.wall())
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When something was left that outlives the process, and maybe the machine's being on.
+
+    Attributes:
+        wall_s: Wall clock [s since 1970]. Without a battery it stands still while the machine is off.
+        synchronised: Whether the wall clock is known to be right.
+        boot_s: Since the machine was started, its sleep included [s].
+        boot: Which start of the machine; empty where nobody says.
+    """
+
+    wall_s: float
+    synchronised: bool
+    boot_s: float
+    boot: str
+
+    def since(self, before: "Moment") -> float:
+        """How long after ``before`` this is [s]; infinite when nobody knows."""
+        if self.boot and self.boot == before.boot:
+            return self.boot_s - before.boot_s
+        passed_s = self.wall_s - before.wall_s
+        return passed_s if passed_s >= 0.0 and self.synchronised and before.synchronised else math.inf
+
+
+def moment() -> Moment:
+    """Now. The unit hides /proc/sys and says in ``BMS_BOOT_ID`` which start of the machine this is."""
+    boot = os.environ.get("BMS_BOOT_ID") or (BOOT_ID.read_text(encoding="ascii") if BOOT_ID.exists() else "")
+    return Moment(
+        wall_s=time.time(),
+        synchronised=SYNCHRONISED.exists(),
+        boot_s=time.clock_gettime(time.CLOCK_BOOTTIME),
+        boot=boot.strip().replace("-", ""),
+    )
 
 
 def iso_utc(epoch_s: float) -> str:

@@ -43,6 +43,7 @@ StandardError=append:/root/report
 ExecStart=sh -c 'for n in $(seq 60); do ls /var/cache/private/bms-estimator/*/* >/dev/null 2>&1 && break; sleep 0.1; done'
 ExecStart=systemctl show bms-estimator -p ActiveState,SubState,NRestarts,Result,WatchdogUSec,StatusText,MainPID,User
 ExecStart=-sh -c 'grep -E "^(Uid|NoNewPrivs|Seccomp|CapEff):" /proc/$(systemctl show bms-estimator -P MainPID)/status'
+ExecStart=-sh -c 'xargs -0 -n1 echo </proc/$(systemctl show bms-estimator -P MainPID)/environ | grep BMS_BOOT_ID'
 ExecStart=find /var/cache/private/bms-estimator -name "*.nbi" -printf "cached %%f\\n"
 ExecStart=-systemctl restart bms-estimator
 ExecStart=systemctl show bms-estimator -p ActiveEnterTimestampMonotonic,InactiveExitTimestampMonotonic

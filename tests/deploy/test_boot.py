@@ -38,6 +38,10 @@ def test_it_has_no_rights(report):
     assert not re.search(r"Uid:\s+0\b", report)
 
 
+def test_it_is_told_which_start_of_the_machine_this_is(report):
+    assert re.search(r"^BMS_BOOT_ID=[0-9a-f]{32}$", report, re.MULTILINE), report
+
+
 def test_kernels_are_compiled_into_the_cache_folder(report):
     assert "cached estimate.run-" in report, report
 
