@@ -5,7 +5,7 @@ import io
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ FORMAT = 4
 """Raise it to make all older checkpoints invalid."""
 LONGEST_FILE = 1 << 20
 """A checkpoint has some kilobytes; a longer file is none [bytes]."""
+REFUSED = "refused: "
+"""A reason that begins so tells why a file that was found is not taken up."""
 
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
 COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
@@ -96,21 +98,36 @@ class CheckpointFile:
             os.close(folder)
 
     def load(self, cell: CellModel) -> Restored:
-        """Read and check; what is wrong is a reason, not an exception."""
+        """Read and check; what is wrong is a reason, not an exception. A file that is refused is set aside.
+
+        One set aside earlier is taken up again when it is good: a setting that was wrong for a while costs nothing.
+        """
+        found = self._load(self.path, cell)
+        if not found.reason.startswith(REFUSED):
+            return found
+        aside, new = self.path.with_suffix(".refused.npz"), self.path.with_suffix(".new")
+        earlier = self._load(aside, cell)
         try:
-            with np.load(io.BytesIO(self._read()), allow_pickle=False) as file:
+            self.path.replace(new)
+            if earlier.state is not None:
+                aside.replace(self.path)
+            new.replace(aside)
+        except OSError as error:
+            return replace(found, reason=f"{found.reason}; it cannot be set aside: {error}")
+        if earlier.state is not None:
+            return replace(earlier, reason=f"{earlier.reason}, set aside earlier")
+        return replace(found, reason=f"{found.reason}; set aside as {aside.name}")
+
+    def _load(self, path: Path, cell: CellModel) -> Restored:
+        try:
+            with np.load(io.BytesIO(_read(path)), allow_pickle=False) as file:
                 return self._checked(file, cell)
         except FileNotFoundError:
             return Restored(None, 0.0, 0, "none found")
         except _RefusedError as error:
-            return Restored(None, 0.0, 0, f"refused: {error}")
+            return Restored(None, 0.0, 0, f"{REFUSED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return Restored(None, 0.0, 0, f"refused: unreadable ({type(error).__name__}: {error})")
-
-    def _read(self) -> bytes:
-        if self.path.stat().st_size > LONGEST_FILE:
-            raise _RefusedError("file too long")
-        return self.path.read_bytes()
+            return Restored(None, 0.0, 0, f"{REFUSED}unreadable ({type(error).__name__}: {error})")
 
     def _checked(self, file: Mapping[str, np.ndarray], cell: CellModel) -> Restored:
         if int(file["format"]) != FORMAT:
@@ -120,7 +137,7 @@ class CheckpointFile:
         state, restarts = file["state"], int(file["restarts"]) + 1
         insane = _insane(state, cell)
         if insane:
-            return Restored(None, 0.0, restarts, f"refused: {insane}")
+            return Restored(None, 0.0, restarts, f"{REFUSED}{insane}")
         saved = Moment(float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"]))
         return Restored(
             state,
@@ -132,6 +149,12 @@ class CheckpointFile:
 
 class _RefusedError(Exception):
     """Why a checkpoint is not taken up."""
+
+
+def _read(path: Path) -> bytes:
+    if path.stat().st_size > LONGEST_FILE:
+        raise _RefusedError("file too long")
+    return path.read_bytes()
 
 
 def _insane(state: NDArray[np.void], cell: CellModel) -> str:

@@ -240,6 +240,7 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
     tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "pack.npz"
+    (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     estimator = new_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
     settings, cell = SETTINGS, CELL
@@ -260,12 +261,26 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
     if damage == "format":
         monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", FORMAT + 1)
         reason = f"refused: format {FORMAT}, this version reads {FORMAT + 1}"
+    found = file.read_bytes()
     async with running(settings, cell, checkpoint=checkpoint(file, settings, cell)) as run:
         snapshot = await run.sink.until(lambda _: True)
         run.source.give((0.0, 0.0, 3.8 * cell.cell.series_count))
         estimator = await run.end()
     assert snapshot.health.checkpoint.startswith(reason)
+    assert snapshot.health.checkpoint.endswith("; set aside as pack.refused.npz")
+    assert (tmp_path / "pack.refused.npz").read_bytes() == found
     assert estimator.state["soc_coulomb"][0] == 0.5
+
+
+async def test_a_setting_that_was_wrong_for_a_while_costs_no_checkpoint(tmp_path: Path) -> None:
+    file, wrong = tmp_path / "pack.npz", CELL.pack(2, 1)
+    for cell, soc, restarts in ((CELL, 0.5, 0), (wrong, 0.5, 0), (CELL, 0.4, 1), (wrong, 0.4, 1)):
+        async with running(cell=cell, checkpoint=checkpoint(file, SETTINGS, cell)) as run:
+            run.source.give(*((float(i), 0.275, 3.8 * cell.cell.series_count) for i in range(361)))  # a tenth
+            estimator = await run.end()
+        assert estimator.state["soc_coulomb"][0] == pytest.approx(soc - 0.1, abs=1e-6)
+        assert run.sink.snapshots[-1].health.restarts == restarts
+    assert run.sink.snapshots[0].health.checkpoint.endswith(", set aside earlier")
 
 
 async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_path: Path) -> None:
