@@ -12,7 +12,7 @@ BY_ID = Path("/dev/serial/by-id")
 
 
 class NoPortError(Exception):
-    """The board's port cannot be told or opened; the message says what was found. It may come yet."""
+    """The board's port cannot be told or opened; the message is the port and why. It may come yet."""
 
 
 def stable_names() -> list[Path]:
@@ -37,13 +37,13 @@ def resolve_port(port: str) -> str:
     """
     if port != "auto":
         if not Path(port).exists():
-            raise NoPortError(f"waiting for {port}: it does not exist")
+            raise NoPortError(f"{port}: it does not exist")
         return port
     found = board_ports()
     if not found:
-        raise NoPortError("waiting for a board: no USB serial port is there")
+        raise NoPortError("auto: no USB serial port is there")
     if len(found) > 1:
-        raise NoPortError(f"{len(found)} serial ports are there; set sensor.port to one of {', '.join(found)}")
+        raise NoPortError(f"auto: {len(found)} serial ports are there; choose one: {', '.join(found)}")
     return found[0]
 
 

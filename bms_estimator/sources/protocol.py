@@ -4,6 +4,7 @@ Samples in bulk are decoded by ``kernels.framing``; this codec is for what is ra
 """
 
 import binascii
+import math
 import struct
 from dataclasses import dataclass, fields
 from enum import IntEnum, IntFlag
@@ -14,6 +15,8 @@ from cobs import cobs
 PROTOCOL_VERSION = 1
 BAUD = 500_000
 RATE_HZ = range(1, 1001)
+LEAST_BANDGAP_V, MOST_BANDGAP_V = 1.0, 1.2
+"""What the internal reference of an ATmega328P may be, by its data sheet [V]."""
 DELIMITER = b"\0"
 MODULUS = 1 << 32
 """Sequence and microseconds count up to here and begin at 0 again."""
@@ -174,6 +177,13 @@ class Hello:
     def firmware(self) -> str:
         """Version as people write it."""
         return f"{self.firmware_major}.{self.firmware_minor}.{self.firmware_patch}"
+
+    @property
+    def reference_v(self) -> float:
+        """Full range of its converter as measured against the bandgap at its reset [V]; NaN when it was not."""
+        if self.bandgap_sum == 0:
+            return math.nan
+        return self.bandgap_uv * 1e-6 * self.bandgap_count * (1 << self.adc_bits) / self.bandgap_sum
 
 
 @dataclass(frozen=True)

@@ -186,7 +186,7 @@ class SerialBoard:
                 path = resolve_port(self._settings.port)
                 line = open_port(path, self._settings.baud)
             except (NoPortError, OSError) as error:
-                self._say(str(error))
+                self._say(f"waiting for {error}")
                 await asyncio.sleep(retry_s)
                 retry_s = min(2.0 * retry_s, LONGEST_RETRY_S)
                 continue

@@ -1,0 +1,80 @@
+"""``bms-estimator board``: what a board says of itself, and what is set once when it is new."""
+
+from typing import Annotated
+
+import typer
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.ports import NoPortError, resolve_port
+from bms_estimator.sources.probe import AskedBoard
+from bms_estimator.sources.protocol import (
+    BAUD,
+    LEAST_BANDGAP_V,
+    MOST_BANDGAP_V,
+    Hello,
+    set_bandgap_command,
+    set_serial_command,
+)
+
+
+def board(
+    port: Annotated[str, typer.Argument(help="serial port; auto: the only one that is there")] = "auto",
+    aref_v: Annotated[
+        float | None,
+        typer.Option(help="measured between AREF and GND [V]: sets the board's bandgap", show_default=False),
+    ] = None,
+    serial: Annotated[
+        int | None, typer.Option(min=1, max=2**32 - 1, help="sets the board's serial number", show_default=False)
+    ] = None,
+    baud: Annotated[int, typer.Option(min=1200, help="of the board")] = BAUD,
+) -> None:
+    """Show what a board says of itself, and set what it keeps in its EEPROM: its bandgap and its serial number.
+
+    Voltage and current are as right as the bandgap is, which differs by up to 10 % from board to board.
+    """
+    try:
+        with AskedBoard(resolve_port(port), baud) as asked:
+            hello = asked.hello()
+            typer.echo(_described(hello))
+            if aref_v is not None:
+                told = asked.tell(set_bandgap_command(_bandgap_v(asked, hello, aref_v)))
+                typer.echo(f"bandgap: was {_volts(hello)}, now {_volts(told)}")
+            if serial is not None:
+                told = asked.tell(set_serial_command(serial))
+                typer.echo(f"serial: was {hello.serial:08x}, now {told.serial:08x}")
+    except NoPortError as error:
+        raise UserError(str(error)) from None
+
+
+def _bandgap_v(asked: AskedBoard, hello: Hello, aref_v: float) -> float:
+    """The bandgap with which the board's reference is ``aref_v``.
+
+    Raises:
+        UserError: No board has such a bandgap.
+    """
+    reference_v = asked.reference_v()
+    bandgap_v = hello.bandgap_uv * 1e-6 * aref_v / reference_v
+    if not LEAST_BANDGAP_V <= bandgap_v <= MOST_BANDGAP_V:
+        raise UserError(
+            f"--aref-v {aref_v:g}: the bandgap would be {bandgap_v:.3f} V, but every board's is between "
+            f"{LEAST_BANDGAP_V} and {MOST_BANDGAP_V} V; with {_volts(hello)} the board measures {reference_v:.3f} V at AREF"
+        )
+    return bandgap_v
+
+
+def _described(hello: Hello) -> str:
+    ntc = f"{hello.ntc_r25_ohm} ohm at 25 degC, beta {hello.ntc_beta_k} K" if hello.channels & 1 else "none"
+    return (
+        f"firmware   {hello.firmware}\n"
+        f"serial     {hello.serial:08x}\n"
+        f"rate       {hello.rate_hz} Hz\n"
+        f"voltage    divider {hello.divider_ppm * 1e-6:g}\n"
+        f"current    {hello.current_uv_per_a * 1e-6:g} V/A, zero at {hello.current_zero_ppm * 1e-6:.6f} of the reference\n"
+        f"NTC        {ntc}\n"
+        f"bandgap    {_volts(hello)}\n"
+        f"reference  {hello.reference_v:.3f} V, measured against the bandgap at reset"
+    )
+
+
+def _volts(hello: Hello) -> str:
+    return f"{hello.bandgap_uv * 1e-6:.4f} V"

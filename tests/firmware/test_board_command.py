@@ -1,0 +1,44 @@
+"""``bms-estimator board`` and the firmware."""
+
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.cli.main import main
+from bms_estimator.sources import probe
+from bms_estimator.sources.frames import FrameDecoder
+from bms_estimator.sources.protocol import hello_command, set_bandgap_command
+from tests.firmware.host import Host
+from tests.patience import LONG_S
+from tests.simavr_board import SimavrBoard, write_readings
+
+pytestmark = pytest.mark.usefixtures("firmware")
+
+
+def measured(host: Host) -> tuple[float, float]:
+    """Mean voltage and current of the next fifty samples [V], [A]."""
+    host.send(hello_command())
+    hello = host.hello()
+    block = FrameDecoder().feed(0.0, b"".join([hello.encode(), *(s.encode() for s in host.take(50))]))
+    return block["voltage_v"].mean(), block["current_a"].mean()
+
+
+def test_a_board_whose_bandgap_was_wrong_measures_right_once_its_aref_was_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probe, "PATIENCE_S", LONG_S)
+    monkeypatch.setattr(probe, "REFERENCE_S", LONG_S)
+    readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 22.2, 25.0)])
+    with SimavrBoard(readings, avcc_mv=4750) as board, Host(board.path) as host:
+        assert host.ask(set_bandgap_command(1.02)).value == 1_020_000
+        assert measured(host) == pytest.approx((22.2 * 1.02 / 1.1, 2.5 * 1.02 / 1.1), rel=5e-3)
+        with pytest.raises(SystemExit) as ended:
+            main(["board", board.path, "--aref-v", "4.75", "--serial", "77"])
+        out, err = capsys.readouterr()
+        assert (ended.value.code or 0, err) == (0, "")
+        assert "bandgap: was 1.0200 V, now 1." in out
+        assert "serial: was 00000000, now 0000004d" in out
+        assert measured(host) == pytest.approx((22.2, 2.5), rel=5e-3)
+        hello = host.hellos[-1][1]
+    assert hello.bandgap_uv == pytest.approx(1_100_000, rel=1e-3)
+    assert hello.serial == 77
