@@ -4,8 +4,6 @@ One decoder serves the live line and the replay. All it knows between calls stan
 depends on how the bytes were cut into calls, except for the arrival time of the byte that ends a frame.
 """
 
-import math
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -165,32 +163,25 @@ def open_packet(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
 
 
 @njit(cache=True)
-def prefer(configured: float, of_board: float) -> float:
-    """What is configured, where it is."""
-    return of_board if math.isnan(configured) else configured
-
-
-@njit(cache=True)
-def take_hello(d: Record, s: Record, fixed: Record) -> None:
-    """The board's own scaling, where ``fixed`` holds NaN; and whether the board was reset."""
+def take_hello(d: Record, s: Record) -> None:
+    """The board's scaling; and whether the board was reset."""
     p = d.packet
     boot_id = take(p, 6, 2)
     behind = (take(p, 12, 4) - d.expected) & _MASK >= _HALF
     if d.started and (behind or (d.boot_id >= 0 and boot_id != d.boot_id)):
         d.reset_pending = 1
     d.boot_id = boot_id
-    s.full_scale = prefer(fixed.full_scale, float(1 << min(take(p, 26, 1), 24)))
+    s.full_scale = float(1 << min(take(p, 26, 1), 24))
     s.ntc_fitted = take(p, 27, 1) & 1
-    s.divider = prefer(fixed.divider, take(p, 28, 4) * 1e-6)
-    s.volts_per_ampere = prefer(fixed.volts_per_ampere, take(p, 32, 4) * 1e-6)
-    s.current_zero = prefer(fixed.current_zero, take(p, 36, 4) * 1e-6)
-    s.bandgap_v = prefer(fixed.bandgap_v, take(p, 40, 4) * 1e-6)
-    s.reference_v = fixed.reference_v
+    s.divider = take(p, 28, 4) * 1e-6
+    s.volts_per_ampere = take(p, 32, 4) * 1e-6
+    s.current_zero = take(p, 36, 4) * 1e-6
+    s.bandgap_v = take(p, 40, 4) * 1e-6
     if s.bandgap_weight == 0.0 and take(p, 48, 2) > 0:
         take_bandgap(s, float(take(p, 44, 4)), float(take(p, 48, 2)))
-    s.ntc_series_ohm = prefer(fixed.ntc_series_ohm, float(take(p, 50, 4)))
-    s.ntc_r25_ohm = prefer(fixed.ntc_r25_ohm, float(take(p, 54, 4)))
-    s.ntc_beta_k = prefer(fixed.ntc_beta_k, float(take(p, 58, 2)))
+    s.ntc_series_ohm = float(take(p, 50, 4))
+    s.ntc_r25_ohm = float(take(p, 54, 4))
+    s.ntc_beta_k = float(take(p, 58, 2))
     s.known = 1
 
 
@@ -283,7 +274,6 @@ def decode(
     arrivals_s: NDArray[np.float64],
     decoder: Records,
     scaling: Records,
-    fixed: Records,
     samples: Records,
     messages: NDArray[np.uint8],
 ) -> tuple[int, int, int]:
@@ -296,14 +286,13 @@ def decode(
         arrivals_s: Shape (reads,): when each read came.
         decoder: Shape (1,), dtype DECODER; updated.
         scaling: Shape (1,), dtype SCALING; updated.
-        fixed: Shape (1,), dtype SCALING: what is configured, NaN where the board's hello counts.
         samples: Output, dtype SAMPLE.
         messages: Output, shape (n, PACKET_BYTES): packets other than samples, whole, filled up with zeros.
 
     Returns:
         Where the next call begins, samples written, messages written.
     """
-    d, s, f = decoder[0], scaling[0], fixed[0]
+    d, s = decoder[0], scaling[0]
     buffer = d.buffer
     length = d.length
     n_samples = n_messages = 0
@@ -330,7 +319,7 @@ def decode(
                 n_samples += take_sample(d, s, arrivals_s[read], samples[n_samples])
             elif kind != 0:
                 if kind == MESSAGE_HELLO:
-                    take_hello(d, s, f)
+                    take_hello(d, s)
                 messages[n_messages, :] = d.packet[:PACKET_BYTES]
                 messages[n_messages, HELLO_BYTES if kind == MESSAGE_HELLO else ACK_BYTES :] = 0
                 n_messages += 1

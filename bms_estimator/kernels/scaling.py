@@ -15,7 +15,6 @@ SCALING = np.dtype(
         ("volts_per_ampere", "f8"),  # slope of the current sensor [V/A]
         ("current_zero", "f8"),  # its output without current, as a part of the reference
         ("bandgap_v", "f8"),  # the converter's internal reference [V]
-        ("reference_v", "f8"),  # the converter's full range [V]; NaN: measured against the bandgap
         ("ntc_series_ohm", "f8"),
         ("ntc_r25_ohm", "f8"),
         ("ntc_beta_k", "f8"),
@@ -57,8 +56,6 @@ def take_ntc(s: Record, total: float, count: float) -> None:
 @njit(cache=True)
 def reference(s: Record) -> float:
     """The converter's full range [V]; NaN before the bandgap was measured."""
-    if math.isfinite(s.reference_v):
-        return s.reference_v
     if s.bandgap_mean <= 0.0:
         return math.nan
     return s.bandgap_v * s.full_scale / s.bandgap_mean

@@ -60,19 +60,6 @@ class FrameCounters:
         return asdict(self)
 
 
-@dataclass(frozen=True)
-class FixedScaling:
-    """What is configured; None: what the board says or measures counts."""
-
-    divider: float | None = None
-    volts_per_ampere: float | None = None
-    current_zero: float | None = None
-    """Sensor's output without current, as a part of the reference."""
-    bandgap_v: float | None = None
-    reference_v: float | None = None
-    """The converter's full range, if it is not to be measured against the bandgap [V]."""
-
-
 class FrameDecoder:
     """Bytes of a board to samples.
 
@@ -80,15 +67,13 @@ class FrameDecoder:
 
     Args:
         current_sign: What the board calls positive; samples are positive on discharge.
-        fixed: Scaling that is configured.
     """
 
-    def __init__(self, *, current_sign: CurrentSign = "discharge_positive", fixed: FixedScaling | None = None) -> None:
+    def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
         self._state = np.zeros(1, dtype=DECODER)
         self._state["boot_id"] = -1
         self._state["current_sign"] = 1.0 if current_sign == "discharge_positive" else -1.0
         self._scaling = np.zeros(1, dtype=SCALING)
-        self._fixed = _fixed_record(fixed or FixedScaling())
         self._samples = np.zeros(256, dtype=SAMPLE)
         self._messages = np.zeros((_MESSAGES, PACKET_BYTES), dtype=np.uint8)
         self._hello: Hello | None = None
@@ -195,7 +180,7 @@ class FrameDecoder:
     ) -> tuple[int, int, int]:
         """``kernels.framing.decode`` from ``position`` on, behind the ``count`` samples that are there."""
         out = self._samples[count:]
-        return decode(data, position, ends, arrivals_s, self._state, self._scaling, self._fixed, out, self._messages)
+        return decode(data, position, ends, arrivals_s, self._state, self._scaling, out, self._messages)
 
     def _take_message(self, packet: NDArray[np.uint8]) -> None:
         if packet[1] == MessageType.HELLO:
@@ -215,13 +200,3 @@ def is_text(data: bytes) -> bool:
 
 
 _TEXT = frozenset(b"\t\r\n" + bytes(range(0x20, 0x7F)))
-
-
-def _fixed_record(fixed: FixedScaling) -> NDArray[np.void]:
-    """Shape (1,), dtype SCALING, NaN where nothing is configured."""
-    record = np.zeros(1, dtype=SCALING)
-    for name in SCALING.names or ():
-        value = getattr(fixed, name, None)
-        if SCALING[name].kind == "f":
-            record[name] = np.nan if value is None else value
-    return record

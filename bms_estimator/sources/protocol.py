@@ -116,11 +116,6 @@ def zero_current_command() -> bytes:
     return command(MessageType.COMMAND_ZERO_CURRENT)
 
 
-def restart_command() -> bytes:
-    """Ask the board to reset itself through its watchdog."""
-    return command(MessageType.COMMAND_RESTART)
-
-
 def set_serial_command(serial: int) -> bytes:
     """Give the board a serial number, 1..2^32 - 1, for good."""
     return command(MessageType.COMMAND_SET_SERIAL, struct.pack("<I", serial))

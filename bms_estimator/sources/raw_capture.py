@@ -5,7 +5,7 @@ File format, version 1, numbers little-endian::
     header   8 bytes  "BMSRAW1\n"
              u32      length of the JSON that follows
              JSON     UTF-8: version, started (wall clock, ISO 8601 UTC), mode ("binary" or "text"), port, baud,
-                      current_sign, and what else the recorder wanted to say under "extra"
+                      current_sign; other names are ignored
              u16      CRC-16/CCITT-FALSE of the JSON
     record   f64      arrival time [s], the very float that the decoder got
              u32      length
@@ -24,11 +24,11 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Literal, Self, cast
+from typing import IO, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,6 @@ class CaptureHeader:
     current_sign: CurrentSign = "discharge_positive"
     started: str = ""
     """Wall clock at the first byte, ISO 8601 UTC; set by the writer when empty."""
-    extra: dict[str, Any] = field(default_factory=dict)
     version: int = VERSION
 
 
@@ -177,8 +176,8 @@ def read_header(path: Path) -> CaptureHeader:
         raise UserError(f"{path}: cannot be read: {error}") from None
 
 
-def read_capture(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[CaptureBatch]:
-    """Batches of reads, each about ``chunk_bytes`` of file, to the last whole record.
+def read_capture(path: Path) -> Iterator[CaptureBatch]:
+    """Batches of reads, each about ``CHUNK_BYTES`` of file, to the last whole record.
 
     Iterating a batch gives the calls that the live decoder got; ``decoder.feed_reads(batch.arrivals_s, batch.ends,
     batch.data)`` makes the same samples faster.
@@ -193,7 +192,7 @@ def read_capture(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture
     with file:
         _read_header(path, file)
         rest = b""
-        while more := _read_some(file, chunk_bytes):
+        while more := _read_some(file, CHUNK_BYTES):
             raw = np.frombuffer(rest + more, dtype=np.uint8)
             batch, taken = _split(raw)
             rest = raw[taken:].tobytes()
@@ -243,4 +242,5 @@ def _read_header(path: Path, file: IO[bytes]) -> CaptureHeader:
     values = json.loads(text)
     if values["version"] != VERSION:
         raise UserError(f"{path}: version {values['version']}, this program reads version {VERSION}")
-    return CaptureHeader(**values)
+    names = {field.name for field in fields(CaptureHeader)}
+    return CaptureHeader(**{name: value for name, value in values.items() if name in names})

@@ -32,11 +32,7 @@ enum sample_status {
     STATUS_VOLTAGE_SATURATED = 0x01,
     STATUS_CURRENT_SATURATED = 0x02,
     STATUS_OVERRUN = 0x04,
-    STATUS_AUX_IS_NTC = 0x08,
-    STATUS_RESET_POWER_ON = 0x10,  // the upper half is MCUSR shifted by four
-    STATUS_RESET_EXTERNAL = 0x20,
-    STATUS_RESET_BROWN_OUT = 0x40,
-    STATUS_RESET_WATCHDOG = 0x80
+    STATUS_AUX_IS_NTC = 0x08  // the upper half is MCUSR shifted by four
 };
 
 #define CHANNEL_NTC 0x01

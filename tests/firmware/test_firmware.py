@@ -22,7 +22,6 @@ from bms_estimator.sources.protocol import (
     SampleMessage,
     command,
     hello_command,
-    restart_command,
     seal,
     set_bandgap_command,
     set_rate_command,
@@ -193,7 +192,7 @@ def test_a_restart_is_a_watchdog_reset_and_what_is_kept_in_eeprom_survives_it(st
     assert host.ask(set_serial_command(0xC0FFEE)).value == 0xC0FFEE
     assert host.ask(set_bandgap_command(1.085)).value == 1_085_000
     host.take(20)  # an EEPROM takes 3.4 ms for a byte
-    assert host.ask(restart_command()).result == AckResult.OK
+    assert host.ask(command(MessageType.COMMAND_RESTART)).result == AckResult.OK
     host.until(lambda: len(host.hellos) == 2)
     hello = host.hellos[1][1]
     assert hello.reset_cause == ResetCause.WATCHDOG
@@ -208,7 +207,7 @@ def test_a_restart_is_a_watchdog_reset_and_what_is_kept_in_eeprom_survives_it(st
 def test_the_decoder_goes_on_across_a_restart(start: Start) -> None:
     host = start()
     host.take(100)
-    host.ask(restart_command())
+    host.ask(command(MessageType.COMMAND_RESTART))
     host.until(lambda: len(host.hellos) == 2)
     host.take(100)
     decoder, (cut, hello) = FrameDecoder(), host.hellos[-1]

@@ -16,9 +16,10 @@ from bms_estimator.sources.decoder import make_decoder
 from bms_estimator.sources.frames import FrameCounters, FrameDecoder
 from bms_estimator.sources.protocol import (
     AckResult,
+    MessageType,
     ResetCause,
+    command,
     hello_command,
-    restart_command,
     set_bandgap_command,
     set_rate_command,
     set_serial_command,
@@ -172,7 +173,7 @@ async def test_commands_are_obeyed_and_answered() -> None:
             assert await ask(hello_command() + set_serial_command(78)) == (AckResult.OK, 78)
             assert decoder.hello is not None
             assert (decoder.hello.rate_hz, decoder.hello.serial) == (250, 77)
-            await ask(restart_command())
+            await ask(command(MessageType.COMMAND_RESTART))
             await ask(hello_command() + set_serial_command(79))
             assert decoder.hello.reset_cause == ResetCause.WATCHDOG
         finally:
