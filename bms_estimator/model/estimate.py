@@ -81,11 +81,13 @@ class Health(Report):
     rss_mib: float | None = Field(description="resident memory [MiB]")
     restarts: int = Field(description="starts that found a checkpoint of an earlier run")
     reconnects: int = Field(description="times the source was opened again")
-    sensor_online: bool = Field(description="a valid frame came within 3 publish periods")
+    sensor_online: bool = Field(description="a valid frame came within 3 publish or sample periods")
     sensor_message: str | None = Field(description="why the sensor is not online; null when it is")
     line: dict[str, int] = Field(description="frames and faults of the line by kind, since start")
     samples: dict[str, int] = Field(description="samples accepted and dropped by kind, since start")
-    identifier: dict[str, int] = Field(description="samples the identifier did not believe, and its resets, since start")
+    identifier: dict[str, int] = Field(
+        description="samples the identifier did not believe, and its resets, since start"
+    )
     suspects: list[str] = Field(description="what the identifier suspects of its input, and what to do; empty: nothing")
     lock_losses: int = Field(description="times the observer lost track")
     gain_rearms: int = Field(description="times k was started again before the gain turned")
