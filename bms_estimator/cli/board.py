@@ -24,7 +24,10 @@ def board(
         typer.Option(help="measured between AREF and GND [V]: sets the board's bandgap", show_default=False),
     ] = None,
     serial: Annotated[
-        int | None, typer.Option(min=1, max=2**32 - 1, help="sets the board's serial number", show_default=False)
+        int | None,
+        typer.Option(
+            min=1, max=2**32 - 1, help="sets the board's serial number; shown in hexadecimal", show_default=False
+        ),
     ] = None,
     baud: Annotated[int, typer.Option(min=1200, help="of the board")] = BAUD,
 ) -> None:

@@ -23,6 +23,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.clock import Clock
+from bms_estimator.service.health import dropped_text
 from bms_estimator.service.live import new_estimator
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.requests import Requests
@@ -62,6 +63,8 @@ def replay(
     if isinstance(source, RawCapture):
         for warning in _unread(source, result.duration_s or 0.0):
             typer.echo(f"warning: {capture}: {warning}", err=True)
+    if result.samples == 0:
+        raise UserError(f"{capture}: no usable sample; dropped: {dropped_text(result.dropped)}")
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
@@ -125,11 +128,12 @@ def result_table(capture: Path, result: Result) -> Table:
     table = Table(title=capture.name, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column(justify="right")
-    dropped = ", ".join(f"{count:,} {kind.replace('_', ' ')}" for kind, count in result.dropped.items() if count)
     lock = f"[red]lost {result.lock_losses} times[/]" if result.lock_lost else "[green]kept[/]"
     rows = {
         "samples": f"{result.samples:,}",
-        "dropped": dropped or "none",
+        "dropped": dropped_text(result.dropped),
+        **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
+        **({"clock set back": f"{result.time_steps_back:,} times"} if result.time_steps_back else {}),
         "duration": _text(result.duration_s, ",.1f", "s"),
         "SOC": f"{_text(result.soc_initial, '.2%')} to {_text(result.soc_final, '.2%')}",
         "SOC, std at the end": _text(result.soc_std_final, ".2%"),

@@ -43,6 +43,7 @@ class Summary:
         self._rows = 0
         self._first: np.void | None = None
         self._last: np.void | None = None
+        self._duration_s = 0.0
         self._innovation = self._error = self._soc_difference = 0.0
 
     def add(self, trace: NDArray[np.void]) -> None:
@@ -51,6 +52,8 @@ class Summary:
             return
         if self._first is None:
             self._first = trace[0].copy()
+        before_s = trace["time_s"][0] if self._last is None else self._last["time_s"]
+        self._duration_s += float(np.diff(trace["time_s"], prepend=before_s).clip(min=0.0).sum())
         self._last = trace[-1].copy()
         self._rows += trace.size
         error = trace["voltage_v"] - trace["voltage_estimate_v"]
@@ -71,7 +74,7 @@ class Summary:
         counters = sample_counters(state)
         return Result(
             samples=self._rows,
-            duration_s=_between(self._first, self._last),
+            duration_s=self._duration_s if self._rows else None,
             soc_initial=_field(self._first, "soc"),
             soc_final=_field(self._last, "soc"),
             soc_std_final=_field(self._last, "soc_std"),
@@ -98,7 +101,3 @@ class Summary:
 
 def _field(row: np.void | None, name: str) -> float | None:
     return None if row is None else finite(row[name])
-
-
-def _between(first: np.void | None, last: np.void | None) -> float | None:
-    return None if first is None or last is None else finite(last["time_s"] - first["time_s"])

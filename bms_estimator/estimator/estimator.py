@@ -114,7 +114,7 @@ class Estimator:
         x["mean"][SOC] = soc
         x["covariance"][SOC, :] = x["covariance"][:, SOC] = 0.0
         x["covariance"][SOC, SOC] = SET_SOC_STD**2
-        x["offset_sense"][SOC] = x["capacity_sense"][SOC] = 0.0
+        x["offset_sense"][SOC] = x["capacity_sense"][SOC] = x["outliers"] = x["breaks"] = 0.0
         keep(x)
 
     def resume(self, unseen_s: float) -> None:

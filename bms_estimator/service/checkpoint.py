@@ -103,20 +103,23 @@ class CheckpointFile:
         One set aside earlier is taken up again when it is good: a setting that was wrong for a while costs nothing.
         """
         found = self._load(self.path, cell)
-        if not found.reason.startswith(REFUSED):
+        if found.state is not None:
             return found
+        refused = found.reason.startswith(REFUSED)
         aside, new = self.path.with_suffix(".refused.npz"), self.path.with_suffix(".new")
         earlier = self._load(aside, cell)
         try:
-            self.path.replace(new)
+            if refused:
+                self.path.replace(new)
             if earlier.state is not None:
                 aside.replace(self.path)
-            new.replace(aside)
+            if refused:
+                new.replace(aside)
         except OSError as error:
             return replace(found, reason=f"{found.reason}; it cannot be set aside: {error}")
         if earlier.state is not None:
             return replace(earlier, reason=f"{earlier.reason}, set aside earlier")
-        return replace(found, reason=f"{found.reason}; set aside as {aside.name}")
+        return replace(found, reason=f"{found.reason}; set aside as {aside.name}") if refused else found
 
     def _load(self, path: Path, cell: CellModel) -> Restored:
         try:

@@ -29,6 +29,12 @@ def sample_counters(state: np.void) -> dict[str, int]:
     return {name: int(state[name]) for name in names}
 
 
+def dropped_text(dropped: Mapping[str, int]) -> str:
+    """What was not used, for people: counts by kind, the kinds without ``dropped_``."""
+    words = {"range": "outside the cell's range"}
+    return ", ".join(f"{n:,} {words.get(kind, kind).replace('_', ' ')}" for kind, n in dropped.items() if n) or "none"
+
+
 def identifier_counters(record: np.void) -> dict[str, int]:
     """How often the identifier did not believe its input or itself, of a record of ESTIMATOR_STATE."""
     return {name: int(record["identifier"][name]) for name in IDENTIFIER_COUNTERS}

@@ -11,7 +11,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.estimate import Estimate, Health, Info, Snapshot
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.clock import Clock
-from bms_estimator.service.health import health_report, sample_counters
+from bms_estimator.service.health import dropped_text, health_report, sample_counters
 from bms_estimator.service.parameters import parameter_report
 from bms_estimator.service.remaining import remaining_charge
 from bms_estimator.service.report import estimate_report, info_report, publish_rate_hz
@@ -147,5 +147,6 @@ class Publisher:
             return self._source.message
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
-        dropped = {k: n for k, n in sample_counters(self._estimator.state[0]).items() if k.startswith("dropped_") and n}
-        return f"no usable sample for {silent_s:.1f} s; dropped so far: {dropped or 'none'}"
+        counted = sample_counters(self._estimator.state[0]).items()
+        dropped = {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}
+        return f"no usable sample for {silent_s:.1f} s; dropped so far: {dropped_text(dropped)}"

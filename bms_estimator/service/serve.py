@@ -1,10 +1,14 @@
 """The service of one pack as ``bms-estimator run`` starts it: board, estimator, broker, checkpoint, signals."""
 
 import asyncio
+import contextlib
+import fcntl
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel
@@ -17,6 +21,8 @@ from bms_estimator.service.requests import Requests
 from bms_estimator.sinks import Sink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sources.serial_board import SerialBoard, Tap
+
+log = structlog.get_logger(__name__)
 
 
 async def serve(
@@ -55,15 +61,36 @@ async def serve(
     if settings.mqtt is not None:
         sample_period_s = settings.sensor.sample_period_s
         all_sinks.append(MqttSink(settings.mqtt, settings.pack.name, requests.answer, sample_period_s=sample_period_s))
-    return await run_live(
-        settings,
-        cell,
-        source=board,
-        sinks=all_sinks,
-        stop=stop,
-        checkpoint=_checkpoint(settings, cell),
-        requests=requests,
-    )
+    checkpoint = _checkpoint(settings, cell)
+    with alone(checkpoint.path.with_suffix(".lock")) if checkpoint else contextlib.nullcontext():
+        return await run_live(
+            settings, cell, source=board, sinks=all_sinks, stop=stop, checkpoint=checkpoint, requests=requests
+        )
+
+
+@contextlib.contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Serve a pack alone: two services would overwrite each other's checkpoint and availability.
+
+    Args:
+        path: Lock file, made where it is not there; the system frees it however the process ends.
+
+    Raises:
+        UserError: Another process holds it.
+    """
+    with contextlib.ExitStack() as held:
+        try:
+            file = held.enter_context(path.open("a+"))
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            file.truncate(0)
+            file.write(f"{os.getpid()}\n")
+            file.flush()
+        except BlockingIOError:
+            holder = path.read_text(encoding="ascii").strip() or "?"
+            raise UserError(f"{path}: this pack is served already, by process {holder}") from None
+        except OSError as error:  # nor will the checkpoint be written, which health says
+            log.warning("cannot make sure that this pack is served once", file=str(path), reason=error.strerror)
+        yield
 
 
 def _checkpoint(settings: Settings, cell: CellModel) -> CheckpointFile | None:

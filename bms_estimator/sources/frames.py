@@ -24,7 +24,7 @@ class FrameFault(Enum):
     """What is wrong with the line as a whole; the value says so to people."""
 
     WRONG_BAUD = "bytes come, but no valid frame among them: wrong baud rate?"
-    TEXT = "the board prints text, not frames: sensor.protocol should be text"
+    TEXT = "the board prints text, not frames: sensor.protocol should be text, --text without a settings file"
     BINARY = "the board sends bytes that are no text: wrong baud rate, or sensor.protocol should be binary"
     NEWER_PROTOCOL = "the board speaks another version of the protocol: update this program or the firmware"
     NO_HELLO = "frames come, but the board has not told its scaling yet"

@@ -164,7 +164,7 @@ def open_capture(path: Path, sensor: SensorSettings | None = None) -> Capture:
         UserError: No such file, or it is neither.
     """
     if not path.is_file():
-        raise UserError(f"{path}: no such file")
+        raise UserError(f"{path}: {'is a directory' if path.is_dir() else 'no such file'}")
     table = table_reader(path)
     if table is not None:
         return table

@@ -168,7 +168,9 @@ class SerialBoard:
         except TimeoutError:
             raise UserError(f"the board has not answered within {ZERO_S:.0f} s") from None
         if ack.result != AckResult.OK:
-            raise UserError(f"the board refuses: {ack.result.name.lower().replace('_', ' ')}; is the sensor connected?")
+            raise UserError(
+                f"the board refuses: {ack.result.name.lower().replace('_', ' ')}; is the sensor connected, and no current flowing?"
+            )
 
     async def _learn_zero(self, zero_ppm: int) -> None:
         """Until the hello that holds the board's new zero has come: the decoder knows no other way to it."""

@@ -4,6 +4,7 @@ import csv
 import gzip
 import json
 import math
+import re
 import shutil
 
 import numpy as np
@@ -200,3 +201,26 @@ def test_estimates_from_before_outlive_a_capture_that_cannot_be_read(capture, tm
     wrong.write_text("time_s,voltage_v\n0,3.7\n")
     assert run(capsys, "replay", wrong, "--cell", "ncr18650", "--out", out)[0] == 2
     assert out.read_bytes() == before
+
+
+def test_a_capture_without_a_usable_sample_is_an_error(tmp_path, capsys):
+    empty = tmp_path / "nan.csv"
+    empty.write_text("time_s,current_a,voltage_v\n0,0.1,nan\n1,0.1,9.9\n")
+    code, out, err = run(capsys, "replay", empty, "--cell", "ncr18650", "--json")
+    assert (code, out) == (2, "")
+    assert "nan.csv: no usable sample; dropped: 1 not finite, 1 outside the cell's range" in err
+
+
+def test_time_that_runs_backwards_is_said(tmp_path, capsys):
+    backwards = tmp_path / "backwards.csv"
+    backwards.write_text("time_s,current_a,voltage_v\n" + "".join(f"{9 - j},0.1,3.8\n" for j in range(10)))
+    code, out, _ = run(capsys, "replay", backwards, "--cell", "ncr18650")
+    assert code == 0
+    assert re.search(r"clock set back +9 times", out)
+    assert re.search(r"duration +0.0 s", out)
+
+
+def test_a_folder_is_no_capture(tmp_path, capsys):
+    code, _, err = run(capsys, "replay", tmp_path, "--cell", "ncr18650")
+    assert code == 2
+    assert f"{tmp_path}: is a directory" in err

@@ -183,7 +183,7 @@ async def test_saturated_and_impossible_voltages_are_dropped_and_the_sensor_is_n
         _, health = await live.end()
     assert health.samples["dropped_saturated"] == 5
     assert health.samples["dropped_range"] == 5
-    assert "dropped_range" in (stale.health.sensor_message or "")
+    assert "outside the cell's range" in (stale.health.sensor_message or "")
 
 
 async def test_a_wrong_baud_rate_reaches_the_published_health(line: Line) -> None:

@@ -1,4 +1,5 @@
 import asyncio
+import os
 import socket
 import threading
 from collections.abc import AsyncIterator
@@ -21,6 +22,7 @@ from bms_estimator.service.clock import Clock
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.requests import Requests
+from bms_estimator.service.serve import alone
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
@@ -151,7 +153,7 @@ async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> N
         await run.end()
     health = run.sink.snapshots[-1].health
     assert not health.sensor_online
-    assert "dropped_range" in (health.sensor_message or "")
+    assert "outside the cell's range" in (health.sensor_message or "")
 
 
 async def test_the_source_says_why_nothing_comes() -> None:
@@ -281,6 +283,30 @@ async def test_a_setting_that_was_wrong_for_a_while_costs_no_checkpoint(tmp_path
         assert estimator.state["soc_coulomb"][0] == pytest.approx(soc - 0.1, abs=1e-6)
         assert run.sink.snapshots[-1].health.restarts == restarts
     assert run.sink.snapshots[0].health.checkpoint.endswith(", set aside earlier")
+
+
+async def test_a_wrong_setting_under_which_nothing_was_saved_costs_no_checkpoint(tmp_path: Path) -> None:
+    file = tmp_path / "pack.npz"
+    async with running(checkpoint=checkpoint(file)) as run:
+        run.source.give((0.0, 0.1, 3.8))
+        await run.end()
+    wrong = CELL.pack(2, 1)
+    async with running(cell=wrong, checkpoint=checkpoint(file, SETTINGS, wrong)) as run:
+        await run.sink.until(lambda _: True)
+        await run.end()
+    assert not file.exists()
+    async with running(checkpoint=checkpoint(file)) as run:
+        snapshot = await run.sink.until(lambda _: True)
+        await run.end()
+    assert snapshot.health.checkpoint == "restored: SOC 0.5000, set aside earlier"
+
+
+def test_a_pack_is_served_once_at_a_time(tmp_path: Path) -> None:
+    served = pytest.raises(UserError, match=f"served already, by process {os.getpid()}")
+    with alone(tmp_path / "pack.lock"), served, alone(tmp_path / "pack.lock"):
+        pass
+    with alone(tmp_path / "pack.lock"), alone(tmp_path / "other.lock"):
+        pass
 
 
 async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_path: Path) -> None:
