@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import VERDICTS
 from bms_estimator.estimator.lemma import failed, lemma_conditions
 from bms_estimator.kernels.estimate import Verdict
 from bms_estimator.model.cell import load_cell, shipped_cells
@@ -68,6 +69,10 @@ def test_a_bad_sample_is_dropped_counted_and_changes_nothing_else(
     assert estimator.step(time_s, current_a, voltage_v, int(status)) is verdict
     before[counter] += 1
     assert before.tobytes() == estimator.state.tobytes()
+
+
+def test_verdicts_are_found_by_their_value() -> None:
+    assert [VERDICTS[verdict] for verdict in Verdict] == list(Verdict)
 
 
 def test_a_clock_set_back_is_counted_and_costs_one_step_only() -> None:
