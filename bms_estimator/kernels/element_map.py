@@ -17,6 +17,8 @@ BINS = 25
 ELEMENT_NAMES = ("r_ts_ohm", "r_tl_ohm", "c_ts_farad", "c_tl_farad", "r_s_ohm")
 """In the order of their parameters: a1..a3, a4..a6, a7..a9, a10..a12, a13..a15."""
 ELEMENTS = len(ELEMENT_NAMES)
+CAPACITANCES = (2, 3)
+"""C_ts, C_tl among the elements."""
 LEARNED_VARIANCE = 0.5**2
 """A logarithm known worse than this (50 %) adds nothing to the map."""
 MODEL_ERROR = 0.02
@@ -125,14 +127,7 @@ def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float
     ):
         return amplitude, exponent, offset
     exponent = min(max(exponent, lower[i + 1]), upper[i + 1])
-    sw = sg = sgg = sy = sgy = 0.0
-    for b in range(BINS):
-        g = _sign(e) * math.exp(-exponent * fit.soc[b])
-        sw += fit.weight[b]
-        sg += fit.weight[b] * g
-        sgg += fit.weight[b] * g * g
-        sy += fit.weight[b] * fit.value[b]
-        sgy += fit.weight[b] * g * fit.value[b]
+    sw, sg, sgg, sy, sgy, _ = _sums(exponent, _sign(e), fit.soc, fit.value, fit.weight)
     for _ in range(ALTERNATIONS):
         amplitude = min(max((sgy - sg * offset) / sgg, lower[i]), upper[i])
         offset = min(max((sy - sg * amplitude) / sw, lower[i + 2]), upper[i + 2])
@@ -142,7 +137,7 @@ def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float
 @njit(cache=True)
 def _sign(e: int) -> float:
     """Capacitances rise with SOC, (2.7), (2.8): theirs is -1."""
-    return -1.0 if e in (2, 3) else 1.0
+    return -1.0 if e in CAPACITANCES else 1.0
 
 
 @njit(cache=True)
@@ -204,8 +199,10 @@ def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -
 
 
 @njit(cache=True)
-def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) -> tuple[float, float, float]:
-    """Amplitude and offset, both positive, of least weighted squares for this exponent; and the cost."""
+def _sums(
+    exponent: float, sign: float, x: Floats, y: Floats, w: Floats
+) -> tuple[float, float, float, float, float, float]:
+    """Weighted sums of 1, g, g g, y, g y, y y with g = sign e^(-exponent x)."""
     sw = sg = sgg = sy = sgy = syy = 0.0
     for b in range(BINS):
         g = sign * math.exp(-exponent * x[b])
@@ -215,6 +212,13 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
         sy += w[b] * y[b]
         sgy += w[b] * g * y[b]
         syy += w[b] * y[b] * y[b]
+    return sw, sg, sgg, sy, sgy, syy
+
+
+@njit(cache=True)
+def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) -> tuple[float, float, float]:
+    """Amplitude and offset, both positive, of least weighted squares for this exponent; and the cost."""
+    sw, sg, sgg, sy, sgy, syy = _sums(exponent, sign, x, y, w)
     det = sw * sgg - sg * sg
     offset = sy / sw
     amplitude = 1e-3 * offset

@@ -8,7 +8,7 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.charge import UNMEASURED_S
-from bms_estimator.kernels.element_map import ELEMENTS, age, fit_element, fit_within, learn
+from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
 from bms_estimator.kernels.identifier import identifier_init, identifier_step, soc
 from bms_estimator.kernels.identifier_state import LN_R_S, LN_R_TL, LN_R_TS, LN_TAU_TL, LN_TAU_TS, SOC
 from bms_estimator.kernels.margins import delta
@@ -18,8 +18,6 @@ FIT_EVERY_S = 10.0
 """One element is fitted this often, each in its turn [s of samples]."""
 LEAST_BINS = 3
 """Three parameters of an element need so many bins of SOC."""
-CAPACITANCES = (2, 3)
-"""C_ts, C_tl among the elements."""
 
 
 @njit(cache=True)

@@ -7,8 +7,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter, present_elements
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels import cell as chen_mora
-from bms_estimator.kernels.element_map import ELEMENTS
-from bms_estimator.kernels.identification import CAPACITANCES, hand_over
+from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS
+from bms_estimator.kernels.identification import hand_over
 from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, LN_CAPACITY, LN_R_S
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
