@@ -14,9 +14,9 @@ from bms_estimator.kernels.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.report import publish_rate_hz
 from bms_estimator.service.requests import Requests
 from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.snapshot.topics import publish_rate_hz
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 

@@ -13,11 +13,11 @@ from rich.console import Console
 
 import bms_estimator
 from bms_estimator.cli.run import LOG_LINES
+from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.model.settings import MqttSettings, ObserverSettings, PackSettings, SensorSettings, Settings
-from bms_estimator.service.demo_broker import DemoBroker
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import new_estimator
 from bms_estimator.service.logs import configure_logs

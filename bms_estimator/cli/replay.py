@@ -20,15 +20,15 @@ from bms_estimator.cli.pack import pack_or_cell, with_broker, with_pack
 from bms_estimator.cli.summary import Result, Summary
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.clock import Clock
-from bms_estimator.service.health import dropped_text
 from bms_estimator.service.live import new_estimator
-from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.requests import Requests
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.table import TableSink, table_sink
+from bms_estimator.snapshot.health import dropped_text
+from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources.replay import RawCapture, Replay, open_capture
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.service.health import sample_counters, suspicions
-from bms_estimator.service.report import finite
+from bms_estimator.snapshot.health import sample_counters, suspicions
+from bms_estimator.snapshot.topics import finite
 
 
 @dataclass(frozen=True)

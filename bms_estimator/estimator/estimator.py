@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.records import estimator_settings
-from bms_estimator.kernels import estimate as kernel
-from bms_estimator.kernels.estimate import Verdict
+from bms_estimator.kernels import sample_step as kernel
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
 from bms_estimator.kernels.identifier import identifier_init
 from bms_estimator.kernels.identifier_guard import keep
 from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, LN_CAPACITY, SOC, V_SLOW, V_TL, V_TS
+from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock

@@ -18,7 +18,7 @@ from bms_estimator.kernels.identifier_state import IDENTIFIER_COUNTERS, IDENTIFI
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.clock import Moment, moment
+from bms_estimator.service.moment import Moment, moment
 
 FORMAT = 4
 """Raise it to make all older checkpoints invalid."""

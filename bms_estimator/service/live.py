@@ -10,17 +10,17 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import CheckpointFile, resume
-from bms_estimator.service.clock import Clock
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
-from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.requests import Requests, number
-from bms_estimator.service.source import Source
 from bms_estimator.sinks import Sink
+from bms_estimator.snapshot.publisher import Publisher
+from bms_estimator.sources import Source
 
 log = structlog.get_logger(__name__)
 

@@ -1,1 +1,37 @@
 """Where samples come from: serial boards, captures, tables, the virtual board."""
+
+from collections.abc import AsyncIterator, Mapping
+from types import TracebackType
+from typing import Protocol, Self
+
+from bms_estimator.model.sample import SampleBlock
+
+
+class Source(Protocol):
+    """An async iterator of SAMPLE blocks that knows its faults.
+
+    A serial board never ends by itself; a capture or a table ends with its last row.
+    """
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Since start: ``frames_received``, ``frames_lost``, ``crc_errors``, ``reconnects`` and faults by kind."""
+
+    @property
+    def message(self) -> str | None:
+        """Why no samples come, for people; None when they do."""
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the board said of itself in its hello; empty when there was none."""
+
+    def __aiter__(self) -> AsyncIterator[SampleBlock]:
+        """Blocks of samples, none of them empty."""
+
+    async def __aenter__(self) -> Self:
+        """Open."""
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""

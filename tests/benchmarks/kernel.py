@@ -11,7 +11,7 @@ from observer_in_c import ObserverInC
 from table import Row
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels import estimate as kernel
+from bms_estimator.kernels import sample_step as kernel
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock

@@ -9,8 +9,8 @@ import sys
 import aiomqtt
 import pytest
 
+from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.demo_broker import DemoBroker
 from tests.patience import LONG_S
 
 RETAINED = ["bms/p/availability", "bms/p/sensor/availability", "bms/p/info", "homeassistant/device/p/config"]

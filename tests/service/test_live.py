@@ -13,12 +13,12 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings
 from bms_estimator.service.checkpoint import FORMAT, CheckpointFile, pack_identity
-from bms_estimator.service.clock import Clock
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.requests import Requests

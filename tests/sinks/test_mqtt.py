@@ -16,13 +16,13 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate, Snapshot
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import MqttSettings, Settings
-from bms_estimator.service.health import health_report
-from bms_estimator.service.parameters import parameter_report
-from bms_estimator.service.remaining import remaining_charge
-from bms_estimator.service.report import estimate_report, info_report
-from bms_estimator.service.window import Window
 from bms_estimator.sinks.home_assistant import discovery
 from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.snapshot.health import health_report
+from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.snapshot.remaining import remaining_charge
+from bms_estimator.snapshot.topics import estimate_report, info_report
+from bms_estimator.snapshot.window import Window
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 
 NOW = 1_700_000_000.0

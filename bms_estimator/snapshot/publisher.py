@@ -8,16 +8,16 @@ import structlog
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.clock import Clock
 from bms_estimator.model.estimate import Estimate, Health, Info, Snapshot
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.clock import Clock
-from bms_estimator.service.health import dropped_text, health_report, sample_counters
-from bms_estimator.service.parameters import parameter_report
-from bms_estimator.service.remaining import remaining_charge
-from bms_estimator.service.report import estimate_report, info_report, publish_rate_hz
-from bms_estimator.service.source import Source
-from bms_estimator.service.window import Window, WindowSummary
 from bms_estimator.sinks import FRESH_PERIODS, Sink
+from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
+from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.snapshot.remaining import remaining_charge
+from bms_estimator.snapshot.topics import estimate_report, info_report, publish_rate_hz
+from bms_estimator.snapshot.window import Window, WindowSummary
+from bms_estimator.sources import Source
 
 log = structlog.get_logger(__name__)
 

@@ -1,28 +1,14 @@
-"""The clocks, taken as a value so that tests can step them."""
+"""Moments that outlive the process: how long nobody measured."""
 
 import math
 import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 """Is there once systemd-timesyncd has set the wall clock."""
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Two clocks: ``wall`` says when (and may be stepped), ``monotonic`` says how long."""
-
-    wall: Callable[[], float] = time.time
-    monotonic: Callable[[], float] = time.monotonic
-
-    def utc(self) -> str:
-        """Wall clock now, ISO 8601."""
-        return iso_utc(self.wall())
 
 
 @dataclass(frozen=True)
@@ -58,8 +44,3 @@ def moment() -> Moment:
         boot_s=time.clock_gettime(time.CLOCK_BOOTTIME),
         boot=boot.strip().replace("-", ""),
     )
-
-
-def iso_utc(epoch_s: float) -> str:
-    """Seconds since 1970 as ISO 8601 in UTC with milliseconds: ``2024-05-01T12:00:00.250Z``."""
-    return datetime.fromtimestamp(epoch_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 
 from bms_estimator import __version__
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Estimate, Info
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.clock import iso_utc
-from bms_estimator.service.remaining import RemainingCharge
-from bms_estimator.service.window import WindowSummary
+from bms_estimator.snapshot.remaining import RemainingCharge
+from bms_estimator.snapshot.window import WindowSummary
 
 
 def finite(value: float) -> float | None:

@@ -9,8 +9,8 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
-from bms_estimator.service.clock import Moment, moment
 from bms_estimator.service.live import new_estimator
+from bms_estimator.service.moment import Moment, moment
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()
 SAVED = Moment(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, boot="one")

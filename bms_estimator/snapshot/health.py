@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from bms_estimator.kernels.identifier_state import IDENTIFIER_COUNTERS
+from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Health
 from bms_estimator.model.suspect import Suspect
-from bms_estimator.service.clock import iso_utc
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
 _SAMPLE_COUNTERS = ("samples", "gaps", "time_steps_back")

@@ -8,9 +8,9 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import Learned, fitted_parameter, present_elements, relative_capacity
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.kernels.identifier_state import LN_CAPACITY
+from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Parameter, ParameterReport
-from bms_estimator.service.clock import iso_utc
-from bms_estimator.service.report import finite
+from bms_estimator.snapshot.topics import finite
 
 CONFIGURED = "configured value: no data has identified it"
 VALID_STD = 0.3

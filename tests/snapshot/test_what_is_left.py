@@ -12,9 +12,9 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import IdentifierSettings
 from bms_estimator.service.checkpoint import resume
-from bms_estimator.service.health import identifier_counters, suspicions
-from bms_estimator.service.parameters import parameter_report
-from bms_estimator.service.remaining import remaining_charge
+from bms_estimator.snapshot.health import identifier_counters, suspicions
+from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.snapshot.remaining import remaining_charge
 
 CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})  # starts at its own values
 Q_AH = CELL.cell.capacity_ah

@@ -1,0 +1,1 @@
+"""The demo: a broker and a board on one machine."""

@@ -1,0 +1,1 @@
+"""From estimator and counters to what is published."""
