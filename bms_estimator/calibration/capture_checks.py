@@ -76,13 +76,13 @@ def _sign(load: Load, cell: CellModel) -> str | None:
     if ohm is not None and ohm < 0.0:
         return (
             f"the current's sign is wrong: at its steps the voltage rises with the current, by {-1e3 * ohm:.1f} mV per "
-            "ampere (median); discharge must be positive"
+            "ampere (median); discharge must be positive (--current-sign)"
         )
     soc = -load.discharged_ah / cell.cell.capacity_ah
     if ohm is None and np.ptp(soc) > LEAST_SWEEP and np.cov(soc, load.voltage_v)[0, 1] < 0.0:
         return (
             f"the current's sign is wrong: {load.discharged_ah[-1]:.3f} Ah drawn while the voltage went from "
-            f"{load.voltage_v[0]:.3f} to {load.voltage_v[-1]:.3f} V; discharge must be positive"
+            f"{load.voltage_v[0]:.3f} to {load.voltage_v[-1]:.3f} V; discharge must be positive (--current-sign)"
         )
     return None
 

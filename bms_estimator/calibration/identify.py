@@ -26,8 +26,8 @@ from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import r_s, soc_from_ocv
 from bms_estimator.kernels.sensitivity import spline_weights
 from bms_estimator.model.cell import ELEMENTS, CellModel, TableOcv
+from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 Floats = NDArray[np.float64]
 
@@ -87,20 +87,18 @@ class Identification:
     iterations: int
 
 
-def identify(
-    captures: Sequence[tuple[str, SampleBlock]], cell: CellModel, *, refine_ocv: bool = True
-) -> Identification:
+def identify(captures: Sequence[Columns], cell: CellModel, *, refine_ocv: bool = True) -> Identification:
     """Fit a1..a15 to captures jointly.
 
     Args:
-        captures: Name and raw samples of each; each should start from rest.
+        captures: Raw samples, rows of dtype ``SAMPLE``; each should start from rest.
         cell: Capacity, limits and OCV; its elements are where the search starts, a factor of 2 off does no harm.
         refine_ocv: Correct the open-circuit voltage as well.
 
     Raises:
         UserError: A capture without excitation, or one that contradicts the cell: sign of the current, capacity, OCV.
     """
-    whole = [whole_load(name, samples, cell) for name, samples in captures]
+    whole = [whole_load(capture.name, capture.rows, cell) for capture in captures]
     found = [line for load in whole for line in contradictions(load, cell)]
     if found:
         raise UserError("\n".join(found))

@@ -237,7 +237,7 @@ def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: NDArray[np
         raise UserError(
             f"{name}: current has the wrong sign or the capture charges: {given * capacity_ah:.3f} Ah out, "
             f"{taken * capacity_ah:.3f} Ah in while the voltage went from {good['voltage_v'][0]:.3f} to "
-            f"{good['voltage_v'][-1]:.3f} V; discharge must be positive"
+            f"{good['voltage_v'][-1]:.3f} V; discharge must be positive (--current-sign)"
         )
     if taken > TAKEN_IN:
         start_s = good["time_s"][int(np.argmax(change > 0.0))]

@@ -12,8 +12,8 @@ from bms_estimator.calibration.relaxation import REST_CURRENT_C
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.sensitivity import sensitivities
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 Floats = NDArray[np.float64]
 
@@ -77,26 +77,25 @@ class Validation:
     soc: Floats
 
 
-def validate(name: str, samples: SampleBlock, cell: CellModel, initial_soc: float | None = None) -> Validation:
+def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = None) -> Validation:
     """Simulate a capture's voltage from its current alone and compare.
 
     Where C_ts, C_tl turn negative (below delta1, delta2) they are held just above 0, so that the simulation goes on.
 
     Args:
-        name: What to call the capture in messages.
-        samples: Dtype ``SAMPLE``, raw; it should start from rest.
+        capture: Raw samples, rows of dtype ``SAMPLE``; it should start from rest.
         cell: What is validated.
         initial_soc: SOC 0..1 at the first good sample; None: from the voltage of the first rest.
 
     Raises:
         UserError: Most samples lie outside the cell's limits, or SOC runs outside 0..1.
     """
-    load = whole_load(name, samples, cell)
+    load = whole_load(capture.name, capture.rows, cell)
     start = soc_of_first_rest(load, cell) if initial_soc is None else initial_soc
     warnings = contradictions(load, cell)
     outside = soc_outside(load, cell.cell.capacity_ah, start)
     if outside:
-        raise UserError("\n".join(dict.fromkeys([*warnings, f"{name}: {outside}"])))
+        raise UserError("\n".join(dict.fromkeys([*warnings, f"{capture.name}: {outside}"])))
     simulated_v = np.empty(load.time_s.size)
     sensitivities(
         load.time_s,

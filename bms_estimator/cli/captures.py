@@ -1,22 +1,34 @@
-"""Whole captures in memory, for the commands that look at all of one at once."""
+"""What the commands that work on recordings have in common: their options, and that nothing is overwritten unasked."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-import numpy as np
+import typer
 
-from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.model.settings import SensorSettings
-from bms_estimator.sources.replay import open_capture
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.frames import CurrentSign
+
+AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
+CellName = Annotated[str, typer.Option(help="shipped cell's name or a cell file", show_default=False)]
+NewCellFile = Annotated[Path, typer.Option(help="cell file to write", show_default=False)]
+Force = Annotated[bool, typer.Option("--force", help="replace the file of --out")]
+SignOfCurrent = Annotated[
+    CurrentSign | None,
+    typer.Option(help="what the current in the file is when positive; else as the file's format says, else discharge"),
+]
 
 
-def read_whole(path: Path, sensor: SensorSettings | None = None) -> SampleBlock:
-    """All samples of a capture, dtype ``SAMPLE``.
+def check_out(out: Path, captures: Sequence[Path], *, force: bool) -> None:
+    """Refuse to write over a file unasked, and over a capture in any case.
 
     Raises:
-        UserError: As ``open_capture``.
+        UserError: ``out`` is one of ``captures``, or it is a file already and ``force`` is not given.
     """
-    blocks = [block.copy() for block in open_capture(path, sensor)]
-    return np.concatenate(blocks) if blocks else np.zeros(0, dtype=SAMPLE)
+    if any(out.exists() and path.exists() and out.samefile(path) for path in captures):
+        raise UserError(f"--out {out}: is a capture itself")
+    if out.is_file() and not force:
+        raise UserError(f"--out {out}: exists already; --force replaces it")
 
 
 def name_of(path: Path) -> str:

@@ -13,10 +13,10 @@ from rich.table import Table
 
 from bms_estimator.calibration.identifiability import Verdict
 from bms_estimator.calibration.identify import Identification, identify
-from bms_estimator.cli.captures import name_of, read_whole
+from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
-from bms_estimator.model.errors import UserError
+from bms_estimator.sources.replay import load_capture
 
 UNITS = {"r": "ohm", "c": "F"}
 COLOURS = {Verdict.IDENTIFIED: "green", Verdict.WEAK: "yellow", Verdict.NOT_TOLD: "red"}
@@ -29,22 +29,22 @@ def identify_command(
     cell: Annotated[
         str, typer.Option(help="shipped cell's name or a cell file: capacity, OCV, start", show_default=False)
     ],
-    out: Annotated[Path, typer.Option(help="cell file to write", show_default=False)],
+    out: NewCellFile,
     keep_ocv: Annotated[bool, typer.Option(help="leave the open-circuit voltage as it is")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    current_sign: SignOfCurrent = None,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Identify a cell's elements from captures and write a cell file.
 
     Several captures are fitted jointly. Loads with steps and rests over the whole range of SOC tell most; what a load
     does not tell keeps about the value of --cell, and is named.
     """
-    for path in captures:
-        if out.exists() and path.exists() and out.samefile(path):
-            raise UserError(f"--out {out}: is a capture itself")
+    check_out(out, captures, force=force)
     model = load_cell(cell)
-    samples = [(path.name, read_whole(path)) for path in captures]
+    loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     started_s = time.perf_counter()
-    found = identify(samples, model, refine_ocv=not keep_ocv)
+    found = identify(loaded, model, refine_ocv=not keep_ocv)
     seconds = time.perf_counter() - started_s
     renamed = found.cell.model_copy(update={"cell": found.cell.cell.model_copy(update={"name": name_of(out)})})
     write_cell(out, renamed, _remarks(cell, found))

@@ -26,11 +26,11 @@ from bms_estimator.calibration.ocv import (
 )
 from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, without_glitches
 from bms_estimator.calibration.rest_elements import rest_elements
-from bms_estimator.cli.captures import name_of, read_whole
+from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
 from bms_estimator.model.cell import Cell, CellModel
 from bms_estimator.model.cell_file import write_cell
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.sources.replay import load_capture
 
 CELL_VOLTAGE_V = 3.7
 """Of one Li-ion cell in the middle of its discharge: tells how many are in series [V]."""
@@ -73,23 +73,23 @@ def ocv(
     capacity_ah: Annotated[
         float, typer.Option(min=1e-6, help="capacity SOC is counted against [Ah]", show_default=False)
     ],
-    out: Annotated[Path, typer.Option(help="cell file to write", show_default=False)],
+    out: NewCellFile,
     form: Annotated[Form, typer.Option(help="the polynomial (2.10), or a monotone table")] = Form.CHEN_MORA,
     soc: Annotated[float, typer.Option(min=0.0, max=1.0, help="at the first sample of each capture")] = 1.0,
     series: Annotated[
         int | None, typer.Option(min=1, help="cells in series; else by 3.7 V each", show_default=False)
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    current_sign: SignOfCurrent = None,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Find the open-circuit voltage in relaxation tests and write a cell file.
 
     A relaxation test discharges a full cell in steps with a rest after each (thesis 5.2.1). Several tests are fitted
     jointly. The file's elements are a first idea, one value each from the rests: `identify` makes them good.
     """
-    for path in captures:
-        if out.exists() and path.exists() and out.samefile(path):
-            raise UserError(f"--out {out}: is a capture itself")
-    samples = [read_whole(path) for path in captures]
+    check_out(out, captures, force=force)
+    samples = [load_capture(path, current_sign=current_sign).rows for path in captures]
     good = [without_glitches(s, path.name) for s, path in zip(samples, captures, strict=True)]
     middle_v = float(np.median(np.concatenate([s["voltage_v"] for s in good])))
     count = series or max(round(middle_v / CELL_VOLTAGE_V), 1)

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from bms_estimator.cli.captures import AsJson, Force, SignOfCurrent, check_out
 from bms_estimator.cli.pack import pack_or_cell, with_broker, with_pack
 from bms_estimator.cli.summary import Result, Summary
 from bms_estimator.estimator import Estimator
@@ -30,10 +31,13 @@ from bms_estimator.sinks.table import TableSink, table_sink
 from bms_estimator.snapshot.health import dropped_text
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources.replay import RawCapture, Replay, open_capture
+from bms_estimator.sources.standard_input import standard_input
 
 
 def replay(
-    capture: Annotated[Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet", show_default=False)],
+    capture: Annotated[
+        Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet; -: from stdin", show_default=False)
+    ],
     cell: Annotated[str | None, typer.Option(help="shipped cell's name or a cell file", show_default=False)] = None,
     pack: Annotated[Path | None, typer.Option(help="settings of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
@@ -42,7 +46,9 @@ def replay(
     out: Annotated[
         Path | None, typer.Option(help="estimates sample by sample: .csv, .csv.gz, .parquet", show_default=False)
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    force: Force = False,
+    current_sign: SignOfCurrent = None,
+    as_json: AsJson = False,
     mqtt: Annotated[str | None, typer.Option(help="publish to this broker, mqtt://host:port")] = None,
     speed: Annotated[
         float | None, typer.Option(min=1e-3, help="times as fast as recorded; else as fast as it goes")
@@ -56,19 +62,20 @@ def replay(
     if soc is not None:
         settings = with_pack(settings, initial_soc=soc)
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
-    source = open_capture(capture, settings.sensor if pack else None)
-    if out is not None and out.exists() and out.samefile(capture):
-        raise UserError(f"--out {out}: is the capture itself")
-    result = asyncio.run(_replay(settings, model, Replay(source, speed=speed), table_sink(out) if out else None))
-    if isinstance(source, RawCapture):
-        for warning in _unread(source, result.duration_s or 0.0):
-            typer.echo(f"warning: {capture}: {warning}", err=True)
-    if result.samples == 0:
-        raise UserError(f"{capture}: no usable sample; dropped: {dropped_text(result.dropped)}")
+    if out is not None:
+        check_out(out, [capture], force=force)
+    with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
+        source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
+        result = asyncio.run(_replay(settings, model, Replay(source, speed=speed), table_sink(out) if out else None))
+        if isinstance(source, RawCapture):
+            for warning in _unread(source, result.duration_s or 0.0):
+                typer.echo(f"warning: {capture}: {warning}", err=True)
+        if result.samples == 0:
+            raise UserError(f"{path}: no usable sample; dropped: {dropped_text(result.dropped)}")
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
-        Console().print(result_table(capture, result))
+        Console().print(result_table(path.name, result))
 
 
 def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
@@ -123,9 +130,9 @@ def _progress(source: Replay) -> Iterator[Callable[[], None]]:
         yield lambda: progress.update(bar, completed=source.capture.fraction, samples=source.samples)
 
 
-def result_table(capture: Path, result: Result) -> Table:
+def result_table(title: str, result: Result) -> Table:
     """The outcome for people."""
-    table = Table(title=capture.name, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
+    table = Table(title=title, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column(justify="right")
     lock = f"[red]lost {result.lock_losses} times[/]" if result.lock_lost else "[green]kept[/]"

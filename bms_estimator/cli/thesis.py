@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bms_estimator.cli.captures import name_of, read_whole
+from bms_estimator.cli.captures import SignOfCurrent, name_of
 from bms_estimator.cli.pack import TABLE_RESOLUTION_V
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
@@ -22,6 +22,7 @@ from bms_estimator.reports import items
 from bms_estimator.reports.experiment import Recorded
 from bms_estimator.reports.html import write
 from bms_estimator.reports.thesis import Report, build
+from bms_estimator.sources.replay import load_capture
 
 WIDE = 160
 """A table of the thesis is not squeezed into fewer columns."""
@@ -36,6 +37,7 @@ def thesis(
     resolution_v: Annotated[
         float, typer.Option(min=1e-9, help="one step of the captures' voltage [V]")
     ] = TABLE_RESOLUTION_V,
+    current_sign: SignOfCurrent = None,
     out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
     table: Annotated[str | None, typer.Option(help="this table only, 1 to 13", show_default=False)] = None,
     figure: Annotated[str | None, typer.Option(help="this figure only, 1 to 50", show_default=False)] = None,
@@ -45,7 +47,7 @@ def thesis(
     Chapters 2 to 4 are simulated. Chapter 5 runs on the captures: at least one voltage relaxation test and one
     constant load, all from the same type of cell.
     """
-    recorded = _recorded(captures, cell, resolution_v) if captures else None
+    recorded = _recorded(captures, cell, resolution_v, current_sign) if captures else None
     started_s = time.perf_counter()
     with _progress() as show:
         report = build(recorded, table=table, figure=figure, progress=show)
@@ -61,10 +63,12 @@ def thesis(
     typer.echo(f"{path}: written in {time.perf_counter() - started_s:.1f} s")
 
 
-def _recorded(captures: list[Path], cell: str | None, resolution_v: float) -> Recorded:
+def _recorded(captures: list[Path], cell: str | None, resolution_v: float, current_sign: SignOfCurrent) -> Recorded:
     if cell is None:
         raise UserError("captures need --cell NAME|CELL.toml: its capacity, limits and bounds")
-    return Recorded(load_cell(cell), tuple((name_of(path), read_whole(path)) for path in captures), resolution_v)
+    loaded = [load_capture(path, current_sign=current_sign) for path in captures]
+    named = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
+    return Recorded(load_cell(cell), named, resolution_v)
 
 
 @contextmanager

@@ -12,24 +12,26 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.validate import Errors, Validation, validate
-from bms_estimator.cli.captures import read_whole
+from bms_estimator.cli.captures import AsJson, CellName, SignOfCurrent
 from bms_estimator.model.cell import load_cell
+from bms_estimator.sources.replay import load_capture
 
 
 def validate_command(
     capture: Annotated[Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet", show_default=False)],
-    cell: Annotated[str, typer.Option(help="shipped cell's name or a cell file", show_default=False)],
+    cell: CellName,
     soc: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="SOC at the first sample; else from the first rest's voltage")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    current_sign: SignOfCurrent = None,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate a capture's voltage from its current alone and compare.
 
     Open loop: the parameters are frozen and the voltage is not used, except the first rest's for the initial SOC.
     """
     model = load_cell(cell)
-    found = validate(capture.name, read_whole(capture), model, soc)
+    found = validate(load_capture(capture, current_sign=current_sign), model, initial_soc=soc)
     for line in found.warnings:
         typer.echo(f"warning: {line}", err=True)
     if as_json:

@@ -20,7 +20,7 @@ class Suspect(IntFlag):
 
 _TEXT = {
     Suspect.SIGN_OF_CURRENT: "innovation grows with current, the voltage rises when discharge is said to rise: "
-    "check the sign of the current (sensor.current_sign)",
+    "check the sign of the current (sensor.current_sign; --current-sign of a recording)",
     Suspect.OFFSET: "counted charge and voltage drift apart with time: "
     "check the zero of the current sensor with the load disconnected",
     Suspect.CAPACITY: "counted charge and voltage drift apart with charge moved: check the declared capacity, "

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES
+from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.model.settings import SensorSettings
-from bms_estimator.sources.frames import FrameDecoder
+from bms_estimator.sources.frames import CurrentSign, FrameDecoder
 from bms_estimator.sources.raw_capture import is_capture, read_capture, read_header
-from bms_estimator.sources.table import READERS, table_reader
+from bms_estimator.sources.table import READERS, ByName, Sign, samples_of, table_reader
 from bms_estimator.sources.text_lines import TextDecoder
 
 TICK_S = 0.05
@@ -45,6 +46,7 @@ class RawCapture:
     Args:
         path: What ``CaptureWriter`` wrote.
         sensor: How to decode; None: as the capture's header says.
+        current_sign: What its current calls positive; None: as ``sensor`` says.
 
     Attributes:
         decoder: What the bytes have gone through so far.
@@ -55,10 +57,12 @@ class RawCapture:
         UserError: No capture, or one of a later version.
     """
 
-    def __init__(self, path: Path, sensor: SensorSettings | None = None) -> None:
+    def __init__(
+        self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
+    ) -> None:
         header = read_header(path)
         text = (sensor.protocol if sensor else header.mode) == "text"
-        sign = sensor.current_sign if sensor else header.current_sign
+        sign = current_sign or (sensor.current_sign if sensor else header.current_sign)
         self.decoder = TextDecoder(current_sign=sign) if text else FrameDecoder(current_sign=sign)
         self.damaged, self.unread_bytes = False, 0
         self._path = path
@@ -153,21 +157,48 @@ def _elapsed(time_s: NDArray[np.float64], last_s: float) -> NDArray[np.float64]:
     return np.cumsum(np.where(np.isfinite(steps), steps, 0.0).clip(min=0.0))
 
 
-def open_capture(path: Path, sensor: SensorSettings | None = None) -> Capture:
+def open_capture(
+    path: Path, sensor: SensorSettings | None = None, *, current_sign: CurrentSign | None = None
+) -> Capture:
     """A capture: a table by the end of its name, else a raw capture by its first bytes.
 
     Args:
         path: The file.
-        sensor: How to decode raw bytes; None: as the capture's header says.
+        sensor: How to decode raw bytes, and what the current of a table calls positive unless its format lays that
+            down; None: as the header of raw bytes says, and discharge.
+        current_sign: What its current calls positive, whatever ``sensor``, header and format say.
 
     Raises:
         UserError: No such file, or it is neither.
     """
     if not path.is_file():
         raise UserError(f"{path}: {'is a directory' if path.is_dir() else 'no such file'}")
-    table = table_reader(path)
+    table = table_reader(path, Sign(current_sign, sensor.current_sign) if sensor else Sign(current_sign))
     if table is not None:
         return table
     if is_capture(path):
-        return RawCapture(path, sensor)
+        return RawCapture(path, sensor, current_sign)
     raise UserError(f"{path}: neither a raw capture nor a table; the name of a table ends in {', '.join(READERS)}")
+
+
+def load_capture(source: str | Path | ByName, *, current_sign: CurrentSign | None = None) -> Columns:
+    """All samples of a capture in memory.
+
+    Args:
+        source: Path of a raw capture or of a table (CSV, gzipped CSV, Parquet), or a table in memory: a DataFrame, a
+            dict of arrays. A table has our columns or the Battery Data Format's.
+        current_sign: What its current calls positive, ``discharge_positive`` or ``charge_positive``; None: as its
+            format says, else discharge.
+
+    Returns:
+        ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor) and
+        ``status``, bits of ``SampleStatus``.
+
+    Raises:
+        UserError: There is no such file, it cannot be read, or a column is missing.
+    """
+    if not isinstance(source, str | Path):
+        return Columns(samples_of(source, Sign(current_sign)), "capture")
+    path = Path(source)
+    blocks = [block.copy() for block in open_capture(path, current_sign=current_sign)]
+    return Columns(np.concatenate(blocks) if blocks else np.zeros(0, dtype=SAMPLE), path.name)

@@ -10,31 +10,57 @@ import zlib
 from collections.abc import Iterator, Sequence
 from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, NamedTuple, cast
+from typing import IO, NamedTuple, Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.sources.frames import CurrentSign
 
 BLOCK_ROWS = 65_536
 
 
 class Dialect(NamedTuple):
-    """How a table calls the columns of ``SAMPLE``, and which sign it gives to discharge."""
+    """How a table calls the columns of ``SAMPLE``, and which sign its current has."""
 
     time_s: str
     current_a: str
     voltage_v: str
     temperature_c: str
-    discharge_sign: float
+    current_sign: CurrentSign | None
+    """What it calls positive; None: that is not laid down."""
 
 
 DIALECTS = (
-    Dialect("time_s", "current_a", "voltage_v", "temperature_c", 1.0),
-    Dialect("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", -1.0),  # Battery Data Format
+    Dialect("time_s", "current_a", "voltage_v", "temperature_c", None),
+    Dialect("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", "charge_positive"),
 )
+"""Ours, and the Battery Data Format."""
+
+
+class Sign(NamedTuple):
+    """What the current of a table calls positive."""
+
+    given: CurrentSign | None = None
+    """Said of this very table: holds whatever its columns are called."""
+    otherwise: CurrentSign = "discharge_positive"
+    """Where neither ``given`` nor the names of the columns tell."""
+
+    def of(self, dialect: Dialect) -> float:
+        """Factor that makes discharge positive."""
+        return 1.0 if (self.given or dialect.current_sign or self.otherwise) == "discharge_positive" else -1.0
+
+
+class ByName(Protocol):
+    """A table in memory, such as a dict of arrays or a DataFrame."""
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of the columns."""
+
+    def __getitem__(self, name: str, /) -> ArrayLike:
+        """A column."""
 
 
 class _Columns(NamedTuple):
@@ -51,10 +77,11 @@ class CsvTable:
 
     Args:
         path: The file.
+        sign: Of its current.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, sign: Sign) -> None:
+        self._path, self._sign = path, sign
         self._raw: IO[bytes] | None = None
         self._size = 0
 
@@ -87,7 +114,7 @@ class CsvTable:
 
     def _blocks(self, text: TextIOWrapper) -> Iterator[SampleBlock]:
         header, line = _header(self._path, text)
-        columns = _columns(self._path, header)
+        columns = _columns(self._path, header, self._sign)
         rows = 0
         while lines := list(itertools.islice(text, BLOCK_ROWS)):
             values = self._values(lines, line + 1, columns, len(header))
@@ -134,10 +161,11 @@ class ParquetTable:
 
     Args:
         path: The file.
+        sign: Of its current.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, sign: Sign) -> None:
+        self._path, self._sign = path, sign
         self.fraction = 0.0
 
     def __iter__(self) -> Iterator[SampleBlock]:
@@ -151,7 +179,7 @@ class ParquetTable:
 
         try:
             with parquet.ParquetFile(self._path) as file:
-                columns = _columns(self._path, file.schema_arrow.names)
+                columns = _columns(self._path, file.schema_arrow.names, self._sign)
                 if file.metadata.num_rows == 0:
                     raise UserError(f"{self._path}: no samples")
                 rows = 0
@@ -185,10 +213,20 @@ READERS: dict[str, type[CsvTable | ParquetTable]] = {
 """End of a file's name -> who reads it."""
 
 
-def table_reader(path: Path) -> CsvTable | ParquetTable | None:
+def table_reader(path: Path, sign: Sign) -> CsvTable | ParquetTable | None:
     """Who reads ``path`` by the end of its name; None when it is no table."""
     name = path.name.lower()
-    return next((reader(path) for suffix, reader in READERS.items() if name.endswith(suffix)), None)
+    return next((reader(path, sign) for suffix, reader in READERS.items() if name.endswith(suffix)), None)
+
+
+def samples_of(table: ByName, sign: Sign) -> SampleBlock:
+    """The samples of a table in memory.
+
+    Raises:
+        UserError: A column is missing.
+    """
+    columns = _columns("the table", list(table), sign)
+    return _block([np.asarray(table[name], dtype=np.float64) for name in columns.names], columns)
 
 
 def _is_data(line: str) -> bool:
@@ -203,7 +241,7 @@ def _header(path: Path, text: TextIOWrapper) -> tuple[list[str], int]:
     raise UserError(f"{path}: empty: the first line must name the columns, {_wanted(DIALECTS[0])}")
 
 
-def _columns(path: Path, header: Sequence[str]) -> _Columns:
+def _columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
     """Where the columns are.
 
     Raises:
@@ -217,7 +255,7 @@ def _columns(path: Path, header: Sequence[str]) -> _Columns:
             f"needed: {_wanted(DIALECTS[0])}, or {_wanted(DIALECTS[1])} (Battery Data Format)"
         )
     names = tuple(name for name in dialect[:4] if name in header)
-    return _Columns(tuple(header.index(name) for name in names), names, dialect.discharge_sign)
+    return _Columns(tuple(header.index(name) for name in names), names, sign.of(dialect))
 
 
 def _wanted(dialect: Dialect) -> str:

@@ -25,14 +25,15 @@ from bms_estimator.calibration.identify import identify
 from bms_estimator.calibration.prediction import open_circuit, predict
 from bms_estimator.calibration.relaxation import without_glitches
 from bms_estimator.calibration.validate import validate
-from bms_estimator.cli.captures import read_whole
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.columns import Columns
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings
+from bms_estimator.sources.replay import load_capture
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +65,9 @@ class Trial:
 
     def __init__(self) -> None:
         self.cell = wrong(load_cell("ncr18650"))
-        self.learn, self.held_back = (without_glitches(read_whole(DATA / f"{n}.csv.gz"), n) for n in (LEARN, HELD_BACK))
+        self.learn, self.held_back = (
+            without_glitches(load_capture(DATA / f"{n}.csv.gz").rows, n) for n in (LEARN, HELD_BACK)
+        )
         self.grid = np.array(ocv_grid(self.cell))
         self.initial_soc = chen_mora.soc_from_ocv(float(self.held_back["voltage_v"][0]), *self.grid)
         time_s, current_a = (np.ascontiguousarray(self.held_back[n]) for n in ("time_s", "current_a"))
@@ -105,7 +108,7 @@ def wrong(cell: CellModel) -> CellModel:
 
 def observer_alone(trial: Trial) -> Outcome:
     """Algorithm 1 as printed: SOC by coulomb counting, a_i go where their bounds say (Lemma 4.1.3)."""
-    estimator = Estimator(trial.cell, initial_soc=1.0)
+    estimator = Estimator(trial.cell, initial_soc=1.0, identifier=None)
     seconds = timed(lambda: estimator.run(trial.learn))
     a = estimator.state[0]["a"].copy()
     return Outcome(
@@ -181,12 +184,12 @@ def pybop(trial: Trial) -> Outcome:
 
 def offline(trial: Trial) -> Outcome:
     """bms-estimator identify; it corrects the OCV as well."""
-    capture = [(LEARN, trial.learn)]
+    capture = [Columns(trial.learn, LEARN)]
     identify(capture, trial.cell)
     start = time.perf_counter()
     found = identify(capture, trial.cell).cell
     seconds = time.perf_counter() - start
-    rms_mv = 1e3 * validate(HELD_BACK, trial.held_back, found).above.voltage_rms_v
+    rms_mv = 1e3 * validate(Columns(trial.held_back, HELD_BACK), found).above.voltage_rms_v
     return Outcome("identify (offline)", rms_mv, None, seconds, "offline; corrects the OCV")
 
 

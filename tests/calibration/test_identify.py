@@ -8,24 +8,25 @@ from bms_estimator.calibration.identifiability import Verdict
 from bms_estimator.calibration.identify import corrected_ocv, identify, spline
 from bms_estimator.calibration.prediction_error import COEFFICIENTS
 from bms_estimator.calibration.validate import validate
-from bms_estimator.cli.captures import read_whole
 from bms_estimator.cli.main import main
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import c_tl, c_ts, r_s, r_tl, r_ts
 from bms_estimator.kernels.sensitivity import sensitivities
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.sources.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps, wrong_start
 
 
 @pytest.fixture(scope="module")
 def identified():
-    return identify([("steps", capture(steps()))], wrong_start())
+    return identify([Columns(capture(steps()), "steps")], wrong_start())
 
 
 @pytest.fixture(scope="module")
 def from_constant_current():
-    return identify([("constant", capture(constant()))], wrong_start())
+    return identify([Columns(capture(constant()), "constant")], wrong_start())
 
 
 def deviations(found):
@@ -59,8 +60,8 @@ def test_series_resistance_within_one_percent_and_rc_products_within_five(identi
 
 def test_identified_cell_predicts_another_load(identified):
     held_back = capture(steps(7), soc=0.9, seed=7)
-    assert validate("other", held_back, identified.cell).above.voltage_rms_v < 1e-3
-    assert validate("other", held_back, wrong_start()).above.voltage_rms_v > 10e-3
+    assert validate(Columns(held_back, "other"), identified.cell).above.voltage_rms_v < 1e-3
+    assert validate(Columns(held_back, "other"), wrong_start()).above.voltage_rms_v > 10e-3
 
 
 def test_constant_current_is_said_not_to_tell_what_it_cannot(from_constant_current):
@@ -81,7 +82,7 @@ def test_captures_are_fitted_jointly_with_their_own_soc_and_contacts():
     first = capture(steps(1), soc=0.97, seed=1)
     second = capture(steps(2), soc=0.70, seed=2)
     second["voltage_v"] -= 0.006 * second["current_a"]
-    found = identify([("first", first), ("second", second)], wrong_start())
+    found = identify([Columns(first, "first"), Columns(second, "second")], wrong_start())
     assert [c.initial_soc for c in found.captures] == pytest.approx([0.97, 0.70], abs=0.006)
     assert found.captures[1].contact_ohm - found.captures[0].contact_ohm == pytest.approx(0.006, abs=5e-4)
 
@@ -89,11 +90,11 @@ def test_captures_are_fitted_jointly_with_their_own_soc_and_contacts():
 def test_a_pack_is_identified_as_well_as_a_cell():
     pack = TRUTH.pack(6, 2)
     samples = capture(2.0 * steps(), cell=pack, noise_v=3e-3)
-    found = identify([("pack", samples)], wrong_start().pack(6, 2))
+    found = identify([Columns(samples, "pack")], wrong_start().pack(6, 2))
     elements = {name: value for name, (value, _) in found.elements[0.5].items()}
     assert elements["r_s"] == pytest.approx(3.0 * r_s(0.5, TRUTH.a), rel=0.01)
     assert elements["r_ts"] * elements["c_ts"] == pytest.approx(r_ts(0.5, TRUTH.a) * c_ts(0.5, TRUTH.a), rel=0.05)
-    assert validate("pack", samples, found.cell).above.voltage_rms_v < 6e-3
+    assert validate(Columns(samples, "pack"), found.cell).above.voltage_rms_v < 6e-3
 
 
 def test_glitches_do_no_harm(identified):
@@ -106,7 +107,7 @@ def test_glitches_do_no_harm(identified):
     resting = places[45:][samples["current_a"][places[45:]] == 0.0]
     samples["current_a"][resting] = 4.6
     samples["time_s"][50:52] = samples["time_s"][49]
-    found = identify([("glitches", samples)], wrong_start())
+    found = identify([Columns(samples, "glitches")], wrong_start())
     assert found.captures[0].glitches >= 45
     assert np.abs(deviations(found)).max() < 3.0
     clean = np.array([p.value for p in identified.parameters])
@@ -116,12 +117,12 @@ def test_glitches_do_no_harm(identified):
 
 def test_a_gap_at_rest_is_stepped_over():
     samples = capture(np.r_[steps()[:6000], np.zeros(3600), steps()[6000:]])
-    found = identify([("gap", np.delete(samples, np.s_[6060:9540]))], wrong_start())
+    found = identify([Columns(np.delete(samples, np.s_[6060:9540]), "gap")], wrong_start())
     assert np.abs(deviations(found)).max() < 3.0
 
 
 def test_ocv_is_kept_when_asked():
-    found = identify([("steps", capture(steps()))], wrong_start(), refine_ocv=False)
+    found = identify([Columns(capture(steps()), "steps")], wrong_start(), refine_ocv=False)
     assert found.cell.ocv == TRUTH.ocv
     assert found.ocv_correction_v == 0.0
     assert np.abs(deviations(found)).max() < 3.0
@@ -133,11 +134,11 @@ def test_a_wrong_ocv_is_corrected():
     table["ocv"]["ocv_v"] = tuple(np.array(table["ocv"]["ocv_v"]) + 0.015 * np.sin(3.0 * soc) * (1.0 - soc))
     wrong = type(TRUTH).model_validate(table)
     held_back = capture(steps(7), seed=7)
-    kept = identify([("steps", capture(steps()))], wrong, refine_ocv=False)
-    refined = identify([("steps", capture(steps()))], wrong)
-    after = validate("other", held_back, refined.cell).above.voltage_rms_v
+    kept = identify([Columns(capture(steps()), "steps")], wrong, refine_ocv=False)
+    refined = identify([Columns(capture(steps()), "steps")], wrong)
+    after = validate(Columns(held_back, "other"), refined.cell).above.voltage_rms_v
     assert after < 1.5e-3
-    assert after < 0.5 * validate("other", held_back, kept.cell).above.voltage_rms_v
+    assert after < 0.5 * validate(Columns(held_back, "other"), kept.cell).above.voltage_rms_v
 
 
 def test_corrected_table_increases_whatever_the_correction():
@@ -214,7 +215,7 @@ def with_gap(samples):
 )
 def test_bad_input_is_named_with_its_numbers(samples, cell, words):
     with pytest.raises(UserError) as caught:
-        identify([("bad.csv", samples)], cell)
+        identify([Columns(samples, "bad.csv")], cell)
     assert str(caught.value).startswith("bad.csv: ")
     assert all(word in str(caught.value) for word in words)
 
@@ -225,8 +226,8 @@ def test_a_good_capture_contradicts_nothing():
 
 def errors_on_random_steps(folder, cell, *names):
     """What a cell identified from some captures of cell 5 leaves of another one."""
-    found = identify([(name, read_whole(folder / f"cell5_{name}.csv.gz")) for name in names], cell)
-    return validate("random steps", read_whole(folder / "cell5_random_steps.csv.gz"), found.cell).above
+    found = identify([load_capture(folder / f"cell5_{name}.csv.gz") for name in names], cell)
+    return validate(load_capture(folder / "cell5_random_steps.csv.gz"), found.cell).above
 
 
 @pytest.mark.parametrize("names", [("relaxation_c2",), ("relaxation_c2", "hppc")])

@@ -5,11 +5,11 @@ import pytest
 
 from bms_estimator.calibration.ocv import fit_chen_mora, pooled
 from bms_estimator.calibration.relaxation import relaxation_test, soc_by_counting, without_glitches
-from bms_estimator.cli.captures import read_whole
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.sources.replay import load_capture
 from tests.calibration.simulated_load import TRUTH
 from tests.calibration.simulated_relaxation import BAD, FIRST_REST_S, LOAD_S, REST_S, glitched, relaxation
 
@@ -113,7 +113,7 @@ def test_slow_sampling(every):
 
 def test_real_rests_cut_in_half_are_extrapolated_towards_their_end(shared_data):
     """Half-hour rests of an NCR18650, of which the first quarter of an hour is shown."""
-    samples = read_whole(shared_data / "ncr18650" / "cell1_dst.csv.gz")
+    samples = load_capture(shared_data / "ncr18650" / "cell1_dst.csv.gz").rows
     whole = relaxation_test(samples, 3.1, initial_soc=1.0, name="mine")
     cut = np.zeros(samples.size, dtype=bool)
     long = [rest for rest in whole.rests if 1700.0 < rest.duration_s < 3000.0 and rest.soc < 0.99]

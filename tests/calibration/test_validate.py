@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.validate import validate
-from bms_estimator.cli.captures import read_whole
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.sources.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
 
 
@@ -15,7 +16,7 @@ def with_series_resistance(extra_ohm):
 
 
 def test_the_true_cell_leaves_the_noise():
-    found = validate("steps", capture(steps(), noise_v=1e-3), TRUTH)
+    found = validate(Columns(capture(steps(), noise_v=1e-3), "steps"), TRUTH)
     assert found.initial_soc == pytest.approx(0.98, abs=1e-3)
     assert found.initial_soc_from == "first rest"
     assert found.above.voltage_rms_v == pytest.approx(1e-3, rel=0.05)
@@ -24,7 +25,7 @@ def test_the_true_cell_leaves_the_noise():
 
 
 def test_a_resistance_beside_the_cell_is_seen():
-    found = validate("steps", capture(steps(), cell=with_series_resistance(0.005)), TRUTH)
+    found = validate(Columns(capture(steps(), cell=with_series_resistance(0.005)), "steps"), TRUTH)
     assert found.extra_ohm == pytest.approx(0.005, abs=1e-4)
     assert found.without_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < found.above.voltage_rms_v
     assert found.resting.voltage_rms_v < 1e-3 < found.loaded.voltage_rms_v
@@ -32,19 +33,19 @@ def test_a_resistance_beside_the_cell_is_seen():
 
 def test_initial_soc_can_be_given():
     samples = capture(steps())
-    found = validate("steps", samples, TRUTH, 0.9)
+    found = validate(Columns(samples, "steps"), TRUTH, initial_soc=0.9)
     assert (found.initial_soc, found.initial_soc_from) == (0.9, "given")
     assert found.above.voltage_rms_v > 10e-3
 
 
 def test_a_capture_that_starts_under_load_starts_at_its_voltage_with_the_ohmic_drop():
-    found = validate("constant", capture(constant(), soc=0.8), TRUTH)
+    found = validate(Columns(capture(constant(), soc=0.8), "constant"), TRUTH)
     assert found.initial_soc_from == "first sample under load"
     assert found.initial_soc == pytest.approx(0.8, abs=0.005)
 
 
 def test_samples_below_soc_a_tenth_count_only_in_all():
-    found = validate("steps", capture(steps()), TRUTH)
+    found = validate(Columns(capture(steps()), "steps"), TRUTH)
     assert found.all.samples == found.time_s.size == found.error_v.size
     assert found.above.samples == int((found.soc > 0.1).sum()) < found.all.samples
     assert found.resting.samples + found.loaded.samples == found.above.samples
@@ -53,7 +54,7 @@ def test_samples_below_soc_a_tenth_count_only_in_all():
 def test_glitches_are_left_out_and_counted():
     samples = capture(steps())
     samples["voltage_v"][[500, 900, 5000]] = [0.0, 1.0, np.nan]
-    found = validate("steps", samples, TRUTH)
+    found = validate(Columns(samples, "steps"), TRUTH)
     assert found.glitches == 3
     assert found.above.voltage_rms_v < 1e-3
 
@@ -62,20 +63,20 @@ def test_a_capture_of_another_cell_is_refused_with_the_numbers():
     table = TRUTH.model_dump()
     table["cell"]["capacity_ah"] = 0.5
     with pytest.raises(UserError, match=r"steps: SOC runs from -\d\.\d+ to 0\.98\d, outside 0\.\.1.* of 0\.5 Ah"):
-        validate("steps", capture(steps()), CellModel.model_validate(table))
+        validate(Columns(capture(steps()), "steps"), CellModel.model_validate(table))
     with pytest.raises(UserError, match=r"SOC runs from -0\.\d+ to 0\.600, outside"):
-        validate("steps", capture(steps()), TRUTH, 0.6)
+        validate(Columns(capture(steps()), "steps"), TRUTH, initial_soc=0.6)
 
 
 def test_too_few_samples_are_not_blamed_on_the_cell():
     with pytest.raises(UserError, match=r"^steps: 3 good samples are too few, at least 5 are needed$"):
-        validate("steps", capture(steps())[:3], TRUTH)
+        validate(Columns(capture(steps())[:3], "steps"), TRUTH)
 
 
 def test_wrong_sign_is_measured_and_warned_of():
     samples = capture(steps(duration_s=6000), soc=0.5)
     samples["current_a"] *= -1.0
-    found = validate("steps", samples, TRUTH)
+    found = validate(Columns(samples, "steps"), TRUTH)
     assert "sign is wrong" in found.warnings[0]
     assert np.isfinite(found.all.voltage_rms_v)
     assert found.all.voltage_rms_v > 0.1
@@ -86,13 +87,13 @@ def test_simulation_goes_on_below_delta_and_below_empty():
     samples = capture(current_a, soc=0.98)
     longer = np.concatenate([samples, samples[-600:]])
     longer["time_s"] = np.arange(longer.size)
-    found = validate("empty", longer, TRUTH)
+    found = validate(Columns(longer, "empty"), TRUTH)
     assert found.final_soc < 0.0
     assert np.isfinite(found.error_v).all()
 
 
 def test_charging_from_empty(shared_data):
-    found = validate("charge", read_whole(shared_data / "ncr18650" / "cell1_charge_c20.csv.gz"), TRUTH)
+    found = validate(load_capture(shared_data / "ncr18650" / "cell1_charge_c20.csv.gz"), TRUTH)
     assert found.initial_soc < 0.02
     assert found.final_soc > 0.98
     assert found.above.voltage_rms_v < 60e-3

@@ -95,6 +95,34 @@ def test_what_a_person_can_mend_ends_with_code_2_and_its_numbers(tables, tmp_pat
     assert (code, text) == (2, "")
     assert "error: flipped.csv: the current's sign is wrong" in err
     assert "error: flipped.csv: SOC runs from 0.98" in err
-    code, _, err = run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", flipped)
+    code, _, err = run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", flipped, "--force")
     assert code == 2
     assert "is a capture itself" in err
+
+
+def test_the_sign_of_a_tables_current_can_be_given(tables, tmp_path, capsys):
+    rows = np.loadtxt(tables / "steps7.csv", delimiter=",", skiprows=1) * [1, -1, 1]
+    flipped = tmp_path / "flipped.csv"
+    np.savetxt(flipped, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
+    plain = run(capsys, "validate", tables / "steps7.csv", "--cell", "ncr18650", "--json")
+    turned = run(capsys, "validate", flipped, "--cell", "ncr18650", "--json", "--current-sign", "charge_positive")
+    assert turned == plain
+    for name in ("first.toml", "second.toml"):
+        capture, sign = (
+            (flipped, "charge_positive") if name == "second.toml" else (tables / "steps7.csv", "discharge_positive")
+        )
+        arguments = (capture, "--cell", "ncr18650", "--out", tmp_path / name, "--current-sign", sign)
+        assert run(capsys, "identify", *arguments)[0] == 0
+    assert np.array_equal(load_cell(tmp_path / "first.toml").a, load_cell(tmp_path / "second.toml").a, equal_nan=True)
+
+
+def test_a_cell_file_is_replaced_with_force_alone(tables, tmp_path, capsys):
+    out = tmp_path / "mine.toml"
+    out.write_text("# measured in May\n")
+    arguments = ("identify", tables / "steps7.csv", "--cell", "ncr18650", "--keep-ocv", "--out", out)
+    code, text, err = run(capsys, *arguments)
+    assert (code, text) == (2, "")
+    assert f"error: --out {out}: exists already; --force replaces it" in err
+    assert out.read_text() == "# measured in May\n"
+    assert run(capsys, *arguments, "--force")[0] == 0
+    assert load_cell(out).cell.name == "mine"

@@ -122,7 +122,7 @@ def test_bad_input_ends_with_code_2_and_the_numbers_that_show_it(tmp_path, capsy
 
 def test_a_capture_is_not_overwritten(captures, capsys):
     before = captures[0].read_bytes()
-    code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0])
+    code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0], "--force")
     assert code == 2
     assert "is a capture itself" in err
     assert captures[0].read_bytes() == before
@@ -153,3 +153,26 @@ def test_a_capture_without_a_number_in_it(tmp_path, capsys):
     code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "3", "--out", tmp_path / "c.toml")
     assert code == 2
     assert err == f"error: nan.csv: none of {samples.size} samples has finite time, current and voltage\n"
+
+
+def test_the_sign_of_a_tables_current_can_be_given(tmp_path, capsys):
+    samples = relaxation()
+    samples["current_a"] *= -1.0
+    arguments = ("ocv", save(tmp_path / "charge.csv", samples), "--capacity-ah", "3", "--out", tmp_path / "c.toml")
+    code, _, err = run(capsys, *arguments)
+    assert code == 2
+    assert "discharge must be positive (--current-sign)" in err
+    assert run(capsys, *arguments, "--current-sign", "charge_positive")[0] == 0
+    assert "20 rests of charge.csv" in (tmp_path / "c.toml").read_text()
+
+
+def test_a_cell_file_is_replaced_with_force_alone(captures, tmp_path, capsys):
+    out = tmp_path / "mine.toml"
+    out.write_text("# measured in May\n")
+    arguments = ("ocv", captures[0], "--capacity-ah", "3", "--out", out)
+    code, text, err = run(capsys, *arguments)
+    assert (code, text) == (2, "")
+    assert f"error: --out {out}: exists already; --force replaces it" in err
+    assert out.read_text() == "# measured in May\n"
+    assert run(capsys, *arguments, "--force")[0] == 0
+    assert load_cell(out).cell.name == "mine"

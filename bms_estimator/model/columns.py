@@ -1,0 +1,44 @@
+"""Columns by name: what a capture holds, and what an estimate of it comes to. The unit stands in each name."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Columns(Mapping[str, NDArray[Any]]):
+    """Equally long columns of one capture, a mapping from name to array.
+
+    Attributes:
+        rows: Shape (n,), a structured array: the same numbers row by row, as ``Estimator.run`` takes and gives them.
+        name: What to call it in messages.
+    """
+
+    rows: NDArray[np.void]
+    name: str = ""
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self.names:
+            raise KeyError(f"{name}: no such column; there are {', '.join(self.names)}")
+        column: NDArray[Any] = self.rows[name]
+        return column
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns, in order."""
+        return self.rows.dtype.names or ()
+
+    def to_pandas(self) -> Any:
+        """A ``pandas.DataFrame`` of them; needs pandas."""
+        import pandas as pd  # noqa: PLC0415 - optional
+
+        return pd.DataFrame(self.rows)
