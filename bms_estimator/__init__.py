@@ -1,5 +1,34 @@
-"""Real-time Li-ion battery estimator: adaptive observer, parameters, SOC and stability margins."""
+"""Real-time Li-ion battery estimator: adaptive observer, parameters, SOC and stability margins.
 
+What others may build on is here, see docs/api.md; all else may change from one version to the next.
+"""
+
+from importlib import import_module
 from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
 
+if TYPE_CHECKING:
+    from bms_estimator.calibration.identify import identify
+    from bms_estimator.calibration.validate import validate
+    from bms_estimator.estimator import Estimator, estimate
+    from bms_estimator.model.cell import load_cell
+    from bms_estimator.sources.replay import load_capture
+
+__all__ = ["Estimator", "__version__", "estimate", "identify", "load_capture", "load_cell", "validate"]
 __version__ = version("bms_estimator")
+
+_HOME = {
+    "Estimator": "estimator",
+    "estimate": "estimator",
+    "identify": "calibration.identify",
+    "load_capture": "sources.replay",
+    "load_cell": "model.cell",
+    "validate": "calibration.validate",
+}
+"""Where each is: imported when it is asked for, for numba alone takes longer than ``bms-estimator --help`` may."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

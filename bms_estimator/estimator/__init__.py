@@ -1,5 +1,5 @@
 """One object around the kernels: settings, state, ``step`` and ``run``."""
 
-from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator, estimate
 
-__all__ = ["Estimator"]
+__all__ = ["Estimator", "estimate"]

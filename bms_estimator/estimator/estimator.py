@@ -14,6 +14,7 @@ from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, LN_CAPACITY, 
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.columns import Columns
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 
@@ -21,6 +22,8 @@ TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
 VERDICTS = tuple(Verdict)
 """By value: ``Verdict(value)`` takes nearly as long as the kernel."""
+IDENTIFIER = IdentifierSettings()
+"""How an estimator identifies unless told otherwise."""
 SET_SOC_STD = 0.01
 """How far an SOC that someone sets may be off."""
 SAME_ELEMENTS_S = 600.0
@@ -54,7 +57,7 @@ class Estimator:
         cell: CellModel,
         observer: ObserverSettings | None = None,
         *,
-        identifier: IdentifierSettings | None = None,
+        identifier: IdentifierSettings | None = IDENTIFIER,
         voltage_resolution_v: float = 1e-3,
         voltage_noise_v: float | None = None,
         initial_soc: float | None = None,
@@ -145,3 +148,22 @@ class Estimator:
         keep(x)
         if math.isfinite(unseen_s):
             self.record["unlearned_s"] += unseen_s
+
+
+def estimate(
+    capture: Columns, cell: CellModel, *, initial_soc: float | None = None, voltage_resolution_v: float = 1e-3
+) -> Columns:
+    """Estimate over a whole capture; with other settings: ``Columns(Estimator(cell, ...).run(capture.rows))``.
+
+    Args:
+        capture: Rows of dtype ``SAMPLE``.
+        cell: The pack as one two-terminal object (``CellModel.pack``).
+        initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
+        voltage_resolution_v: One step of the capture's voltage [V].
+
+    Returns:
+        The columns of dtype ``TRACE``, one row for each accepted sample: ``soc`` with ``soc_std``, the elements with
+        their standard deviations, the observer's values. NaN is what is not known.
+    """
+    estimator = Estimator(cell, initial_soc=initial_soc, voltage_resolution_v=voltage_resolution_v)
+    return Columns(estimator.run(capture.rows), capture.name)

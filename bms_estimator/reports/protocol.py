@@ -163,6 +163,7 @@ class Protocol:
         estimator = Estimator(
             self.with_ocv,
             ObserverSettings(),
+            identifier=None,
             voltage_resolution_v=self.voltage_step_v,
             initial_soc=self.initial_soc(self.smallest),
         )

@@ -101,7 +101,9 @@ class Simulation:
 
     def _scheme(self, law: str, initial: tuple[float, ...], start_v: float = 0.0) -> AdaptiveRun:
         """A run of a scheme from ``initial`` a1..a15, with x2(0) = x3(0) = start_v / 2."""
-        estimator = Estimator(self.cell, observer_settings(law), voltage_resolution_v=1e-6, initial_soc=1.0)
+        estimator = Estimator(
+            self.cell, observer_settings(law), identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0
+        )
         record = estimator.settings[0]
         record["a_initial"][1:] = initial
         record["target"][1:] = initial
@@ -165,7 +167,9 @@ class Simulation:
     def improved(self) -> AdaptiveRun:
         """The improved method with the settings of Table 5 (a8: E4) at C/10."""
         samples = discharge(self.cell, SMALL_CURRENT_A, 10.0 * STEP_S)
-        estimator = Estimator(self.cell, observer_settings("improved"), voltage_resolution_v=1e-6, initial_soc=1.0)
+        estimator = Estimator(
+            self.cell, observer_settings("improved"), identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0
+        )
         return adaptive_run(estimator, samples)
 
     @cached_property

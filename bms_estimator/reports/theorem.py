@@ -80,7 +80,9 @@ def measure(cell: CellModel) -> list[Measured]:
 def _measure(cell: CellModel, name: str, c_rate: float, limit: Floats) -> Measured:
     current_a = c_rate * cell.cell.capacity_ah
     samples = discharge(cell, current_a, 3600.0 / c_rate / SAMPLES)
-    estimator = Estimator(cell, observer_settings("improved"), voltage_resolution_v=1e-6, initial_soc=1.0)
+    estimator = Estimator(
+        cell, observer_settings("improved"), identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0
+    )
     run = adaptive_run(estimator, samples)
     judged = (run.time_s >= SETTLED_FROM_S) & (run.time_s <= run.window.t_unst_s)
     return Measured(

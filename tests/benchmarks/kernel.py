@@ -45,7 +45,7 @@ def rows() -> Iterator[Row]:
 
 def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
     """Time per sample of ``run`` and of its twin in C [ns]."""
-    estimator, twin = (Estimator(load_cell(CELL)) for _ in range(2))
+    estimator, twin = (Estimator(load_cell(CELL), identifier=None) for _ in range(2))
     trace = np.zeros(BLOCK, dtype=TRACE)
     with tempfile.TemporaryDirectory() as folder:
         in_c = ObserverInC(Path(folder))
@@ -76,7 +76,7 @@ def whole_step(block: SampleBlock) -> float:
 
 def calls_from_python(block: SampleBlock) -> tuple[float, float]:
     """Time of one ``Estimator.step``, and of the kernel's own ``step``, called sample by sample [ns]."""
-    estimator = Estimator(load_cell(CELL))
+    estimator = Estimator(load_cell(CELL), identifier=None)
     state, settings = estimator.record, estimator.settings_record
     samples = [(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), 0) for x in block[:CALLS]]
 

@@ -27,7 +27,7 @@ def test_c_and_kernel_agree(settings, tmp_path):
         pytest.skip("no C compiler (apt install gcc)")
     block = pulses(60_000)
     block["voltage_v"][20_000:20_010] = np.nan
-    estimator, twin = (Estimator(load_cell(CELL), settings) for _ in range(2))
+    estimator, twin = (Estimator(load_cell(CELL), settings, identifier=None) for _ in range(2))
     expected = estimator.run(block)
     trace = np.zeros(block.size, dtype=TRACE)
     rows = ObserverInC(tmp_path).run(twin.state, twin.settings, block, trace)

@@ -36,7 +36,7 @@ def disturbed():
 
 def moved(law, samples, cell=CELL):
     """Change of a1..a15 at index 1..15, and the integral of e^2 over the run."""
-    estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0)
+    estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     trace = estimator.run(samples)
     error_v = trace["tracking_error_v"][1:]  # the first sample starts the observer, and moves nothing
     return estimator.state["a"][0] - estimator.settings["a_initial"][0], float(np.sum(error_v**2) * 0.01)
@@ -58,7 +58,9 @@ def test_scheme_2_draws_the_small_parameters_back(disturbed):
 
 
 def test_scheme_2_holds_what_lies_below_its_epsilon(disturbed):
-    estimator = Estimator(CELL, settings("scheme-2", scheme_2_epsilon=7.0, scheme_2_lambda=50.0), initial_soc=1.0)
+    estimator = Estimator(
+        CELL, settings("scheme-2", scheme_2_epsilon=7.0, scheme_2_lambda=50.0), initial_soc=1.0, identifier=None
+    )
     assert estimator.settings["rate"][0, [1, 3, 4, 6, 13, 15]].tolist() == [50.0] * 6
     assert estimator.settings["rate"][0, [2, 5, 7, 14]].tolist() == [0.0] * 4
 
@@ -71,7 +73,7 @@ def test_bounded_laws_go_to_their_limits_from_anywhere(disturbed, law, last, fac
         i: CELL.bounds(i).model_copy(update={"initial": factor * CELL.bounds(i).limit}) for i in range(1, last + 1)
     }
     cell = with_bounds(CELL, bounds)
-    estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0)
+    estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     estimator.run(disturbed)
     found = estimator.state["a"][0]
     assert found[1 : last + 1] == pytest.approx([bounds[i].limit for i in range(1, last + 1)], rel=1e-4)
@@ -81,7 +83,9 @@ def test_bounded_laws_go_to_their_limits_from_anywhere(disturbed, law, last, fac
 def test_scheme_3_goes_to_the_limits_of_table_4(disturbed):
     table_4 = {1: (0.30, 0.25), 3: (0.045, 0.03), 6: (0.05, 0.04), 13: (0.15, 0.1), 15: (0.07, 0.04)}
     bounds = {i: Bounds(upper=u, lower=low, weight_upper=100.0, weight_lower=1.0) for i, (u, low) in table_4.items()}
-    estimator = Estimator(with_bounds(CELL, bounds), settings("scheme-3"), voltage_resolution_v=1e-6, initial_soc=1.0)
+    estimator = Estimator(
+        with_bounds(CELL, bounds), settings("scheme-3"), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+    )
     estimator.run(disturbed)
     limits = [0.2995050, 0.0448515, 0.0499010, 0.1495050, 0.0697030]
     assert estimator.state["a"][0, SMALL] == pytest.approx(limits, rel=1e-4)
@@ -92,7 +96,7 @@ def test_output_equation_of_each_law(law):
     """(3.14) with its loop through u = -N e closed for the schemes, (4.1) for the improved method."""
     samples = discharge(CELL, 0.275, 0.01)[:40]
     samples["voltage_v"] -= 0.1
-    estimator = Estimator(CELL, settings(law, k0=0.3), voltage_resolution_v=1e-6, initial_soc=1.0)
+    estimator = Estimator(CELL, settings(law, k0=0.3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     for time_s, current_a, voltage_v, *_ in samples.tolist():
         state = estimator.state[0].copy()
         estimator.step(time_s, current_a, voltage_v)
@@ -109,7 +113,9 @@ def test_output_equation_of_each_law(law):
 def converged():
     """Algorithm 1 at C/10, 1 Hz."""
     samples = discharge(CELL, 0.0275, 1.0)
-    estimator = Estimator(CELL, settings("improved", epsilon_v=1e-3), voltage_resolution_v=1e-6, initial_soc=1.0)
+    estimator = Estimator(
+        CELL, settings("improved", epsilon_v=1e-3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+    )
     return adaptive_run(estimator, samples)
 
 
@@ -148,7 +154,9 @@ def test_algorithm_1_says_why_it_did_not_converge():
     noisy["voltage_v"] += 0.02 * np.random.default_rng(3).standard_normal(noisy.size)
 
     def outcome(block, **others):
-        estimator = Estimator(CELL, settings("improved", **others), voltage_resolution_v=1e-6, initial_soc=1.0)
+        estimator = Estimator(
+            CELL, settings("improved", **others), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+        )
         return adaptive_run(estimator, block).outcome
 
     assert outcome(noisy, epsilon_v=1e-3).startswith("not converged: the error never settles within 1.00 mV")
@@ -170,4 +178,4 @@ def test_a_capture_outside_the_limits_is_refused():
     samples = discharge(CELL, 0.0275, 100.0)
     samples["voltage_v"] = 0.0
     with pytest.raises(UserError, match=f"none of {samples.size} samples is within the cell's limits"):
-        adaptive_run(Estimator(CELL, initial_soc=1.0), samples)
+        adaptive_run(Estimator(CELL, initial_soc=1.0, identifier=None), samples)

@@ -17,7 +17,7 @@ TIME_S = np.arange(0.0, 1000.0)
 
 
 def run(samples, **given):
-    estimator = Estimator(CELL, SETTINGS, voltage_resolution_v=1e-6, initial_soc=1.0)
+    estimator = Estimator(CELL, SETTINGS, voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     return adaptive_run(estimator, samples, **given)
 
 

@@ -2,16 +2,21 @@
 
 import csv
 import gzip
+import io
 import json
 import math
 import re
 import shutil
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pyarrow import parquet
 
+from bms_estimator import estimate, load_capture, load_cell
 from bms_estimator.cli.main import main
+from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
 
 SUMMARY = {
     "samples",
@@ -77,9 +82,9 @@ def columns_of_parquet(path):
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def test_a_real_capture_comes_to_one_json_object(shared_data, capsys):
-    capture = shared_data / "ncr18650" / "cell5_random_steps.csv.gz"
-    code, out, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--json")
+def test_a_real_capture_comes_to_one_json_object(data, capsys):
+    capture = data / "leaf" / "hppc_25c_from_full.csv.gz"
+    code, out, err = run(capsys, "replay", capture, "--cell", "leaf", "--json")
     assert (code, err) == (0, "")
     result = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} in the summary"))
     assert out.count("\n") == 1
@@ -156,7 +161,8 @@ def test_what_a_person_can_mend_ends_with_code_2_and_names_it(capture, tmp_path,
     cell = ("--cell", "ncr18650")
     for arguments, named in [
         ((missing, *cell), ["missing.csv: no such file"]),
-        ((missing, *cell, "--out", other), ["missing.csv: no such file"]),
+        ((missing, *cell, "--out", other, "--force"), ["missing.csv: no such file"]),
+        ((capture, *cell, "--out", other), ["other.csv: exists already; --force replaces it"]),
         ((capture, "--cell", "nonsense"), ["nonsense", "ncr18650"]),
         ((capture, "--cell", ""), ["a cell of no name", "ncr18650"]),
         ((wrong, *cell), ["wrong.csv", "voltage_v"]),
@@ -177,9 +183,9 @@ def test_the_capture_is_never_written_over(capture, tmp_path, capsys):
     before, link = capture.read_bytes(), tmp_path / "link.csv"
     link.symlink_to(capture)
     for out in (capture, link):
-        code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out)
+        code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--force")
         assert code == 2
-        assert "is the capture itself" in err
+        assert "is a capture itself" in err
     assert capture.read_bytes() == before
 
 
@@ -199,7 +205,7 @@ def test_estimates_from_before_outlive_a_capture_that_cannot_be_read(capture, tm
     assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out)[0] == 0
     before = out.read_bytes()
     wrong.write_text("time_s,voltage_v\n0,3.7\n")
-    assert run(capsys, "replay", wrong, "--cell", "ncr18650", "--out", out)[0] == 2
+    assert run(capsys, "replay", wrong, "--cell", "ncr18650", "--out", out, "--force")[0] == 2
     assert out.read_bytes() == before
 
 
@@ -224,3 +230,87 @@ def test_a_folder_is_no_capture(tmp_path, capsys):
     code, _, err = run(capsys, "replay", tmp_path, "--cell", "ncr18650")
     assert code == 2
     assert f"{tmp_path}: is a directory" in err
+
+
+def test_a_real_capture_gives_what_estimate_gives_to_the_last_bit(data, tmp_path, capsys):
+    capture, out = data / "leaf" / "cc_1c.csv.gz", tmp_path / "out.csv"
+    assert run(capsys, "replay", capture, "--cell", "leaf", "--soc", 0.2, "--out", out)[0] == 0
+    found = estimate(load_capture(capture), load_cell("leaf"), initial_soc=0.2)
+    for name, values in columns_of_csv(out).items():
+        assert np.array_equal(values, found[name], equal_nan=True), name
+
+
+def packed(path):
+    return gzip.compress(path.read_bytes())
+
+
+def raw(path):
+    """The same samples as a board of text lines was recorded."""
+    recorded = path.with_name("small.bms")
+    with CaptureWriter(recorded, CaptureHeader(mode="text")) as writer:
+        for line in path.read_text().splitlines()[1:]:
+            time_s, current_a, voltage_v = line.split(",")
+            writer.write(float(time_s), f"{voltage_v},{current_a}\n".encode())
+    return recorded.read_bytes()
+
+
+def replay_stdin(monkeypatch, capsys, data, *arguments):
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(data)))
+    return run(capsys, "replay", "-", "--cell", "ncr18650", *arguments)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [Path.read_bytes, packed, raw, lambda path: gzip.compress(raw(path))],
+    ids=["CSV", "CSV.gz", "raw", "raw.gz"],
+)
+def test_a_capture_comes_from_stdin_as_from_a_file(form, capture, monkeypatch, capsys):
+    code, out, err = replay_stdin(monkeypatch, capsys, form(capture), "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["samples"] == SAMPLES
+
+
+def test_what_is_wrong_on_stdin_is_named_without_a_path(monkeypatch, capsys):
+    for data, said in [
+        (b"time_s,current_a,voltage_v\n0,none,3.7\n", "stdin: line 2: current_a = 'none': must be a number"),
+        (b"", "stdin: empty: the first line must name the columns"),
+        (b"\x1f\x8b\x08 no gzip", "stdin: gzip data damaged or cut short"),
+    ]:
+        code, out, err = replay_stdin(monkeypatch, capsys, data)
+        assert (code, out) == (2, "")
+        assert err.startswith(f"error: {said}")
+
+
+def test_a_table_is_replaced_with_force_alone(capture, tmp_path, capsys):
+    out = tmp_path / "out.csv"
+    out.write_text("mine\n")
+    assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out)[0] == 2
+    assert out.read_text() == "mine\n"
+    assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--force")[0] == 0
+    assert len(columns_of_csv(out)["soc"]) == SAMPLES
+
+
+def currents(capsys, out, *arguments):
+    """What the estimator took, with the command line's arguments."""
+    code, _, err = run(capsys, "replay", *arguments, "--out", out, "--force")
+    assert (code, err) == (0, "")
+    return np.unique(columns_of_csv(out)["current_a"]).tolist()
+
+
+def test_the_sign_of_a_tables_current_is_given_by_the_pack_or_the_option(capture, tmp_path, capsys):
+    out, pack = tmp_path / "out.csv", tmp_path / "pack.toml"
+    pack.write_text('[sensor]\ncurrent_sign = "charge_positive"\n')
+    charge, discharge = (("--current-sign", f"{sign}_positive") for sign in ("charge", "discharge"))
+    assert currents(capsys, out, capture, "--cell", "ncr18650") == [0.0, 1.0]
+    assert currents(capsys, out, capture, "--cell", "ncr18650", *charge) == [-1.0, 0.0]
+    assert currents(capsys, out, capture, "--pack", pack) == [-1.0, 0.0]
+    assert currents(capsys, out, capture, "--pack", pack, *discharge) == [0.0, 1.0]
+
+
+def test_the_battery_data_format_keeps_its_sign_whatever_the_board_has(capture, tmp_path, capsys):
+    bdf, out, pack = tmp_path / "small.bdf", tmp_path / "out.csv", tmp_path / "pack.toml"
+    bdf.write_text(capture.read_text().replace("time_s,current_a,voltage_v", "Test Time / s,Current / A,Voltage / V"))
+    for sign in ("charge_positive", "discharge_positive"):
+        pack.write_text(f'[sensor]\ncurrent_sign = "{sign}"\n')
+        assert currents(capsys, out, bdf, "--pack", pack) == [-1.0, 0.0]
+    assert currents(capsys, out, bdf, "--pack", pack, "--current-sign", "discharge_positive") == [0.0, 1.0]

@@ -25,7 +25,7 @@ def noisy_load(n: int = 5000) -> SampleBlock:
 
 def test_step_and_run_are_bit_identical_whatever_the_blocks() -> None:
     samples = noisy_load()
-    whole, stepped, pieces = (Estimator(load_cell("ncr18650"), initial_soc=0.8) for _ in range(3))
+    whole, stepped, pieces = (Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None) for _ in range(3))
     whole.run(samples)
     for x in samples:
         stepped.step(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), int(x["status"]))
@@ -36,11 +36,11 @@ def test_step_and_run_are_bit_identical_whatever_the_blocks() -> None:
 
 def test_saved_state_goes_on_where_it_was() -> None:
     samples = noisy_load()
-    straight = Estimator(load_cell("ncr18650"), initial_soc=0.8)
+    straight = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
     straight.run(samples)
-    first = Estimator(load_cell("ncr18650"), initial_soc=0.8)
+    first = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
     first.run(samples[:2000])
-    second = Estimator(load_cell("ncr18650"))
+    second = Estimator(load_cell("ncr18650"), identifier=None)
     second.state[:] = first.state
     second.run(samples[2000:])
     assert straight.state.tobytes() == second.state.tobytes()
@@ -62,7 +62,7 @@ def test_saved_state_goes_on_where_it_was() -> None:
 def test_a_bad_sample_is_dropped_counted_and_changes_nothing_else(
     time_s: float, current_a: float, voltage_v: float, status: int, verdict: Verdict, counter: str
 ) -> None:
-    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     estimator.step(0.0, 0.1, 3.7)
     estimator.step(1.0, 0.1, 3.7)
     before = estimator.state.copy()
@@ -76,7 +76,7 @@ def test_verdicts_are_found_by_their_value() -> None:
 
 
 def test_a_clock_set_back_is_counted_and_costs_one_step_only() -> None:
-    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 1.0, 2.0, -500.0, -499.0):
         assert estimator.step(time_s, 3.0, 3.7) is Verdict.ACCEPTED
     assert estimator.state["time_steps_back"][0] == 1
@@ -84,7 +84,7 @@ def test_a_clock_set_back_is_counted_and_costs_one_step_only() -> None:
 
 
 def test_charge_flows_on_over_a_gap() -> None:
-    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     estimator.step(0.0, 1.0, 3.7)
     estimator.step(10.0, 1.0, 3.7)
     assert estimator.state["gaps"][0] == 1
@@ -92,21 +92,21 @@ def test_charge_flows_on_over_a_gap() -> None:
 
 
 def test_slow_sampling_is_no_row_of_gaps() -> None:
-    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 10.0, 20.0, 30.0, 90.0, 100.0):
         estimator.step(time_s, 1.0, 3.7)
     assert estimator.state["gaps"][0] == 2  # the first step, which nothing tells from a gap, and the long one
 
 
 def test_over_an_unmeasured_hour_flows_what_both_ends_agree_on() -> None:
-    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s, current_a in ((0.0, 1.0), (1800.0, 0.2), (3600.0, -1.0)):
         estimator.step(time_s, current_a, 3.7)
     assert estimator.state["soc"][0] == pytest.approx(0.5 - 0.2 * 0.5 / 3.0)
 
 
 def test_one_wrong_time_stamp_does_not_empty_the_cell() -> None:
-    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5)
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 1.0, 1e9, 2.0, 3.0):
         estimator.step(time_s, 0.3, 3.7)
     assert estimator.state["soc_coulomb"][0] == pytest.approx(0.4, abs=1e-3)  # an hour's charge
@@ -114,7 +114,7 @@ def test_one_wrong_time_stamp_does_not_empty_the_cell() -> None:
 
 def test_soc_starts_from_the_open_circuit_voltage_when_not_given() -> None:
     cell = load_cell("chen_mora")
-    estimator = Estimator(cell)
+    estimator = Estimator(cell, identifier=None)
     estimator.step(0.0, 0.0, 3.85)
     soc = float(estimator.state["soc"][0])
     a = cell.a
@@ -124,7 +124,7 @@ def test_soc_starts_from_the_open_circuit_voltage_when_not_given() -> None:
 @pytest.mark.parametrize("name", shipped_cells())
 def test_shipped_cells_load_and_step(name: str) -> None:
     cell = load_cell(name)
-    assert Estimator(cell).step(0.0, 0.0, cell.cell.nominal_voltage_v) is Verdict.ACCEPTED
+    assert Estimator(cell, identifier=None).step(0.0, 0.0, cell.cell.nominal_voltage_v) is Verdict.ACCEPTED
 
 
 def test_printed_settings_of_table_5_fail_condition_1_of_the_lemma() -> None:

@@ -157,7 +157,7 @@ def test_laws_without_a_limit_get_none(load, law: str) -> None:
 
 
 def test_without_the_identifier_nothing_is_learned(load) -> None:
-    estimator = Estimator(TRUTH, initial_soc=0.8)
+    estimator = Estimator(TRUTH, initial_soc=0.8, identifier=None)
     trace = estimator.run(load[0])
     assert np.isnan(trace["soc_std"]).all()
     assert np.array_equal(trace["soc"], trace["soc_coulomb"])

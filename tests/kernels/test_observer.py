@@ -50,7 +50,7 @@ def test_states_step_is_the_matrix_exponential(
 def test_parameters_go_to_the_limit_of_lemma_4_1_3_at_every_sample_rate(rate_hz: float) -> None:
     """Explicit Euler diverges here at 10 Hz and below: rates are 100 to 130 per second."""
     cell = load_cell("chen_mora")
-    estimator = Estimator(cell, initial_soc=1.0)
+    estimator = Estimator(cell, initial_soc=1.0, identifier=None)
     estimator.run(discharge(cell, 0.1, rate_hz, 0.05))
     for i in range(1, 13):
         assert estimator.state["a"][0, i] == pytest.approx(cell.bounds(i).limit, rel=1e-4)
@@ -65,7 +65,7 @@ def test_limits_are_those_of_table_5() -> None:
 def test_runtime_error_falls_below_ten_microvolts_within_seconds() -> None:
     """What does hold of Theorem 4.1.2 (E3): the output is tracked."""
     cell = load_cell("chen_mora")
-    trace = Estimator(cell, PRINTED_LAW, initial_soc=1.0).run(discharge(cell, 0.2, 100.0, 1e-4))
+    trace = Estimator(cell, PRINTED_LAW, initial_soc=1.0, identifier=None).run(discharge(cell, 0.2, 100.0, 1e-4))
     settled = trace["time_s"] > 20.0
     assert np.abs(trace["innovation_v"][settled]).max() < 1e-5
 
@@ -73,7 +73,7 @@ def test_runtime_error_falls_below_ten_microvolts_within_seconds() -> None:
 def test_dead_zone_of_zero_is_the_printed_law_for_k() -> None:
     """k' = e^2 (3.13): k is the integral of the squared error, here by Simpson from the trace."""
     cell = load_cell("chen_mora")
-    trace = Estimator(cell, PRINTED_LAW, initial_soc=0.98).run(discharge(cell, 0.01, 1000.0, 0.275))
+    trace = Estimator(cell, PRINTED_LAW, initial_soc=0.98, identifier=None).run(discharge(cell, 0.01, 1000.0, 0.275))
     integral = np.trapezoid(trace["innovation_v"] ** 2, trace["time_s"])
     assert trace["k"][-1] - trace["k"][0] == pytest.approx(integral, rel=2e-2)
 
@@ -93,7 +93,9 @@ def thesis_pack_on_an_adc(bits: int, hours: int = 16) -> SampleBlock:
 
 
 def test_thesis_pack_keeps_lock_for_16_hours_on_a_10_bit_adc() -> None:
-    estimator = Estimator(load_cell("thunder_power_6s"), voltage_resolution_v=25 / 1024, initial_soc=1.0)
+    estimator = Estimator(
+        load_cell("thunder_power_6s"), voltage_resolution_v=25 / 1024, initial_soc=1.0, identifier=None
+    )
     trace = estimator.run(thesis_pack_on_an_adc(10))
     assert len(trace) == 16 * 360_000
     assert trace["lock"].all()
@@ -104,7 +106,9 @@ def test_thesis_pack_keeps_lock_for_16_hours_on_a_10_bit_adc() -> None:
 
 
 def test_without_dead_zone_lock_is_lost_reported_and_regained() -> None:
-    estimator = Estimator(load_cell("thunder_power_6s"), PRINTED_LAW, voltage_resolution_v=25 / 1024, initial_soc=1.0)
+    estimator = Estimator(
+        load_cell("thunder_power_6s"), PRINTED_LAW, voltage_resolution_v=25 / 1024, initial_soc=1.0, identifier=None
+    )
     trace = estimator.run(thesis_pack_on_an_adc(10))
     assert estimator.state["lock_losses"][0] >= 1
     lost = np.flatnonzero(np.diff(trace["lock"]) < 0)
@@ -120,7 +124,7 @@ def test_gain_is_rearmed_before_its_sign_turns() -> None:
     time_s = np.arange(0.0, 40_000.0, 1.0)
     current_a = np.where(time_s // 20 % 2 == 0, 0.5, -0.5)
     voltage_v, _ = simulate_cell((0.5, 0.0, 0.0), time_s, current_a, 0.275 * 3600, cell.a)
-    estimator = Estimator(cell, ObserverSettings(**{"lambda": 50.0}), initial_soc=0.5)
+    estimator = Estimator(cell, ObserverSettings(**{"lambda": 50.0}), initial_soc=0.5, identifier=None)
     trace = estimator.run(block(time_s, current_a, voltage_v))
     assert estimator.state["gain_rearms"][0] > 0
     assert trace["nussbaum_gain"].min() >= 0.5
@@ -130,7 +134,7 @@ def test_gain_is_rearmed_before_its_sign_turns() -> None:
 @pytest.mark.parametrize("nussbaum", ["k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"])
 def test_a_gain_that_begins_at_zero_is_left_to_rise(nussbaum: str) -> None:
     cell = load_cell("chen_mora")
-    estimator = Estimator(cell, ObserverSettings(nussbaum=nussbaum), initial_soc=0.9)
+    estimator = Estimator(cell, ObserverSettings(nussbaum=nussbaum), initial_soc=0.9, identifier=None)
     estimator.run(discharge(cell, 0.1, 10.0, 0.275))
     assert estimator.state["gain_rearms"][0] == 0
     assert estimator.state["k"][0] > 0.0
@@ -139,7 +143,7 @@ def test_a_gain_that_begins_at_zero_is_left_to_rise(nussbaum: str) -> None:
 def test_a_capacitance_is_never_evaluated_where_it_is_negative() -> None:
     """A limit that moves delta1 above the SOC within one sample: the margins move first, then the states."""
     cell = load_cell("chen_mora")
-    estimator = Estimator(cell, initial_soc=0.5)
+    estimator = Estimator(cell, initial_soc=0.5, identifier=None)
     samples = discharge(cell, 0.02, 1.0, 0.0)
     estimator.run(samples[:5])
     estimator.state["target"][0, 7] = 1e3 * estimator.state["a"][0, 9]
@@ -151,7 +155,7 @@ def test_a_capacitance_is_never_evaluated_where_it_is_negative() -> None:
 
 def test_adaptation_stops_above_the_margin_and_says_so() -> None:
     cell = load_cell("chen_mora")
-    trace = Estimator(cell, initial_soc=1.0)
+    trace = Estimator(cell, initial_soc=1.0, identifier=None)
     samples = discharge(cell, 0.95, 1.0, 0.275)
     samples["current_a"] *= 1.2  # the count runs empty before the cell does
     rows = trace.run(samples)
@@ -166,7 +170,7 @@ def test_adaptation_stops_above_the_margin_and_says_so() -> None:
 def test_schemes_track_the_cell_they_start_from(law: str) -> None:
     cell = load_cell("chen_mora").model_copy(update={"adaptation": {}})
     settings = ObserverSettings(law=law, dead_zone_v=0.0, rearm_gain=None)  # type: ignore[arg-type]
-    estimator = Estimator(cell, settings, initial_soc=1.0)
+    estimator = Estimator(cell, settings, initial_soc=1.0, identifier=None)
     trace = estimator.run(discharge(cell, 0.5, 100.0, 0.0275))
     settled = trace["time_s"] > 60
     assert np.abs(trace["innovation_v"][settled]).max() < 5e-3

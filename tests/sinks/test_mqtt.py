@@ -31,7 +31,7 @@ RETAINED = ("info", "availability", "sensor/availability", "schema", "health")
 
 def snapshot(sensor_message: str | None = None) -> Snapshot:
     cell = load_cell("chen_mora")
-    estimator = Estimator(cell, initial_soc=0.5)
+    estimator = Estimator(cell, identifier=None, initial_soc=0.5)
     window = Window()
     block = np.zeros(2, dtype=SAMPLE)
     block["time_s"], block["voltage_v"], block["temperature_c"] = [0.0, 0.1], 3.8, np.nan
@@ -85,7 +85,7 @@ async def test_topics_and_retained_flags_are_as_documented(broker: Broker) -> No
 
 async def test_parameters_come_not_before_the_first_sample(broker: Broker) -> None:
     cell = load_cell("chen_mora")
-    nothing_yet = ONE._replace(estimate=None, parameters=parameter_report(Estimator(cell), NOW))
+    nothing_yet = ONE._replace(estimate=None, parameters=parameter_report(Estimator(cell, identifier=None), NOW))
     async with Listener(broker) as live, sink(broker) as mqtt:
         mqtt.publish(nothing_yet)
         await live.wait("homeassistant/device/bms_pack/config")

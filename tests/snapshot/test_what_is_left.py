@@ -22,7 +22,7 @@ NOW_S = 1.7e9
 
 
 def at(soc: float) -> Estimator:
-    estimator = Estimator(CELL, initial_soc=soc)
+    estimator = Estimator(CELL, initial_soc=soc, identifier=None)
     estimator.step(0.0, 0.0, chen_mora.emf(soc, CELL.a))
     return estimator
 
@@ -63,7 +63,7 @@ def test_a_pack_that_does_not_discharge_has_no_time_to_empty(current_a: float) -
 
 
 def test_nothing_is_known_before_the_first_sample() -> None:
-    estimator = Estimator(CELL, initial_soc=0.5)
+    estimator = Estimator(CELL, initial_soc=0.5, identifier=None)
     assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)
     assert parameter_report(estimator, NOW_S).elements == {}
 
