@@ -9,16 +9,20 @@ import typer
 from bms_estimator.cli.pack import load_pack
 from bms_estimator.cli.settings_file import settings_file
 from bms_estimator.estimator.lemma import Condition, failed
+from bms_estimator.estimator.plausible import implausible
 from bms_estimator.estimator.records import observer_settings
 from bms_estimator.kernels.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.requests import Requests
+from bms_estimator.sinks.credential import is_for_the_service
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.snapshot.topics import publish_rate_hz
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
+
+ONLY_IN_SERVICE = "not there now, so not checked: a credential of systemd is there only while the service runs"
 
 PackFile = Annotated[Path, typer.Argument(help="settings of the pack")]
 
@@ -40,10 +44,15 @@ def init(file: PackFile = Path("pack.toml")) -> None:
 def check(file: PackFile = Path("pack.toml")) -> None:
     """Check a settings file and its cell file; name what is wrong, warn of what will not work well."""
     settings, cell = load_pack(file)
+    warnings = [*implausible(settings, cell), *(f"{cell.cell.name}: {_unmet(c)}" for c in failed(cell))]
     if settings.mqtt is not None:
-        MqttSink(settings.mqtt, settings.pack.name, Requests().answer)  # reads password and certificates
-    for condition in failed(cell):
-        typer.echo(f"warning: {file}: {cell.cell.name}: {_unmet(condition)}", err=True)
+        mqtt = settings.mqtt
+        if mqtt.password_file is not None and is_for_the_service(mqtt.password_file):
+            warnings.append(f"mqtt.password_file = {mqtt.password_file}: {ONLY_IN_SERVICE}")
+            mqtt = mqtt.model_copy(update={"password_file": None})
+        MqttSink(mqtt, settings.pack.name, Requests().answer)  # reads password and certificates
+    for warning in warnings:
+        typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
 
 

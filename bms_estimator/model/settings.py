@@ -116,7 +116,10 @@ class MqttSettings(Strict):
         description="mqtt://host:port or mqtts://host:port for TLS",
     )
     username: str | None = None
-    password_file: Path | None = Field(default=None, description="file that holds the password, read at start")
+    password_file: Path | None = Field(
+        default=None,
+        description="file that holds the password, read at start; a name alone: systemd's credential of this name",
+    )
     ca_file: Path | None = Field(default=None, description="certificate authority for mqtts, else the system's")
     base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
         default="bms", description="first part of all topics: no +, # or spaces, no / at either end"

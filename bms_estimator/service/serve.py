@@ -11,6 +11,7 @@ from typing import Any
 import structlog
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.plausible import implausible
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
@@ -49,6 +50,8 @@ async def serve(
         UserError: A setting that cannot be used.
     """
     stop = stop_on_signal(stop)
+    for line in implausible(settings, cell):
+        log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     requests = Requests()
     board = SerialBoard(settings.sensor, tap=tap)
 

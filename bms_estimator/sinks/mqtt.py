@@ -23,6 +23,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate, Health, Info, ParameterReport, Report, Snapshot
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Answer
+from bms_estimator.sinks.credential import credential
 from bms_estimator.sinks.home_assistant import BIRTH_TOPIC, discovery, discovery_topic
 
 FIRST_DELAY_S = 5.0
@@ -303,7 +304,7 @@ def _connection(settings: MqttSettings) -> dict[str, Any]:
     connection: dict[str, Any] = {"hostname": host, "port": port, "username": settings.username}
     if settings.password_file is not None:
         try:
-            connection["password"] = settings.password_file.read_text(encoding="utf-8").rstrip("\r\n")
+            connection["password"] = credential(settings.password_file).read_text(encoding="utf-8").rstrip("\r\n")
         except (OSError, UnicodeDecodeError) as error:
             raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: {error}") from None
     if url.scheme == "mqtts":

@@ -5,6 +5,8 @@ import tomllib
 import pytest
 
 from bms_estimator.cli.main import main
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.settings import Settings, load_settings
 
 
@@ -127,3 +129,78 @@ def _shown(capsys):
     code, out, _ = run(capsys, "config", "show")
     assert code == 0
     return out
+
+
+@pytest.fixture
+def cell_file(tmp_path):
+    """Writes the shipped NCR18650 with some of ``[cell]`` changed."""
+
+    def write(**changes):
+        cell = load_cell("ncr18650")
+        path = tmp_path / "cell.toml"
+        write_cell(path, cell.model_copy(update={"cell": cell.cell.model_copy(update=changes)}))
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("cell", "settings", "said"),
+    [
+        ({"capacity_ah": 1e5}, "", "cell.capacity_ah = 100000: no cell holds more than 2000 Ah"),
+        ({"series_count": 4}, "series = 4", "pack.series = 4: the cell file is of 4 cells in series already"),
+        ({"nominal_voltage_v": 14.4, "voltage_max_v": 17.0}, "", "14.4 V nominal of 1 in series: 14.4 V a cell"),
+        ({}, "series = 14", "14 in series of 3 Ah: a single row of small cells; is pack.parallel right?"),
+        (
+            {},
+            "series = 7\nparallel = 4",
+            "sensor.voltage_resolution_v = 0.02441: the board's range ends at 25.0 V, but this pack has 29.1",
+        ),
+    ],
+)
+def test_check_warns_of_what_cannot_be(cell, settings, said, cell_file, pack, capsys):
+    pack.write_text(f'[pack]\ncell = "{cell_file(**cell)}"\n{settings}\n')
+    code, out, err = run(capsys, "config", "check", pack)
+    assert code == 0
+    assert f"{pack}: good: " in out
+    assert f"warning: {pack}: {said}" in err
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        'cell = "ncr18650"\nseries = 6\n[sensor]\nvoltage_resolution_v = 0.03',
+        'cell = "ncr18650"\nseries = 14\nparallel = 4\n[sensor]\nvoltage_resolution_v = 0.06',
+        'cell = "ncr18650"\nseries = 14\nparallel = 4\n[sensor]\nprotocol = "text"',
+        'cell = "leaf"\nseries = 4\nparallel = 2',
+    ],
+)
+def test_check_has_nothing_to_say_of_a_pack_that_may_be(settings, pack, capsys):
+    pack.write_text(f"[pack]\n{settings}\n")
+    code, _, err = run(capsys, "config", "check", pack)
+    assert (code, err) == (0, "")
+
+
+@pytest.mark.parametrize("name", ["mqtt-password", "/run/credentials/bms-estimator.service/mqtt-password"])
+def test_check_warns_of_a_credential_that_only_the_running_service_sees(name, pack, capsys, monkeypatch):
+    monkeypatch.delenv("CREDENTIALS_DIRECTORY", raising=False)
+    pack.write_text(f'[mqtt]\npassword_file = "{name}"\n')
+    code, out, err = run(capsys, "config", "check", pack)
+    assert code == 0
+    assert f"{pack}: good: " in out
+    assert f"warning: {pack}: mqtt.password_file = {name}: not there now" in err
+
+
+def test_check_finds_a_credential_by_its_name_alone(pack, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    (tmp_path / "mqtt-password").write_text("secret\n")
+    pack.write_text('[mqtt]\npassword_file = "mqtt-password"\n')
+    assert run(capsys, "config", "check", pack)[::2] == (0, "")
+
+
+def test_check_fails_on_a_password_file_that_is_nowhere(pack, tmp_path, capsys):
+    pack.write_text(f'[mqtt]\npassword_file = "{tmp_path / "none"}"\n')
+    code, _, err = run(capsys, "config", "check", pack)
+    assert code == 2
+    assert "mqtt.password_file" in err
+    assert "cannot be read" in err

@@ -1,0 +1,71 @@
+"""Settings that are allowed, but cannot be: a slip of the unit, a count given twice or not at all."""
+
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.settings import Settings
+
+LARGEST_AH = 2000.0
+"""The largest Li-ion cells on sale hold some 1300 Ah [Ah]."""
+CELL_V = 1.5, 4.5
+"""Between these lies the nominal voltage of any Li-ion cell: titanate 2.3 V, NMC 3.7 V [V]."""
+SMALL_AH, MANY = 5.5, 8
+"""A 18650 or 21700 cell holds no more [Ah]; more than so many of them in one row, and nothing beside it, is rare."""
+CONVERTER_STEPS = 1024
+"""Of the firmware's voltage converter: its range in steps."""
+
+
+def implausible(settings: Settings, cell: CellModel) -> list[str]:
+    """One line for each setting that cannot be, with what it may have been meant to be; empty where all may be.
+
+    Args:
+        settings: The pack's.
+        cell: The pack as one object (``CellModel.pack``).
+    """
+    checks = _capacity, _counted_twice, _cell_voltage, _single_row, _range
+    return [line for line in (check(settings, cell) for check in checks) if line]
+
+
+def _capacity(settings: Settings, cell: CellModel) -> str | None:
+    capacity_ah = cell.cell.capacity_ah / settings.pack.parallel
+    if capacity_ah <= LARGEST_AH:
+        return None
+    return f"cell.capacity_ah = {capacity_ah:g}: no cell holds more than {LARGEST_AH:g} Ah; is it in mAh?"
+
+
+def _counted_twice(settings: Settings, cell: CellModel) -> str | None:
+    series = settings.pack.series
+    within = cell.cell.series_count // series
+    if series == 1 or within == 1:
+        return None
+    return (
+        f"pack.series = {series}: the cell file is of {within} cells in series already (series_count), which makes "
+        f"{cell.cell.series_count}; is the file the whole pack, and series 1?"
+    )
+
+
+def _cell_voltage(_: Settings, cell: CellModel) -> str | None:
+    each_v = cell.cell.nominal_voltage_v / cell.cell.series_count
+    if CELL_V[0] <= each_v <= CELL_V[1]:
+        return None
+    return (
+        f"{cell.cell.nominal_voltage_v:g} V nominal of {cell.cell.series_count} in series: {each_v:.3g} V a cell, but "
+        f"Li-ion cells have {CELL_V[0]:g} to {CELL_V[1]:g} V; is series_count of the cell file right?"
+    )
+
+
+def _single_row(settings: Settings, cell: CellModel) -> str | None:
+    c = cell.cell
+    if settings.pack.parallel > 1 or c.capacity_ah > SMALL_AH or c.series_count <= MANY:
+        return None
+    return f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
+
+
+def _range(settings: Settings, cell: CellModel) -> str | None:
+    sensor = settings.sensor
+    range_v, full_v = CONVERTER_STEPS * sensor.voltage_resolution_v, float(ocv_grid(cell)[0][-1])
+    if sensor.protocol == "text" or full_v <= range_v:
+        return None
+    return (
+        f"sensor.voltage_resolution_v = {sensor.voltage_resolution_v:.4g}: the board's range ends at {range_v:.1f} V, "
+        f"but this pack has {full_v:.1f} V when full; it needs another divider, and its resolution here"
+    )
