@@ -247,3 +247,33 @@ def test_real_cell_from_its_relaxation_test_alone(shared_data, tmp_path, capsys,
     errors = errors_on_random_steps(folder, load_cell(out), "relaxation_c2")
     assert errors.voltage_rms_v <= 6.1e-3
     assert errors.mean_abs_percent <= 0.13
+
+
+def scaled(cell, factor):
+    """The cell with every resistance, and so every time constant, wrong by a factor."""
+    table = cell.model_dump()
+    for name in ("r_s", "r_ts", "r_tl"):
+        table[name] |= {key: factor * table[name][key] for key in ("amplitude_ohm", "offset_ohm")}
+    return type(cell).model_validate(table)
+
+
+def test_a_real_cell_is_identified_from_a_wrong_start_and_predicts_another_load(data):
+    """Nissan Leaf: pulses and rests, then cycles at 1C which the fit never saw."""
+    found = identify([load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")], scaled(load_cell("leaf"), 2.0))
+    assert {"a9", "a15"} <= {p.name for p in found.parameters if p.verdict is Verdict.IDENTIFIED}
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(1.7e-3, rel=0.1)
+    assert found.captures[0].voltage_rms_v < 5e-3
+    assert validate(load_capture(data / "leaf" / "cc_1c.csv.gz"), found.cell).above.voltage_rms_v < 20e-3
+
+
+def test_a_real_constant_load_is_said_not_to_tell_what_it_cannot(data):
+    """LG M50 at C/2 and back: of the fast branch it tells nothing. A tenth of the load is predicted all the same."""
+    points = np.genfromtxt(data / "lgm50" / "ocv_25c.csv", delimiter=",", names=True)
+    table = scaled(TRUTH, 1.0).model_dump()
+    table["ocv"] = {"form": "table", "soc": tuple(points["soc"]), "ocv_v": tuple(points["ocv_v"])}
+    table["cell"] |= {"capacity_ah": 4.95}
+    found = identify([load_capture(data / "lgm50" / "rate_0p5c_25c.csv.gz")], type(TRUTH).model_validate(table))
+    told = {p.name for p in found.parameters if p.verdict is Verdict.IDENTIFIED}
+    assert not told & {"a1", "a2", "a3", "a7", "a8", "a9"}
+    assert found.captures[0].voltage_rms_v < 10e-3
+    assert validate(load_capture(data / "lgm50" / "rate_0p1c_25c.csv.gz"), found.cell).above.voltage_rms_v < 25e-3

@@ -1,9 +1,11 @@
 import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
 from bms_estimator.cli.main import main
+from tests.calibration.simulated_relaxation import relaxation
 
 TABLES = [str(n) for n in range(2, 14)]
 FIGURES = [str(n) for n in (*range(3, 9), 10, *range(13, 18), *range(19, 24), *range(26, 40), 41, 42)]
@@ -146,14 +148,16 @@ def test_one_figure(tmp_path, capsys):
     assert page.articles["figure-19"]["shapes"] > 5
 
 
-def test_what_a_person_can_mend_ends_with_code_2(tmp_path, capsys, shared_data):
-    captures = shared_data / "ncr18650"
+def test_what_a_person_can_mend_ends_with_code_2(tmp_path, capsys, data):
+    steps, rests = data / "leaf" / "cc_1c.csv.gz", tmp_path / "rests.csv"
+    rows = relaxation()[["time_s", "current_a", "voltage_v"]]
+    np.savetxt(rests, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
     for arguments, words in (
         (("--table", "14"), "no table 14: tables are 1 to 13"),
         (("--figure", "51"), "no figure 51"),
-        ((captures / RELAXATION,), "captures need --cell"),
-        ((captures / RELAXATION, "--cell", "ncr18650"), "the protocol needs a constant load"),
-        ((captures / FAST, "--cell", "ncr18650"), "the protocol needs a voltage relaxation test"),
+        ((steps,), "captures need --cell"),
+        ((rests, "--cell", "ncr18650"), "the protocol needs a constant load"),
+        ((steps, "--cell", "leaf"), "the protocol needs a voltage relaxation test"),
     ):
         code, out, err = run(capsys, "thesis", *arguments, "--out", tmp_path / "none")
         assert (code, out) == (2, "")

@@ -1,0 +1,29 @@
+"""The estimator on a real capture that comes with the tests, from a wrong start."""
+
+import numpy as np
+import pytest
+
+from bms_estimator import Estimator, estimate, load_capture, load_cell
+from bms_estimator.model.columns import Columns
+
+
+@pytest.mark.parametrize("first", [0, 3000, 6000], ids=["from full", "under 10 A", "mid way"])
+def test_soc_wrong_by_a_fifth_is_right_within_an_hour(data, first):
+    """Nissan Leaf, its own cell file; truth is the charge counted from full."""
+    cell, whole = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
+    drawn_as = np.r_[0.0, np.cumsum(whole["current_a"][:-1] * np.diff(whole["time_s"]))]
+    soc = (1.0 - drawn_as / (3600.0 * cell.cell.capacity_ah))[first:]
+    found = estimate(Columns(whole.rows[first:]), cell, initial_soc=soc[0] - 0.2)
+    judged = (found["time_s"] > found["time_s"][0] + 3600.0) & (soc > 0.05)
+    error = found["soc"][judged] - soc[judged]
+    assert np.abs(error).max() < 0.01
+    assert (np.abs(error) < 2.0 * found["soc_std"][judged]).mean() > 0.9
+
+
+def test_blocks_of_a_real_capture_leave_what_its_samples_leave_to_the_last_bit(data):
+    cell, capture = load_cell("leaf"), load_capture(data / "leaf" / "cc_1c.csv.gz")
+    whole, stepped = Estimator(cell), Estimator(cell)
+    whole.run(capture.rows)
+    for sample in capture.rows:
+        stepped.step(sample["time_s"], sample["current_a"], sample["voltage_v"])
+    assert whole.record.tobytes() == stepped.record.tobytes()
