@@ -114,15 +114,3 @@ def test_the_sign_of_a_tables_current_can_be_given(tables, tmp_path, capsys):
         arguments = (capture, "--cell", "ncr18650", "--out", tmp_path / name, "--current-sign", sign)
         assert run(capsys, "identify", *arguments)[0] == 0
     assert np.array_equal(load_cell(tmp_path / "first.toml").a, load_cell(tmp_path / "second.toml").a, equal_nan=True)
-
-
-def test_a_cell_file_is_replaced_with_force_alone(tables, tmp_path, capsys):
-    out = tmp_path / "mine.toml"
-    out.write_text("# measured in May\n")
-    arguments = ("identify", tables / "steps7.csv", "--cell", "ncr18650", "--keep-ocv", "--out", out)
-    code, text, err = run(capsys, *arguments)
-    assert (code, text) == (2, "")
-    assert f"error: --out {out}: exists already; --force replaces it" in err
-    assert out.read_text() == "# measured in May\n"
-    assert run(capsys, *arguments, "--force")[0] == 0
-    assert load_cell(out).cell.name == "mine"

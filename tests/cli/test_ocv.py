@@ -164,15 +164,3 @@ def test_the_sign_of_a_tables_current_can_be_given(tmp_path, capsys):
     assert "discharge must be positive (--current-sign)" in err
     assert run(capsys, *arguments, "--current-sign", "charge_positive")[0] == 0
     assert "20 rests of charge.csv" in (tmp_path / "c.toml").read_text()
-
-
-def test_a_cell_file_is_replaced_with_force_alone(captures, tmp_path, capsys):
-    out = tmp_path / "mine.toml"
-    out.write_text("# measured in May\n")
-    arguments = ("ocv", captures[0], "--capacity-ah", "3", "--out", out)
-    code, text, err = run(capsys, *arguments)
-    assert (code, text) == (2, "")
-    assert f"error: --out {out}: exists already; --force replaces it" in err
-    assert out.read_text() == "# measured in May\n"
-    assert run(capsys, *arguments, "--force")[0] == 0
-    assert load_cell(out).cell.name == "mine"

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pyarrow import parquet
+from pyarrow import BufferOutputStream, parquet
+from pyarrow.csv import read_csv
 
 from bms_estimator import estimate, load_capture, load_cell
 from bms_estimator.cli.main import main
@@ -254,6 +255,12 @@ def raw(path):
     return recorded.read_bytes()
 
 
+def as_parquet(path):
+    buffer = BufferOutputStream()
+    parquet.write_table(read_csv(path), buffer)
+    return buffer.getvalue().to_pybytes()
+
+
 def replay_stdin(monkeypatch, capsys, data, *arguments):
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(data)))
     return run(capsys, "replay", "-", "--cell", "ncr18650", *arguments)
@@ -261,8 +268,8 @@ def replay_stdin(monkeypatch, capsys, data, *arguments):
 
 @pytest.mark.parametrize(
     "form",
-    [Path.read_bytes, packed, raw, lambda path: gzip.compress(raw(path))],
-    ids=["CSV", "CSV.gz", "raw", "raw.gz"],
+    [Path.read_bytes, packed, as_parquet, raw, lambda path: gzip.compress(raw(path))],
+    ids=["CSV", "CSV.gz", "Parquet", "raw", "raw.gz"],
 )
 def test_a_capture_comes_from_stdin_as_from_a_file(form, capture, monkeypatch, capsys):
     code, out, err = replay_stdin(monkeypatch, capsys, form(capture), "--json")
@@ -279,15 +286,6 @@ def test_what_is_wrong_on_stdin_is_named_without_a_path(monkeypatch, capsys):
         code, out, err = replay_stdin(monkeypatch, capsys, data)
         assert (code, out) == (2, "")
         assert err.startswith(f"error: {said}")
-
-
-def test_a_table_is_replaced_with_force_alone(capture, tmp_path, capsys):
-    out = tmp_path / "out.csv"
-    out.write_text("mine\n")
-    assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out)[0] == 2
-    assert out.read_text() == "mine\n"
-    assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--force")[0] == 0
-    assert len(columns_of_csv(out)["soc"]) == SAMPLES
 
 
 def currents(capsys, out, *arguments):

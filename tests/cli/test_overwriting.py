@@ -1,0 +1,38 @@
+"""What a command writes with ``--out`` never replaces a file unasked."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.cli.main import main
+from tests.calibration.simulated_relaxation import relaxation
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    path = tmp_path_factory.mktemp("capture") / "rests.csv"
+    rows = relaxation()[["time_s", "current_a", "voltage_v"]]
+    np.savetxt(path, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "name"),
+    [
+        ("replay", ("--cell", "ncr18650"), "out.csv"),
+        ("ocv", ("--capacity-ah", "3"), "out.toml"),
+        ("identify", ("--cell", "ncr18650", "--keep-ocv"), "out.toml"),
+    ],
+)
+def test_a_file_that_is_there_is_replaced_with_force_alone(command, options, name, capture, tmp_path, capsys):
+    out = tmp_path / name
+    out.write_text("# measured in May\n")
+    arguments = [command, str(capture), *options, "--out", str(out)]
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert f"error: --out {out}: exists already; --force replaces it" in capsys.readouterr().err
+    assert out.read_text() == "# measured in May\n"
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--force"])
+    assert not ended.value.code
+    assert len(out.read_text().splitlines()) > 10
