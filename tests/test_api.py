@@ -30,6 +30,7 @@ def test_the_package_and_its_help_do_not_wait_for_numba(program):
 
 
 def test_every_public_name_is_there():
+    assert dir(bms_estimator) == sorted(bms_estimator.__all__)
     assert all(getattr(bms_estimator, name) is not None for name in bms_estimator.__all__)
     with pytest.raises(AttributeError, match="module 'bms_estimator' has no attribute 'estimates'"):
         bms_estimator.estimates  # noqa: B018 - to be refused
@@ -53,6 +54,8 @@ def test_a_table_in_memory_is_a_capture_with_the_errors_of_a_file(data):
     assert np.array_equal(bms_estimator.load_capture(bdf)["current_a"], capture["current_a"])
     with pytest.raises(UserError, match="the table: no column voltage_v; found time_s, current_a"):
         bms_estimator.load_capture({"time_s": [0.0], "current_a": [0.0]})
+    with pytest.raises(UserError, match="current_sign = 'charge': must be one of discharge_positive, charge_positive"):
+        bms_estimator.load_capture(bdf, current_sign="charge")
 
 
 def test_a_column_that_is_not_there_is_a_key_error_that_names_those_that_are(data):

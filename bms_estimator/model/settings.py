@@ -35,7 +35,7 @@ class SensorSettings(Strict):
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(default=500_000)
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
-        default="discharge_positive", description="what the board calls positive; inside, discharge is"
+        default="discharge_positive", description="what the board, or a table, calls positive; inside, discharge is"
     )
     voltage_resolution_v: Positive = Field(default=25.0 / 1024, description="one step of the voltage converter")
     voltage_noise_v: NotNegative | None = Field(

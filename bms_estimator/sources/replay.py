@@ -6,7 +6,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,8 +195,10 @@ def load_capture(source: str | Path | ByName, *, current_sign: CurrentSign | Non
         ``status``, bits of ``SampleStatus``.
 
     Raises:
-        UserError: There is no such file, it cannot be read, or a column is missing.
+        UserError: There is no such file, it cannot be read, or a column is missing; no such sign.
     """
+    if current_sign not in (None, *get_args(CurrentSign)):
+        raise UserError(f"current_sign = {current_sign!r}: must be one of {', '.join(get_args(CurrentSign))}")
     if not isinstance(source, str | Path):
         return Columns(samples_of(source, Sign(current_sign)), "capture")
     path = Path(source)
