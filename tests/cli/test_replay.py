@@ -255,6 +255,16 @@ def raw(path):
     return recorded.read_bytes()
 
 
+def test_documented_replays_of_the_captures_that_come_with_the_tests_run_as_they_stand(monkeypatch, capsys):
+    root = Path(__file__).parents[2]
+    text = "".join((root / name).read_text() for name in ("README.md", "docs/cli.md"))
+    commands = re.findall(r"bms-estimator (replay tests/data/.+)", text)
+    assert commands
+    monkeypatch.chdir(root)
+    for command in commands:
+        assert run(capsys, *command.split())[0] == 0, command
+
+
 def as_parquet(path):
     buffer = BufferOutputStream()
     parquet.write_table(read_csv(path), buffer)
