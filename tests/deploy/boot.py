@@ -8,6 +8,8 @@ import sysconfig
 import uuid
 from pathlib import Path
 
+from tests.deploy import kernel_cache
+
 PROJECT = Path(__file__).parents[2]
 LINKS = {"bin": "usr/bin", "sbin": "usr/sbin", "lib": "usr/lib", "lib64": "usr/lib64"}
 FOLDERS = ("etc/bms-estimator", "etc/systemd/system/multi-user.target.wants", "opt/bms-estimator/bin")
@@ -71,6 +73,9 @@ def make_root(root: Path) -> None:
     (root / "etc/bms-estimator/pack.toml").write_text(PACK)
     shutil.copy(PROJECT / "deploy/bms-estimator.service", root / "etc/systemd/system")
     (root / "etc/systemd/system/judge.service").write_text(JUDGE)
+    private = root / "var/cache/private"
+    private.mkdir(mode=0o700, parents=True)  # as systemd wants it
+    kernel_cache.fill(private / "bms-estimator", Path("/opt/project/bms_estimator/kernels/__init__.py"))
 
 
 def boot(root: Path, systemd_nspawn: str, timeout_s: float) -> str:

@@ -6,6 +6,7 @@ import re
 import pytest
 
 from tests.deploy.boot import boot, make_root
+from tests.deploy.kernel_cache import LEFT_OUT
 from tests.patience import LONG_S
 
 
@@ -43,7 +44,7 @@ def test_it_is_told_which_start_of_the_machine_this_is(report):
 
 
 def test_kernels_are_compiled_into_the_cache_folder(report):
-    assert "cached estimate.run-" in report, report
+    assert f"cached {LEFT_OUT}" in report, report
 
 
 def test_it_says_that_the_board_is_missing(report):
