@@ -31,6 +31,8 @@ from tests.patience import LONG_S
 
 STEADY = Reading(2.5, 22.2, 25.0)
 
+LAST = b"and that is all"
+
 Event = Callable[[VirtualBoard], None]
 
 
@@ -39,27 +41,27 @@ async def received(board: VirtualBoard, samples: int, events: dict[int, Event] |
     data = bytearray()
 
     async def run() -> None:
-        for at in sorted({*(events or {}), samples}):
-            await board.run((at - board.samples - 0.5) * window_of(100)[1] * 1e-9)  # the last one begins by then
-            if events and at in events:
-                events[at](board)
+        try:
+            for at in sorted({*(events or {}), samples}):
+                await board.run((at - board.samples - 0.5) * window_of(100)[1] * 1e-9)  # the last one begins by then
+                if events and at in events:
+                    events[at](board)
+        finally:
+            board.send(LAST)
 
     with board:
         host = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
             async with asyncio.timeout(LONG_S):
                 task = asyncio.create_task(run())
-                quiet = 0
-                while not task.done() or quiet < 3:
+                while not data.endswith(LAST):
                     await asyncio.sleep(0.005)
-                    before = len(data)
                     with contextlib.suppress(BlockingIOError):
                         data += os.read(host, 1 << 16)
-                    quiet = quiet + 1 if len(data) == before else 0
                 await task
         finally:
             os.close(host)
-    return bytes(data)
+    return bytes(data.removesuffix(LAST))
 
 
 def board(reading: Reading = STEADY, **options: Any) -> VirtualBoard:
