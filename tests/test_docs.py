@@ -1,15 +1,13 @@
-"""What the documents point at exists, and what they say of the thesis is what the report says."""
+"""What the documents point at exists, and wherever the thesis differs they say why."""
 
 import ast
 import re
-from collections import Counter
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 from bms_estimator.reports.items import Verdict
-from bms_estimator.reports.thesis import build
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -71,17 +69,6 @@ def test_relative_links_lead_to_files(document: Path) -> None:
     links = re.findall(r"\]\(([^)\s#]+)[^)]*\)", document.read_text(encoding="utf-8"))
     relative = [link for link in links if not re.match(r"[a-z]+:", link)]
     assert [link for link in relative if not (document.parent / link).exists()] == []
-
-
-def test_thesis_document_says_what_the_report_says() -> None:
-    """Every table and figure with its title and verdict, in the report's order, and their counts."""
-    items = [item for item in build().items if item.verdict is not Verdict.ADDED]
-    said = [tuple(cells[:3]) for cells in rows(THESIS) if cells[0].startswith(("Table ", "Figure "))]
-    assert said == [(f"{item.kind} {item.key}", item.title, item.verdict.value) for item in items]
-
-    summary = " ".join(THESIS.split())
-    for verdict, count in Counter(item.verdict.value for item in items).items():
-        assert f" {count} {verdict}" in summary
 
 
 def test_thesis_document_gives_a_reason_wherever_something_differs() -> None:

@@ -1,5 +1,7 @@
 import re
+from collections import Counter
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,10 +19,13 @@ RELAXATION, SLOW, FAST, STEPS = (
     "cell5_random_steps.csv.gz",
 )
 NOT_REPRODUCED = "cannot be reproduced"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "thesis.md"
 
 
 class Page(HTMLParser):
-    """Articles of the report: verdict, headings of the table, number of drawn shapes, reason; and what a browser loads."""
+    """Articles of the report: number, title, verdict, headings of the table, number of drawn shapes, reason; and what a
+    browser loads.
+    """
 
     def __init__(self, text):
         super().__init__()
@@ -33,12 +38,14 @@ class Page(HTMLParser):
         if tag in ("script", "img", "iframe", "link", "object", "embed", "image", "use"):
             self.loads += [found[key] for key in ("src", "href", "xlink:href", "data") if found.get(key)]
         if tag == "article":
-            fields = {"verdict": "", "reason": "", "heads": [], "rows": 0, "shapes": 0}
+            fields = {"number": "", "title": "", "verdict": "", "reason": "", "heads": [], "rows": 0, "shapes": 0}
             self._here = self.articles.setdefault(found["id"], fields)
             assert self._here is fields, f"{found['id']} stands twice"
         elif self._here is not None:
             words = (found.get("class") or "").split()
-            if "badge" in words:
+            if "no" in words:
+                self._field = "number"
+            elif "badge" in words:
                 self._field = "verdict"
             elif "reason" in words:
                 self._field = "reason"
@@ -52,7 +59,7 @@ class Page(HTMLParser):
         if tag == "article":
             self._here = None
         if tag in ("span", "p", "th", "article"):
-            self._field = None
+            self._field = "title" if self._field == "number" else None
 
     def handle_data(self, data):
         if self._here is None or self._field is None:
@@ -128,6 +135,18 @@ def test_closing_note_lists_every_item(whole, page):
     note = whole.split('id="account"', 1)[1]
     for key in page.articles:
         assert f'href="#{key}"' in note
+
+
+def test_the_document_gives_each_title_and_verdict_in_the_reports_order_and_how_many_there_are(page):
+    text = DOCUMENT.read_text(encoding="utf-8")
+    rows = [
+        row.replace("\\|", "|").split(" | ")[:3]
+        for row in re.findall(r"(?<=^\| )(?:Table|Figure) .*", text, re.MULTILINE)
+    ]
+    items = [article for article in page.articles.values() if article["verdict"] != "added"]
+    assert rows == [[item["number"], item["title"].strip(), item["verdict"]] for item in items]
+    for verdict, count in Counter(item["verdict"] for item in items).items():
+        assert f" {count} {verdict}" in " ".join(text.split())
 
 
 def test_one_table(tmp_path, capsys):
