@@ -11,7 +11,7 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare firmware lock
+.PHONY: help venv apt check test demo benchmark compare firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -30,8 +30,9 @@ check: venv ## style and types, in seconds
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-test: apt check firmware ## all there is to check: packages, style, types, firmware, pytest
-	$(BIN)/python -m pytest $(ARGS)
+test: apt venv ## all there is to check: packages, style, types, firmware, pytest
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware
+	$(BIN)/python -m pytest --numprocesses=2 --dist=loadfile $(ARGS)
 
 demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory --silent firmware || echo "the firmware does not build here: the Python board serves"; fi
@@ -48,6 +49,9 @@ compare: ## methods side by side on real captures, PyBOP among them: minutes
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
 	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
+
+kernels: venv
+	$(BIN)/python -m tests.compile_kernels
 
 lock: ## write requirements.lock anew after a change of dependencies (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --no-annotate --universal pyproject.toml -o requirements.lock

@@ -7,10 +7,7 @@ import numba
 from numba.core.caching import _CacheLocator
 
 from bms_estimator import kernels
-from bms_estimator.model.cell import load_cell
-from bms_estimator.model.settings import Settings
-from bms_estimator.service.live import new_estimator
-from bms_estimator.sources.frames import FrameDecoder
+from tests.compile_kernels import compile_kernels
 
 KERNELS = Path(kernels.__file__)
 LEFT_OUT = "sample_step.run-"
@@ -19,8 +16,7 @@ LEFT_OUT = "sample_step.run-"
 
 def fill(cache: Path, sources: Path = KERNELS) -> None:
     """Fill a cache for kernels that will lie where ``sources`` says."""
-    new_estimator(Settings(), load_cell("chen_mora"))
-    FrameDecoder()
+    compile_kernels()
     compiled = Path(numba.config.CACHE_DIR)
     named = _CacheLocator.get_suitable_cache_subpath  # by the folder of the sources
     shutil.copytree(
