@@ -61,7 +61,8 @@ def test_a_board_answers_the_probe_and_goes_on(capsys):
         assert process.poll() is None
 
 
-def test_what_is_no_board_is_not_called_one(capsys, tmp_path):
+def test_what_is_no_board_is_not_called_one(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "500")  # no row is folded
     master, slave = os.openpty()
     try:
         silent = os.ttyname(slave)
