@@ -18,7 +18,6 @@ from bms_estimator.model.settings import Settings
 from bms_estimator.service.requests import Requests
 from bms_estimator.sinks.credential import is_for_the_service
 from bms_estimator.sinks.mqtt import MqttSink
-from bms_estimator.snapshot.topics import publish_rate_hz
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 
@@ -83,7 +82,7 @@ def derived(settings: Settings, cell: CellModel) -> dict[str, float]:
         "observer.lock_error_v": record["lock_error_v"],
         "observer.delta_1": delta(a[8], a[9], a[7]),  # (2.11)
         "observer.delta_2": delta(a[11], a[12], a[10]),  # (2.12)
-        "publish_period_s": 1.0 / publish_rate_hz(settings),
+        "publish_period_s": 1.0 / settings.publish.rate_hz,
     }
 
 

@@ -107,8 +107,14 @@ class IdentifierSettings(Strict):
     )
 
 
+class PublishSettings(Strict):
+    """How often what is estimated goes out."""
+
+    rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="snapshots per second")
+
+
 class MqttSettings(Strict):
-    """The broker and how often to publish."""
+    """The broker."""
 
     url: str = Field(
         default="mqtt://localhost:1883",
@@ -124,7 +130,14 @@ class MqttSettings(Strict):
     base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
         default="bms", description="first part of all topics: no +, # or spaces, no / at either end"
     )
-    publish_rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="of the state topic")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_publish_rate(cls, table: object) -> object:
+        """The rate stood here once."""
+        if isinstance(table, dict) and "publish_rate_hz" in table:
+            raise ValueError("publish_rate_hz is now called rate_hz and stands in the section [publish]")
+        return table
 
 
 class StateSettings(Strict):
@@ -143,6 +156,7 @@ class Settings(Strict):
     sensor: SensorSettings = SensorSettings()
     observer: ObserverSettings = ObserverSettings()
     identifier: IdentifierSettings = IdentifierSettings()
+    publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
     state: StateSettings = StateSettings()
 

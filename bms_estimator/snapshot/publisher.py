@@ -15,7 +15,7 @@ from bms_estimator.sinks import FRESH_PERIODS, Sink
 from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.topics import estimate_report, info_report, publish_rate_hz
+from bms_estimator.snapshot.topics import estimate_report, info_report
 from bms_estimator.snapshot.window import Window, WindowSummary
 from bms_estimator.sources import Source
 
@@ -60,7 +60,7 @@ class Publisher:
         self._source, self._sinks, self._clock = source, sinks, clock
         self._restarts = restarts
         self.checkpoint = checkpoint
-        self.period_s = 1.0 / publish_rate_hz(settings)
+        self.period_s = 1.0 / settings.publish.rate_hz
         self._fresh_s = FRESH_PERIODS * max(self.period_s, settings.sensor.sample_period_s)
         self._window = Window()
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()

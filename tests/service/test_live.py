@@ -17,7 +17,7 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
-from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings
+from bms_estimator.model.settings import PackSettings, PublishSettings, SensorSettings, Settings
 from bms_estimator.service.checkpoint import FORMAT, CheckpointFile, pack_identity
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.notify import Notifier
@@ -28,7 +28,7 @@ from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
-SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), mqtt=MqttSettings(publish_rate_hz=10.0))
+SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), publish=PublishSettings(rate_hz=10.0))
 
 
 @dataclass
