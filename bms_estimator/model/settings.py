@@ -10,6 +10,8 @@ from bms_estimator.model.toml_file import Strict, read_toml
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Command = Literal["set_soc", "current_zero"]
+"""A request that changes something."""
 DeviceName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 
 
@@ -114,7 +116,7 @@ class PublishSettings(Strict):
 
 
 class MqttSettings(Strict):
-    """The broker."""
+    """The broker, and what others may have done over it."""
 
     url: str = Field(
         default="mqtt://localhost:1883",
@@ -129,6 +131,9 @@ class MqttSettings(Strict):
     ca_file: Path | None = Field(default=None, description="certificate authority for mqtts, else the system's")
     base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
         default="bms", description="first part of all topics: no +, # or spaces, no / at either end"
+    )
+    commands: tuple[Command, ...] = Field(
+        default=(), description="requests that change something and may be made by whoever may publish; none by default"
     )
 
     @model_validator(mode="before")
