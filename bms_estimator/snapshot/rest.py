@@ -6,7 +6,7 @@ from bms_estimator.model.estimate import Estimate
 
 WATCHED_S = 30.0
 """So long current and voltage must have kept still [s]."""
-MOST_CURRENT = 0.02
+MOST_CURRENT = 0.04
 """Of the largest current that the cell file allows: what a sensor's offset may be; more is a load."""
 MOST_STEPS = 2.0
 """Of the voltage's resolution: between the means of two publish windows noise makes less."""

@@ -283,7 +283,7 @@ async def test_the_present_current_is_taken_as_zero_when_the_pack_was_at_rest() 
         ([], "no usable sample"),
         (AT_REST[:5], "watched for"),
         ([*AT_REST, (4.5, 3.8)], "current flows: 4.5 A"),
-        ([(0.2, 3.8)] * len(AT_REST), "current flows: 0.2 A"),
+        ([(0.3, 3.8)] * len(AT_REST), "current flows: 0.3 A"),
         ([*AT_REST, (0.03, 3.7), (0.03, 3.7)], "the voltage moved by 0.1 V"),
     ],
 )
