@@ -15,10 +15,8 @@ from bms_estimator.kernels.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.requests import Requests
 from bms_estimator.sinks.credential import is_for_the_service
-from bms_estimator.sinks.mqtt import MqttSink
-from bms_estimator.snapshot.topics import publish_rate_hz
+from bms_estimator.sinks.mqtt import broker_arguments
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 
@@ -50,7 +48,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         if mqtt.password_file is not None and is_for_the_service(mqtt.password_file):
             warnings.append(f"mqtt.password_file = {mqtt.password_file}: {ONLY_IN_SERVICE}")
             mqtt = mqtt.model_copy(update={"password_file": None})
-        MqttSink(mqtt, settings.pack.name, Requests().answer)  # reads password and certificates
+        broker_arguments(mqtt)  # reads password and certificates
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
@@ -83,7 +81,7 @@ def derived(settings: Settings, cell: CellModel) -> dict[str, float]:
         "observer.lock_error_v": record["lock_error_v"],
         "observer.delta_1": delta(a[8], a[9], a[7]),  # (2.11)
         "observer.delta_2": delta(a[11], a[12], a[10]),  # (2.12)
-        "publish_period_s": 1.0 / publish_rate_hz(settings),
+        "publish_period_s": 1.0 / settings.publish.rate_hz,
     }
 
 

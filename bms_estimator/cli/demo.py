@@ -17,7 +17,14 @@ from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.settings import MqttSettings, ObserverSettings, PackSettings, SensorSettings, Settings
+from bms_estimator.model.settings import (
+    MqttSettings,
+    ObserverSettings,
+    PackSettings,
+    PublishSettings,
+    SensorSettings,
+    Settings,
+)
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import new_estimator
 from bms_estimator.service.logs import configure_logs
@@ -139,7 +146,8 @@ def _settings(path: str, url: str, rate_hz: int) -> Settings:
         pack=PackSettings(name="demo", cell=CELL),
         sensor=SensorSettings(port=path, sample_rate_hz=rate_hz, voltage_resolution_v=RESOLUTION_V),
         observer=ObserverSettings.model_validate({"lambda": LAMBDA}),
-        mqtt=MqttSettings(url=url, publish_rate_hz=PUBLISH_RATE_HZ),
+        publish=PublishSettings(rate_hz=PUBLISH_RATE_HZ),
+        mqtt=MqttSettings(url=url),
     )
 
 

@@ -25,8 +25,9 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.live import new_estimator
-from bms_estimator.service.requests import Requests
+from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.sinks.requests import Requests
 from bms_estimator.sinks.table import TableSink, table_sink
 from bms_estimator.snapshot.health import dropped_text
 from bms_estimator.snapshot.publisher import Publisher
@@ -116,8 +117,10 @@ async def _publisher(
     """Who publishes, when there is a broker."""
     if settings.mqtt is None:
         return None
-    sink = await stack.enter_async_context(MqttSink(settings.mqtt, settings.pack.name, Requests().answer))
-    return Publisher(settings, cell, estimator, source=source, sinks=[sink], clock=Clock())
+    delivery = Delivery()
+    mqtt = MqttSink(settings.mqtt, settings.pack.name, Requests(delivery), delivery)
+    sinks = [await stack.enter_async_context(mqtt)]
+    return Publisher(settings, cell, estimator, source=source, sinks=sinks, clock=Clock(), delivery=delivery)
 
 
 @contextmanager

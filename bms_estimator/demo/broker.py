@@ -3,12 +3,15 @@
 No broker for a pack that matters: it knows no passwords here, keeps nothing over a restart, and see ``_Broker``.
 """
 
+import asyncio
+import contextlib
 import errno
 import logging
 import socket
 from types import TracebackType
 from typing import Self
 
+from amqtt.adapters import StreamReaderAdapter, StreamWriterAdapter
 from amqtt.broker import Broker
 from amqtt.contexts import BrokerConfig, ListenerConfig
 from amqtt.session import Session
@@ -19,10 +22,34 @@ MQTT_PORT = 1883
 """Where MQTT clients look when nobody tells them."""
 LOOPBACK = "127.0.0.1"
 ANONYMOUS = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
+MQTT_5 = b"MQTT\x05"
+"""How the CONNECT of an MQTT 5 client goes on after its length."""
+UNSUPPORTED_VERSION = b"\x20\x02\x00\x01"
+"""CONNACK of a broker that does not know the client's version."""
 
 
 class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
-    """amqtt 0.12 hands a client that connects the retained messages of everyone's subscriptions: only its own are right."""
+    """amqtt 0.12, put right where it is wrong.
+
+    It hands a client that connects the retained messages of everyone's subscriptions: only its own are right. What
+    MQTT 5 adds to a CONNECT it takes for something else and waits for more: the client is to hear that 3.1.1 is spoken.
+    """
+
+    async def stream_connected(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, listener_name: str
+    ) -> None:
+        try:
+            start = await reader.readuntil(MQTT_5[:-1]) + await reader.readexactly(1)
+        except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, ConnectionError):
+            writer.close()
+            return
+        if not start.endswith(MQTT_5):
+            await self.external_connected(_Again(start, reader), StreamWriterAdapter(writer), listener_name)
+            return
+        writer.write(UNSUPPORTED_VERSION)
+        with contextlib.suppress(ConnectionError):
+            await writer.drain()
+        writer.close()
 
     async def _publish_retained_messages_for_subscription(
         self, subscription: tuple[str, int], session: Session
@@ -30,6 +57,19 @@ class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
         topic_filter, _ = subscription
         if any(subscriber is session for subscriber, _ in self._subscriptions.get(topic_filter, ())):
             await super()._publish_retained_messages_for_subscription(subscription, session)
+
+
+class _Again(StreamReaderAdapter):  # type: ignore[misc]  # as above
+    """A reader whose first bytes have been read already."""
+
+    def __init__(self, start: bytes, reader: asyncio.StreamReader) -> None:
+        super().__init__(reader)
+        self._start = start
+
+    async def read(self, n: int = -1) -> bytes:
+        start, self._start = self._start[:n], self._start[n:]
+        rest: bytes = await super().read(n - len(start))
+        return start + rest
 
 
 class DemoBroker:

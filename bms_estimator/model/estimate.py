@@ -92,6 +92,9 @@ class Health(Report):
     lock_losses: int = Field(description="times the observer lost track")
     gain_rearms: int = Field(description="times k was started again before the gain turned")
     publish_drops: int = Field(description="messages replaced before a sink could take them")
+    refused_topics: list[str] = Field(description="what the broker denies, as far as it can be told; empty: nothing")
+    availability_corrections: int = Field(description="times somebody else wrote an availability and was put right")
+    requests: dict[str, int] = Field(description="by what became of them, since start")
     checkpoint: str = Field(description="what became of the last checkpoint")
 
 

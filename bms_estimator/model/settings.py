@@ -10,6 +10,8 @@ from bms_estimator.model.toml_file import Strict, read_toml
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Command = Literal["set_soc", "current_zero"]
+"""A request that changes something."""
 DeviceName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 
 
@@ -107,8 +109,14 @@ class IdentifierSettings(Strict):
     )
 
 
+class PublishSettings(Strict):
+    """How often what is estimated goes out."""
+
+    rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="snapshots per second")
+
+
 class MqttSettings(Strict):
-    """The broker and how often to publish."""
+    """The broker, and what others may have done over it."""
 
     url: str = Field(
         default="mqtt://localhost:1883",
@@ -124,7 +132,17 @@ class MqttSettings(Strict):
     base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
         default="bms", description="first part of all topics: no +, # or spaces, no / at either end"
     )
-    publish_rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="of the state topic")
+    commands: tuple[Command, ...] = Field(
+        default=(), description="requests that change something and may be made by whoever may publish; none by default"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_publish_rate(cls, table: object) -> object:
+        """The rate stood here once."""
+        if isinstance(table, dict) and "publish_rate_hz" in table:
+            raise ValueError("publish_rate_hz is now called rate_hz and stands in the section [publish]")
+        return table
 
 
 class StateSettings(Strict):
@@ -143,6 +161,7 @@ class Settings(Strict):
     sensor: SensorSettings = SensorSettings()
     observer: ObserverSettings = ObserverSettings()
     identifier: IdentifierSettings = IdentifierSettings()
+    publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
     state: StateSettings = StateSettings()
 

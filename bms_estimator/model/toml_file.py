@@ -46,8 +46,10 @@ def _line(path: Path, model: type[BaseModel], detail: Any) -> str:
         return f"{path}: {where}: missing{hint}"
     if detail["type"] == "extra_forbidden":
         return f"{path}: {where}: unknown key"
-    shown = "" if isinstance(detail["input"], dict) else f" = {detail['input']!r}"
-    return f"{path}: {where}{shown}: {detail['msg'].removeprefix('Value error, ')}{hint}"
+    message = detail["msg"].removeprefix("Value error, ")
+    if isinstance(detail["input"], dict):
+        return f"{path}: {where}: {message}"
+    return f"{path}: {where} = {detail['input']!r}: {message}{hint}"
 
 
 def _description(model: type[BaseModel], keys: list[str]) -> str:

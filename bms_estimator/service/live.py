@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import CheckpointFile, resume
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
-from bms_estimator.service.requests import Requests, number
-from bms_estimator.sinks import Sink
+from bms_estimator.sinks import Delivery, Sink
+from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources import Source
 
@@ -34,6 +34,8 @@ async def run_live(
     stop: asyncio.Event,
     checkpoint: CheckpointFile | None = None,
     requests: Requests | None = None,
+    delivery: Delivery | None = None,
+    current_zero: Callable[[], Awaitable[None]] | None = None,
     notifier: Notifier | None = None,
     clock: Clock | None = None,
 ) -> Estimator:
@@ -47,6 +49,8 @@ async def run_live(
         stop: Set to end cleanly.
         checkpoint: Where the state outlives a restart; None: it does not.
         requests: Where this loop offers what it can answer.
+        delivery: What became of what was sent and asked.
+        current_zero: Has the board take the present current as zero; None: it cannot.
         notifier: Who hears that the loop is ready and alive.
         clock: The clocks.
 
@@ -66,8 +70,10 @@ async def run_live(
         clock=clock,
         restarts=restarts,
         checkpoint=restored,
+        delivery=delivery,
     )
-    _offer(requests or Requests(), estimator, publisher)
+    if requests is not None:
+        _offer(requests, estimator, publisher, current_zero)
     async with contextlib.AsyncExitStack() as stack:
         for sink in sinks:
             await stack.enter_async_context(sink)
@@ -149,7 +155,12 @@ async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Pub
         log.warning("checkpoint cannot be saved", file=str(checkpoint.path), error=str(error))
 
 
-def _offer(requests: Requests, estimator: Estimator, publisher: Publisher) -> None:
+def _offer(
+    requests: Requests,
+    estimator: Estimator,
+    publisher: Publisher,
+    board_zero: Callable[[], Awaitable[None]] | None,
+) -> None:
     """Offer the requests that need the loop."""
 
     async def state(_: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -170,5 +181,14 @@ def _offer(requests: Requests, estimator: Estimator, publisher: Publisher) -> No
         log.info("SOC set on request", before=before, soc=soc)
         return {"soc": soc, "before": before}
 
-    for handler in (state, parameters, health, set_soc):
+    async def current_zero(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        if board_zero is None:
+            raise UserError("this source has no zero to be set")
+        if publisher.disturbed:
+            raise UserError(publisher.disturbed)
+        await board_zero()
+        log.info("present current taken as zero on request")
+        return {}
+
+    for handler in (state, parameters, health, set_soc, current_zero):
         requests.offer(handler.__name__, handler)

@@ -4,9 +4,8 @@ import asyncio
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import structlog
 
@@ -18,9 +17,9 @@ from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import run_live
-from bms_estimator.service.requests import Requests
-from bms_estimator.sinks import Sink
+from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources.serial_board import SerialBoard, Tap
 
 log = structlog.get_logger(__name__)
@@ -52,22 +51,25 @@ async def serve(
     stop = stop_on_signal(stop)
     for line in implausible(settings, cell):
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
-    requests = Requests()
+    delivery, all_sinks = Delivery(), list(sinks)
+    requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     board = SerialBoard(settings.sensor, tap=tap)
-
-    async def current_zero(_: Mapping[str, Any]) -> Mapping[str, Any]:
-        await board.current_zero()
-        return {}
-
-    requests.offer("current_zero", current_zero)
-    all_sinks = list(sinks)
     if settings.mqtt is not None:
         sample_period_s = settings.sensor.sample_period_s
-        all_sinks.append(MqttSink(settings.mqtt, settings.pack.name, requests.answer, sample_period_s=sample_period_s))
+        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, sample_period_s=sample_period_s)
+        all_sinks.append(mqtt)
     checkpoint = _checkpoint(settings, cell)
     with alone(checkpoint.path.with_suffix(".lock")) if checkpoint else contextlib.nullcontext():
         return await run_live(
-            settings, cell, source=board, sinks=all_sinks, stop=stop, checkpoint=checkpoint, requests=requests
+            settings,
+            cell,
+            source=board,
+            sinks=all_sinks,
+            stop=stop,
+            checkpoint=checkpoint,
+            requests=requests,
+            delivery=delivery,
+            current_zero=board.current_zero,
         )
 
 

@@ -3,17 +3,29 @@
 All sinks are peers: async context managers whose ``publish`` neither blocks nor fails.
 """
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections import Counter
+from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
 from bms_estimator.model.estimate import Snapshot
 
 FRESH_PERIODS = 3
 """Values are stale when no sample was accepted for so many periods of publishing or of sampling, whichever are longer."""
 
-Answer = Callable[[str, Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
-"""Answers a request by name and arguments with data. Raises UserError when it cannot be granted."""
+
+@dataclass
+class Delivery:
+    """What became of what one pack sends and of what is asked of it, since start; topic ``health`` shows it."""
+
+    drops: int = 0
+    """Snapshots with an estimate that were replaced before the broker could take them."""
+    refused_topics: list[str] = field(default_factory=list)
+    """What the broker denies, as far as it can be told."""
+    corrections: int = 0
+    """Times somebody else wrote an availability of ours and was put right."""
+    requests: Counter[str] = field(default_factory=Counter)
+    """By what became of them."""
 
 
 class Sink(Protocol):

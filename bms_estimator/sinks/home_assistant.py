@@ -1,47 +1,84 @@
-"""Home Assistant's device discovery: one retained message that describes all entities of one pack."""
+"""Home Assistant's device discovery: one retained message that describes all entities of one pack.
+
+Home Assistant keeps a row for each change of each entity. So it gets topics of its own, rounded and slow
+(``home_assistant_values``); what only a researcher looks at is there but disabled until he enables it.
+"""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from bms_estimator.model.estimate import Info
 from bms_estimator.sinks import FRESH_PERIODS
 
 BIRTH_TOPIC = "homeassistant/status"
 """Home Assistant says ``online`` here when it has started."""
-LEAST_EXPIRY_S = 3
-"""Home Assistant calls no value unavailable that is younger than this: parameters come but once a second [s]."""
+VALUES, PROBLEMS = "home_assistant", "home_assistant/problems"
+"""Topics below the device's."""
+LEAST_EXPIRY_S = 30
+"""Home Assistant calls no value unavailable that is younger than this [s]."""
+QUICK_S = 15.0
+"""What a load moves all the time is shown anew no more often than this: four rows a minute [s]."""
+SLOW_S = 60.0
+"""All other values [s]."""
 
-_ESTIMATE = {
-    # field of topic state: (name, unit, device class, decimals)
-    "voltage_v": ("Voltage", "V", "voltage", 3),
-    "current_a": ("Current (discharge positive)", "A", "current", 3),
-    "power_w": ("Power (discharge positive)", "W", "power", 2),
-    "temperature_c": ("Temperature", "°C", "temperature", 1),
-    "soc_percent": ("State of charge", "%", "battery", 1),
-    "remaining_capacity_ah": ("Remaining capacity", "Ah", None, 3),
-    "remaining_energy_wh": ("Remaining energy", "Wh", "energy_storage", 2),
-    "time_to_empty_s": ("Time to empty", "s", "duration", 0),
-    "usable_capacity_ah": ("Usable capacity", "Ah", None, 3),
-    "soc_std": ("State of charge, standard deviation", None, None, 4),
-    "voltage_estimate_v": ("Estimated voltage", "V", "voltage", 3),
-    "innovation_v": ("Innovation", "V", "voltage", 4),
-    "stability_margin": ("Stability margin", None, None, 4),
-    "delta_1": ("delta 1", None, None, 4),
-    "delta_2": ("delta 2", None, None, 4),
-    "adaptive_gain_k": ("Adaptive gain k", "V²s", None, 6),
-    "nussbaum_gain": ("Nussbaum gain", None, None, 4),
-    "sample_rate_hz": ("Sample rate", "Hz", "frequency", 1),
+
+class Entity(NamedTuple):
+    """A number that Home Assistant shows."""
+
+    name: str
+    unit: str | None
+    decimals: int
+    """To which it is rounded."""
+    step: float
+    """It is shown anew when it has changed by so much, in its unit: what noise moves is less."""
+    device_class: str | None = None
+    pace_s: float = SLOW_S
+    """Nor more often than this [s]."""
+    main: bool = False
+    """Else Home Assistant lists it among the diagnostics."""
+    enabled: bool = True
+    """Else the user enables it."""
+    state_class: str = "measurement"
+
+
+def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
+    """What the observer looks like inside."""
+    return Entity(name, unit, decimals, 10.0**-decimals, device_class, enabled=False)
+
+
+ESTIMATE = {
+    # by field of the estimate
+    "voltage_v": Entity("Voltage", "V", 2, 0.02, "voltage", QUICK_S, main=True),
+    "current_a": Entity("Current (discharge positive)", "A", 2, 0.05, "current", QUICK_S, main=True),
+    "power_w": Entity("Power (discharge positive)", "W", 1, 0.5, "power", QUICK_S, main=True),
+    "temperature_c": Entity("Temperature", "°C", 1, 0.3, "temperature", main=True),
+    "soc_percent": Entity("State of charge", "%", 1, 0.2, "battery", main=True),
+    "remaining_capacity_ah": Entity("Remaining capacity", "Ah", 2, 0.02, main=True),
+    "remaining_energy_wh": Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", main=True),
+    "time_to_empty_s": Entity("Time to empty", "s", 0, 60.0, "duration", main=True),
+    "frames_lost": Entity("Frames lost", None, 0, 1.0, state_class="total_increasing"),
+    "crc_errors": Entity("CRC errors", None, 0, 1.0, state_class="total_increasing"),
+    "soc_std": _raw("State of charge, standard deviation", None, 3),
+    "usable_capacity_ah": _raw("Usable capacity", "Ah", 2),
+    "voltage_estimate_v": _raw("Estimated voltage", "V", 2, "voltage"),
+    "innovation_v": _raw("Innovation", "V", 3, "voltage"),
+    "stability_margin": _raw("Stability margin", None, 3),
+    "delta_1": _raw("delta 1", None, 4),
+    "delta_2": _raw("delta 2", None, 4),
+    "adaptive_gain_k": _raw("Adaptive gain k", "V²s", 6),
+    "nussbaum_gain": _raw("Nussbaum gain", None, 3),
+    "sample_rate_hz": _raw("Sample rate", "Hz", 1, "frequency"),
 }
-_ELEMENTS = {
-    "r_s_ohm": ("R_s", "Ω", 5),
-    "r_ts_ohm": ("R_ts", "Ω", 5),
-    "r_tl_ohm": ("R_tl", "Ω", 5),
-    "c_ts_farad": ("C_ts", "F", 1),
-    "c_tl_farad": ("C_tl", "F", 1),
+ELEMENTS = {
+    # by element of the parameters
+    "r_s_ohm": Entity("R_s", "Ω", 4, 0.0005),
+    "r_ts_ohm": _raw("R_ts", "Ω", 4),
+    "r_tl_ohm": _raw("R_tl", "Ω", 4),
+    "c_ts_farad": _raw("C_ts", "F", 0),
+    "c_tl_farad": _raw("C_tl", "F", 0),
 }
-_FAULTS = {"frames_lost": "Frames lost", "crc_errors": "CRC errors"}
-_MAIN = {"voltage_v", "current_a", "power_w", "temperature_c", "soc_percent", "time_to_empty_s"}
-_MAIN |= {"remaining_capacity_ah", "remaining_energy_wh"}
+ENTITIES = ESTIMATE | ELEMENTS
+PROBLEM_NAMES = {"sensor_silent": "Sensor silent", "suspicion": "Input suspected", "lock_lost": "Lock lost"}
 
 
 def device_id(device: str) -> str:
@@ -71,98 +108,55 @@ def discovery(info: Info, root: str, sample_period_s: float) -> dict[str, Any]:
     }
     if info.board.get("serial"):
         device["serial_number"] = info.board["serial"]
+    fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
+    expiry_s = max(LEAST_EXPIRY_S, math.ceil(fresh_s))
+    numbers = {key: _number(key, entity, root, expiry_s) for key, entity in ENTITIES.items()}
+    problems = {key: _problem(key, name, root) for key, name in PROBLEM_NAMES.items()}
     return {
         "device": device,
         "origin": {"name": "bms_estimator", "sw_version": info.version},
         "availability": [{"topic": f"{root}/availability"}, {"topic": f"{root}/sensor/availability"}],
         "availability_mode": "all",
-        "components": _components(info, root, sample_period_s),
+        "components": {
+            key: component | _identity(info.device, key, component["platform"])
+            for key, component in (numbers | problems).items()
+        },
     }
 
 
-def _components(info: Info, root: str, sample_period_s: float) -> dict[str, Any]:
-    fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
-    stale_s = max(LEAST_EXPIRY_S, math.ceil(fresh_s))
-    components: dict[str, Any] = {}
+def _identity(device: str, key: str, platform: str) -> dict[str, str]:
+    entity = f"{device_id(device)}_{key}"
+    return {"unique_id": entity, "default_entity_id": f"{platform}.{entity}"}
 
-    def add(key: str, platform: str, name: str, **options: Any) -> None:
-        entity = f"{device_id(info.device)}_{key}"
-        components[key] = {
-            "platform": platform,
-            "unique_id": entity,
-            "default_entity_id": f"{platform}.{entity}",
-            "name": name,
-            **{option: value for option, value in options.items() if value is not None},
-        }
 
-    for key, (name, unit, device_class, decimals) in _ESTIMATE.items():
-        add(
-            key,
-            "sensor",
-            name,
-            state_topic=f"{root}/state",
-            value_template=f"{{{{ value_json.{key} }}}}",
-            unit_of_measurement=unit,
-            device_class=device_class,
-            state_class="measurement",
-            suggested_display_precision=decimals,
-            entity_category=None if key in _MAIN else "diagnostic",
-            expire_after=stale_s,
-        )
-    for key, (name, unit, decimals) in _ELEMENTS.items():
-        add(
-            key,
-            "sensor",
-            name,
-            state_topic=f"{root}/parameters",
-            value_template=f"{{{{ value_json.elements.{key}.value }}}}",
-            unit_of_measurement=unit,
-            state_class="measurement",
-            suggested_display_precision=decimals,
-            entity_category="diagnostic",
-            expire_after=stale_s,
-        )
-    for key, name in _FAULTS.items():
-        add(
-            key,
-            "sensor",
-            name,
-            state_topic=f"{root}/state",
-            value_template=f"{{{{ value_json.{key} }}}}",
-            state_class="total_increasing",
-            entity_category="diagnostic",
-            expire_after=stale_s,
-        )
-    add(
-        "lock_lost",
-        "binary_sensor",
-        "Lock lost",
-        state_topic=f"{root}/state",
-        value_template="{{ 'OFF' if value_json.lock else 'ON' }}",
-        device_class="problem",
-        entity_category="diagnostic",
-        expire_after=stale_s,
-    )
-    add(
-        "sensor_silent",
-        "binary_sensor",
-        "Sensor silent",
-        state_topic=f"{root}/health",
-        value_template="{{ 'OFF' if value_json.sensor_online else 'ON' }}",
-        json_attributes_topic=f"{root}/health",
-        availability=[{"topic": f"{root}/availability"}],
-        device_class="problem",
-        entity_category="diagnostic",
-    )
-    add(
-        "suspicion",
-        "binary_sensor",
-        "Input suspected",
-        state_topic=f"{root}/health",
-        value_template="{{ 'ON' if value_json.suspects else 'OFF' }}",
-        json_attributes_topic=f"{root}/health",
-        availability=[{"topic": f"{root}/availability"}],
-        device_class="problem",
-        entity_category="diagnostic",
-    )
-    return components
+def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any]:
+    options = {
+        "platform": "sensor",
+        "name": entity.name,
+        "state_topic": f"{root}/{VALUES}",
+        "value_template": f"{{{{ value_json.{key} }}}}",
+        "unit_of_measurement": entity.unit,
+        "device_class": entity.device_class,
+        "state_class": entity.state_class,
+        "suggested_display_precision": entity.decimals,
+        "entity_category": None if entity.main else "diagnostic",
+        "enabled_by_default": None if entity.enabled else False,
+        "expire_after": expiry_s,
+    }
+    return {option: value for option, value in options.items() if value is not None}
+
+
+def _problem(key: str, name: str, root: str) -> dict[str, Any]:
+    """On while there is a reason, which is its only attribute; it matters when the sensor is silent, too."""
+    topic = f"{root}/{PROBLEMS}"
+    return {
+        "platform": "binary_sensor",
+        "name": name,
+        "state_topic": topic,
+        "value_template": f"{{{{ 'ON' if value_json.{key} else 'OFF' }}}}",
+        "json_attributes_topic": topic,
+        "json_attributes_template": f"{{{{ {{'reason': value_json.{key}}} | tojson }}}}",
+        "availability": [{"topic": f"{root}/availability"}],
+        "device_class": "problem",
+        "entity_category": "diagnostic",
+    }

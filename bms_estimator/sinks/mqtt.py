@@ -1,36 +1,52 @@
-"""The MQTT sink: topics under ``bms/<device>/``, with a broker that may come and go.
+"""The MQTT sink: a connection to a broker that may come and go.
 
 ``publish`` puts a snapshot in a slot for one; a task takes it from there when the broker does. The loop
-never waits, and what the broker could not take in time is counted.
+never waits, and what the broker could not take in time is counted. What is said stands in ``messages``, what may
+be asked in ``requests``.
 """
 
 import asyncio
 import contextlib
-import json
 import math
+import random
 import secrets
 import socket
 import ssl
-from collections.abc import Mapping
+from collections.abc import Iterable
+from functools import partial
 from types import TracebackType
 from typing import Any, Self
 from urllib.parse import urlsplit
 
 import aiomqtt
 import structlog
+from aiomqtt import ProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Estimate, Health, Info, ParameterReport, Report, Snapshot
+from bms_estimator.model.estimate import Snapshot
 from bms_estimator.model.settings import MqttSettings
-from bms_estimator.sinks import Answer
+from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.credential import credential
-from bms_estimator.sinks.home_assistant import BIRTH_TOPIC, discovery, discovery_topic
+from bms_estimator.sinks.home_assistant import BIRTH_TOPIC
+from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY, Message, Messages, Sent
+from bms_estimator.sinks.requests import MOST_SHOWN, Requests
 
 FIRST_DELAY_S = 5.0
 """Before the first attempt to reach a lost broker again; doubles with each [s]."""
-LONGEST_DELAY_S = 300.0
+LONGEST_DELAY_S = 30.0
+"""A broker in the house is back before long [s]."""
 BIRTH_DELAY_S = 2.0
 """Home Assistant says it is online some time before it listens [s]."""
+CORRECTION_S = 5.0
+"""An availability that somebody else wrote is put right no more often than this [s]."""
+BURST_S = 60.0
+"""Corrections closer than this are one burst, of which one line is logged [s]."""
+ECHO_S = 10.0
+"""A broker that has not given back ``online`` by then denies it [s]."""
 KEEPALIVE_S = 20
 """A broker that lost us without a word publishes the will after one and a half times this [s]."""
 CLOSING_S = 3.0
@@ -38,8 +54,12 @@ CLOSING_S = 3.0
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 """Small messages go at once."""
-MOST_REQUESTS = 100
-"""Requests waiting beyond this are lost."""
+MOST_WAITING = 100
+"""Messages that wait to be read; more are lost."""
+MOST_BYTES = 16_384
+"""Nothing that comes is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
+UNSUPPORTED_VERSION = 132
+"""Reason code of a broker that does not know MQTT 5."""
 
 log = structlog.get_logger(__name__)
 
@@ -50,10 +70,12 @@ class MqttSink:
     Args:
         settings: The broker.
         device: Name of the pack in the topics.
-        answer: Answers requests.
+        requests: Answers requests.
+        delivery: Where it is counted what became of what was sent.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
         first_delay_s: Before the first attempt to reach a lost broker again [s].
         birth_delay_s: From Home Assistant's birth message to the retained messages [s].
+        echo_s: Until a broker has given back ``online`` [s].
 
     Raises:
         UserError: The URL, the password file or the certificates cannot be used.
@@ -63,32 +85,37 @@ class MqttSink:
         self,
         settings: MqttSettings,
         device: str,
-        answer: Answer,
+        requests: Requests,
+        delivery: Delivery,
         *,
         sample_period_s: float = 0.0,
         first_delay_s: float = FIRST_DELAY_S,
         birth_delay_s: float = BIRTH_DELAY_S,
+        echo_s: float = ECHO_S,
     ) -> None:
-        self._settings, self._device, self._answer = settings, device, answer
-        self._sample_period_s = sample_period_s
-        self._first_delay_s, self._birth_delay_s = first_delay_s, birth_delay_s
-        self._root = f"{settings.base_topic}/{device}"
-        self._connection = _connection(settings)
+        self._url, self._connection = settings.url, broker_arguments(settings)
+        self._requests, self._delivery = requests, delivery
+        self._first_delay_s, self._birth_delay_s, self._echo_s = first_delay_s, birth_delay_s, echo_s
+        self._messages = Messages(settings.base_topic, device, sample_period_s)
+        # The same at each connection: the broker ends an older one that it still holds, and its will comes first.
+        self._identifier = f"bms-{device}-{secrets.token_hex(4)}"
         self._slot: Snapshot | None = None
-        self._sent: Snapshot | None = None  # what the broker holds; only the sending task sets it
+        self._sent = Sent()  # only the sending task sets it
         self._again = True  # the broker may hold nothing: send all of it
+        self._forged = False  # somebody else wrote an availability of ours
+        self._corrected_s = -math.inf
+        self._echoed = asyncio.Event()
+        self._delay_s = first_delay_s
         self._wake = asyncio.Event()
         self._closing = False
         self._task: asyncio.Task[None] | None = None
-        self.drops = 0
-        """Snapshots replaced before the broker could take them."""
 
     def publish(self, snapshot: Snapshot) -> None:
         """Take a snapshot; returns at once."""
         if self._task is not None and self._task.done():
             self._task.result()  # only a fault of ours ends it: let it be seen
         if self._slot is not None and self._slot.estimate is not None:
-            self.drops += 1
+            self._delivery.drops += 1
         self._slot = snapshot
         self._wake.set()
 
@@ -113,21 +140,17 @@ class MqttSink:
 
     async def _stay_connected(self) -> None:
         """Connect, serve, and again after a pause that doubles."""
-        delay_s = self._first_delay_s
         while not self._closing:
             self._again = True
             try:
-                async with self._client() as client:
-                    log.info("broker connected", url=self._settings.url)
-                    delay_s = self._first_delay_s
-                    await self._serve(client)
+                await self._connect()
             except* aiomqtt.MqttError as errors:
                 log.warning(
-                    "broker not reachable", url=self._settings.url, reason=str(errors.exceptions[0]), retry_s=delay_s
+                    "broker not reachable", url=self._url, reason=str(errors.exceptions[0]), retry_s=self._delay_s
                 )
             if not self._closing:
-                await self._pause(delay_s)
-                delay_s = min(2.0 * delay_s, LONGEST_DELAY_S)
+                await self._pause(self._delay_s * random.uniform(0.5, 1.0))  # not all its clients at once
+                self._delay_s = min(2.0 * self._delay_s, LONGEST_DELAY_S)
 
     async def _pause(self, delay_s: float) -> None:
         """Sleep, but not through the end."""
@@ -140,154 +163,182 @@ class MqttSink:
             except TimeoutError:
                 return
 
-    def _client(self) -> aiomqtt.Client:
+    async def _connect(self) -> None:
+        """Serve by MQTT 5, by 3.1.1 where the broker refuses that or does not know what to say."""
+        try:
+            await self._serve(ProtocolVersion.V5)
+        except aiomqtt.MqttError as error:
+            if isinstance(error, aiomqtt.MqttCodeError) and error.rc != UNSUPPORTED_VERSION:
+                raise
+            await self._serve(ProtocolVersion.V311)
+
+    def _client(self, protocol: ProtocolVersion) -> aiomqtt.Client:
+        limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
+        limit.MaximumPacketSize = MOST_BYTES
         return aiomqtt.Client(
             **self._connection,
-            identifier=f"bms-{self._device}-{secrets.token_hex(4)}",
-            will=aiomqtt.Will(f"{self._root}/availability", b"offline", qos=1, retain=True),
+            protocol=protocol,
+            properties=limit if protocol is ProtocolVersion.V5 else None,
+            identifier=self._identifier,
+            will=aiomqtt.Will(*self._messages.farewell()[-1]),
             keepalive=KEEPALIVE_S,
-            max_queued_incoming_messages=MOST_REQUESTS,
+            max_queued_incoming_messages=MOST_WAITING,
+            queue_type=partial(_Inbox, self._requests),  # type: ignore[arg-type]  # it is only called
             socket_options=[NO_DELAY],
         )
 
-    async def _serve(self, client: aiomqtt.Client) -> None:
+    async def _serve(self, protocol: ProtocolVersion) -> None:
         """Send and receive until the connection is lost or the sink closes."""
-        await client.subscribe([(f"{self._root}/request/+", 1), (BIRTH_TOPIC, 1)])
-        self._wake.set()
+        async with self._client(protocol) as client:
+            log.info("broker connected", url=self._url, protocol=protocol.name)
+            self._delay_s = self._first_delay_s
+            await self._subscribe(client, protocol)
+            self._wake.set()
+            try:
+                async with asyncio.TaskGroup() as tasks:
+                    others = [tasks.create_task(self._receive(client)), tasks.create_task(self._expect_echo())]
+                    await self._send(client)
+                    for task in others:
+                        task.cancel()
+            except* aiomqtt.MqttError:
+                raise  # the broker publishes the will
+            except* Exception:  # a fault of ours: the client parts in good order, which withholds the will
+                with contextlib.suppress(aiomqtt.MqttError):
+                    await _publish(client, self._messages.farewell())
+                raise
+
+    async def _subscribe(self, client: aiomqtt.Client, protocol: ProtocolVersion) -> None:
+        """Subscribe, and say what the broker refuses.
+
+        At QoS 0: Mosquitto counts what it keeps back as too long among the messages in flight, where at QoS 1 it stays.
+        """
+        requests = self._topic("request/+")
+        topics = [requests, self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY), BIRTH_TOPIC]
+        if protocol is ProtocolVersion.V5:  # a request that is retained must say so, though it comes live
+            wanted: Any = [(topic, SubscribeOptions(qos=0, retainAsPublished=topic == requests)) for topic in topics]
+        else:
+            wanted = [(topic, 0) for topic in topics]
+        self._echoed.clear()
+        answers = await client.subscribe(wanted)
+        self._delivery.refused_topics = []
+        for topic, answer in zip(topics, answers, strict=False):
+            if isinstance(answer, ReasonCode) and answer.is_failure:
+                self._say_refused(topic, "not allowed to read it")
+
+    async def _expect_echo(self) -> None:
+        """Find out a broker that denies us without a word, as Mosquitto does by its access list."""
+        topic = self._topic(AVAILABILITY)
         try:
-            async with asyncio.TaskGroup() as tasks:
-                receiving = tasks.create_task(self._receive(client))
-                await self._send(client)
-                receiving.cancel()
-        except* aiomqtt.MqttError:
-            raise  # the broker publishes the will
-        except* Exception:  # a fault of ours: the client parts in good order, which withholds the will
-            with contextlib.suppress(aiomqtt.MqttError):
-                await self._say_offline(client)
-            raise
+            async with asyncio.timeout(self._echo_s):
+                await self._echoed.wait()
+        except TimeoutError:
+            if topic not in self._delivery.refused_topics:
+                self._say_refused(topic, "it does not come back: not allowed to write or to read it")
+
+    def _say_refused(self, topic: str, why: str) -> None:
+        self._delivery.refused_topics.append(topic)
+        log.warning("broker refuses a topic; see its access list", topic=topic, reason=why)
 
     async def _send(self, client: aiomqtt.Client) -> None:
         while True:
             await self._wake.wait()
             self._wake.clear()
             if self._again:
-                self._again, self._sent = False, None
-                await self._retain(client, "availability", b"online")
-                await self._retain(client, "schema", _json(schema()))
+                self._again, self._forged, self._sent = False, False, Sent()
+                await _publish(client, self._messages.greeting())
+            await self._correct(client)
             snapshot, self._slot = self._slot, None
             if snapshot is not None:
-                await self._send_snapshot(client, snapshot)
+                now_s = asyncio.get_running_loop().time()
+                messages, self._sent = self._messages.due(self._sent, snapshot, now_s)
+                await _publish(client, messages)
             if self._closing:
-                await self._say_offline(client)
+                await _publish(client, self._messages.farewell())
                 return
 
-    async def _say_offline(self, client: aiomqtt.Client) -> None:
-        await self._retain(client, "sensor/availability", b"offline")
-        await self._retain(client, "availability", b"offline")
-
-    async def _send_snapshot(self, client: aiomqtt.Client, snapshot: Snapshot) -> None:
-        """State first, for it is in a hurry; of the rest, what has changed since the last time."""
-        estimate, parameters, health, info = snapshot
-        if estimate is not None:
-            await client.publish(f"{self._root}/state", estimate.model_dump_json(), qos=0)
-        sent, self._sent = self._sent, snapshot
-        known = bool(parameters.elements)  # not before the first sample, and Home Assistant's templates need them
-        if known and (sent is None or sent.parameters is not parameters):
-            await client.publish(f"{self._root}/parameters", parameters.model_dump_json(), qos=0)
-        if sent is None or sent.health.sensor_online != health.sensor_online:
-            await self._retain(client, "sensor/availability", b"online" if health.sensor_online else b"offline")
-        if sent is None or sent.health is not health:
-            counted = health.model_copy(update={"publish_drops": self.drops})
-            await self._retain(client, "health", counted.model_dump_json().encode())
-        if sent is None or sent.info != info:
-            await self._retain(client, "info", info.model_dump_json().encode())
-            found = _json(discovery(info, self._root, self._sample_period_s))
-            await client.publish(discovery_topic(self._device), found, qos=1, retain=True)
-
-    async def _retain(self, client: aiomqtt.Client, topic: str, payload: bytes) -> None:
-        await client.publish(f"{self._root}/{topic}", payload, qos=1, retain=True)
+    async def _correct(self, client: aiomqtt.Client) -> None:
+        """Put the availabilities right, if it is time."""
+        now_s = asyncio.get_running_loop().time()
+        since_s = now_s - self._corrected_s
+        if not self._forged or since_s < CORRECTION_S:
+            return
+        self._forged, self._corrected_s = False, now_s
+        self._delivery.corrections += 1
+        if since_s > BURST_S:
+            log.warning(
+                "somebody else wrote an availability of this pack: put right", so_far=self._delivery.corrections
+            )
+        await _publish(client, self._messages.availability(self._sent))
 
     async def _receive(self, client: aiomqtt.Client) -> None:
-        """Answer requests; after Home Assistant's birth say everything again."""
+        """Answer requests, hear Home Assistant's birth, watch over the availabilities."""
         async for message in client.messages:
-            if message.topic.matches(BIRTH_TOPIC):
+            topic = message.topic.value
+            if topic == BIRTH_TOPIC:
                 if message.payload == b"online" and not message.retain:
                     asyncio.get_running_loop().call_later(self._birth_delay_s, self._say_again)
-            elif not message.retain:  # a retained request would be granted again with each connection
-                name = message.topic.value.rsplit("/", 1)[-1]
-                response = await _respond(self._answer, name, message.payload)
-                await client.publish(f"{self._root}/response/{name}", _json(response), qos=1)
+            elif topic in (self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)):
+                if not message.retain:  # what the broker kept from earlier is not news
+                    self._compare(topic, message.payload)
+            else:
+                await self._answer(client, topic.rsplit("/", 1)[-1], message)
+
+    async def _answer(self, client: aiomqtt.Client, name: str, message: aiomqtt.Message) -> None:
+        if message.retain:  # it would be granted again with each connection
+            self._requests.refuse("retained", name[:MOST_SHOWN])
+            return
+        response = await self._requests.respond(name, message.payload)
+        if response is not None:  # so the name is one of ours
+            # not at QoS 1: in a flood the broker's word that it has it comes late, and who waits for that reads nothing
+            await client.publish(self._topic(f"response/{name}"), response, qos=0)
+
+    def _compare(self, topic: str, payload: bytes) -> None:
+        """An availability has come: given back, or somebody else's."""
+        right = {own.topic: own.payload for own in self._messages.availability(self._sent)}
+        if right.get(topic, payload) == payload:
+            self._echoed.set()
+        elif not self._forged:
+            self._forged = True
+            loop = asyncio.get_running_loop()
+            loop.call_at(max(self._corrected_s + CORRECTION_S, loop.time()), self._wake.set)
 
     def _say_again(self) -> None:
         """Send all retained messages again with the next snapshot."""
         self._again = True
 
-
-def schema() -> dict[str, Any]:
-    """JSON schema of each topic's payload."""
-    topics: dict[str, type[Report]] = {"state": Estimate, "parameters": ParameterReport, "health": Health, "info": Info}
-    return {topic: model.model_json_schema() for topic, model in topics.items()}
+    def _topic(self, name: str) -> str:
+        return f"{self._messages.root}/{name}"
 
 
-async def _respond(answer: Answer, name: str, payload: object) -> dict[str, Any]:
-    """The response to a request: status, data, error, transaction."""
-    transaction = None
-    try:
-        arguments = _arguments(payload)
-        transaction = _transaction(arguments)
-        data = await answer(name, arguments)
-    except UserError as error:
-        return {"status": "error", "data": None, "error": str(error), "transaction": transaction}
-    return {"status": "ok", "data": data, "error": None, "transaction": transaction}
+class _Inbox(asyncio.Queue[aiomqtt.Message]):
+    """What waits to be read; bounded in bytes, too, and without a log line for each message that is lost.
 
-
-def _arguments(payload: object) -> Mapping[str, Any]:
-    """A request's payload: a JSON object of finite numbers, or nothing.
-
-    Raises:
-        UserError: It is something else.
+    Args:
+        requests: What is lost is counted there.
+        maxsize: Messages.
     """
-    if not payload:
-        return {}
-    try:
-        text = payload if isinstance(payload, str | bytes) else str(payload)
-        arguments = json.loads(text, parse_float=_finite, parse_constant=_finite)
-    except (ValueError, RecursionError):
-        raise UserError("a request's payload must be a JSON object or empty") from None
-    if not isinstance(arguments, dict):
-        raise UserError("a request's payload must be a JSON object or empty")
-    return arguments
+
+    def __init__(self, requests: Requests, maxsize: int) -> None:
+        super().__init__(maxsize)
+        self._requests = requests
+
+    def put_nowait(self, item: aiomqtt.Message) -> None:
+        """Take a message, or count that it is lost."""
+        topic = item.topic.value
+        if len(topic) + len(item.payload) > MOST_BYTES:
+            self._requests.refuse("too_long", topic[:MOST_SHOWN])
+        elif self.full():
+            self._requests.refuse("overflow", topic[:MOST_SHOWN])
+        else:
+            super().put_nowait(item)
 
 
-def _finite(token: str) -> float:
-    """A number of a request; Python's JSON knows NaN, and takes 1e999 for infinity.
-
-    Raises:
-        UserError: It is not finite.
-    """
-    number = float(token)
-    if not math.isfinite(number):
-        raise UserError(f"{token}: numbers of a request must be finite")
-    return number
+async def _publish(client: aiomqtt.Client, messages: Iterable[Message]) -> None:
+    for message in messages:
+        await client.publish(*message)
 
 
-def _transaction(arguments: Mapping[str, Any]) -> str | int | None:
-    """What the response repeats, so that who asked knows it again.
-
-    Raises:
-        UserError: It is neither a string nor an integer.
-    """
-    transaction = arguments.get("transaction")
-    if transaction is not None and (isinstance(transaction, bool) or not isinstance(transaction, str | int)):
-        raise UserError("transaction: must be a string or an integer")
-    return transaction
-
-
-def _json(value: Mapping[str, Any]) -> bytes:
-    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
-
-
-def _connection(settings: MqttSettings) -> dict[str, Any]:
+def broker_arguments(settings: MqttSettings) -> dict[str, Any]:
     """Arguments of the client that reach the broker.
 
     Raises:

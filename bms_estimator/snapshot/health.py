@@ -10,6 +10,7 @@ from bms_estimator.kernels.identifier_state import IDENTIFIER_COUNTERS
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Health
 from bms_estimator.model.suspect import Suspect
+from bms_estimator.sinks import Delivery
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
 _SAMPLE_COUNTERS = ("samples", "gaps", "time_steps_back")
@@ -55,6 +56,7 @@ def health_report(
     restarts: int,
     checkpoint: str,
     sensor_message: str | None,
+    delivery: Delivery,
 ) -> Health:
     """Topic ``health``.
 
@@ -66,6 +68,7 @@ def health_report(
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the last checkpoint.
         sensor_message: Why values are not fresh; None when they are.
+        delivery: What became of what was sent and asked.
     """
     state = record["observer"]
     return Health(
@@ -82,6 +85,9 @@ def health_report(
         suspects=suspicions(record),
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),
-        publish_drops=0,
+        publish_drops=delivery.drops,
+        refused_topics=list(delivery.refused_topics),
+        availability_corrections=delivery.corrections,
+        requests=dict(delivery.requests),
         checkpoint=checkpoint,
     )

@@ -1,7 +1,7 @@
 """Snapshots at the publish rate: from window, estimator and source to all sinks."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import structlog
 
@@ -11,11 +11,12 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.estimate import Estimate, Health, Info, Snapshot
 from bms_estimator.model.settings import Settings
-from bms_estimator.sinks import FRESH_PERIODS, Sink
+from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
 from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.topics import estimate_report, info_report, publish_rate_hz
+from bms_estimator.snapshot.rest import Rest
+from bms_estimator.snapshot.topics import estimate_report, info_report
 from bms_estimator.snapshot.window import Window, WindowSummary
 from bms_estimator.sources import Source
 
@@ -37,6 +38,7 @@ class Publisher:
         clock: The clocks.
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the checkpoint at start.
+        delivery: What became of what was sent and asked.
 
     Attributes:
         checkpoint: What became of the last checkpoint.
@@ -55,12 +57,15 @@ class Publisher:
         clock: Clock,
         restarts: int = 0,
         checkpoint: str = "off",
+        delivery: Delivery | None = None,
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
         self._source, self._sinks, self._clock = source, sinks, clock
-        self._restarts = restarts
+        self._restarts, self._delivery = restarts, delivery or Delivery()
+        self._rest = Rest(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
+        self._board: Mapping[str, str] = {}
         self.checkpoint = checkpoint
-        self.period_s = 1.0 / publish_rate_hz(settings)
+        self.period_s = 1.0 / settings.publish.rate_hz
         self._fresh_s = FRESH_PERIODS * max(self.period_s, settings.sensor.sample_period_s)
         self._window = Window()
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
@@ -90,7 +95,9 @@ class Publisher:
         if self._due_s <= now_s:  # behind: do not catch up
             self._due_s = now_s + self.period_s
         self.snapshot = self._next_snapshot(now_s)
-        self.latest = self.snapshot.estimate or self.latest
+        if self.snapshot.estimate is not None:
+            self.latest = self.snapshot.estimate
+            self._rest.add(self.latest, now_s)
         for sink in self._sinks:
             sink.publish(self.snapshot)
 
@@ -98,6 +105,11 @@ class Publisher:
         """Publish the end, all of it made anew."""
         self._slow_s = -math.inf
         self.publish()
+
+    @property
+    def disturbed(self) -> str | None:
+        """Why the pack is not known to be at rest; None when it is."""
+        return self.snapshot.health.sensor_message or self._rest.disturbed(self._clock.monotonic())
 
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_s = self._started_s
@@ -133,10 +145,12 @@ class Publisher:
             restarts=self._restarts,
             checkpoint=self.checkpoint,
             sensor_message=message,
+            delivery=self._delivery,
         )
 
     def _info(self) -> Info:
-        return info_report(self._settings, self._cell, self._source.board, self._started_wall_s)
+        self._board = self._source.board or self._board  # one that was lost is most likely to come back
+        return info_report(self._settings, self._cell, self._board, self._started_wall_s)
 
     def _sensor_message(self, now_s: float) -> str | None:
         """Why values are not fresh, None when they are."""

@@ -83,11 +83,6 @@ def info_report(settings: Settings, cell: CellModel, board: Mapping[str, str], s
         series_count=cell.cell.series_count,
         nominal_voltage_v=cell.cell.nominal_voltage_v,
         observer=f"{settings.observer.law}, {settings.observer.nussbaum}",
-        publish_rate_hz=publish_rate_hz(settings),
+        publish_rate_hz=settings.publish.rate_hz,
         board=dict(board),
     )
-
-
-def publish_rate_hz(settings: Settings) -> float:
-    """How often snapshots are made [Hz]; 1 Hz where there is no broker."""
-    return settings.mqtt.publish_rate_hz if settings.mqtt else 1.0

@@ -36,9 +36,11 @@ cell = "{cell}"
 port = "{port}"
 sample_rate_hz = {rate_hz}
 
+[publish]
+rate_hz = {publish_rate_hz}
+
 [mqtt]
 url = "{url}"
-publish_rate_hz = {publish_rate_hz}
 """
 
 

@@ -1,6 +1,7 @@
 """The Mosquitto example, run by Mosquitto: passwords, no anonymous clients, access control."""
 
 import asyncio
+import contextlib
 import os
 import socket
 import subprocess
@@ -115,3 +116,38 @@ async def test_nobody_but_the_estimator_may_publish_state(broker):
 async def test_the_estimator_hears_the_birth_message(broker):
     seen = await arrived(broker, "homeassistant", [], reader="bms-estimator", subscription="homeassistant/status")
     assert seen == []  # but the last, without which it would not have ended
+
+
+async def test_the_estimator_hears_who_else_writes_its_availabilities(broker):
+    topics = ["bms/pack/availability", "bms/pack/sensor/availability", "bms/pack/request/last"]
+    async with client(broker, "bms-estimator") as estimator:
+        for topic in topics[:2]:
+            await estimator.subscribe(topic)
+        await estimator.subscribe("bms/+/request/+")
+        async with client(broker, "homeassistant") as other:  # may not write the first two, so the estimator does
+            for topic in topics[:2]:
+                await other.publish(topic, b"forged", qos=1)
+                await estimator.publish(topic, b"online", qos=1)
+            await other.publish(topics[2], b"", qos=1)
+        async with asyncio.timeout(LONG_S):
+            heard = [await anext(estimator.messages) for _ in topics]
+    assert [(m.topic.value, m.payload) for m in heard] == [
+        (topics[0], b"online"),
+        (topics[1], b"online"),
+        (topics[2], b""),
+    ]
+
+
+async def test_a_message_that_would_fill_the_memory_goes_no_further(broker):
+    async with client(broker, "bms-estimator") as estimator:
+        await estimator.subscribe("bms/+/request/+")
+        with contextlib.suppress(aiomqtt.MqttError):
+            async with client(broker, "homeassistant") as flooder, asyncio.timeout(LONG_S):
+                sending = asyncio.create_task(flooder.publish("bms/pack/request/state", bytes(5_000_000), qos=1))
+                with pytest.raises(aiomqtt.MqttError):
+                    await anext(flooder.messages)  # the broker ends the connection
+        sending.cancel()
+        async with client(broker, "homeassistant") as other:
+            await other.publish("bms/pack/request/last", b"{}", qos=1)
+        async with asyncio.timeout(LONG_S):
+            assert (await anext(estimator.messages)).topic.value == "bms/pack/request/last"

@@ -55,3 +55,8 @@ def test_machine_code_may_be_made_at_run_time(deploy):
     """Import numba fails under MemoryDenyWriteExecute, so it must never be switched on."""
     keys = [line.split("=")[0] for line in (deploy / "bms-estimator.service").read_text().splitlines()]
     assert "MemoryDenyWriteExecute" not in keys
+
+
+def test_the_memory_that_a_flood_may_take_is_limited(deploy):
+    settings = dict(line.partition("=")[::2] for line in (deploy / "bms-estimator.service").read_text().splitlines())
+    assert settings["MemoryMax"] == "1G"

@@ -88,9 +88,10 @@ cell = "chen_mora"
 initial_soc = {START_SOC}
 [sensor]
 port = "{plug.path}"
+[publish]
+rate_hz = 10
 [mqtt]
 url = "{broker.url}"
-publish_rate_hz = 10
 [state]
 folder = "{folder / "state"}"
 """)

@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.estimate import Health, Snapshot
-from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings
+from bms_estimator.model.settings import PackSettings, PublishSettings, SensorSettings, Settings
 from bms_estimator.service.live import run_live
 from bms_estimator.sources.protocol import MODULUS, Hello, SampleMessage
 from bms_estimator.sources.serial_board import SerialBoard
@@ -65,7 +65,7 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
     settings = Settings(
         pack=PackSettings(initial_soc=0.5),
         sensor=SensorSettings(port=str(line.path), **sensor),
-        mqtt=MqttSettings(publish_rate_hz=10.0),
+        publish=PublishSettings(rate_hz=10.0),
     )
     board = SerialBoard(settings.sensor, first_retry_s=0.05, silent_s=0.3)
     sink, stop = Collector(), asyncio.Event()

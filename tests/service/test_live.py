@@ -1,4 +1,5 @@
 import asyncio
+import json
 import os
 import socket
 import threading
@@ -17,18 +18,20 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
-from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings
+from bms_estimator.model.settings import PackSettings, PublishSettings, SensorSettings, Settings
 from bms_estimator.service.checkpoint import FORMAT, CheckpointFile, pack_identity
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.notify import Notifier
-from bms_estimator.service.requests import Requests
 from bms_estimator.service.serve import alone
+from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.requests import Requests
+from bms_estimator.snapshot.rest import WATCHED_S
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
-SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), mqtt=MqttSettings(publish_rate_hz=10.0))
+SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), publish=PublishSettings(rate_hz=10.0))
 
 
 @dataclass
@@ -38,6 +41,16 @@ class Run:
     requests: Requests
     task: asyncio.Task[Estimator]
     stop: asyncio.Event
+    delivery: Delivery
+
+    async def ask(self, name: str, **arguments: Any) -> Any:
+        """The data of the response; UserError where there is an error."""
+        response = await self.requests.respond(name, json.dumps(arguments).encode())
+        assert response
+        answer = json.loads(response)
+        if answer["error"]:
+            raise UserError(answer["error"])
+        return answer["data"]
 
     async def end(self) -> Estimator:
         self.source.finish()
@@ -46,12 +59,12 @@ class Run:
 
 @asynccontextmanager
 async def running(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
-    source, sink, requests, stop = ScriptedSource(), Collector(), Requests(), asyncio.Event()
-    task = asyncio.create_task(
-        run_live(settings, cell, source=source, sinks=[sink], stop=stop, requests=requests, **options)
-    )
+    source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), Delivery()
+    requests = Requests(delivery, ("set_soc", "current_zero"))
+    edges = {"requests": requests, "delivery": delivery}
+    task = asyncio.create_task(run_live(settings, cell, source=source, sinks=[sink], stop=stop, **edges, **options))
     try:
-        yield Run(source, sink, requests, task, stop)
+        yield Run(source, sink, requests, task, stop, delivery)
     finally:
         stop.set()
         await asyncio.wait_for(task, LONG_S)
@@ -186,20 +199,109 @@ async def test_requests_reach_the_running_estimator() -> None:
     async with running() as run:
         await run.sink.until(lambda _: True)
         with pytest.raises(UserError, match="no sample"):
-            await run.requests.answer("set_soc", {"soc": 0.8})
+            await run.ask("set_soc", soc=0.8)
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.estimate is not None)
-        assert (await run.requests.answer("set_soc", {"soc": 0.8}))["before"] == pytest.approx(0.5)
-        for wrong in ({}, {"soc": 1.5}, {"soc": "0.5"}, {"soc": True}, {"soc": float("nan")}):
+        assert (await run.ask("set_soc", soc=0.8))["before"] == pytest.approx(0.5)
+        for wrong in ({}, {"soc": 1.5}, {"soc": "0.5"}, {"soc": True}):
             with pytest.raises(UserError, match=r"soc = .*must be a number from 0 to 1"):
-                await run.requests.answer("set_soc", wrong)
-        with pytest.raises(UserError, match=r"health, parameters, set_soc, state"):
-            await run.requests.answer("reboot", {})
-        assert (await run.requests.answer("state", {}))["estimate"]["soc"] == pytest.approx(0.5)
-        assert set((await run.requests.answer("parameters", {}))["a"]) == {f"a{i}" for i in range(1, 22)}
-        assert (await run.requests.answer("health", {}))["samples"]["samples"] == 1
+                await run.ask("set_soc", **wrong)
+        assert (await run.ask("state"))["estimate"]["soc"] == pytest.approx(0.5)
+        assert set((await run.ask("parameters"))["a"]) == {f"a{i}" for i in range(1, 22)}
+        assert (await run.ask("health"))["samples"]["samples"] == 1
         state = await run.end()
     assert state.state["soc"][0] == 0.8
+
+
+async def test_health_on_request_and_on_its_topic_tell_the_true_drops_and_what_was_asked() -> None:
+    async with running() as run:
+        await run.sink.until(lambda _: True)
+        run.delivery.drops = 7
+        run.delivery.refused_topics = ["bms/pack/request/+"]
+        run.source.give((0.0, 0.1, 3.8))  # health is made anew when the sensor comes
+        published = await run.sink.until(lambda s: s.health.sensor_online)
+        asked = await run.ask("health")
+    assert published.health.publish_drops == asked["publish_drops"] == 7
+    assert asked["refused_topics"] == ["bms/pack/request/+"]
+    assert run.delivery.requests == {"granted": 1}
+
+
+@pytest.mark.parametrize("again", [{}, {"serial": "A1", "firmware": "1.1"}])
+async def test_a_board_that_says_nothing_for_a_while_is_still_the_one_that_is_known(again: dict[str, str]) -> None:
+    async with running() as run:
+        run.source.board = {"serial": "A1", "firmware": "1.0"}
+        run.source.give((0.0, 0.1, 3.8))
+        await run.sink.until(lambda s: bool(s.info.board))
+        run.source.board = {}
+        seen = len(run.sink.snapshots)
+        at_s = run.sink.snapshots[-1].health.uptime_s
+        await run.sink.until(lambda s: s.health.uptime_s > at_s + 1.0, skip=seen)
+        run.source.board = again
+        await run.end()
+    boards = [s.info.board for s in run.sink.snapshots[seen:]]
+    assert {} not in boards
+    assert boards[-1] == (again or {"serial": "A1", "firmware": "1.0"})
+
+
+class Zeroed:
+    """What has the board take the present current as zero, and a clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.times, self.now_s = 0, 0.0
+        self.clock = Clock(monotonic=lambda: self.now_s)
+
+    async def __call__(self) -> None:
+        self.times += 1
+
+    async def watch(self, run: Run, rows: list[tuple[float, float]]) -> None:
+        """A second for each (current, voltage), from the first publication on."""
+        while not run.sink.snapshots:
+            self.now_s += 0.1
+            await asyncio.sleep(0.01)
+        for current_a, voltage_v in rows:
+            self.now_s += 1.0
+            seen = len(run.sink.snapshots)
+            run.source.give((self.now_s, current_a, voltage_v))
+            await run.sink.until(lambda s: s.estimate is not None, skip=seen)
+
+
+AT_REST = [(0.03, 3.8)] * (round(WATCHED_S) + 2)
+
+
+async def test_the_present_current_is_taken_as_zero_when_the_pack_was_at_rest() -> None:
+    zero = Zeroed()
+    async with running(current_zero=zero, clock=zero.clock) as run:
+        await zero.watch(run, AT_REST)
+        assert await run.ask("current_zero") == {}
+    assert zero.times == 1
+
+
+@pytest.mark.parametrize(
+    ("rows", "why"),
+    [
+        ([], "no usable sample"),
+        (AT_REST[:5], "watched for"),
+        ([*AT_REST, (4.5, 3.8)], "current flows: 4.5 A"),
+        ([(0.3, 3.8)] * len(AT_REST), "current flows: 0.3 A"),
+        ([*AT_REST, (0.03, 3.7), (0.03, 3.7)], "the voltage moved by 0.1 V"),
+    ],
+)
+async def test_the_present_current_is_not_taken_as_zero_while_it_flows(
+    rows: list[tuple[float, float]], why: str
+) -> None:
+    zero = Zeroed()
+    async with running(current_zero=zero, clock=zero.clock) as run:
+        await zero.watch(run, rows)
+        with pytest.raises(UserError, match=why):
+            await run.ask("current_zero")
+    assert zero.times == 0
+
+
+async def test_a_source_without_a_zero_says_so() -> None:
+    async with running() as run:
+        await run.sink.until(lambda _: True)
+        with pytest.raises(UserError, match="no zero"):
+            await run.ask("current_zero")
 
 
 async def test_a_parameter_says_where_it_comes_from_and_a_negative_capacitance_why_it_is_missing() -> None:

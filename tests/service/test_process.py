@@ -28,9 +28,10 @@ initial_soc = 0.5
 port = "{line.path}"
 protocol = "text"
 baud = 115200
+[publish]
+rate_hz = 10
 [mqtt]
 url = "{broker.url}"
-publish_rate_hz = 10
 [state]
 folder = "{folder / "state"}"
 """

@@ -1,170 +1,122 @@
 import asyncio
 import json
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import aiomqtt
-import numpy as np
 import pytest
+import structlog
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.state import TRACE
-from bms_estimator.model.cell import load_cell
+from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Estimate, Snapshot
-from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import MqttSettings, Settings
-from bms_estimator.sinks.home_assistant import discovery
-from bms_estimator.sinks.mqtt import MqttSink
-from bms_estimator.snapshot.health import health_report
-from bms_estimator.snapshot.parameters import parameter_report
-from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.topics import estimate_report, info_report
-from bms_estimator.snapshot.window import Window
+from bms_estimator.model.settings import MqttSettings
+from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.mqtt import (
+    CORRECTION_S,
+    LONGEST_DELAY_S,
+    MOST_BYTES,
+    MOST_WAITING,
+    MqttSink,
+    _Inbox,
+    broker_arguments,
+)
+from bms_estimator.sinks.requests import NAMES, Requests
 from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.patience import LONG_S
+from tests.sinks.proxy import Proxy
+from tests.sinks.snapshots import ONE, snapshot
 
-NOW = 1_700_000_000.0
-RETAINED = ("info", "availability", "sensor/availability", "schema", "health")
-
-
-def snapshot(sensor_message: str | None = None) -> Snapshot:
-    cell = load_cell("chen_mora")
-    estimator = Estimator(cell, identifier=None, initial_soc=0.5)
-    window = Window()
-    block = np.zeros(2, dtype=SAMPLE)
-    block["time_s"], block["voltage_v"], block["temperature_c"] = [0.0, 0.1], 3.8, np.nan
-    trace = estimator.run(block)
-    assert trace.dtype == TRACE
-    window.add(trace, NOW)
-    summary = window.take()
-    assert summary
-    return Snapshot(
-        estimate_report(summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW),
-        parameter_report(estimator, NOW),
-        health_report(
-            estimator.record[0],
-            {"frames_received": 2},
-            now_s=NOW,
-            uptime_s=1.0,
-            restarts=0,
-            checkpoint="off",
-            sensor_message=sensor_message,
-        ),
-        info_report(Settings(), cell, {"firmware": "1.0", "serial_number": "A1"}, NOW),
-    )
+RETAINED = ("info", "availability", "sensor/availability", "schema", "health", "home_assistant/problems")
+DISCOVERY = "homeassistant/device/bms_pack/config"
+DYNAMIC_SECURITY = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
 
 
-ONE = snapshot()
+class Sink:
+    """A sink for the pack, and what it counts; every request is answered with its name."""
+
+    def __init__(self, url: str, **options: Any) -> None:
+        self.delivery = Delivery()
+        self.requests = Requests(self.delivery, ["set_soc", "current_zero"])
+        self.asked: list[str] = []
+        for name in NAMES:
+            self.requests.offer(name, self._handler(name))
+        options = {"first_delay_s": 0.1, "birth_delay_s": 0.1} | options
+        self.mqtt = MqttSink(MqttSettings(url=url), "pack", self.requests, self.delivery, **options)
+
+    def _handler(self, name: str) -> Any:
+        async def answer(_: Mapping[str, Any]) -> Mapping[str, Any]:
+            self.asked.append(name)
+            return {"name": name}
+
+        return answer
+
+    async def __aenter__(self) -> Self:
+        await self.mqtt.__aenter__()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.mqtt.__aexit__(None, None, None)
 
 
-async def refuse(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    raise UserError(f"{name}: not here")
+async def until(condition: Any) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - counters have no event
+            await asyncio.sleep(0.01)
 
 
-def sink(broker: Broker, **options: Any) -> MqttSink:
-    options = {"first_delay_s": 0.1, "birth_delay_s": 0.1, "answer": refuse} | options
-    return MqttSink(MqttSettings(url=broker.url), "pack", **options)
+@pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])
+async def url(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[str]:
+    """The broker's, directly or as one that does not know MQTT 5."""
+    async with Proxy(broker.port, knows_5=request.param == "MQTT 5") as proxy:
+        yield proxy.url
 
 
-async def test_topics_and_retained_flags_are_as_documented(broker: Broker) -> None:
-    async with Listener(broker) as live, sink(broker) as mqtt:
-        mqtt.publish(snapshot())
-        await live.wait("homeassistant/device/bms_pack/config")
+async def test_topics_and_retained_flags_are_as_documented(broker: Broker, url: str) -> None:
+    async with Listener(broker) as live, Sink(url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(f"bms/pack/{RETAINED[-1]}")  # the last of all
         async with Listener(broker) as late:
             for topic in RETAINED:
                 await late.wait(f"bms/pack/{topic}")
-            await late.wait("homeassistant/device/bms_pack/config")
+            await late.wait(DISCOVERY)
             kept = {name for name, _, retain in late.messages if retain}
-    assert kept == {f"bms/pack/{topic}" for topic in RETAINED} | {"homeassistant/device/bms_pack/config"}
+    assert kept == {f"bms/pack/{topic}" for topic in RETAINED} | {DISCOVERY}
     assert live.all("bms/pack/availability") == [b"online", b"offline"]
     assert live.all("bms/pack/sensor/availability") == [b"online", b"offline"]
-    assert {"bms/pack/state", "bms/pack/parameters"} <= {name for name, _, _ in live.messages}
-
-
-async def test_parameters_come_not_before_the_first_sample(broker: Broker) -> None:
-    cell = load_cell("chen_mora")
-    nothing_yet = ONE._replace(estimate=None, parameters=parameter_report(Estimator(cell, identifier=None), NOW))
-    async with Listener(broker) as live, sink(broker) as mqtt:
-        mqtt.publish(nothing_yet)
-        await live.wait("homeassistant/device/bms_pack/config")
-        assert live.all("bms/pack/parameters") == []
-        mqtt.publish(ONE)
-        assert (await live.wait_json("bms/pack/parameters"))["elements"]
-
-
-async def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missing(broker: Broker) -> None:
-    async with Listener(broker) as live, sink(broker) as mqtt:
-        mqtt.publish(snapshot())
-        state = await live.wait_json("bms/pack/state")
-        schema = await live.wait_json("bms/pack/schema")
-    described = schema["state"]["properties"]
-    assert set(state) == set(described) == set(schema["state"]["required"])
-    assert all("description" in field for field in described.values())
-    assert state["temperature_c"] is None
-    assert state["soc_percent"] == pytest.approx(50.0)
-    assert state["crc_errors"] == 3
-    Estimate.model_validate(state)
-
-
-async def test_discovery_describes_every_entity_with_both_availabilities(broker: Broker) -> None:
-    async with Listener(broker) as live, sink(broker) as mqtt:
-        mqtt.publish(snapshot())
-        found = await live.wait_json("homeassistant/device/bms_pack/config")
-        state = await live.wait_json("bms/pack/state")
-    assert found["device"]["identifiers"] == ["bms_pack"]
-    assert found["origin"]["name"] == "bms_estimator"
-    assert found["availability_mode"] == "all"
-    assert [a["topic"] for a in found["availability"]] == ["bms/pack/availability", "bms/pack/sensor/availability"]
-    components = found["components"]
-    soc, current = components["soc_percent"], components["current_a"]
-    assert (soc["device_class"], soc["unit_of_measurement"], soc["expire_after"]) == ("battery", "%", 3)
-    assert "discharge positive" in current["name"]
-    assert "device_class" not in components["r_s_ohm"]
-    assert components["lock_lost"]["device_class"] == "problem"
-    unique = [component["unique_id"] for component in components.values()]
-    assert len(set(unique)) == len(unique)
-    for key, component in components.items():
-        if component["state_topic"] == "bms/pack/state" and key != "lock_lost":
-            assert key in state
-
-
-@pytest.mark.parametrize(("rate_hz", "sample_period_s", "expire_s"), [(0.1, 1.0, 30), (10.0, 1.0, 3), (1.0, 2.5, 8)])
-def test_a_value_expires_after_three_periods_of_publishing_or_of_sampling(
-    rate_hz: float, sample_period_s: float, expire_s: int
-) -> None:
-    info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(info, "bms/pack", sample_period_s)["components"].values()
-    assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
+    seen = {name for name, _, _ in live.messages}
+    assert {"bms/pack/state", "bms/pack/parameters", "bms/pack/home_assistant"} <= seen
+    assert sink.delivery == Delivery()
 
 
 async def test_retained_messages_are_sent_again_when_home_assistant_is_born(broker: Broker) -> None:
-    async with Listener(broker) as live, sink(broker) as mqtt:
-        mqtt.publish(snapshot())
-        await live.wait("homeassistant/device/bms_pack/config")
+    async with Listener(broker) as live, Sink(broker.url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(DISCOVERY)
         before = len(live.messages)
         await live.publish("homeassistant/status", b"online")
-        while len(live.all("homeassistant/device/bms_pack/config")) < 2:
-            mqtt.publish(snapshot())
+        while len(live.all(DISCOVERY)) < 2:
+            sink.mqtt.publish(ONE)
             await asyncio.sleep(0.05)
-        for topic in ("info", "availability", "schema", "health"):
+        for topic in RETAINED:
             await live.wait(f"bms/pack/{topic}", skip=before)
+        await live.wait("bms/pack/home_assistant", skip=before)
 
 
 async def test_a_broker_that_comes_late_goes_and_comes_back_is_served_and_drops_are_counted(tmp_path: Path) -> None:
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     broker = Broker(tmp_path)
-    async with sink(broker) as mqtt:
+    async with Sink(broker.url) as sink:
         for _ in range(5):
-            mqtt.publish(snapshot())
-        assert mqtt.drops == 4
+            sink.mqtt.publish(ONE)
+        assert sink.delivery.drops == 4
         for _ in range(2):  # persistence is off: each start has forgotten everything
             broker.start()
             try:
                 async with Listener(broker) as live:
-                    mqtt.publish(snapshot())
+                    sink.mqtt.publish(snapshot(delivery=sink.delivery))
                     for topic in (*RETAINED, "state"):
                         await live.wait(f"bms/pack/{topic}")
                     health = await live.wait_json("bms/pack/health")
@@ -175,76 +127,231 @@ async def test_a_broker_that_comes_late_goes_and_comes_back_is_served_and_drops_
 
 async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_path: Path) -> None:
     broker = Broker(tmp_path)  # never started
-    async with sink(broker) as mqtt:
+    async with Sink(broker.url) as sink:
         for _ in range(1000):
-            mqtt.publish(ONE)
-    assert mqtt.drops == 999
+            sink.mqtt.publish(ONE)
+    assert sink.delivery.drops == 999
 
 
-@pytest.mark.parametrize(
-    ("payload", "status", "transaction"),
-    [
-        (b'{"transaction": "t1", "x": 2}', "ok", "t1"),
-        (b"", "ok", None),
-        (b'{"transaction": 7, "refuse": true}', "error", 7),
-        (b"[1, 2]", "error", None),
-        (b"\xff\xfe not json", "error", None),
-        (b"[" * 5000, "error", None),
-        (b'{"transaction": NaN}', "error", None),
-        (b'{"transaction": [1e999], "x": 1}', "error", None),
-        (b'{"transaction": "t2", "x": -Infinity}', "error", None),
-        (b'{"transaction": 1.5}', "error", None),
-        (b'{"transaction": true}', "error", None),
-        (b'{"transaction": {"a": 1}}', "error", None),
-    ],
-)
-async def test_a_request_is_answered(broker: Broker, payload: bytes, status: str, transaction: object) -> None:
-    async def echo(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        if arguments.get("refuse"):
-            raise UserError("refused")
-        return {"name": name, "x": arguments.get("x")}
+async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path: Path) -> None:
+    pauses: list[float] = []
 
-    async with Listener(broker) as live, sink(broker, answer=echo) as mqtt:
-        mqtt.publish(ONE)
+    class Impatient(MqttSink):
+        async def _pause(self, delay_s: float) -> None:
+            pauses.append(delay_s)
+            self._closing = len(pauses) == 12
+
+    delivery = Delivery()
+    await Impatient(MqttSettings(url=Broker(tmp_path).url), "pack", Requests(delivery), delivery)._stay_connected()
+    assert max(pauses) <= LONGEST_DELAY_S == 30.0
+    assert pauses[0] <= 5.0 < pauses[3]
+    assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"
+
+
+async def test_after_a_half_open_connection_the_availability_is_online(broker: Broker) -> None:
+    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(DISCOVERY)
+        network.cut()
+        async with asyncio.timeout(LONG_S):
+            await network.half_open_ended.wait()  # else not before one and a half keep-alives
+        before = len(live.messages)
+        sink.mqtt.publish(ONE)
+        await live.wait("bms/pack/state", skip=before)
+        async with Listener(broker) as late:
+            assert await late.wait("bms/pack/availability") == b"online"
+        assert live.all("bms/pack/availability") == [b"online", b"offline", b"online"]
+        assert sink.delivery.corrections == 0, "the will came before the new online"
+
+
+@pytest.mark.parametrize("forged", [b"offline", b"", b"nonsense"])
+@pytest.mark.parametrize("topic", ["bms/pack/availability", "bms/pack/sensor/availability"])
+async def test_an_availability_that_somebody_else_wrote_is_put_right(
+    broker: Broker, url: str, topic: str, forged: bytes
+) -> None:
+    async with Listener(broker) as live, Sink(url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(DISCOVERY)
+        await live.publish(topic, forged, qos=1, retain=True)
+        await until(lambda: live.all(topic) == [b"online", forged, b"online"])
+        async with Listener(broker) as late:
+            assert await late.wait(topic) == b"online"
+    assert sink.delivery.corrections == 1
+
+
+async def test_somebody_who_keeps_writing_an_availability_is_not_answered_each_time(broker: Broker) -> None:
+    loop = asyncio.get_running_loop()
+    async with Listener(broker) as live, Sink(broker.url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(DISCOVERY)
+        began_s = loop.time()
+        for _ in range(200):
+            await live.publish("bms/pack/availability", b"offline", qos=1, retain=True)
+        await until(
+            lambda: (heard := live.all("bms/pack/availability")).count(b"offline") == 200 and heard[-1] == b"online"
+        )
+        assert 1 <= sink.delivery.corrections <= 1 + (loop.time() - began_s) / CORRECTION_S
+        async with Listener(broker) as late:
+            assert await late.wait("bms/pack/availability") == b"online"
+
+
+async def test_a_request_comes_back_as_a_response(broker: Broker, url: str) -> None:
+    async with Listener(broker) as live, Sink(url) as sink:
+        sink.mqtt.publish(ONE)
         await live.wait("bms/pack/availability")
-        await live.publish("bms/pack/request/echo", payload, qos=1)
-        response = await live.wait_json("bms/pack/response/echo")
-    assert set(response) == {"status", "data", "error", "transaction"}
-    assert (response["status"], response["transaction"]) == (status, transaction)
-    assert (response["data"] is None) == (status == "error")
-    assert (response["error"] is None) == (status == "ok")
+        await live.publish("bms/pack/request/health", b'{"transaction": 7}', qos=1)
+        response = await live.wait_json("bms/pack/response/health")
+    assert response == {"status": "ok", "data": {"name": "health"}, "error": None, "transaction": 7}
+
+
+async def test_a_retained_request_that_waited_is_not_granted(broker: Broker, url: str) -> None:
+    async with Listener(broker) as live:
+        await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
+        async with Sink(url) as sink:
+            await live.wait("bms/pack/availability")
+            await live.publish("bms/pack/request/state", b"{}", qos=1)
+            await live.wait("bms/pack/response/state")
+    assert sink.asked == ["state"]
+    assert sink.delivery.requests == {"retained": 1, "granted": 1}
+
+
+async def test_a_retained_request_is_not_granted_while_connected_either(broker: Broker) -> None:
+    async with Listener(broker) as live, Sink(broker.url) as sink:
+        await live.wait("bms/pack/availability")
+        await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
+        await live.publish("bms/pack/request/state", b"{}", qos=1)
+        await live.wait("bms/pack/response/state")
+    assert sink.asked == ["state"]
+    assert sink.delivery.requests == {"retained": 1, "granted": 1}
+
+
+@pytest.mark.parametrize("name_bytes", [50_000, 65_535 - len("bms/pack/request/")])
+async def test_no_topic_of_a_request_ends_the_service(broker: Broker, url: str, name_bytes: int) -> None:
+    async with Listener(broker, "bms/pack/response/#") as live, Sink(url) as sink:
+        async with Listener(broker, "bms/pack/availability") as started:
+            await started.wait("bms/pack/availability")
+        for name in ("x" * name_bytes, "é" * (name_bytes // 2), "nonsense"):
+            await live.publish(f"bms/pack/request/{name}", b"{}", qos=1)
+        await live.publish("bms/pack/request/state", b"{}", qos=1)
+        await live.wait("bms/pack/response/state")
+        assert len(live.messages) == 1
+    assert sink.delivery.requests["granted"] == sink.delivery.requests["unknown"] == 1
+
+
+async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None:
+    gate = asyncio.Event()
+
+    async def slow(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        await gate.wait()
+        return {}
+
+    async with Listener(broker, "bms/pack/response/#") as live, Sink(url) as sink:
+        sink.requests.offer("current_zero", slow)
+        async with Listener(broker, "bms/pack/availability") as started:
+            await started.wait("bms/pack/availability")
+        with structlog.testing.capture_logs() as logs:
+            await live.publish("bms/pack/request/current_zero", qos=1)
+            for _ in range(20):
+                await live.publish("bms/pack/request/state", b"x" * 1_000_000, qos=1)
+            for _ in range(3 * MOST_WAITING):
+                await live.publish("bms/pack/request/state", b"x" * 4000, qos=1)
+            await until(lambda: sink.delivery.requests["overflow"] > MOST_WAITING)
+            gate.set()
+            await live.wait("bms/pack/response/current_zero")
+        assert len(logs) < 10
+        while not live.all("bms/pack/response/health"):  # the first may still find no room
+            await live.publish("bms/pack/request/health", qos=1)
+            await asyncio.sleep(0.1)
+
+
+def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
+    delivery = Delivery()
+    inbox = _Inbox(Requests(delivery), MOST_WAITING)
+    for length in (MOST_BYTES - 1, 200_000_000) * (2 * MOST_WAITING):
+        payload = bytes(1) * min(length, 2 * MOST_BYTES)
+        inbox.put_nowait(aiomqtt.Message("t", payload, 1, retain=False, mid=1, properties=None))
+    waiting = [inbox.get_nowait() for _ in range(inbox.qsize())]
+    assert sum(len(message.payload) for message in waiting) <= MOST_WAITING * MOST_BYTES
+    assert delivery.requests == {"too_long": 2 * MOST_WAITING, "overflow": MOST_WAITING}
 
 
 async def test_a_fault_of_ours_is_offline_for_the_broker_and_raised(broker: Broker) -> None:
-    async def break_down(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        raise ZeroDivisionError
-
     async with Listener(broker) as live:
-        mqtt = await sink(broker, answer=break_down).__aenter__()
-        mqtt.publish(ONE)
+        sink = await Sink(broker.url).__aenter__()
         await live.wait("bms/pack/availability")
-        await live.publish("bms/pack/request/any", qos=1)
+        sink.mqtt.publish(ONE._replace(health=None))  # type: ignore[arg-type]
         await live.wait("bms/pack/availability", lambda p: p == b"offline")
         with pytest.raises(ExceptionGroup) as fault:
-            await mqtt.__aexit__(None, None, None)
-    assert fault.value.split(ZeroDivisionError)[1] is None
+            await sink.__aexit__()
+    assert fault.value.split(AttributeError)[1] is None
 
 
-async def test_a_retained_request_is_not_granted_again_with_every_connection(broker: Broker) -> None:
-    asked = []
+async def test_the_demo_s_broker_which_knows_no_mqtt_5_is_served() -> None:
+    async with DemoBroker() as broker, aiomqtt.Client("127.0.0.1", broker.port) as client, Sink(broker.url) as sink:
+        await client.subscribe([("bms/pack/state", 0), ("bms/pack/response/state", 1)])
+        sink.mqtt.publish(ONE)
+        async with asyncio.timeout(LONG_S):
+            assert (await anext(client.messages)).topic.value == "bms/pack/state"
+            await client.publish("bms/pack/request/state", qos=1)
+            assert (await anext(client.messages)).topic.value == "bms/pack/response/state"
 
-    async def note(name: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        asked.append(name)
-        return {}
 
-    async with Listener(broker) as live:
-        await live.publish("bms/pack/request/old", b"{}", qos=1, retain=True)
-        async with sink(broker, answer=note) as mqtt:
-            mqtt.publish(ONE)
-            await live.wait("bms/pack/availability")
-            await live.publish("bms/pack/request/new", b"{}", qos=1)
-            await live.wait("bms/pack/response/new")
-    assert asked == ["new"]
+@pytest.fixture
+def mute_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Its access list gives the estimator no right at all, which Mosquitto does not say."""
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    (tmp_path / "acl").write_text("topic read nothing\n")
+    broker = Broker(tmp_path, f"allow_anonymous true\nacl_file {tmp_path / 'acl'}").start()
+    yield broker
+    broker.stop()
+
+
+async def test_a_broker_that_denies_everything_without_a_word_is_found_out(mute_broker: Broker) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Sink(mute_broker.url, echo_s=0.5) as sink:
+            await until(lambda: sink.delivery.refused_topics)
+            assert snapshot(delivery=sink.delivery).health.refused_topics == ["bms/pack/availability"]
+    assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/availability"]
+
+
+@pytest.fixture
+def refusing_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Says that requests must not be read."""
+    if MOSQUITTO is None or DYNAMIC_SECURITY is None:
+        pytest.skip("mosquitto with its dynamic security is not installed (apt-get install mosquitto)")
+    acls = [
+        {"acltype": "subscribeLiteral", "topic": "bms/+/request/#", "priority": 1, "allow": False},
+        {"acltype": "subscribePattern", "topic": "bms/pack/request/+", "priority": 1, "allow": False},
+        {"acltype": "subscribePattern", "topic": "#", "priority": 0, "allow": True},
+    ]
+    rights = {
+        "defaultACLAccess": {"publishClientSend": True, "publishClientReceive": True, "subscribe": True},
+        "groups": [{"groupname": "all", "roles": [{"rolename": "most"}]}],
+        "roles": [{"rolename": "most", "acls": acls}],
+        "anonymousGroup": "all",
+        "clients": [],
+    }
+    (tmp_path / "rights.json").write_text(json.dumps(rights))
+    (tmp_path / "rights.json").chmod(0o600)
+    extra = f"allow_anonymous true\nplugin {DYNAMIC_SECURITY}\nplugin_opt_config_file {tmp_path / 'rights.json'}"
+    broker = Broker(tmp_path, extra).start()
+    yield broker
+    broker.stop()
+
+
+@pytest.mark.parametrize("knows_5", [True, False])
+async def test_a_topic_that_the_broker_refuses_is_named_in_log_and_health(
+    refusing_broker: Broker, knows_5: bool
+) -> None:
+    async with Proxy(refusing_broker.port, knows_5=knows_5) as proxy, Listener(refusing_broker) as live:
+        with structlog.testing.capture_logs() as logs:
+            async with Sink(proxy.url) as sink:
+                await live.wait("bms/pack/availability")
+                sink.mqtt.publish(snapshot(delivery=sink.delivery))
+                health = await live.wait_json("bms/pack/health")
+    assert health["refused_topics"] == ["bms/pack/request/+"]
+    assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/request/+"]
 
 
 @pytest.fixture
@@ -278,7 +385,7 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
     tls = aiomqtt.TLSParameters(ca_certs=str(certificate))
     async with (
         Listener(secure_broker, "bms/#", username="meter", password="s3cret", tls_params=tls) as live,
-        MqttSink(settings, "pack", refuse) as mqtt,
+        MqttSink(settings, "pack", Requests(Delivery()), Delivery()) as mqtt,
     ):
         mqtt.publish(ONE)
         await live.wait("bms/pack/state")
@@ -298,10 +405,4 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
 )
 def test_settings_that_cannot_reach_a_broker_are_named(changes: dict[str, Any], named: str) -> None:
     with pytest.raises(UserError, match=named):
-        MqttSink(MqttSettings(**changes), "pack", refuse)
-
-
-def test_every_payload_is_json_without_nan() -> None:
-    for part in ONE:
-        assert part is not None
-        json.loads(part.model_dump_json(), parse_constant=pytest.fail)
+        broker_arguments(MqttSettings(**changes))

@@ -1,0 +1,120 @@
+"""What goes to a broker: from what it got last and a snapshot to messages. Pure: no connection, no clock."""
+
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from bms_estimator.model.estimate import Estimate, Health, Info, ParameterReport, Report, Snapshot
+from bms_estimator.sinks.home_assistant import PROBLEMS, VALUES, discovery, discovery_topic
+from bms_estimator.sinks.home_assistant_values import Shown, next_problems, next_values
+
+AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
+"""Topics below the device's."""
+
+
+class Message(NamedTuple):
+    """One message."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+
+
+class Sent(NamedTuple):
+    """What the broker got last; at first nothing."""
+
+    snapshot: Snapshot | None = None
+    shown: Shown = Shown()
+
+
+class Messages:
+    """The messages of one pack.
+
+    Args:
+        base_topic: First part of all topics.
+        device: Name of the pack.
+        sample_period_s: Between two samples, where that may be longer than the publish period [s].
+    """
+
+    def __init__(self, base_topic: str, device: str, sample_period_s: float = 0.0) -> None:
+        self.root = f"{base_topic}/{device}"
+        self._device, self._sample_period_s = device, sample_period_s
+
+    def greeting(self) -> list[Message]:
+        """What a broker is told first."""
+        return [self._retained(AVAILABILITY, b"online"), self._retained("schema", _json(schema()))]
+
+    def farewell(self) -> list[Message]:
+        """What it is told last; the last of these is the will, too."""
+        return [self._retained(SENSOR_AVAILABILITY, b"offline"), self._retained(AVAILABILITY, b"offline")]
+
+    def availability(self, sent: Sent) -> list[Message]:
+        """What the two availabilities hold, unless somebody else writes there."""
+        sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
+        return [self._retained(AVAILABILITY, b"online"), *sensor]
+
+    def due(self, sent: Sent, snapshot: Snapshot, now_s: float) -> tuple[list[Message], Sent]:
+        """What a snapshot brings that the broker has not got yet.
+
+        Args:
+            sent: What it got.
+            snapshot: The snapshot.
+            now_s: Monotonic clock [s].
+
+        Returns:
+            The messages, the state first, for it is in a hurry; and what the broker has got after them.
+        """
+        estimate, parameters, health, info = snapshot
+        before, messages = sent.snapshot, []
+        if estimate is not None:
+            messages.append(self._live("state", _report(estimate)))
+        known = bool(parameters.elements)  # not before the first sample
+        if known and (before is None or before.parameters is not parameters):
+            messages.append(self._live("parameters", _report(parameters)))
+        if before is None or before.health.sensor_online != health.sensor_online:
+            messages.append(self._sensor(health))
+        if before is None or before.health is not health:
+            messages.append(self._retained("health", _report(health)))
+        if before is None or before.info != info:
+            messages.append(self._retained("info", _report(info)))
+            if before is None or self._discovery(before.info) != self._discovery(info):
+                messages.append(Message(discovery_topic(self._device), _json(self._discovery(info)), 1, retain=True))
+        told, shown = self._home_assistant(sent.shown, snapshot, now_s)
+        return messages + told, Sent(snapshot, shown)
+
+    def _home_assistant(self, before: Shown, snapshot: Snapshot, now_s: float) -> tuple[list[Message], Shown]:
+        messages = []
+        shown = next_values(before, snapshot, now_s)
+        if shown is not before:
+            messages.append(self._live(VALUES, _json(shown.values)))
+        after = next_problems(shown, snapshot, now_s)
+        if after is not shown:
+            messages.append(self._retained(PROBLEMS, _json(after.problems)))
+        return messages, after
+
+    def _sensor(self, health: Health) -> Message:
+        return self._retained(SENSOR_AVAILABILITY, b"online" if health.sensor_online else b"offline")
+
+    def _discovery(self, info: Info) -> dict[str, Any]:
+        return discovery(info, self.root, self._sample_period_s)
+
+    def _live(self, topic: str, payload: bytes) -> Message:
+        return Message(f"{self.root}/{topic}", payload, 0, retain=False)
+
+    def _retained(self, topic: str, payload: bytes) -> Message:
+        return Message(f"{self.root}/{topic}", payload, 1, retain=True)
+
+
+def schema() -> dict[str, Any]:
+    """JSON schema of each topic's payload."""
+    topics: dict[str, type[Report]] = {"state": Estimate, "parameters": ParameterReport, "health": Health, "info": Info}
+    return {topic: model.model_json_schema() for topic, model in topics.items()}
+
+
+def _report(report: Report) -> bytes:
+    return report.model_dump_json().encode()
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()

@@ -1,0 +1,51 @@
+"""Whether the pack is seen at rest: the only time when a current of zero may be learned."""
+
+from collections import deque
+
+from bms_estimator.model.estimate import Estimate
+
+WATCHED_S = 30.0
+"""So long current and voltage must have kept still [s]."""
+MOST_CURRENT = 0.04
+"""Of the largest current that the cell file allows: what a sensor's offset may be; more is a load."""
+MOST_STEPS = 2.0
+"""Of the voltage's resolution: between the means of two publish windows noise makes less."""
+
+
+class Rest:
+    """Watches the publish windows.
+
+    Args:
+        current_max_a: Largest current of the pack [A].
+        voltage_resolution_v: One step of the voltage's converter [V].
+    """
+
+    def __init__(self, current_max_a: float, voltage_resolution_v: float) -> None:
+        self._current_a, self._voltage_v = MOST_CURRENT * current_max_a, MOST_STEPS * voltage_resolution_v
+        self._windows: deque[tuple[float, float, float]] = deque()  # when, current, voltage
+
+    def add(self, estimate: Estimate, now_s: float) -> None:
+        """Take a window; ``now_s`` is monotonic [s]."""
+        self._windows.append((now_s, estimate.current_a, estimate.voltage_v))
+        while len(self._windows) > 1 and now_s - self._windows[1][0] >= WATCHED_S:
+            self._windows.popleft()
+
+    def disturbed(self, now_s: float) -> str | None:
+        """Why the pack is not known to be at rest; None when it is.
+
+        Args:
+            now_s: Monotonic clock [s].
+        """
+        watched_s = now_s - self._windows[0][0] if self._windows else 0.0
+        if watched_s < WATCHED_S:
+            return f"the pack was watched for {watched_s:.0f} s only; wait until it is {WATCHED_S:.0f} s"
+        _, currents_a, voltages_v = zip(*self._windows, strict=True)
+        current_a = max(currents_a, key=abs)
+        if abs(current_a) > self._current_a:
+            return (
+                f"current flows: {current_a:.3g} A within the last {WATCHED_S:.0f} s; at most {self._current_a:.3g} A"
+            )
+        moved_v = max(voltages_v) - min(voltages_v)
+        if moved_v > self._voltage_v:
+            return f"current flows: the voltage moved by {moved_v:.3g} V within the last {WATCHED_S:.0f} s"
+        return None

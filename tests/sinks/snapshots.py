@@ -1,0 +1,50 @@
+"""Snapshots as the service makes them."""
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.settings import Settings
+from bms_estimator.sinks import Delivery
+from bms_estimator.snapshot.health import health_report
+from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.snapshot.remaining import remaining_charge
+from bms_estimator.snapshot.topics import estimate_report, info_report
+from bms_estimator.snapshot.window import Window
+
+NOW = 1_700_000_000.0
+
+
+def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None) -> Snapshot:
+    cell = load_cell("chen_mora")
+    estimator = Estimator(cell, identifier=None, initial_soc=0.5)
+    window = Window()
+    block = np.zeros(2, dtype=SAMPLE)
+    block["time_s"], block["voltage_v"], block["temperature_c"] = [0.0, 0.1], 3.8, np.nan
+    window.add(estimator.run(block), NOW)
+    summary = window.take()
+    assert summary
+    return Snapshot(
+        estimate_report(summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW),
+        parameter_report(estimator, NOW),
+        health_report(
+            estimator.record[0],
+            {"frames_received": 2},
+            now_s=NOW,
+            uptime_s=1.0,
+            restarts=0,
+            checkpoint="off",
+            sensor_message=sensor_message,
+            delivery=delivery or Delivery(),
+        ),
+        info_report(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW),
+    )
+
+
+ONE = snapshot()
+NOTHING_YET = ONE._replace(
+    estimate=None, parameters=parameter_report(Estimator(load_cell("chen_mora"), identifier=None), NOW)
+)
+"""Before the first sample."""

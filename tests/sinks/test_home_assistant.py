@@ -1,0 +1,180 @@
+"""What Home Assistant is told: few changes, never too late."""
+
+import json
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.estimate import Snapshot
+from bms_estimator.sinks.home_assistant import discovery
+from bms_estimator.sinks.messages import Messages, Sent
+from tests.sinks.snapshots import ONE
+
+ROOT = "bms/pack"
+COMPONENTS = discovery(ONE.info, ROOT, 0.0)["components"]
+SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
+MOST_ROWS_PER_MIN = 20
+
+
+def with_values(**values: float | None) -> Snapshot:
+    assert ONE.estimate
+    return ONE._replace(estimate=ONE.estimate.model_copy(update=values))
+
+
+def noisy(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, Snapshot]]:
+    """A load that steps every twenty seconds, as an 18650's board measures it, and what follows from it."""
+    rng, soc, load_a = np.random.default_rng(5), 0.9, 0.0
+    for i in range(round(seconds / period_s)):
+        now_s = i * period_s
+        if i % round(20.0 / period_s) == 0:
+            load_a = float(rng.uniform(0.0, 3.0))
+        soc -= load_a * period_s / 3600.0 / 2.7
+        current_a = load_a + float(rng.normal(0.0, 0.02))
+        voltage_v = 3.2 + soc - 0.07 * load_a + float(rng.normal(0.0, 0.003))
+        yield (
+            now_s,
+            with_values(
+                voltage_v=voltage_v,
+                current_a=current_a,
+                power_w=voltage_v * current_a,
+                temperature_c=25.0 + float(rng.normal(0.0, 0.1)),
+                soc_percent=100.0 * soc + float(rng.normal(0.0, 0.05)),
+                remaining_capacity_ah=2.7 * soc,
+                remaining_energy_wh=2.7 * soc * 3.6,
+                time_to_empty_s=3600.0 * 2.7 * soc / current_a if current_a > 0.0 else None,
+                innovation_v=float(rng.normal(0.0, 0.003)),
+                frames_lost=i // 50,
+            ),
+        )
+
+
+def restless(seconds: float, period_s: float = 0.1) -> Iterator[tuple[float, Snapshot]]:
+    """Every value is another one each time."""
+    names = [key for key in SHOWN if hasattr(ONE.estimate, key)]
+    for i in range(round(seconds / period_s)):
+        elements = {key: e.model_copy(update={"value": float(i)}) for key, e in ONE.parameters.elements.items()}
+        parameters = ONE.parameters.model_copy(update={"elements": elements})
+        yield i * period_s, with_values(**dict.fromkeys(names, i))._replace(parameters=parameters)
+
+
+def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str, dict[str, object]]]:
+    """When Home Assistant is told what on which of its topics."""
+    messages, sent = Messages("bms", "pack"), Sent()
+    for now_s, each in stream:
+        due, sent = messages.due(sent, each, now_s)
+        for message in due:
+            if message.topic.startswith(f"{ROOT}/home_assistant"):
+                yield now_s, message.topic, json.loads(message.payload)
+
+
+def rows(stream: Iterator[tuple[float, Snapshot]]) -> list[float]:
+    """When the recorder of Home Assistant writes a row: for each change of state or attribute of an entity it shows."""
+    last: dict[str, object] = {}
+    written = []
+    for now_s, topic, payload in told(stream):
+        for key in SHOWN & set(payload):
+            assert COMPONENTS[key]["state_topic"] == topic
+            if key in last and last[key] != payload[key]:
+                written.append(now_s)
+            last[key] = payload[key]
+    assert set(last) == SHOWN
+    return written
+
+
+@pytest.mark.parametrize("stream", [noisy, restless])
+def test_home_assistant_records_at_most_20_rows_in_any_minute(
+    stream: Callable[[float], Iterator[tuple[float, Snapshot]]],
+) -> None:
+    written = np.array(rows(stream(900.0)))
+    assert written.size > 100
+    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
+
+
+def test_noise_alone_makes_no_rows() -> None:
+    rng = np.random.default_rng(2)
+    stream = (
+        (float(i), with_values(voltage_v=3.705 + float(rng.normal(0.0, 0.002)), current_a=float(rng.normal(0.0, 0.01))))
+        for i in range(600)
+    )
+    assert rows(stream) == []
+
+
+@pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.0, 4.0, 10.0])
+def test_values_never_expire_while_estimates_come(rate_hz: float) -> None:
+    info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
+    components = discovery(info, ROOT, 0.0)["components"].values()
+    expiry_s = min(c["expire_after"] for c in components if "expire_after" in c)
+    rng = np.random.default_rng(3)
+    late_s = [float(rng.uniform(0.0, 0.9 / rate_hz)) for _ in range(round(600 * rate_hz))]
+    stream = ((i / rate_hz + late, ONE) for i, late in enumerate(late_s))
+    times_s = [now_s for now_s, topic, _ in told(stream) if topic == f"{ROOT}/home_assistant"]
+    assert times_s[-1] > 550.0
+    assert max(np.diff(times_s)) < expiry_s
+
+
+def test_values_expire_when_no_estimate_comes() -> None:
+    silent = ONE._replace(estimate=None)
+    times_s = [
+        t for t, topic, _ in told((float(i), silent if i else ONE) for i in range(60)) if "problems" not in topic
+    ]
+    assert times_s == [0.0]
+
+
+def test_a_change_comes_within_five_seconds_when_it_is_the_first_for_long() -> None:
+    stream = ((float(i), with_values(current_a=0.0 if i < 43 else 3.0)) for i in range(60))
+    changed_s = next(t for t, _, payload in told(stream) if payload.get("current_a") == 3.0)
+    assert changed_s <= 48.0
+
+
+def test_values_are_rounded_to_what_they_resolve() -> None:
+    values = with_values(voltage_v=3.7049999, soc_percent=56.7890123, remaining_energy_wh=1.23456789)
+    payload = next(p for _, _, p in told(iter([(0.0, values)])))
+    assert (payload["voltage_v"], payload["soc_percent"], payload["remaining_energy_wh"]) == (3.7, 56.8, 1.2)
+    assert payload["temperature_c"] is None
+
+
+def test_a_problem_is_told_at_once_and_a_count_within_its_reason_but_once_a_minute() -> None:
+    def silent(message: str | None) -> Snapshot:
+        return ONE._replace(health=ONE.health.model_copy(update={"sensor_message": message}))
+
+    stream = ((float(i), silent(f"silent for {i} s" if i >= 10 else None)) for i in range(100))
+    problems = [(t, p["sensor_silent"]) for t, topic, p in told(stream) if topic == f"{ROOT}/home_assistant/problems"]
+    assert problems == [(0.0, None), (10.0, "silent for 10 s"), (70.0, "silent for 70 s")]
+
+
+def test_no_entity_has_more_attributes_than_the_reason() -> None:
+    for component in COMPONENTS.values():
+        assert not component["state_topic"].endswith(("/health", "/state", "/parameters"))
+        if "json_attributes_topic" in component:
+            assert set(component["json_attributes_template"].split("'")[1::2]) == {"reason"}
+
+
+def test_raw_observer_values_are_disabled_until_the_user_wants_them() -> None:
+    raw = {"delta_1", "delta_2", "adaptive_gain_k", "nussbaum_gain", "innovation_v", "sample_rate_hz", "r_ts_ohm"}
+    assert not SHOWN & raw
+    assert raw < set(COMPONENTS)
+    assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_s", "r_s_ohm", "sensor_silent"} <= SHOWN
+
+
+def test_discovery_describes_every_entity_with_both_availabilities() -> None:
+    found = discovery(ONE.info, ROOT, 0.0)
+    assert (found["device"]["identifiers"], found["device"]["serial_number"]) == (["bms_pack"], "A1")
+    assert found["origin"]["name"] == "bms_estimator"
+    assert found["availability_mode"] == "all"
+    assert [a["topic"] for a in found["availability"]] == ["bms/pack/availability", "bms/pack/sensor/availability"]
+    soc, current = COMPONENTS["soc_percent"], COMPONENTS["current_a"]
+    assert (soc["device_class"], soc["unit_of_measurement"], soc["expire_after"]) == ("battery", "%", 30)
+    assert "discharge positive" in current["name"]
+    assert "device_class" not in COMPONENTS["r_s_ohm"]
+    assert COMPONENTS["lock_lost"]["device_class"] == "problem"
+    assert len({component["unique_id"] for component in COMPONENTS.values()}) == len(COMPONENTS)
+
+
+@pytest.mark.parametrize(("rate_hz", "sample_period_s", "expire_s"), [(0.1, 1.0, 30), (10.0, 1.0, 30), (1.0, 25.0, 75)])
+def test_a_value_expires_after_three_periods_and_half_a_minute_at_least(
+    rate_hz: float, sample_period_s: float, expire_s: int
+) -> None:
+    info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
+    components = discovery(info, ROOT, sample_period_s)["components"].values()
+    assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
