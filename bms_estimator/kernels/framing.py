@@ -172,7 +172,9 @@ def take_hello(d: Record, s: Record) -> None:
         d.reset_pending = 1
     d.boot_id = boot_id
     s.full_scale = float(1 << min(take(p, 26, 1), 24))
-    s.ntc_fitted = take(p, 27, 1) & 1
+    channels = take(p, 27, 1)
+    s.ntc_fitted = channels & 1
+    s.ratiometric = channels >> 1 & 1
     s.divider = take(p, 28, 4) * 1e-6
     s.volts_per_ampere = take(p, 32, 4) * 1e-6
     s.current_zero = take(p, 36, 4) * 1e-6

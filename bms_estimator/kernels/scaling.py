@@ -13,6 +13,10 @@ SCALING = np.dtype(
         ("full_scale", "f8"),  # conversions at the reference: 2^bits
         ("divider", "f8"),  # pack voltage over voltage at the pin
         ("volts_per_ampere", "f8"),  # slope of the current sensor [V/A]
+        (
+            "ratiometric",
+            "i8",
+        ),  # 1: that slope holds at 5 V and is proportional to the reference, which supplies the sensor
         ("current_zero", "f8"),  # its output without current, as a part of the reference
         ("bandgap_v", "f8"),  # the converter's internal reference [V]
         ("ntc_series_ohm", "f8"),
@@ -30,6 +34,7 @@ SCALING = np.dtype(
 _BANDGAP_WEIGHT = 512.0  # at 16 readings a second half a minute: 0.5 LSB of noise becomes 0.02 LSB
 _NTC_WEIGHT = 32.0  # two seconds
 _RAIL = 0.01  # an NTC this near to either end of the range is open or shorted
+_RATIOMETRIC_V = 5.0  # supply at which the data sheet of a ratiometric sensor gives its slope
 _ZERO_C_K = 273.15
 _R25_K = 298.15
 
@@ -84,4 +89,5 @@ def current(s: Record, total: float, count: float, reference_v: float) -> float:
     """Through the sensor [A], positive as the board is wired; NaN without a conversion."""
     if count == 0.0:
         return math.nan
-    return (total / count / s.full_scale - s.current_zero) * reference_v / s.volts_per_ampere
+    range_v = _RATIOMETRIC_V if s.ratiometric else reference_v
+    return (total / count / s.full_scale - s.current_zero) * range_v / s.volts_per_ampere

@@ -11,6 +11,8 @@ FULL_SCALE = 1024
 CLOCK_HZ = 16_000_000
 SLOTS_PER_S = 8000
 """Conversions of the firmware per second; a pair of them is one of voltage and one of current."""
+RATIOMETRIC_V = 5.0
+"""Supply at which the data sheet of a ratiometric sensor gives its slope [V]."""
 _NOISE_POINTS = 1 << 16
 
 
@@ -39,13 +41,21 @@ class BoardParts:
     supply_v: float = 5.0
     """AVcc, the converter's reference, which the host has to find out."""
     bandgap_v: float = 1.1
-    divider: float = 5.0
+    divider: float = 6.1
     volts_per_ampere: float = 0.1
+    """Of a ratiometric sensor at 5 V of supply."""
+    ratiometric: bool = True
+    """The current sensor is supplied with AVcc, and its slope is proportional to that."""
     current_zero: float = 0.5
     """Sensor's output without current, as a part of the supply."""
     ntc_series_ohm: int = 10_000
     ntc_r25_ohm: int = 10_000
     ntc_beta_k: int = 3950
+
+    @property
+    def part_per_ampere(self) -> float:
+        """Slope of the current sensor as a part of the supply [1/A]."""
+        return self.volts_per_ampere / (RATIOMETRIC_V if self.ratiometric else self.supply_v)
 
 
 class VirtualConverter:
@@ -66,7 +76,7 @@ class VirtualConverter:
         """Sums of ``count`` pairs of conversions."""
         parts = self.parts
         voltage = self.convert(reading.voltage_v / parts.divider / parts.supply_v, count)
-        current = self.convert(parts.current_zero + reading.current_a * parts.volts_per_ampere / parts.supply_v, count)
+        current = self.convert(parts.current_zero + reading.current_a * parts.part_per_ampere, count)
         return Sums(
             int(voltage.sum()),
             int(current.sum()),
