@@ -55,6 +55,7 @@ def health_report(
     restarts: int,
     checkpoint: str,
     sensor_message: str | None,
+    clock_ppm: float | None = None,
 ) -> Health:
     """Topic ``health``.
 
@@ -66,6 +67,7 @@ def health_report(
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the last checkpoint.
         sensor_message: Why values are not fresh; None when they are.
+        clock_ppm: The source's.
     """
     state = record["observer"]
     return Health(
@@ -76,6 +78,7 @@ def health_report(
         reconnects=line.get("reconnects", 0),
         sensor_online=sensor_message is None,
         sensor_message=sensor_message,
+        clock_ppm=clock_ppm,
         line={name: int(count) for name, count in line.items() if name != "reconnects"},
         samples=sample_counters(state),
         identifier=identifier_counters(record),

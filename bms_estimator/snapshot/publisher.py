@@ -133,6 +133,7 @@ class Publisher:
             restarts=self._restarts,
             checkpoint=self.checkpoint,
             sensor_message=message,
+            clock_ppm=self._source.clock_ppm,
         )
 
     def _info(self) -> Info:
