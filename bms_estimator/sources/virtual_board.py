@@ -39,7 +39,14 @@ from bms_estimator.sources.protocol import (
     SampleMessage,
     unseal,
 )
-from bms_estimator.sources.virtual_converter import FULL_SCALE, BoardParts, Reading, VirtualConverter, window_of
+from bms_estimator.sources.virtual_converter import (
+    FULL_SCALE,
+    BoardParts,
+    Reading,
+    VirtualConverter,
+    aux_readings_of,
+    window_of,
+)
 
 Signal = Callable[[float], Reading] | Iterable[Reading]
 """Readings by time [s], or one for each sample; the board stops where they end."""
@@ -207,6 +214,7 @@ class VirtualBoard:
     def _set_rate(self, rate_hz: int) -> None:
         self._rate_hz = rate_hz
         self._count, self._period_ns = window_of(rate_hz)
+        self._aux_count = aux_readings_of(rate_hz)
 
     async def _sample_until(self, end_s: float, loop: asyncio.AbstractEventLoop) -> None:
         offset_s = loop.time() - self.time_s / self._speed
@@ -247,10 +255,11 @@ class VirtualBoard:
         status |= BoardStatus.VOLTAGE_SATURATED * sums.voltage_saturated
         status |= BoardStatus.CURRENT_SATURATED * sums.current_saturated
         status |= BoardStatus.OVERRUN * self._overrun
-        aux = self._converter.ntc(reading.temperature_c) if self._aux_is_ntc else self._converter.bandgap(1)
+        n = self._aux_count
+        aux = self._converter.ntc(reading.temperature_c, n) if self._aux_is_ntc else self._converter.bandgap(n)
         self._aux_is_ntc = not self._aux_is_ntc
         board_us = self._ns // 1000 % MODULUS
-        return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, 1, int(status))
+        return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, n, int(status))
 
     def _text(self, message: SampleMessage, reading: Reading) -> bytes:
         """The line that a hobby sketch prints."""

@@ -17,10 +17,6 @@
 #define PRESCALER_128 (_BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0))
 #define TRIGGER_TIMER1_COMPARE_B (_BV(ADTS2) | _BV(ADTS0))
 
-// The bandgap's source is weak: it takes some 350 us to charge the converter's capacitor. Four slots at the end of a
-// window are given to it, of which only the last counts.
-#define AUX_SLOTS 4
-
 #define BOOT_READINGS 256
 #define NTC_OPEN_READING 1015  // with the pull-up on; an NTC at -40 degC gives 999
 
@@ -86,10 +82,16 @@ static void end_window(sample_message *w) {
     begin_window(&windows[filling], status);
 }
 
+static inline bool aux_is_next() {
+    const uint8_t aux_slots = timing.aux_readings + AUX_SETTLING_SLOTS;
+    return aux_now && slots_left != 0 && slots_left <= aux_slots;
+}
+
 static inline void take_aux(sample_message *w, uint16_t reading) {
-    if (slots_left != 0) return;  // not settled yet
-    w->aux_sum = reading;
-    w->aux_count = 1;
+    if (slots_left >= timing.aux_readings) return;  // not settled yet
+    w->aux_sum += reading;
+    w->aux_count++;
+    if (slots_left != 0) return;
     if (aux_mux == MUX_NTC) w->status |= STATUS_AUX_IS_NTC;
     if (ntc_fitted) aux_mux = aux_mux == MUX_NTC ? MUX_BANDGAP : MUX_NTC;
 }
@@ -109,7 +111,7 @@ ISR(ADC_vect) {
         return;
     }
     const bool was_current = mux == MUX_CURRENT;
-    mux = aux_now && slots_left != 0 && slots_left <= AUX_SLOTS ? aux_mux : MUX_VOLTAGE;
+    mux = aux_is_next() ? aux_mux : MUX_VOLTAGE;
     ADMUX = mux;
     TIFR1 = _BV(OCF1B);
     if (was_current) {

@@ -34,7 +34,7 @@ from bms_estimator.sources.protocol import (
     zero_current_command,
 )
 from bms_estimator.sources.serial_board import SerialBoard
-from bms_estimator.sources.virtual_converter import window_of
+from bms_estimator.sources.virtual_converter import aux_readings_of, window_of
 from tests.firmware.host import Host
 from tests.simavr_board import FIRMWARE, SimavrBoard, write_readings
 
@@ -42,8 +42,8 @@ pytestmark = pytest.mark.usefixtures("firmware")
 
 FLAT_OUT = math.inf
 STEADY = [(0.0, 2.5, 22.2, 25.0)]
-AUX_PAIRS = 2
-"""Pairs of conversions that an aux reading takes from its window."""
+AUX_SETTLING = 3
+"""Conversions of an aux input before those that count."""
 
 Start = Callable[..., Host]
 
@@ -131,13 +131,27 @@ def test_every_rate_has_its_exact_period_from_the_next_sample_on(start: Start, r
     host.take(2)  # the window that had begun, and one that may have ended before the command
     samples = host.take(min(2 * rate_hz, 1500) + 1)
     assert [s.sequence for s in samples] == list(range(samples[0].sequence, samples[0].sequence + len(samples)))
-    assert all(s.count + AUX_PAIRS * s.aux_count == pairs for s in samples)
+    assert all(2 * s.count + bool(s.aux_count) * (AUX_SETTLING + s.aux_count) == 2 * pairs for s in samples)
     since_us = np.array([s.board_us for s in samples]) - samples[0].board_us
     assert np.abs(since_us - np.arange(len(samples)) * period_ns * 1e-3).max() <= 1.0
     assert not any(s.status & BoardStatus.OVERRUN for s in samples)
     aux = [s for s in samples if s.aux_count]
+    assert {s.aux_count for s in aux} == {aux_readings_of(rate_hz)}
     assert len(aux) == pytest.approx(len(samples) / max(rate_hz // 100, 1), abs=1)
     assert all((a.status ^ b.status) & BoardStatus.AUX_IS_NTC for a, b in itertools.pairwise(aux))
+
+
+@pytest.mark.parametrize("rate_hz", [1, 10])
+def test_at_low_rates_the_reference_is_as_steady_as_at_high_ones(start: Start, rate_hz: int) -> None:
+    """A time constant of seconds leaves few samples to average: each holds many readings of the bandgap."""
+    host, decoder = start(), FrameDecoder()
+    host.ask(set_rate_command(rate_hz))
+    decoder.feed(0.0, host.hellos[0][1].encode())
+    references_v = []
+    for sample in host.take(40):
+        decoder.feed(0.0, sample.encode())
+        references_v.append(decoder.reference_v)
+    assert np.std(references_v) < 2e-4 * 5.0
 
 
 @pytest.mark.parametrize("rate_hz", [0, 1001, 65535])
