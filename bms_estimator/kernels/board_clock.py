@@ -43,7 +43,7 @@ def take_arrival(d: Record, arrival_s: float) -> None:
 
 @njit(cache=True)
 def clock_ppm(d: Record) -> float:
-    """How much faster the board's clock runs than the host's [1e-6]; NaN before it has been seen for a minute."""
+    """How much faster the board's clock runs than the host's [1e-6]; NaN before it has been seen for a minute, or where all came at once."""
     count = min(d.clock_windows, CLOCK_WINDOWS)
     at_s, late_s = np.empty(count), np.empty(count)
     for i in range(count):
@@ -63,8 +63,9 @@ def clock_ppm(d: Record) -> float:
     while at_s[hull[corner]] < middle_s:
         corner += 1
     begin, end = hull[corner - 1], hull[corner]
-    slope = (late_s[end] - late_s[begin]) / (at_s[end] - at_s[begin])
-    return (1.0 / (1.0 + slope) - 1.0) * 1e6
+    board_s = at_s[end] - at_s[begin]
+    host_s = board_s + late_s[end] - late_s[begin]
+    return (board_s / host_s - 1.0) * 1e6 if host_s > 0.0 else math.nan
 
 
 @njit(cache=True)

@@ -63,6 +63,12 @@ def test_nothing_is_said_of_the_clock_before_a_minute_of_it() -> None:
     assert FrameDecoder().clock_ppm is None
 
 
+def test_samples_that_all_came_at_once_tell_nothing_of_the_clock() -> None:
+    decoder = FrameDecoder()
+    decoder.feed(START_S, b"".join(data for _, data in reads(90.0)))
+    assert decoder.clock_ppm is None
+
+
 def test_it_begins_anew_after_a_reset_of_the_board() -> None:
     before, later_s = reads(120.0), START_S + 300.0
     assert fed(before, reads(50.0, boot_id=2, start_s=later_s)).clock_ppm is None
