@@ -15,7 +15,7 @@ from bms_estimator.kernels.state import Record
 CLOCK_WINDOWS = 60
 """The last ten minutes: a resonator drifts with its temperature."""
 _WINDOW_US = 10_000_000
-_LEAST_US = 60_000_000  # delays that differ by 1 ms are 17 ppm of it
+_LEAST_US = 60_000_000  # of this 1 ms, by which delays may differ, is 17 ppm
 _US = 1e-6
 
 
@@ -43,7 +43,10 @@ def take_arrival(d: Record, arrival_s: float) -> None:
 
 @njit(cache=True)
 def clock_ppm(d: Record) -> float:
-    """How much faster the board's clock runs than the host's [1e-6]; NaN before it has been seen for a minute, or where all came at once."""
+    """How much faster the board's clock runs than the host's [1e-6].
+
+    NaN before it has been seen for a minute, and where all samples came at once.
+    """
     count = min(d.clock_windows, CLOCK_WINDOWS)
     at_s, late_s = np.empty(count), np.empty(count)
     for i in range(count):
