@@ -17,6 +17,7 @@ class ScriptedSource:
         self.counters: dict[str, int] = {"frames_received": 0, "frames_lost": 0, "crc_errors": 0, "reconnects": 0}
         self.message: str | None = None
         self.board: dict[str, str] = {}
+        self.clock_ppm: float | None = None
         self._queue: asyncio.Queue[SampleBlock | None] = asyncio.Queue()
 
     async def __aenter__(self) -> Self:

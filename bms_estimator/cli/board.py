@@ -10,9 +10,17 @@ from bms_estimator.sources.probe import AskedBoard
 from bms_estimator.sources.protocol import (
     BAUD,
     LEAST_BANDGAP_V,
+    LEAST_DIVIDER,
+    LEAST_VOLTS_PER_AMPERE,
     MOST_BANDGAP_V,
+    MOST_DIVIDER,
+    MOST_VOLTS_PER_AMPERE,
+    Channels,
     Hello,
     set_bandgap_command,
+    set_current_slope_command,
+    set_divider_command,
+    set_ratiometric_command,
     set_serial_command,
 )
 
@@ -23,6 +31,29 @@ def board(
         float | None,
         typer.Option(help="measured between AREF and GND [V]: sets the board's bandgap", show_default=False),
     ] = None,
+    divider: Annotated[
+        float | None,
+        typer.Option(
+            min=LEAST_DIVIDER, max=MOST_DIVIDER, help="sets how many times A0 the pack's voltage is", show_default=False
+        ),
+    ] = None,
+    volts_per_ampere: Annotated[
+        float | None,
+        typer.Option(
+            min=LEAST_VOLTS_PER_AMPERE,
+            max=MOST_VOLTS_PER_AMPERE,
+            help="sets the slope of the current sensor [V/A]; of a ratiometric one at 5 V",
+            show_default=False,
+        ),
+    ] = None,
+    ratiometric: Annotated[
+        bool | None,
+        typer.Option(
+            "--ratiometric/--absolute",
+            help="sets whether that slope is proportional to the 5 V supply or the same at any",
+            show_default=False,
+        ),
+    ] = None,
     serial: Annotated[
         int | None,
         typer.Option(
@@ -31,9 +62,10 @@ def board(
     ] = None,
     baud: Annotated[int, typer.Option(min=1200, help="of the board")] = BAUD,
 ) -> None:
-    """Show what a board says of itself, and set what it keeps in its EEPROM: its bandgap and its serial number.
+    """Show what a board says of itself, and set what it keeps in its EEPROM: bandgap, gains and serial number.
 
-    Voltage and current are as right as the bandgap is, which differs by up to 10 % from board to board.
+    Voltage and current are as right as the bandgap is, which differs by up to 10 % from board to board, and as the gains
+    of divider and current sensor are.
     """
     try:
         with AskedBoard(resolve_port(port), baud) as asked:
@@ -42,6 +74,12 @@ def board(
             if aref_v is not None:
                 told = asked.tell(set_bandgap_command(_bandgap_v(asked, hello, aref_v)))
                 typer.echo(f"bandgap: was {_volts(hello)}, now {_volts(told)}")
+            if divider is not None:
+                told = asked.tell(set_divider_command(divider))
+                typer.echo(f"divider: was {_divider(hello)}, now {_divider(told)}")
+            if volts_per_ampere is not None or ratiometric is not None:
+                told = _set_current(asked, volts_per_ampere, ratiometric)
+                typer.echo(f"current: was {_slope(hello)}, now {_slope(told)}")
             if serial is not None:
                 told = asked.tell(set_serial_command(serial))
                 typer.echo(f"serial: was {hello.serial:08x}, now {told.serial:08x}")
@@ -65,14 +103,22 @@ def _bandgap_v(asked: AskedBoard, hello: Hello, aref_v: float) -> float:
     return bandgap_v
 
 
+def _set_current(asked: AskedBoard, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
+    if ratiometric is not None:
+        told = asked.tell(set_ratiometric_command(ratiometric))
+    if volts_per_ampere is not None:
+        told = asked.tell(set_current_slope_command(volts_per_ampere))
+    return told
+
+
 def _described(hello: Hello) -> str:
-    ntc = f"{hello.ntc_r25_ohm} ohm at 25 degC, beta {hello.ntc_beta_k} K" if hello.channels & 1 else "none"
+    ntc = f"{hello.ntc_r25_ohm} ohm at 25 degC, beta {hello.ntc_beta_k} K" if hello.channels & Channels.NTC else "none"
     return (
         f"firmware   {hello.firmware}\n"
         f"serial     {hello.serial:08x}\n"
         f"rate       {hello.rate_hz} Hz\n"
-        f"voltage    divider {hello.divider_ppm * 1e-6:g}\n"
-        f"current    {hello.current_uv_per_a * 1e-6:g} V/A, zero at {hello.current_zero_ppm * 1e-6:.6f} of the reference\n"
+        f"voltage    divider {_divider(hello)}\n"
+        f"current    {_slope(hello)}, zero at {hello.current_zero_ppm * 1e-6:.6f} of the reference\n"
         f"NTC        {ntc}\n"
         f"bandgap    {_volts(hello)}\n"
         f"reference  {hello.reference_v:.3f} V, measured against the bandgap at reset"
@@ -81,3 +127,12 @@ def _described(hello: Hello) -> str:
 
 def _volts(hello: Hello) -> str:
     return f"{hello.bandgap_uv * 1e-6:.4f} V"
+
+
+def _divider(hello: Hello) -> str:
+    return f"{hello.divider_ppm * 1e-6:g}"
+
+
+def _slope(hello: Hello) -> str:
+    ratiometric = " at 5 V, ratiometric" if hello.channels & Channels.CURRENT_RATIOMETRIC else ""
+    return f"{hello.current_uv_per_a * 1e-6:g} V/A{ratiometric}"

@@ -8,7 +8,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.scaling import current, reference, take_bandgap, take_ntc, temperature, voltage
+from bms_estimator.kernels.board_clock import CLOCK_WINDOWS, forget_clock, take_arrival
+from bms_estimator.kernels.scaling import (
+    current,
+    forget_readings,
+    reference,
+    take_bandgap,
+    take_ntc,
+    temperature,
+    voltage,
+)
 from bms_estimator.kernels.state import Record
 
 Bytes = NDArray[np.uint8]
@@ -35,12 +44,18 @@ DECODER = np.dtype(
         ("started", "i8"),  # a sample was taken
         ("expected", "i8"),  # sequence of the next sample
         ("boot_id", "i8"),  # of the last hello; -1: none since the reset
+        ("serial", "i8"),  # of the last hello
         ("reset_pending", "i8"),  # a hello told of a reset
         ("board_us", "i8"),  # of the last sample, 32 bit
         ("elapsed_us", "i8"),  # board clock since the first sample or the reset
         ("origin_s", "f8"),  # time at which elapsed_us was 0
         ("time_s", "f8"),  # of the last sample
         ("arrival_s", "f8"),  # of the last sample
+        ("clock_windows", "i8"),  # for the clock's rate, since the first sample or the reset
+        ("clock_begin_us", "i8"),  # elapsed_us at the begin of the last window
+        ("clock_origin_s", "f8"),  # arrival from which lateness counts
+        ("clock_at_us", "i8", CLOCK_WINDOWS),  # elapsed_us of each window's least late sample
+        ("clock_late_s", "f8", CLOCK_WINDOWS),  # its arrival beyond origin and elapsed_us
         ("current_sign", "f8"),  # 1 where the board's positive current is a discharge, else -1
         ("bytes_received", "i8"),
         ("heard_at", "i8"),  # bytes_received at the end of the last frame with a right CRC
@@ -164,21 +179,26 @@ def open_packet(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
 
 @njit(cache=True)
 def take_hello(d: Record, s: Record) -> None:
-    """The board's scaling; and whether the board was reset."""
+    """The board's scaling; and whether the board was reset, or is another one."""
     p = d.packet
-    boot_id = take(p, 6, 2)
+    boot_id, serial = take(p, 6, 2), take(p, 8, 4)
+    anew = boot_id != d.boot_id or serial != d.serial
     behind = (take(p, 12, 4) - d.expected) & _MASK >= _HALF
-    if d.started and (behind or (d.boot_id >= 0 and boot_id != d.boot_id)):
+    if d.started and (behind or (d.boot_id >= 0 and anew)):
         d.reset_pending = 1
-    d.boot_id = boot_id
+    if anew:
+        forget_readings(s)
+    d.boot_id, d.serial = boot_id, serial
     s.full_scale = float(1 << min(take(p, 26, 1), 24))
-    s.ntc_fitted = take(p, 27, 1) & 1
+    channels = take(p, 27, 1)
+    s.ntc_fitted = channels & 1
+    s.ratiometric = channels >> 1 & 1
     s.divider = take(p, 28, 4) * 1e-6
     s.volts_per_ampere = take(p, 32, 4) * 1e-6
     s.current_zero = take(p, 36, 4) * 1e-6
     s.bandgap_v = take(p, 40, 4) * 1e-6
     if s.bandgap_weight == 0.0 and take(p, 48, 2) > 0:
-        take_bandgap(s, float(take(p, 44, 4)), float(take(p, 48, 2)))
+        take_bandgap(s, float(take(p, 44, 4)), float(take(p, 48, 2)), take(p, 16, 4))
     s.ntc_series_ohm = float(take(p, 50, 4))
     s.ntc_r25_ohm = float(take(p, 54, 4))
     s.ntc_beta_k = float(take(p, 58, 2))
@@ -203,6 +223,7 @@ def restart_clock(d: Record, board_us: int, arrival_s: float) -> None:
     d.time_s = d.origin_s
     d.elapsed_us = 0
     d.reset_pending = 0
+    forget_clock(d)
     d.resets += 1
 
 
@@ -233,6 +254,7 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
     d.expected = (sequence + 1) & _MASK
     d.board_us = board_us
     d.arrival_s = arrival_s
+    take_arrival(d, arrival_s)
     d.frames_received += 1
     return status
 
@@ -251,9 +273,9 @@ def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     aux_count = float(p[20])
     if aux_count > 0.0:
         if bits & _AUX_IS_NTC:
-            take_ntc(s, float(take(p, 18, 2)), aux_count)
+            take_ntc(s, float(take(p, 18, 2)), aux_count, d.board_us)
         else:
-            take_bandgap(s, float(take(p, 18, 2)), aux_count)
+            take_bandgap(s, float(take(p, 18, 2)), aux_count, d.board_us)
     if bits & _OVERRUN:
         d.overruns += 1
     count = float(take(p, 16, 2))

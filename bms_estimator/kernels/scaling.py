@@ -13,6 +13,10 @@ SCALING = np.dtype(
         ("full_scale", "f8"),  # conversions at the reference: 2^bits
         ("divider", "f8"),  # pack voltage over voltage at the pin
         ("volts_per_ampere", "f8"),  # slope of the current sensor [V/A]
+        (
+            "ratiometric",
+            "i8",
+        ),  # 1: that slope holds at 5 V and is proportional to the reference, which supplies the sensor
         ("current_zero", "f8"),  # its output without current, as a part of the reference
         ("bandgap_v", "f8"),  # the converter's internal reference [V]
         ("ntc_series_ohm", "f8"),
@@ -20,37 +24,59 @@ SCALING = np.dtype(
         ("ntc_beta_k", "f8"),
         ("ntc_fitted", "i8"),
         ("bandgap_mean", "f8"),  # filtered conversions of the bandgap
-        ("bandgap_weight", "f8"),  # conversions in that mean
+        ("bandgap_weight", "f8"),  # conversions since the reset
+        ("bandgap_us", "i8"),  # board_us of the last
         ("ntc_mean", "f8"),  # filtered conversions of the NTC
         ("ntc_weight", "f8"),
+        ("ntc_us", "i8"),
     ],
     align=True,
 )
 
-_BANDGAP_WEIGHT = 512.0  # at 16 readings a second half a minute: 0.5 LSB of noise becomes 0.02 LSB
-_NTC_WEIGHT = 32.0  # two seconds
+# At the firmware's own rate these are 512 and 32 readings: 0.5 LSB of noise becomes 0.02 LSB in the bandgap's mean.
+_BANDGAP_US = 5_120_000  # time constant; twice that where NTC and bandgap are read by turns
+_NTC_US = 640_000
+_CLOCK_MASK = (1 << 32) - 1
 _RAIL = 0.01  # an NTC this near to either end of the range is open or shorted
+_RATIOMETRIC_V = 5.0  # supply at which the data sheet of a ratiometric sensor gives its slope
 _ZERO_C_K = 273.15
 _R25_K = 298.15
 
 
 @njit(cache=True)
-def running_mean(mean: float, weight: float, total: float, count: float, longest: float) -> tuple[float, float]:
-    """Mean with ``count`` readings of sum ``total`` added: a plain mean at first, exponential from ``longest`` on."""
-    weight = min(weight + count, longest)
-    return mean + (total - mean * count) / weight, weight
+def running_mean(mean: float, weight: float, total: float, count: float, part: float) -> float:
+    """Mean with ``count`` readings of sum ``total`` added to the ``weight`` there were: a plain mean at first.
+
+    From then on exponential: ``part`` is the time since the last readings over the time constant.
+    """
+    weight += count
+    if part * weight > count:
+        weight = max(count / part, count)
+    return mean + (total - mean * count) / weight
 
 
 @njit(cache=True)
-def take_bandgap(s: Record, total: float, count: float) -> None:
+def take_bandgap(s: Record, total: float, count: float, board_us: int) -> None:
     """Filter readings of the bandgap."""
-    s.bandgap_mean, s.bandgap_weight = running_mean(s.bandgap_mean, s.bandgap_weight, total, count, _BANDGAP_WEIGHT)
+    part = ((board_us - s.bandgap_us) & _CLOCK_MASK) / (_BANDGAP_US * (1 + s.ntc_fitted))
+    s.bandgap_mean = running_mean(s.bandgap_mean, s.bandgap_weight, total, count, part)
+    s.bandgap_weight += count
+    s.bandgap_us = board_us
 
 
 @njit(cache=True)
-def take_ntc(s: Record, total: float, count: float) -> None:
+def take_ntc(s: Record, total: float, count: float, board_us: int) -> None:
     """Filter readings of the NTC."""
-    s.ntc_mean, s.ntc_weight = running_mean(s.ntc_mean, s.ntc_weight, total, count, _NTC_WEIGHT)
+    part = ((board_us - s.ntc_us) & _CLOCK_MASK) / _NTC_US
+    s.ntc_mean = running_mean(s.ntc_mean, s.ntc_weight, total, count, part)
+    s.ntc_weight += count
+    s.ntc_us = board_us
+
+
+@njit(cache=True)
+def forget_readings(s: Record) -> None:
+    """Reference and temperature begin anew: the board was reset, or is another one."""
+    s.bandgap_mean = s.bandgap_weight = s.ntc_mean = s.ntc_weight = 0.0
 
 
 @njit(cache=True)
@@ -84,4 +110,5 @@ def current(s: Record, total: float, count: float, reference_v: float) -> float:
     """Through the sensor [A], positive as the board is wired; NaN without a conversion."""
     if count == 0.0:
         return math.nan
-    return (total / count / s.full_scale - s.current_zero) * reference_v / s.volts_per_ampere
+    range_v = _RATIOMETRIC_V if s.ratiometric else reference_v
+    return (total / count / s.full_scale - s.current_zero) * range_v / s.volts_per_ampere

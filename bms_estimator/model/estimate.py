@@ -83,6 +83,9 @@ class Health(Report):
     reconnects: int = Field(description="times the source was opened again")
     sensor_online: bool = Field(description="a valid frame came within 3 publish or sample periods")
     sensor_message: str | None = Field(description="why the sensor is not online; null when it is")
+    clock_ppm: float | None = Field(
+        default=None, description="how much faster the board's clock runs than the host's [1e-6]; null while unknown"
+    )
     line: dict[str, int] = Field(description="frames and faults of the line by kind, since start")
     samples: dict[str, int] = Field(description="samples accepted and dropped by kind, since start")
     identifier: dict[str, int] = Field(

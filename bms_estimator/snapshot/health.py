@@ -57,6 +57,7 @@ def health_report(
     checkpoint: str,
     sensor_message: str | None,
     delivery: Delivery,
+    clock_ppm: float | None,
 ) -> Health:
     """Topic ``health``.
 
@@ -69,6 +70,7 @@ def health_report(
         checkpoint: What became of the last checkpoint.
         sensor_message: Why values are not fresh; None when they are.
         delivery: What became of what was sent and asked.
+        clock_ppm: The source's.
     """
     state = record["observer"]
     return Health(
@@ -79,6 +81,7 @@ def health_report(
         reconnects=line.get("reconnects", 0),
         sensor_online=sensor_message is None,
         sensor_message=sensor_message,
+        clock_ppm=clock_ppm,
         line={name: int(count) for name, count in line.items() if name != "reconnects"},
         samples=sample_counters(state),
         identifier=identifier_counters(record),

@@ -146,6 +146,7 @@ class Publisher:
             checkpoint=self.checkpoint,
             sensor_message=message,
             delivery=self._delivery,
+            clock_ppm=self._source.clock_ppm,
         )
 
     def _info(self) -> Info:

@@ -25,6 +25,10 @@ class Source(Protocol):
     def board(self) -> Mapping[str, str]:
         """What the board said of itself in its hello; empty when there was none."""
 
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock runs than the host's [1e-6]; None while unknown."""
+
     def __aiter__(self) -> AsyncIterator[SampleBlock]:
         """Blocks of samples, none of them empty."""
 

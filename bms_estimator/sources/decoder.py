@@ -22,6 +22,10 @@ class Decoder(Protocol):
         """What the board said of itself, for people."""
 
     @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock runs than that of the arrivals [1e-6]; None while unknown."""
+
+    @property
     def counters(self) -> FrameCounters:
         """Since start."""
 

@@ -1,5 +1,6 @@
 """The binary board's bytes to samples: ``kernels.framing`` with its state, its messages and its counters."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import Enum
@@ -8,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.board_clock import clock_ppm
 from bms_estimator.kernels.framing import DECODER, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
 from bms_estimator.kernels.scaling import SCALING, reference
 from bms_estimator.model.sample import SAMPLE, SampleBlock
@@ -102,6 +104,15 @@ class FrameDecoder:
     def reference_v(self) -> float:
         """Full range of the board's converter [V]; NaN before it is known."""
         return float(reference(self._scaling[0]))
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock runs than that of the arrivals [1e-6]; None before a minute has told.
+
+        To 0.1. It changes no time stamp.
+        """
+        ppm = clock_ppm(self._state[0])
+        return None if math.isnan(ppm) else round(ppm, 1)
 
     @property
     def counters(self) -> FrameCounters:

@@ -17,6 +17,8 @@ BAUD = 500_000
 RATE_HZ = range(1, 1001)
 LEAST_BANDGAP_V, MOST_BANDGAP_V = 1.0, 1.2
 """What the internal reference of an ATmega328P may be, by its data sheet [V]."""
+LEAST_DIVIDER, MOST_DIVIDER = 1.0, 100.0
+LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE = 0.001, 2.0
 DELIMITER = b"\0"
 MODULUS = 1 << 32
 """Sequence and microseconds count up to here and begin at 0 again."""
@@ -34,6 +36,9 @@ class MessageType(IntEnum):
     COMMAND_RESTART = 0x13
     COMMAND_SET_SERIAL = 0x14
     COMMAND_SET_BANDGAP = 0x15
+    COMMAND_SET_DIVIDER = 0x16
+    COMMAND_SET_CURRENT_SLOPE = 0x17
+    COMMAND_SET_RATIOMETRIC = 0x18
 
 
 class AckResult(IntEnum):
@@ -53,6 +58,13 @@ class BoardStatus(IntFlag):
     CURRENT_SATURATED = 0x02
     OVERRUN = 0x04
     AUX_IS_NTC = 0x08
+
+
+class Channels(IntFlag):
+    """What is built onto a board, as its hello says."""
+
+    NTC = 0x01
+    CURRENT_RATIOMETRIC = 0x02
 
 
 class ResetCause(IntFlag):
@@ -124,6 +136,21 @@ def set_serial_command(serial: int) -> bytes:
 def set_bandgap_command(bandgap_v: float) -> bytes:
     """Tell the board its internal reference as measured [V], 1.0..1.2, for good."""
     return command(MessageType.COMMAND_SET_BANDGAP, struct.pack("<I", round(bandgap_v * 1e6)))
+
+
+def set_divider_command(divider: float) -> bytes:
+    """Tell the board how many times the voltage at its pin the pack's is, 1..100, for good."""
+    return command(MessageType.COMMAND_SET_DIVIDER, struct.pack("<I", round(divider * 1e6)))
+
+
+def set_current_slope_command(volts_per_ampere: float) -> bytes:
+    """Tell the board the slope of its current sensor [V/A], 0.001..2, for good; of a ratiometric one at 5 V."""
+    return command(MessageType.COMMAND_SET_CURRENT_SLOPE, struct.pack("<I", round(volts_per_ampere * 1e6)))
+
+
+def set_ratiometric_command(ratiometric: int) -> bytes:
+    """Tell the board whether its current sensor's slope is proportional to the supply: 0 or 1, for good."""
+    return command(MessageType.COMMAND_SET_RATIOMETRIC, struct.pack("<I", ratiometric))
 
 
 @dataclass(frozen=True)

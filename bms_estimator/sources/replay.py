@@ -115,6 +115,11 @@ class Replay:
         """What the board said of itself when it was recorded."""
         return self._decoder.board if self._decoder else {}
 
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock ran when it was recorded; a table does not tell."""
+        return self._decoder.clock_ppm if self._decoder else None
+
     async def __aenter__(self) -> Self:
         """Nothing to open: iterating does."""
         return self

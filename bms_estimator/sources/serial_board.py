@@ -105,6 +105,11 @@ class SerialBoard:
         """What the board said of itself."""
         return self._decoder.board
 
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock runs than the monotonic one."""
+        return self._decoder.clock_ppm
+
     async def __aenter__(self) -> Self:
         """Begin to open the port; it need not be there yet."""
         self._task = asyncio.create_task(self._stay_open(), name="serial board")

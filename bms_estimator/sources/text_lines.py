@@ -26,6 +26,8 @@ class TextDecoder:
 
     hello: Hello | None = None
     """Text has none."""
+    clock_ppm: float | None = None
+    """Lines carry no clock."""
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
         self._sign = 1.0 if current_sign == "discharge_positive" else -1.0

@@ -19,12 +19,19 @@ from typing import Literal, Self
 
 from bms_estimator.sources.protocol import (
     DELIMITER,
+    LEAST_BANDGAP_V,
+    LEAST_DIVIDER,
+    LEAST_VOLTS_PER_AMPERE,
     MODULUS,
+    MOST_BANDGAP_V,
+    MOST_DIVIDER,
+    MOST_VOLTS_PER_AMPERE,
     PROTOCOL_VERSION,
     RATE_HZ,
     Ack,
     AckResult,
     BoardStatus,
+    Channels,
     Hello,
     MessageType,
     ProtocolError,
@@ -32,7 +39,14 @@ from bms_estimator.sources.protocol import (
     SampleMessage,
     unseal,
 )
-from bms_estimator.sources.virtual_converter import FULL_SCALE, BoardParts, Reading, VirtualConverter, window_of
+from bms_estimator.sources.virtual_converter import (
+    FULL_SCALE,
+    BoardParts,
+    Reading,
+    VirtualConverter,
+    aux_readings_of,
+    window_of,
+)
 
 Signal = Callable[[float], Reading] | Iterable[Reading]
 """Readings by time [s], or one for each sample; the board stops where they end."""
@@ -48,6 +62,20 @@ _PATIENCE_S = 1.0
 _BURST = 256
 _BOOT_READINGS = 256
 _NEAR_MIDDLE = 0.1
+
+
+def _millionths(least: float, most: float) -> range:
+    return range(round(least * 1e6), round(most * 1e6) + 1)
+
+
+_RANGES = {
+    MessageType.COMMAND_SET_SERIAL: range(MODULUS),
+    MessageType.COMMAND_SET_BANDGAP: _millionths(LEAST_BANDGAP_V, MOST_BANDGAP_V),
+    MessageType.COMMAND_SET_DIVIDER: _millionths(LEAST_DIVIDER, MOST_DIVIDER),
+    MessageType.COMMAND_SET_CURRENT_SLOPE: _millionths(LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE),
+    MessageType.COMMAND_SET_RATIOMETRIC: range(2),
+}
+"""Of the number that a command sets."""
 
 
 class BoardFault(Enum):
@@ -94,9 +122,16 @@ class VirtualBoard:
         self._readings = self._by_time(signal) if callable(signal) else iter(signal)
         self._reading = Reading(0.0, 0.0)
         self._converter = VirtualConverter(parts or BoardParts(), noise_lsb, seed)
-        self._serial, self._clock_us = serial, clock_us
-        self._bandgap_uv = round(self._converter.parts.bandgap_v * 1e6)
-        self._zero_ppm = round(self._converter.parts.current_zero * 1e6)
+        self._clock_us = clock_us
+        parts = self._converter.parts
+        self._zero_ppm = round(parts.current_zero * 1e6)
+        self._kept: dict[int, int] = {
+            MessageType.COMMAND_SET_SERIAL: serial,
+            MessageType.COMMAND_SET_BANDGAP: round(parts.bandgap_v * 1e6),
+            MessageType.COMMAND_SET_DIVIDER: round(parts.divider * 1e6),
+            MessageType.COMMAND_SET_CURRENT_SLOPE: round(parts.volts_per_ampere * 1e6),
+            MessageType.COMMAND_SET_RATIOMETRIC: int(parts.ratiometric),
+        }
         self._random = random.Random(seed)
         self._boot_id = self._random.randrange(1 << 16)
         self._first_rate_hz = rate_hz
@@ -179,6 +214,7 @@ class VirtualBoard:
     def _set_rate(self, rate_hz: int) -> None:
         self._rate_hz = rate_hz
         self._count, self._period_ns = window_of(rate_hz)
+        self._aux_count = aux_readings_of(rate_hz)
 
     async def _sample_until(self, end_s: float, loop: asyncio.AbstractEventLoop) -> None:
         offset_s = loop.time() - self.time_s / self._speed
@@ -219,19 +255,19 @@ class VirtualBoard:
         status |= BoardStatus.VOLTAGE_SATURATED * sums.voltage_saturated
         status |= BoardStatus.CURRENT_SATURATED * sums.current_saturated
         status |= BoardStatus.OVERRUN * self._overrun
-        aux = self._converter.ntc(reading.temperature_c) if self._aux_is_ntc else self._converter.bandgap(1)
+        n = self._aux_count
+        aux = self._converter.ntc(reading.temperature_c, n) if self._aux_is_ntc else self._converter.bandgap(n)
         self._aux_is_ntc = not self._aux_is_ntc
         board_us = self._ns // 1000 % MODULUS
-        return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, 1, int(status))
+        return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, n, int(status))
 
     def _text(self, message: SampleMessage, reading: Reading) -> bytes:
         """The line that a hobby sketch prints."""
         parts = self._converter.parts
         volts_per_step = parts.supply_v / FULL_SCALE / message.count
         voltage_v = message.voltage_sum * volts_per_step * parts.divider
-        current_a = (
-            message.current_sum * volts_per_step - parts.current_zero * parts.supply_v
-        ) / parts.volts_per_ampere
+        part = message.current_sum / message.count / FULL_SCALE
+        current_a = (part - parts.current_zero) / parts.part_per_ampere
         if math.isnan(reading.temperature_c):
             return b"%.3f,%.3f\r\n" % (voltage_v, current_a)
         return b"%.3f,%.3f,%.1f\r\n" % (voltage_v, current_a, reading.temperature_c)
@@ -266,17 +302,17 @@ class VirtualBoard:
             *FIRMWARE,
             reset_cause=self._cause,
             boot_id=self._boot_id,
-            serial=self._serial,
+            serial=self._kept[MessageType.COMMAND_SET_SERIAL],
             sequence=self._sequence,
             board_us=self._ns // 1000 % MODULUS,
             rate_hz=self._rate_hz,
             period_ns=self._period_ns,
             adc_bits=10,
-            channels=1,
-            divider_ppm=round(parts.divider * 1e6),
-            current_uv_per_a=round(parts.volts_per_ampere * 1e6),
+            channels=Channels.NTC + Channels.CURRENT_RATIOMETRIC * self._kept[MessageType.COMMAND_SET_RATIOMETRIC],
+            divider_ppm=self._kept[MessageType.COMMAND_SET_DIVIDER],
+            current_uv_per_a=self._kept[MessageType.COMMAND_SET_CURRENT_SLOPE],
             current_zero_ppm=self._zero_ppm,
-            bandgap_uv=self._bandgap_uv,
+            bandgap_uv=self._kept[MessageType.COMMAND_SET_BANDGAP],
             bandgap_sum=self._boot_bandgap,
             bandgap_count=_BOOT_READINGS,
             ntc_series_ohm=parts.ntc_series_ohm,
@@ -313,16 +349,17 @@ class VirtualBoard:
             if rate_hz in RATE_HZ:
                 self._set_rate(rate_hz)
             self._answer(kind, AckResult.OK if rate_hz in RATE_HZ else AckResult.BAD_VALUE, self._period_ns)
-        elif kind == MessageType.COMMAND_SET_SERIAL and len(body) == 4:
-            (self._serial,) = struct.unpack("<I", body)
-            self._answer(kind, AckResult.OK, self._serial)
-        elif kind == MessageType.COMMAND_SET_BANDGAP and len(body) == 4:
-            (bandgap_uv,) = struct.unpack("<I", body)
-            good = 1_000_000 <= bandgap_uv <= 1_200_000
-            self._bandgap_uv = bandgap_uv if good else self._bandgap_uv
-            self._answer(kind, AckResult.OK if good else AckResult.BAD_VALUE, self._bandgap_uv)
+        elif kind in self._kept and len(body) == 4:
+            self._keep(MessageType(kind), *struct.unpack("<I", body))
         else:
             self._answer(kind, AckResult.UNKNOWN_COMMAND, 0)
+
+    def _keep(self, kind: MessageType, value: int) -> None:
+        """Take a number if it is in its range."""
+        good = value in _RANGES[kind]
+        if good:
+            self._kept[kind] = value
+        self._answer(kind, AckResult.OK if good else AckResult.BAD_VALUE, self._kept[kind])
 
     def _zero_current(self) -> None:
         """Take the present current as zero."""

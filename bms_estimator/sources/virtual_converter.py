@@ -9,8 +9,12 @@ from numpy.typing import NDArray
 
 FULL_SCALE = 1024
 CLOCK_HZ = 16_000_000
+AUX_PER_S = 100
+AUX_MAX = 63
 SLOTS_PER_S = 8000
 """Conversions of the firmware per second; a pair of them is one of voltage and one of current."""
+RATIOMETRIC_V = 5.0
+"""Supply at which the data sheet of a ratiometric sensor gives its slope [V]."""
 _NOISE_POINTS = 1 << 16
 
 
@@ -39,13 +43,21 @@ class BoardParts:
     supply_v: float = 5.0
     """AVcc, the converter's reference, which the host has to find out."""
     bandgap_v: float = 1.1
-    divider: float = 5.0
+    divider: float = 6.1
     volts_per_ampere: float = 0.1
+    """Of a ratiometric sensor at 5 V of supply."""
+    ratiometric: bool = True
+    """The current sensor is supplied with AVcc, and its slope is proportional to that."""
     current_zero: float = 0.5
     """Sensor's output without current, as a part of the supply."""
     ntc_series_ohm: int = 10_000
     ntc_r25_ohm: int = 10_000
     ntc_beta_k: int = 3950
+
+    @property
+    def part_per_ampere(self) -> float:
+        """Slope of the current sensor as a part of the supply [1/A]."""
+        return self.volts_per_ampere / (RATIOMETRIC_V if self.ratiometric else self.supply_v)
 
 
 class VirtualConverter:
@@ -66,7 +78,7 @@ class VirtualConverter:
         """Sums of ``count`` pairs of conversions."""
         parts = self.parts
         voltage = self.convert(reading.voltage_v / parts.divider / parts.supply_v, count)
-        current = self.convert(parts.current_zero + reading.current_a * parts.volts_per_ampere / parts.supply_v, count)
+        current = self.convert(parts.current_zero + reading.current_a * parts.part_per_ampere, count)
         return Sums(
             int(voltage.sum()),
             int(current.sum()),
@@ -79,13 +91,13 @@ class VirtualConverter:
         """Sum of ``count`` conversions of the internal reference."""
         return int(self.convert(self.parts.bandgap_v / self.parts.supply_v, count).sum())
 
-    def ntc(self, temperature_c: float) -> int:
-        """One conversion of the NTC; an open input without one."""
+    def ntc(self, temperature_c: float, count: int) -> int:
+        """Sum of ``count`` conversions of the NTC; of an open input without one."""
         if math.isnan(temperature_c):
-            return FULL_SCALE - 1
+            return count * (FULL_SCALE - 1)
         parts = self.parts
         r_ohm = parts.ntc_r25_ohm * math.exp(parts.ntc_beta_k * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
-        return int(self.convert(r_ohm / (r_ohm + parts.ntc_series_ohm), 1)[0])
+        return int(self.convert(r_ohm / (r_ohm + parts.ntc_series_ohm), count).sum())
 
     def convert(self, part_of_reference: float, count: int) -> NDArray[np.float64]:
         """``count`` conversions of a voltage given as a part of the reference."""
@@ -103,3 +115,9 @@ def window_of(rate_hz: int) -> tuple[int, int]:
     slots = SLOTS_PER_S // rate_hz // 2 * 2
     cycles = round(CLOCK_HZ / (rate_hz * slots))
     return slots // 2, slots * cycles * 1_000_000_000 // CLOCK_HZ
+
+
+def aux_readings_of(rate_hz: int) -> int:
+    """Readings of NTC or bandgap in one window: odd, as the firmware makes them."""
+    wanted = AUX_PER_S // rate_hz
+    return 1 if wanted == 0 else min((wanted - 1) | 1, AUX_MAX)

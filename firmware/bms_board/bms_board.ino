@@ -1,6 +1,9 @@
 // Voltage (A0), current (A1) and temperature (A2) of a battery pack, for an ATmega328P at 16 MHz: Uno, Nano.
 // Timer 1 triggers the converter, its interrupt sums up, this loop sends. PROTOCOL.md tells what.
-// The watchdog is on: a Nano with the boot loader of before 2018 hangs after a watchdog reset, burn Optiboot on it.
+
+#ifndef __AVR_ATmega328P__
+#error "This firmware is for an ATmega328P at 16 MHz: choose Arduino Uno or Nano as the board."
+#endif
 
 #include <avr/interrupt.h>
 #include <avr/io.h>

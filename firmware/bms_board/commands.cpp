@@ -9,8 +9,6 @@
 #define FIRMWARE_PATCH 0
 
 #define ADC_BITS 10
-#define DIVIDER_PPM 5000000UL       // 30 kohm over 7.5 kohm: 25 V become 5 V
-#define CURRENT_UV_PER_A 100000UL   // LA 25-NP with its burden
 #define NTC_SERIES_OHM 10000UL
 #define NTC_R25_OHM 10000UL
 #define NTC_BETA_K 3950
@@ -50,9 +48,10 @@ static bool send_hello() {
     hello.rate_hz = sampling_timing().rate_hz;
     hello.period_ns = period_ns(&sampling_timing());
     hello.adc_bits = ADC_BITS;
-    hello.channels = boot.ntc_fitted ? CHANNEL_NTC : 0;
-    hello.divider_ppm = DIVIDER_PPM;
-    hello.current_uv_per_a = CURRENT_UV_PER_A;
+    hello.channels = (boot.ntc_fitted ? CHANNEL_NTC : 0) |
+                     (settings_get(SETTING_CURRENT_RATIOMETRIC) ? CHANNEL_CURRENT_RATIOMETRIC : 0);
+    hello.divider_ppm = settings_get(SETTING_DIVIDER_PPM);
+    hello.current_uv_per_a = settings_get(SETTING_CURRENT_UV_PER_A);
     hello.current_zero_ppm = settings_get(SETTING_CURRENT_ZERO_PPM);
     hello.bandgap_uv = settings_get(SETTING_BANDGAP_UV);
     hello.bandgap_sum = boot.bandgap_sum;
@@ -109,6 +108,18 @@ static void end_zero() {
     answer_setting(COMMAND_ZERO_CURRENT, SETTING_CURRENT_ZERO_PPM, (uint32_t)((scaled + (1 << 9)) >> ADC_BITS));
 }
 
+// What a command with one number sets; SETTINGS: nothing.
+static setting setting_of(uint8_t command) {
+    switch (command) {
+        case COMMAND_SET_SERIAL: return SETTING_SERIAL;
+        case COMMAND_SET_BANDGAP: return SETTING_BANDGAP_UV;
+        case COMMAND_SET_DIVIDER: return SETTING_DIVIDER_PPM;
+        case COMMAND_SET_CURRENT_SLOPE: return SETTING_CURRENT_UV_PER_A;
+        case COMMAND_SET_RATIOMETRIC: return SETTING_CURRENT_RATIOMETRIC;
+        default: return SETTINGS;
+    }
+}
+
 static void obey(const uint8_t *packet, uint8_t length) {
     const uint8_t command = packet[1], *body = packet + 2, bytes = length - 2;
     if (packet[0] != PROTOCOL_VERSION)
@@ -119,10 +130,8 @@ static void obey(const uint8_t *packet, uint8_t length) {
         set_rate(take(body, 2));
     else if (command == COMMAND_ZERO_CURRENT)
         zero_current();
-    else if (command == COMMAND_SET_SERIAL && bytes == 4)
-        answer_setting(command, SETTING_SERIAL, take(body, 4));
-    else if (command == COMMAND_SET_BANDGAP && bytes == 4)
-        answer_setting(command, SETTING_BANDGAP_UV, take(body, 4));
+    else if (setting_of(command) != SETTINGS && bytes == 4)
+        answer_setting(command, setting_of(command), take(body, 4));
     else if (command == COMMAND_RESTART) {
         answer_ack(command, ACK_OK, 0);
         reset_restart();

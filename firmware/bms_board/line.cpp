@@ -16,6 +16,7 @@ void line_start() {
     UBRR0 = F_CPU / 8 / PROTOCOL_BAUD - 1;
     UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
     UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
+    UDR0 = 0;  // ends the frame that a reset has cut off, which would spoil the hello
 }
 
 ISR(USART_UDRE_vect) {

@@ -17,7 +17,10 @@ enum message_type {
     COMMAND_ZERO_CURRENT = 0x12,
     COMMAND_RESTART = 0x13,
     COMMAND_SET_SERIAL = 0x14,
-    COMMAND_SET_BANDGAP = 0x15
+    COMMAND_SET_BANDGAP = 0x15,
+    COMMAND_SET_DIVIDER = 0x16,
+    COMMAND_SET_CURRENT_SLOPE = 0x17,
+    COMMAND_SET_RATIOMETRIC = 0x18
 };
 
 enum ack_result {
@@ -36,6 +39,7 @@ enum sample_status {
 };
 
 #define CHANNEL_NTC 0x01
+#define CHANNEL_CURRENT_RATIOMETRIC 0x02
 
 #define RATE_MIN_HZ 1
 #define RATE_MAX_HZ 1000

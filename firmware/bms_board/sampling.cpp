@@ -17,12 +17,12 @@
 #define PRESCALER_128 (_BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0))
 #define TRIGGER_TIMER1_COMPARE_B (_BV(ADTS2) | _BV(ADTS0))
 
-// The bandgap's source is weak: it takes some 350 us to charge the converter's capacitor. Four slots at the end of a
-// window are given to it, of which only the last counts.
-#define AUX_SLOTS 4
-
 #define BOOT_READINGS 256
 #define NTC_OPEN_READING 1015  // with the pull-up on; an NTC at -40 degC gives 999
+
+// Timer 1 triggers when it counts this: once a slot, however long the slot is. The chip would take 0 as well, simavr
+// needs some instructions from the turn of the counter to it.
+#define TRIGGER_AT 16
 
 // A conversion ends 1728 cycles after its trigger; before that there is time to fall asleep.
 #define SLEEP_FROM_CYCLES 64
@@ -54,11 +54,15 @@ static void begin_window(sample_message *w, uint8_t status) {
     if (aux_now) aux_countdown = timing.aux_windows;
 }
 
+// The counter may stand anywhere, also beyond the new top. In CTC mode it would go on to 65535 then: "If the new value
+// written to OCR1A is lower than the current value of TCNT1, the counter will miss the compare match" (data sheet,
+// 15.9.2). In fast PWM OCR1A is double buffered and changes where the counter turns (15.9.3): the slot that runs keeps
+// its length, and those of the new window get theirs.
 static void apply_timing() {
     timing = next_timing;
     timing_changed = false;
     aux_countdown = 1;
-    OCR1A = OCR1B = timing.slot_cycles - 1;  // never below TCNT1 here: slots only get longer than what has passed
+    OCR1A = timing.slot_cycles - 1;
 }
 
 static void end_window(sample_message *w) {
@@ -78,10 +82,16 @@ static void end_window(sample_message *w) {
     begin_window(&windows[filling], status);
 }
 
+static inline bool aux_is_next() {
+    const uint8_t aux_slots = timing.aux_readings + AUX_SETTLING_SLOTS;
+    return aux_now && slots_left != 0 && slots_left <= aux_slots;
+}
+
 static inline void take_aux(sample_message *w, uint16_t reading) {
-    if (slots_left != 0) return;  // not settled yet
-    w->aux_sum = reading;
-    w->aux_count = 1;
+    if (slots_left >= timing.aux_readings) return;  // not settled yet
+    w->aux_sum += reading;
+    w->aux_count++;
+    if (slots_left != 0) return;
     if (aux_mux == MUX_NTC) w->status |= STATUS_AUX_IS_NTC;
     if (ntc_fitted) aux_mux = aux_mux == MUX_NTC ? MUX_BANDGAP : MUX_NTC;
 }
@@ -101,7 +111,7 @@ ISR(ADC_vect) {
         return;
     }
     const bool was_current = mux == MUX_CURRENT;
-    mux = aux_now && slots_left != 0 && slots_left <= AUX_SLOTS ? aux_mux : MUX_VOLTAGE;
+    mux = aux_is_next() ? aux_mux : MUX_VOLTAGE;
     ADMUX = mux;
     TIFR1 = _BV(OCF1B);
     if (was_current) {
@@ -149,6 +159,7 @@ void sampling_start(bool fitted) {
     TCCR1A = 0;
     TCCR1B = 0;
     TCNT1 = 0;
+    OCR1B = TRIGGER_AT;
     apply_timing();
     begin_window(&windows[filling], 0);
     mux = MUX_VOLTAGE;
@@ -156,7 +167,8 @@ void sampling_start(bool fitted) {
     ADCSRB = TRIGGER_TIMER1_COMPARE_B;
     ADCSRA = _BV(ADEN) | _BV(ADATE) | _BV(ADIF) | _BV(ADIE) | PRESCALER_128;
     TIFR1 = _BV(OCF1B);
-    TCCR1B = _BV(WGM12) | _BV(CS10);  // counts CPU clocks up to OCR1A
+    TCCR1A = _BV(WGM11) | _BV(WGM10);
+    TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS10);  // fast PWM without a pin: counts CPU clocks up to OCR1A
 }
 
 void sampling_set_timing(const window_timing &wanted) {

@@ -18,6 +18,8 @@
 #include "readings.h"
 #include "sensors.h"
 
+#define MCUSR_ADDRESS 0x54
+#define WATCHDOG_RESET 0x08
 #define TURN_CYCLES 16000    // of line and clock: 1 ms
 #define BYTE_CYCLES 352      // simavr counts 11 bits a byte where the chip has 10, and drops what comes faster
 #define NEVER UINT64_MAX
@@ -101,6 +103,10 @@ static int run(avr_t *avr, const options *o) {
         const int state = avr_run(avr);
         if (state == cpu_Done || state == cpu_Crashed) {
             fprintf(stderr, "the firmware has stopped\n");
+            return 1;
+        }
+        if (avr->data[MCUSR_ADDRESS] & WATCHDOG_RESET) {
+            fprintf(stderr, "the watchdog has reset the chip: an old boot loader hangs in that\n");
             return 1;
         }
         if (avr->cycle >= next_byte) next_byte = hear_byte(avr->cycle);

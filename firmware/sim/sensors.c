@@ -6,12 +6,13 @@
 #include <simavr/sim_interrupts.h>
 #include <simavr/sim_io.h>
 #include <stdbool.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "readings.h"
 
-#define DIVIDER 5.0
-#define VOLTS_PER_AMPERE 0.1
+#define DIVIDER 6.1
+#define PART_PER_AMPERE (0.1 / 5.0)  // of its supply
 #define BANDGAP_V 1.1
 #define NTC_SERIES_OHM 10e3
 #define NTC_R25_OHM 10e3
@@ -23,6 +24,12 @@ enum { PIN_VOLTAGE = 0, PIN_CURRENT = 1, PIN_NTC = 2, PIN_BANDGAP = 7 };  // of 
 #define FULL_SCALE 1024.0
 #define SIMAVR_FULL_SCALE 0x3FF
 
+#define TCCR1A_ADDRESS 0x80
+#define TCCR1B_ADDRESS 0x81
+#define OCR1A_ADDRESS 0x88
+#define WGM1_HIGH_BITS 0x18
+#define WGM1_CTC 0x08
+#define WGM1_LOW_BITS 0x03
 #define TIFR1_ADDRESS 0x36
 #define OCF1B_BIT 2
 #define TIMER1_COMPB_VECTOR 12
@@ -30,6 +37,7 @@ enum { PIN_VOLTAGE = 0, PIN_CURRENT = 1, PIN_NTC = 2, PIN_BANDGAP = 7 };  // of 
 static avr_t *board;
 static converter parts;
 static bool trigger_armed = true;
+static avr_cycle_count_t last_compare;  // with OCR1B: the counter's zero, but for a few cycles
 
 static double uniform(void) {  // xorshift64*, in (0, 1)
     parts.seed ^= parts.seed >> 12;
@@ -46,7 +54,7 @@ static double pin_v(unsigned pin) {
     const reading *r = readings_at((double)board->cycle / (double)board->frequency);
     switch (pin) {
         case PIN_VOLTAGE: return r->voltage_v / DIVIDER;
-        case PIN_CURRENT: return parts.avcc_v / 2.0 + r->current_a * VOLTS_PER_AMPERE;
+        case PIN_CURRENT: return parts.avcc_v * (0.5 + r->current_a * PART_PER_AMPERE);
         case PIN_BANDGAP: return BANDGAP_V;
         case PIN_NTC:
             if (!isnan(r->temperature_c)) {
@@ -76,7 +84,9 @@ static void convert(struct avr_irq_t *irq, uint32_t value, void *param) {
 // simavr leaves the converter's trigger by timers to others. As on the chip, the flag must have been cleared since.
 static void compare_b(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
-    if (!value || !trigger_armed) return;
+    if (!value) return;
+    last_compare = board->cycle;
+    if (!trigger_armed) return;
     trigger_armed = false;
     avr_raise_irq((avr_irq_t *)param, 1);
 }
@@ -85,6 +95,21 @@ static void write_tifr1(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     (void)param;
     if (value & (1 << OCF1B_BIT)) trigger_armed = true;
+}
+
+// simavr takes a new top wherever the counter stands. The chip does not in CTC mode, which has no double buffering: a
+// counter beyond the new top goes on to 65535, and 4 ms pass that no sample counts.
+static void write_top(struct avr_irq_t *irq, uint32_t value, void *param) {
+    (void)irq;
+    (void)value;
+    (void)param;
+    const bool ctc = (board->data[TCCR1B_ADDRESS] & WGM1_HIGH_BITS) == WGM1_CTC &&
+                     (board->data[TCCR1A_ADDRESS] & WGM1_LOW_BITS) == 0;
+    const unsigned top = board->data[OCR1A_ADDRESS] | board->data[OCR1A_ADDRESS + 1] << 8;
+    if (!ctc || board->cycle - last_compare <= top) return;
+    fprintf(stderr, "OCR1A was set to %u when timer 1 stood at %u: the compare is missed\n", top,
+            (unsigned)(board->cycle - last_compare));
+    exit(1);
 }
 
 // The bandgap becomes a pin, so that it has noise as well.
@@ -103,5 +128,6 @@ void sensors_attach(avr_t *avr, const converter *c) {
     avr_irq_register_notify(pins + ADC_IRQ_OUT_TRIGGER, convert, pins);
     avr_irq_register_notify(avr_get_interrupt_irq(avr, TIMER1_COMPB_VECTOR) + AVR_INT_IRQ_PENDING, compare_b,
                             pins + ADC_IRQ_IN_TRIGGER);
+    avr_irq_register_notify(avr_iomem_getirq(avr, OCR1A_ADDRESS, "ocr1a", AVR_IOMEM_IRQ_ALL), write_top, NULL);
     avr_irq_register_notify(avr_iomem_getirq(avr, TIFR1_ADDRESS, "tifr1", AVR_IOMEM_IRQ_ALL), write_tifr1, NULL);
 }

@@ -1,7 +1,7 @@
 // The board's own headers on the host. A line in, a line out:
 //   sample|hello|ack NUMBER...   encodes the message, gives packet and frame in hexadecimal
 //   unframe HEX                  gives the packet without CRC of a frame without delimiter, "bad" when it is none
-//   timing RATE                  gives pairs of conversions in a window, its length in ns
+//   timing RATE                  gives pairs of conversions in a window, its length in ns, aux readings in one
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -94,7 +94,7 @@ static void unframe(void) {
 
 static void timing(void) {
     const window_timing t = timing_of((uint16_t)number());
-    printf("%u %u\n", t.slots / 2u, period_ns(&t));
+    printf("%u %u %u\n", t.slots / 2u, period_ns(&t), t.aux_readings);
 }
 
 int main(void) {

@@ -32,7 +32,9 @@ def test_a_board_whose_bandgap_was_wrong_measures_right_once_its_aref_was_told(
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 22.2, 25.0)])
     with SimavrBoard(readings, avcc_mv=4750) as board, Host(board.path) as host:
         assert host.ask(set_bandgap_command(1.02)).value == 1_020_000
-        assert measured(host) == pytest.approx((22.2 * 1.02 / 1.1, 2.5 * 1.02 / 1.1), rel=5e-3)
+        assert measured(host) == pytest.approx(
+            (22.2 * 1.02 / 1.1, 2.5), rel=5e-3
+        )  # a ratiometric sensor needs no bandgap
         with pytest.raises(SystemExit) as ended:
             main(["board", board.path, "--aref-v", "4.75", "--serial", "77"])
         out, err = capsys.readouterr()
@@ -43,3 +45,18 @@ def test_a_board_whose_bandgap_was_wrong_measures_right_once_its_aref_was_told(
         hello = host.hellos[-1][1]
     assert hello.bandgap_uv == pytest.approx(1_100_000, rel=1e-3)
     assert hello.serial == 77
+
+
+def test_gains_that_differ_from_the_drawings_are_set_once_and_used_from_then_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probe, "PATIENCE_S", LONG_S)
+    readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 20.0, 25.0)])
+    with SimavrBoard(readings) as board, Host(board.path) as host:
+        with pytest.raises(SystemExit) as ended:
+            main(["board", board.path, "--divider", "5", "--volts-per-ampere", "0.05", "--absolute"])
+        out, err = capsys.readouterr()
+        assert (ended.value.code or 0, err) == (0, "")
+        assert "divider: was 6.1, now 5\n" in out
+        assert "current: was 0.1 V/A at 5 V, ratiometric, now 0.05 V/A\n" in out
+        assert measured(host) == pytest.approx((20.0 * 5.0 / 6.1, 5.0), rel=5e-3)

@@ -52,7 +52,7 @@ def test_a_looped_file_begins_again(tmp_path: Path) -> None:
     with SimavrBoard(readings, speed=math.inf, loop=True) as board, Host(board.path) as host:
         host.take(300)
         means = [s.voltage_sum / s.count for s in host.samples]
-    low, high = 10.0 / 25.0 * 1024, 20.0 / 25.0 * 1024
+    low, high = 10.0 / 30.5 * 1024, 20.0 / 30.5 * 1024
     for second in range(3):
         assert means[100 * second + 20] == pytest.approx(low, abs=1.0)
         assert means[100 * second + 70] == pytest.approx(high, abs=1.0)
@@ -71,8 +71,8 @@ def test_readings_come_through_a_pipe_and_their_end_can_be_the_boards() -> None:
             host.until(lambda: board.poll() is not None)
             means = [s.voltage_sum / s.count for s in host.samples]
         assert board.returncode == 0
-    assert means[50] == pytest.approx(10.0 / 25.0 * 1024, abs=1.0)
-    assert means[140] == pytest.approx(20.0 / 25.0 * 1024, abs=1.0)
+    assert means[50] == pytest.approx(10.0 / 30.5 * 1024, abs=1.0)
+    assert means[140] == pytest.approx(20.0 / 30.5 * 1024, abs=1.0)
 
 
 def test_it_ends_when_told_while_it_waits_for_readings() -> None:

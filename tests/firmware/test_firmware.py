@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,6 +18,7 @@ from bms_estimator.sources.protocol import (
     PROTOCOL_VERSION,
     AckResult,
     BoardStatus,
+    Channels,
     MessageType,
     ResetCause,
     SampleMessage,
@@ -24,21 +26,24 @@ from bms_estimator.sources.protocol import (
     hello_command,
     seal,
     set_bandgap_command,
+    set_current_slope_command,
+    set_divider_command,
     set_rate_command,
+    set_ratiometric_command,
     set_serial_command,
     zero_current_command,
 )
 from bms_estimator.sources.serial_board import SerialBoard
-from bms_estimator.sources.virtual_converter import window_of
+from bms_estimator.sources.virtual_converter import aux_readings_of, window_of
 from tests.firmware.host import Host
-from tests.simavr_board import SimavrBoard, write_readings
+from tests.simavr_board import FIRMWARE, SimavrBoard, write_readings
 
 pytestmark = pytest.mark.usefixtures("firmware")
 
 FLAT_OUT = math.inf
 STEADY = [(0.0, 2.5, 22.2, 25.0)]
-AUX_PAIRS = 2
-"""Pairs of conversions that an aux reading takes from its window."""
+AUX_SETTLING = 3
+"""Conversions of an aux input before those that count."""
 
 Start = Callable[..., Host]
 
@@ -69,11 +74,21 @@ def test_the_hello_comes_before_the_first_sample_and_tells_how_the_board_is_buil
     assert before == 0
     assert hello.reset_cause == ResetCause.POWER_ON
     assert (hello.serial, hello.sequence, hello.board_us) == (0, 0, 0)
-    assert (hello.rate_hz, hello.period_ns, hello.adc_bits, hello.channels) == (100, 10_000_000, 10, 1)
-    assert (hello.divider_ppm, hello.current_uv_per_a) == (5_000_000, 100_000)
+    assert (hello.rate_hz, hello.period_ns, hello.adc_bits) == (100, 10_000_000, 10)
+    assert hello.channels == Channels.NTC | Channels.CURRENT_RATIOMETRIC
+    assert (hello.divider_ppm, hello.current_uv_per_a) == (6_100_000, 100_000)
     assert (hello.current_zero_ppm, hello.bandgap_uv) == (500_000, 1_100_000)
     assert (hello.ntc_series_ohm, hello.ntc_r25_ohm, hello.ntc_beta_k) == (10_000, 10_000, 3950)
     assert hello.bandgap_sum / hello.bandgap_count == pytest.approx(1.1 / 5.0 * 1024, abs=0.2)
+
+
+@pytest.mark.parametrize("mcu", ["atmega2560", "atmega32u4", "atmega328"])
+def test_it_does_not_compile_for_another_chip_and_says_why(tmp_path: Path, mcu: str) -> None:
+    target = tmp_path / "bms_board.ino.o"
+    command = ["make", "--silent", "-C", FIRMWARE, f"MCU={mcu}", f"BUILD={tmp_path}", target]
+    made = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert made.returncode != 0
+    assert "This firmware is for an ATmega328P at 16 MHz" in made.stderr
 
 
 def test_a_hello_on_request_tells_where_the_board_is(start: Start) -> None:
@@ -116,13 +131,27 @@ def test_every_rate_has_its_exact_period_from_the_next_sample_on(start: Start, r
     host.take(2)  # the window that had begun, and one that may have ended before the command
     samples = host.take(min(2 * rate_hz, 1500) + 1)
     assert [s.sequence for s in samples] == list(range(samples[0].sequence, samples[0].sequence + len(samples)))
-    assert all(s.count + AUX_PAIRS * s.aux_count == pairs for s in samples)
+    assert all(2 * s.count + bool(s.aux_count) * (AUX_SETTLING + s.aux_count) == 2 * pairs for s in samples)
     since_us = np.array([s.board_us for s in samples]) - samples[0].board_us
     assert np.abs(since_us - np.arange(len(samples)) * period_ns * 1e-3).max() <= 1.0
     assert not any(s.status & BoardStatus.OVERRUN for s in samples)
     aux = [s for s in samples if s.aux_count]
+    assert {s.aux_count for s in aux} == {aux_readings_of(rate_hz)}
     assert len(aux) == pytest.approx(len(samples) / max(rate_hz // 100, 1), abs=1)
     assert all((a.status ^ b.status) & BoardStatus.AUX_IS_NTC for a, b in itertools.pairwise(aux))
+
+
+@pytest.mark.parametrize("rate_hz", [1, 10])
+def test_at_low_rates_the_reference_is_as_steady_as_at_high_ones(start: Start, rate_hz: int) -> None:
+    """A time constant of seconds leaves few samples to average: each holds many readings of the bandgap."""
+    host, decoder = start(), FrameDecoder()
+    host.ask(set_rate_command(rate_hz))
+    decoder.feed(0.0, host.hellos[0][1].encode())
+    references_v = []
+    for sample in host.take(40):
+        decoder.feed(0.0, sample.encode())
+        references_v.append(decoder.reference_v)
+    assert np.std(references_v) < 2e-4 * 5.0
 
 
 @pytest.mark.parametrize("rate_hz", [0, 1001, 65535])
@@ -143,7 +172,7 @@ def test_what_is_fed_is_measured_within_the_converters_resolution_at_any_supply(
     volt_step = decoder.reference_v / 1024
     for i, (current_a, voltage_v) in enumerate(fed):
         part = block[50 * i + 10 : 50 * i + 40]
-        for name, truth, step in (("voltage_v", voltage_v, 5.0 * volt_step), ("current_a", current_a, volt_step / 0.1)):
+        for name, truth, step in (("voltage_v", voltage_v, 6.1 * volt_step), ("current_a", current_a, 50.0 / 1024)):
             if name == "voltage_v" and truth == 0.0:
                 continue  # noise below zero is cut off by the converter
             assert np.abs(part[name] - truth).max() < 1.0 * step
@@ -153,10 +182,10 @@ def test_what_is_fed_is_measured_within_the_converters_resolution_at_any_supply(
 @pytest.mark.parametrize(
     ("current_a", "voltage_v", "bits"),
     [
-        (0.0, 25.5, SampleStatus.VOLTAGE_SATURATED),
+        (0.0, 31.0, SampleStatus.VOLTAGE_SATURATED),
         (26.0, 12.0, SampleStatus.CURRENT_SATURATED),
         (-26.0, 12.0, SampleStatus.CURRENT_SATURATED),
-        (24.0, 24.0, 0),
+        (24.0, 30.0, 0),
     ],
 )
 def test_readings_beyond_the_converters_range_are_marked(
@@ -178,7 +207,7 @@ def test_the_ntc_is_read_by_turns_with_the_bandgap(start: Start) -> None:
 def test_without_an_ntc_only_the_bandgap_is_read(start: Start) -> None:
     host = start([(0.0, 0.0, 22.2)])
     samples = host.take(20)
-    assert host.hellos[0][1].channels == 0
+    assert not host.hellos[0][1].channels & Channels.NTC
     assert all(s.aux_count == 1 and not s.status & BoardStatus.AUX_IS_NTC for s in samples)
     assert np.mean([s.aux_sum for s in samples]) == pytest.approx(1.1 / 5.0 * 1024, abs=1.0)
 
@@ -191,6 +220,9 @@ def test_a_restart_is_a_watchdog_reset_and_what_is_kept_in_eeprom_survives_it(st
     assert zero.value == pytest.approx(516_000, abs=30)  # 0.5 + 0.8 A x 0.1 V/A / 5 V
     assert host.ask(set_serial_command(0xC0FFEE)).value == 0xC0FFEE
     assert host.ask(set_bandgap_command(1.085)).value == 1_085_000
+    assert host.ask(set_divider_command(5.0123)).value == 5_012_300
+    assert host.ask(set_current_slope_command(0.025)).value == 25_000
+    assert host.ask(set_ratiometric_command(0)).value == 0
     host.take(20)  # an EEPROM takes 3.4 ms for a byte
     assert host.ask(command(MessageType.COMMAND_RESTART)).result == AckResult.OK
     host.until(lambda: len(host.hellos) == 2)
@@ -199,6 +231,7 @@ def test_a_restart_is_a_watchdog_reset_and_what_is_kept_in_eeprom_survives_it(st
     assert hello.boot_id != first.boot_id
     assert (hello.sequence, hello.board_us, hello.rate_hz) == (0, 0, 100)
     assert (hello.serial, hello.bandgap_uv, hello.current_zero_ppm) == (0xC0FFEE, 1_085_000, zero.value)
+    assert (hello.divider_ppm, hello.current_uv_per_a, hello.channels) == (5_012_300, 25_000, Channels.NTC)
     sample = host.take(10)[-1]
     assert sample.sequence < 20
     assert sample.status >> 4 == ResetCause.WATCHDOG
@@ -233,9 +266,44 @@ def test_a_second_zero_is_refused_while_the_first_is_measured(start: Start) -> N
     assert host.acks[1].result == AckResult.OK
 
 
-def test_a_bandgap_that_no_part_has_is_refused(start: Start) -> None:
-    ack = start().ask(set_bandgap_command(1.3))
-    assert (ack.result, ack.value) == (AckResult.BAD_VALUE, 1_100_000)
+@pytest.mark.parametrize(
+    ("wanted", "kept"),
+    [
+        (set_bandgap_command(1.3), 1_100_000),
+        (set_divider_command(0.99), 6_100_000),
+        (set_divider_command(101.0), 6_100_000),
+        (set_current_slope_command(0.0009), 100_000),
+        (set_current_slope_command(2.1), 100_000),
+        (set_ratiometric_command(2), 1),
+    ],
+)
+def test_a_value_that_no_board_has_is_refused(start: Start, wanted: bytes, kept: int) -> None:
+    ack = start().ask(wanted)
+    assert (ack.result, ack.value) == (AckResult.BAD_VALUE, kept)
+
+
+@pytest.mark.parametrize("rates_hz", [(801, 1000), (667, 999), (1, 900)])
+def test_slots_get_shorter_wherever_the_counter_stands(start: Start, rates_hz: tuple[int, int]) -> None:
+    """The simulator ends where the chip would miss the compare, and with it 4 ms that the board's clock does not see."""
+    host = start()
+    for i in range(10):
+        for rate_hz in rates_hz:
+            assert host.ask(set_rate_command(rate_hz)).result == AckResult.OK
+            host.take(2 + i % 3)
+
+
+def test_a_restart_asks_nothing_of_the_boot_loader(start: Start) -> None:
+    """The simulator ends at a reset by the watchdog, in which a Nano's old boot loader hangs."""
+    host = start()
+    for restarts in range(1, 4):
+        host.take(30)
+        host.ask(set_rate_command(1000))
+        host.ask(command(MessageType.COMMAND_RESTART))
+        host.until(lambda wanted=restarts: len(host.hellos) > wanted)
+        assert host.hellos[-1][1].reset_cause == ResetCause.WATCHDOG
+        samples = host.take(20)
+        assert [s.sequence for s in samples[-10:]] == list(range(samples[-10].sequence, samples[-10].sequence + 10))
+    assert len({hello.boot_id for _, hello in host.hellos}) == 4
 
 
 def test_garbage_is_ignored_and_the_next_command_is_heard(start: Start) -> None:

@@ -168,6 +168,13 @@ async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> N
     assert "outside the cell's range" in (health.sensor_message or "")
 
 
+async def test_the_rate_of_the_boards_clock_is_published_once_it_is_known() -> None:
+    async with running() as run:
+        assert (await run.sink.until(lambda _: True)).health.clock_ppm is None
+        run.source.clock_ppm = 3012.5
+        await run.sink.until(lambda s: s.health.clock_ppm == 3012.5)
+
+
 async def test_the_source_says_why_nothing_comes() -> None:
     async with running() as run:
         run.source.message = "waiting for /dev/ttyUSB0: it does not exist"

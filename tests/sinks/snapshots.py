@@ -37,6 +37,7 @@ def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None
             restarts=0,
             checkpoint="off",
             sensor_message=sensor_message,
+            clock_ppm=None,
             delivery=delivery or Delivery(),
         ),
         info_report(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW),

@@ -18,7 +18,10 @@ from bms_estimator.sources.protocol import (
     command,
     hello_command,
     set_bandgap_command,
+    set_current_slope_command,
+    set_divider_command,
     set_rate_command,
+    set_ratiometric_command,
     set_serial_command,
     unseal,
     zero_current_command,
@@ -33,6 +36,9 @@ COMMANDS: dict[str, Callable[..., bytes]] = {
     "set_rate": set_rate_command,
     "set_serial": set_serial_command,
     "set_bandgap": set_bandgap_command,
+    "set_divider": set_divider_command,
+    "set_current_slope": set_current_slope_command,
+    "set_ratiometric": set_ratiometric_command,
 }
 CLASSES: dict[str, type[SampleMessage | Hello | Ack]] = {"sample": SampleMessage, "hello": Hello, "ack": Ack}
 

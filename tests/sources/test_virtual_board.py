@@ -16,12 +16,16 @@ from bms_estimator.sources.decoder import make_decoder
 from bms_estimator.sources.frames import FrameCounters, FrameDecoder
 from bms_estimator.sources.protocol import (
     AckResult,
+    Channels,
     MessageType,
     ResetCause,
     command,
     hello_command,
     set_bandgap_command,
+    set_current_slope_command,
+    set_divider_command,
     set_rate_command,
+    set_ratiometric_command,
     set_serial_command,
     zero_current_command,
 )
@@ -78,9 +82,9 @@ async def test_frames_hold_the_readings_within_the_converters_resolution() -> No
     assert block.size == 500
     assert np.allclose(np.diff(block["time_s"]), 0.01, rtol=0.0, atol=1e-9)
     step_v = 5.0 / 1024
-    assert np.abs(block["voltage_v"] - 22.2).max() < 5.0 * step_v
+    assert np.abs(block["voltage_v"] - 22.2).max() < 6.1 * step_v
     assert np.abs(block["current_a"] - 2.5).max() < step_v / 0.1
-    assert block["voltage_v"].mean() == pytest.approx(22.2, abs=0.2 * 5.0 * step_v)
+    assert block["voltage_v"].mean() == pytest.approx(22.2, abs=0.2 * 6.1 * step_v)
     assert block["temperature_c"][-1] == pytest.approx(25.0, abs=0.3)
     assert counters == FrameCounters(bytes_received=counters.bytes_received, frames_received=500)
 
@@ -88,6 +92,13 @@ async def test_frames_hold_the_readings_within_the_converters_resolution() -> No
 async def test_a_supply_that_is_not_five_volts_is_found_out() -> None:
     block, _ = decoded(await received(board(parts=BoardParts(supply_v=4.75)), 300))
     assert block["voltage_v"].mean() == pytest.approx(22.2, rel=1e-3)
+    assert block["current_a"].mean() == pytest.approx(2.5, rel=2e-3)
+
+
+async def test_a_current_sensor_with_a_slope_of_its_own_is_measured_right_at_any_supply() -> None:
+    parts = BoardParts(supply_v=4.75, volts_per_ampere=0.09, ratiometric=False)
+    block, _ = decoded(await received(board(parts=parts), 300))
+    assert block["current_a"].mean() == pytest.approx(2.5, rel=2e-3)
 
 
 async def test_the_same_seed_sends_the_same_bytes() -> None:
@@ -98,7 +109,7 @@ async def test_the_same_seed_sends_the_same_bytes() -> None:
 @pytest.mark.parametrize(
     ("reading", "status"),
     [
-        (Reading(0.0, 25.6, 25.0), SampleStatus.VOLTAGE_SATURATED),
+        (Reading(0.0, 30.6, 25.0), SampleStatus.VOLTAGE_SATURATED),
         (Reading(26.0, 12.0, 25.0), SampleStatus.CURRENT_SATURATED),
         (Reading(-26.0, 12.0, 25.0), SampleStatus.CURRENT_SATURATED),
     ],
@@ -168,6 +179,10 @@ async def test_commands_are_obeyed_and_answered() -> None:
             assert await ask(set_rate_command(250)) == (AckResult.OK, window_of(250)[1])
             assert await ask(set_serial_command(77)) == (AckResult.OK, 77)
             assert await ask(set_bandgap_command(1.3)) == (AckResult.BAD_VALUE, 1_100_000)
+            assert await ask(set_divider_command(5.0)) == (AckResult.OK, 5_000_000)
+            assert await ask(set_divider_command(0.5)) == (AckResult.BAD_VALUE, 5_000_000)
+            assert await ask(set_current_slope_command(0.025)) == (AckResult.OK, 25_000)
+            assert await ask(set_ratiometric_command(0)) == (AckResult.OK, 0)
             result, zero_ppm = await ask(zero_current_command())
             assert result == AckResult.OK
             assert abs(zero_ppm - 550_000) < 100  # 0.5 + 2.5 A x 0.1 V/A / 5 V
@@ -175,6 +190,8 @@ async def test_commands_are_obeyed_and_answered() -> None:
             assert await ask(hello_command() + set_serial_command(78)) == (AckResult.OK, 78)
             assert decoder.hello is not None
             assert (decoder.hello.rate_hz, decoder.hello.serial) == (250, 77)
+            assert (decoder.hello.divider_ppm, decoder.hello.current_uv_per_a) == (5_000_000, 25_000)
+            assert decoder.hello.channels == Channels.NTC
             await ask(command(MessageType.COMMAND_RESTART))
             await ask(hello_command() + set_serial_command(79))
             assert decoder.hello.reset_cause == ResetCause.WATCHDOG

@@ -1,0 +1,77 @@
+"""How fast the board's clock runs by the host's: a line under the times at which its samples came.
+
+A sample comes late by what the line, the USB bridge and the host's scheduler take, never early. So of each ten seconds only
+the sample that came with the least delay counts, and of those the ones on the lower hull: the line lies under all of them
+(Moon, Skelly, Towsley 1999). However many others were held up changes nothing. It moves no time stamp.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from bms_estimator.kernels.state import Record
+
+CLOCK_WINDOWS = 60
+"""The last ten minutes: a resonator drifts with its temperature."""
+_WINDOW_US = 10_000_000
+_LEAST_US = 60_000_000  # of this 1 ms, by which delays may differ, is 17 ppm
+_US = 1e-6
+
+
+@njit(cache=True)
+def forget_clock(d: Record) -> None:
+    """The board's clock begins anew."""
+    d.clock_windows = 0
+
+
+@njit(cache=True)
+def take_arrival(d: Record, arrival_s: float) -> None:
+    """See when the sample at ``d.elapsed_us`` came."""
+    if d.clock_windows == 0:
+        d.clock_origin_s = arrival_s
+    late_s = arrival_s - d.clock_origin_s - d.elapsed_us * _US
+    if d.clock_windows == 0 or d.elapsed_us - d.clock_begin_us >= _WINDOW_US:
+        d.clock_windows += 1
+        d.clock_begin_us = d.elapsed_us
+    elif late_s >= d.clock_late_s[(d.clock_windows - 1) % CLOCK_WINDOWS]:
+        return
+    at = (d.clock_windows - 1) % CLOCK_WINDOWS
+    d.clock_at_us[at] = d.elapsed_us
+    d.clock_late_s[at] = late_s
+
+
+@njit(cache=True)
+def clock_ppm(d: Record) -> float:
+    """How much faster the board's clock runs than the host's [1e-6].
+
+    NaN before it has been seen for a minute, and where all samples came at once.
+    """
+    count = min(d.clock_windows, CLOCK_WINDOWS)
+    at_s, late_s = np.empty(count), np.empty(count)
+    for i in range(count):
+        window = (d.clock_windows - count + i) % CLOCK_WINDOWS
+        at_s[i] = d.clock_at_us[window] * _US
+        late_s[i] = d.clock_late_s[window]
+    if count < 2 or at_s[-1] - at_s[0] < _LEAST_US * _US:
+        return math.nan
+    hull = np.empty(count, np.int64)
+    corners = 0
+    for i in range(count):
+        while corners > 1 and _above(at_s, late_s, hull[corners - 2], hull[corners - 1], i):
+            corners -= 1
+        hull[corners] = i
+        corners += 1
+    middle_s, corner = at_s.mean(), 1  # the edge over the middle lies closest under all the points
+    while at_s[hull[corner]] < middle_s:
+        corner += 1
+    begin, end = hull[corner - 1], hull[corner]
+    board_s = at_s[end] - at_s[begin]
+    host_s = board_s + late_s[end] - late_s[begin]
+    return (board_s / host_s - 1.0) * 1e6 if host_s > 0.0 else math.nan
+
+
+@njit(cache=True)
+def _above(x: np.ndarray, y: np.ndarray, begin: int, middle: int, end: int) -> bool:
+    """Whether the middle one of three points lies on or above the line through the other two."""
+    return bool((y[middle] - y[begin]) * (x[end] - x[begin]) >= (y[end] - y[begin]) * (x[middle] - x[begin]))

@@ -1,0 +1,97 @@
+"""The rate of the board's clock, found in the times at which its samples come."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.sources.frames import FrameDecoder
+from bms_estimator.sources.protocol import Hello, SampleMessage, unseal
+from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
+from bms_estimator.sources.replay import RawCapture, Replay
+from tests.sources.test_decoder_fuzz import HELLO
+
+START_S = 1_700_000_000.0
+FAST = 1.003
+"""The board counts so many of its seconds in one of the host's."""
+TOLERANCE_PPM = 100.0
+BATCH_S = 0.016
+"""An FTDI bridge hands over what has come in so long [s]."""
+
+Read = tuple[float, bytes]
+
+
+def reads(seconds: float, *, boot_id: int = 1, start_s: float = START_S, seed: int = 1) -> Iterator[Read]:
+    """What a host reads of a board that runs fast, at 10 Hz: late by an exponential 3 ms, in batches, held up for 4 s in 20."""
+    random = np.random.default_rng(seed)
+    hello = dataclasses.replace(Hello.decode(unseal(HELLO)), boot_id=boot_id)
+    yield start_s, hello.encode()
+    last_s = start_s
+    for i in range(int(10 * seconds)):
+        board_us = 100_000 * (i + 1)
+        at_s = start_s + board_us * 1e-6 / FAST
+        come_s = at_s + 0.001 + random.exponential(0.003)
+        if (at_s - start_s) % 20.0 > 16.0:
+            come_s = start_s + 20.0 * np.ceil((at_s - start_s) / 20.0)
+        last_s = max(last_s, BATCH_S * np.ceil(come_s / BATCH_S))
+        yield last_s, SampleMessage(i, board_us, 34_571, 21_405, 38, 225, 1, 16).encode()
+
+
+def fed(*parts: Iterator[Read]) -> FrameDecoder:
+    decoder = FrameDecoder()
+    for arrival_s, data in itertools.chain(*parts):
+        decoder.feed(arrival_s, data)
+    return decoder
+
+
+def ppm(decoder: FrameDecoder | Replay) -> float:
+    assert decoder.clock_ppm is not None
+    return decoder.clock_ppm
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seconds", [90.0, 600.0, 1500.0])
+def test_a_resonator_that_runs_fast_is_found_out_whatever_held_the_samples_up(seconds: float, seed: int) -> None:
+    assert ppm(fed(reads(seconds, seed=seed))) == pytest.approx(3000.0, abs=TOLERANCE_PPM)
+
+
+def test_nothing_is_said_of_the_clock_before_a_minute_of_it() -> None:
+    assert fed(reads(55.0)).clock_ppm is None
+    assert FrameDecoder().clock_ppm is None
+
+
+def test_samples_that_all_came_at_once_tell_nothing_of_the_clock() -> None:
+    decoder = FrameDecoder()
+    decoder.feed(START_S, b"".join(data for _, data in reads(90.0)))
+    assert decoder.clock_ppm is None
+
+
+def test_it_begins_anew_after_a_reset_of_the_board() -> None:
+    before, later_s = reads(120.0), START_S + 300.0
+    assert fed(before, reads(50.0, boot_id=2, start_s=later_s)).clock_ppm is None
+    assert ppm(fed(reads(120.0), reads(120.0, boot_id=2, start_s=later_s))) == pytest.approx(3000.0, abs=TOLERANCE_PPM)
+
+
+def test_an_outage_of_the_line_spoils_nothing() -> None:
+    heard = (read for read in reads(300.0) if not 60.0 < read[0] - START_S < 200.0)
+    assert ppm(fed(heard)) == pytest.approx(3000.0, abs=TOLERANCE_PPM)
+
+
+def test_time_stamps_stay_the_boards_own() -> None:
+    decoder = FrameDecoder()
+    time_s = np.concatenate([decoder.feed(*read)["time_s"] for read in reads(90.0)])
+    assert np.array_equal(time_s, 1e-6 * (100_000 * np.arange(900)))
+
+
+async def test_a_replay_finds_the_same_rate_to_the_last_bit(tmp_path: Path) -> None:
+    recorded = list(reads(90.0))
+    with CaptureWriter(tmp_path / "line.bms", CaptureHeader()) as writer:
+        for read in recorded:
+            writer.write(*read)
+    replay = Replay(RawCapture(tmp_path / "line.bms"))
+    async for _ in replay:
+        pass
+    assert ppm(replay) == ppm(fed(iter(recorded)))
