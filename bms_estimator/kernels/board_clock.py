@@ -15,7 +15,7 @@ from bms_estimator.kernels.state import Record
 CLOCK_WINDOWS = 60
 """The last ten minutes: a resonator drifts with its temperature."""
 _WINDOW_US = 10_000_000
-_LEAST_US = 60_000_000  # of this 1 ms, by which delays may differ, is 17 ppm
+_LEAST_US = 60_000_000  # 1 ms, by which the least delays may differ, is 17 ppm of it
 _US = 1e-6
 
 

@@ -13,10 +13,7 @@ SCALING = np.dtype(
         ("full_scale", "f8"),  # conversions at the reference: 2^bits
         ("divider", "f8"),  # pack voltage over voltage at the pin
         ("volts_per_ampere", "f8"),  # slope of the current sensor [V/A]
-        (
-            "ratiometric",
-            "i8",
-        ),  # 1: that slope holds at 5 V and is proportional to the reference, which supplies the sensor
+        ("ratiometric", "i8"),  # 1: that slope holds at 5 V, and is proportional to the reference
         ("current_zero", "f8"),  # its output without current, as a part of the reference
         ("bandgap_v", "f8"),  # the converter's internal reference [V]
         ("ntc_series_ohm", "f8"),
