@@ -1,0 +1,40 @@
+"""A sample that no pack like this can give: what it says, what is possible, and what may be the matter."""
+
+import numpy as np
+
+from bms_estimator.model.sample import SampleBlock
+
+
+def impossible_sample(block: SampleBlock, settings: np.void) -> str | None:
+    """The last sample of a block that is out of range, for people; None where there is none.
+
+    Args:
+        block: Some of its samples were dropped.
+        settings: A record of OBSERVER_SETTINGS.
+    """
+    low_v, high_v = float(settings["voltage_min_v"]), float(settings["voltage_max_v"])
+    most_a = float(settings["current_max_a"])
+    voltage_v, current_a = block["voltage_v"], block["current_a"]
+    outside = (voltage_v < low_v) | (voltage_v > high_v) | (np.abs(current_a) > most_a)
+    if not outside.any():
+        return None
+    volt, ampere = float(voltage_v[outside][-1]), float(current_a[outside][-1])
+
+    def possible(volt: float, ampere: float) -> bool:
+        return low_v <= volt <= high_v and abs(ampere) <= most_a
+
+    said = (
+        f"the last of them {volt:g} V, {ampere:g} A, where {low_v:g}..{high_v:g} V and up to {most_a:g} A are possible"
+    )
+    if possible(ampere, volt) or possible(-ampere, volt):
+        return f"{said}: are the columns swapped?"
+    units = [
+        unit
+        for unit, v, a in (
+            ("millivolts", 1e-3 * volt, ampere),
+            ("milliamperes", volt, 1e-3 * ampere),
+            ("millivolts and milliamperes", 1e-3 * volt, 1e-3 * ampere),
+        )
+        if possible(v, a)
+    ]
+    return f"{said}: are these {units[0]}?" if units else said
