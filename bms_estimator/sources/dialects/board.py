@@ -87,7 +87,7 @@ class BoardDialect(Dialect):
 
     def opened(self) -> None:
         """There is no hello until the next comes; samples keep the scaling of the last."""
-        self._decoder.forget_hello()
+        self._forget_hello()
         self._unheard_at = self._decoder.heard_at
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
@@ -132,6 +132,11 @@ class BoardDialect(Dialect):
         self._told = _Told(frame=frame, again_s=again_s, hint=hint)
         return self._told
 
+    def _forget_hello(self) -> None:
+        """Have the board asked for its hello anew; what it said stays until then."""
+        self._board = self.board
+        self._decoder.forget_hello()
+
     def _wanted(self) -> tuple[bytes, float]:
         """What the board has still to be told, and after how long again [s]."""
         hello = self._decoder.hello
@@ -150,7 +155,7 @@ class BoardDialect(Dialect):
                 continue
             if ack.result == AckResult.OK:
                 told.acknowledged = True
-                self._decoder.forget_hello()  # the next one holds what was set; one that is lost is asked for again
+                self._forget_hello()  # the next one holds what was set; one that is lost is asked for again
             else:
                 told.refusal = f"the board refuses: {ack.result.name.lower().replace('_', ' ')}{told.hint}"
                 told.done = True
