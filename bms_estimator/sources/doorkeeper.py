@@ -1,15 +1,13 @@
 """Whether a board that was found is the one with which it began: under ``auto`` another may have been plugged in."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from bms_estimator.sources.dialects import Dialect
+from bms_estimator.sources.line import Read
 
 HELD_READS = 4096
 """So many reads are kept for a board that has not told its serial number yet: seconds at any rate."""
-
-Read = tuple[float, bytes]
-"""Arrival [s], bytes."""
 
 
 class OtherBoardError(Exception):
@@ -38,19 +36,19 @@ class Doorkeeper:
         self.stranger = self._make() if self.serial else None
         self._held.clear()
 
-    def admit(self, arrival_s: float, data: bytes) -> list[Read]:
+    def admit(self, read: Read) -> Sequence[Read]:
         """The reads that may pass now.
 
         Raises:
             OtherBoardError: None ever will.
         """
         if self.stranger is None:
-            return [(arrival_s, data)]
-        self._held.append((arrival_s, data))
-        self.stranger.feed(arrival_s, data)
+            return (read,)
+        self._held.append(read)
+        self.stranger.feed(*read)
         found = self.stranger.board
         if not found:
-            return []
+            return ()
         if (other := found.get("serial", "")) != self.serial:
             raise OtherBoardError(
                 f"board {other or 'without a serial number'} is not the one with which this began, {self.serial}: "

@@ -6,7 +6,7 @@ Knows no protocol.
 import asyncio
 import os
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import structlog
@@ -20,6 +20,9 @@ FIRST_RETRY_S = 0.5
 """Before a missing or lost port is tried again; doubles with each attempt [s]."""
 LONGEST_RETRY_S = 10.0
 READ_BYTES = 1 << 16
+
+Read = tuple[float, bytes]
+"""Arrival [s since 1970], bytes."""
 
 log = structlog.get_logger(__name__)
 
@@ -55,7 +58,7 @@ class Line:
         self._name, self._baud, self._say = port, baud, say
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
-        self._reads: asyncio.Queue[tuple[float, bytes] | None] = asyncio.Queue()
+        self._reads: asyncio.Queue[Read | None] = asyncio.Queue()
         self._port: serial.Serial | None = None
         self.openings = 0
         self.lost = asyncio.Event()
@@ -99,13 +102,12 @@ class Line:
             self._port = None
 
     def end(self) -> None:
-        """Let who iterates come to an end."""
+        """Let who reads come to an end."""
         self._reads.put_nowait(None)
 
-    async def __aiter__(self) -> AsyncIterator[tuple[float, bytes]]:
-        """Each read with its arrival [s since 1970]; one without bytes where the port was opened."""
-        while (read := await self._reads.get()) is not None:
-            yield read
+    async def read(self) -> Read | None:
+        """What came next; without bytes where the port was opened, None at the end."""
+        return await self._reads.get()
 
     def send(self, data: bytes) -> None:
         """Write. What a dying port does not take is lost."""

@@ -1,9 +1,10 @@
 """The board on a serial port, whatever it speaks: line and dialect tied together."""
 
 import asyncio
+import contextlib
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -13,11 +14,13 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.dialects.table import make_dialect
-from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError, Read
-from bms_estimator.sources.line import FIRST_RETRY_S, Line
+from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
+from bms_estimator.sources.line import FIRST_RETRY_S, Line, Read
 
-TICK_S = 1.0
-"""So often is looked whether samples come, and sent what is due on a silent line [s]."""
+TALK_S = 0.25
+"""So often is sent what is due [s]."""
+TALKS = 4
+"""After so many is looked whether samples come."""
 SILENT_S = 3.0
 """Without a frame for so long the line is at fault [s]."""
 JUNK_LOG_S = 30.0
@@ -132,32 +135,31 @@ class SerialBoard:
 
         What the tap gets is what has been yielded: nothing is recorded that the caller has not taken.
         """
-        async for arrival_s, data in self._line:
-            for read in self._admit(arrival_s, data):
-                block = self._decode(*read)
+        while (read := await self._line.read()) is not None:
+            for arrival_s, data in self._admit(read):
+                block = self._decode(arrival_s, data)
                 if block.size:
                     if self._message is not None:
                         self._message, self._refused = None, False
                         self._line.good()
                     yield block
-            self._send_due()
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 
-    def _admit(self, arrival_s: float, data: bytes) -> list[Read]:
+    def _admit(self, read: Read) -> Sequence[Read]:
         """The reads that are decoded now."""
-        if not data:
+        if not read[1]:
             self._openings += 1
             self._dialect.opened()
             self._door.opened()
-            return []
+            return ()
         try:
-            return self._door.admit(arrival_s, data)
+            return self._door.admit(read)
         except OtherBoardError as error:
             self._say(f"refused: {error}")
             self._refused = True
             self._line.lost.set()
-            return []
+            return ()
 
     def _send_due(self) -> None:
         """Send what is due to the device that has been heard last, if it is the one on the port now."""
@@ -214,8 +216,7 @@ class SerialBoard:
             log.info("port opened", port=path, baud=self._settings.baud)
         heard_s, frames = self._monotonic(), self._frames()
         while not self._line.lost.is_set():
-            self._send_due()
-            await self._pause(TICK_S)
+            await self._talk()
             now_s = self._monotonic()
             if self._frames() != frames:
                 heard_s, frames = now_s, self._frames()
@@ -229,12 +230,14 @@ class SerialBoard:
                 self._say(f"{path}: open, but silent")
             self._log_faults()
 
-    async def _pause(self, seconds: float) -> None:
-        try:
-            async with asyncio.timeout(seconds):
-                await self._line.lost.wait()
-        except TimeoutError:
-            return
+    async def _talk(self) -> None:
+        """Send what falls due, until it is time to look whether samples come or the line is lost."""
+        for _ in range(TALKS):
+            self._send_due()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(TALK_S):
+                    await self._line.lost.wait()
+                    return
 
     def _frames(self) -> int:
         return self._dialect.counters["frames_received"]

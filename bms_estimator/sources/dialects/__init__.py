@@ -65,13 +65,7 @@ class Dialect(ABC):
     def feed_reads(
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
     ) -> SampleBlock:
-        """Decode many reads of the line at once: the same samples as ``feed`` for each.
-
-        Args:
-            arrivals_s: Shape (reads,): when each came [s].
-            ends: Shape (reads,): where in ``data`` each ends.
-            data: Their bytes, one behind the other.
-        """
+        """Decode many reads of the line, as a ``CaptureBatch`` holds them: the same samples as ``feed`` for each."""
         blocks, cells = [np.empty(0, dtype=SAMPLE)], list[Sequence[float]]()
         begin = 0
         for arrival_s, end in zip(arrivals_s.tolist(), ends.tolist(), strict=True):
