@@ -103,7 +103,7 @@ class SerialBoard:
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the board said of itself last."""
+        """What the board said of itself."""
         return self._dialect.board
 
     @property

@@ -47,7 +47,7 @@ class Dialect(ABC):
 
     @property
     def board(self) -> Mapping[str, str]:
-        """What the device said of itself last: ``serial`` where it has a number of its own; empty until it did."""
+        """What the device said of itself: ``serial`` where it has a number of its own; empty until it did."""
         return {}
 
     @abstractmethod

@@ -46,7 +46,6 @@ class BoardDialect(Dialect):
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive", rate_hz: int | None = None) -> None:
         self._decoder = FrameDecoder(current_sign=current_sign)
         self._rate_hz = rate_hz
-        self._board: Mapping[str, str] = {}
         self._unheard_at = 0
         self._asked, self._asked_s = b"", -math.inf
         self._told: _Told | None = None
@@ -68,9 +67,8 @@ class BoardDialect(Dialect):
 
     @property
     def board(self) -> Mapping[str, str]:
-        """Of its last hello; what it said before is kept until it says it anew."""
-        self._board = self._decoder.board or self._board
-        return self._board
+        """Of its hello."""
+        return self._decoder.board
 
     @property
     def described(self) -> str | None:
@@ -87,7 +85,7 @@ class BoardDialect(Dialect):
 
     def opened(self) -> None:
         """There is no hello until the next comes; samples keep the scaling of the last."""
-        self._forget_hello()
+        self._decoder.forget_hello()
         self._unheard_at = self._decoder.heard_at
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
@@ -132,11 +130,6 @@ class BoardDialect(Dialect):
         self._told = _Told(frame=frame, again_s=again_s, hint=hint)
         return self._told
 
-    def _forget_hello(self) -> None:
-        """Have the board asked for its hello anew; what it said stays until then."""
-        self._board = self.board
-        self._decoder.forget_hello()
-
     def _wanted(self) -> tuple[bytes, float]:
         """What the board has still to be told, and after how long again [s]."""
         hello = self._decoder.hello
@@ -155,7 +148,7 @@ class BoardDialect(Dialect):
                 continue
             if ack.result == AckResult.OK:
                 told.acknowledged = True
-                self._forget_hello()  # the next one holds what was set; one that is lost is asked for again
+                self._decoder.forget_hello()  # the next one holds what was set; one that is lost is asked for again
             else:
                 told.refusal = f"the board refuses: {ack.result.name.lower().replace('_', ' ')}{told.hint}"
                 told.done = True
