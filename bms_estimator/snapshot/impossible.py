@@ -20,21 +20,15 @@ def impossible_sample(block: SampleBlock, settings: np.void) -> str | None:
         return None
     volt, ampere = float(voltage_v[outside][-1]), float(current_a[outside][-1])
 
-    def possible(volt: float, ampere: float) -> bool:
-        return low_v <= volt <= high_v and abs(ampere) <= most_a
-
     said = (
         f"the last of them {volt:g} V, {ampere:g} A, where {low_v:g}..{high_v:g} V and up to {most_a:g} A are possible"
     )
-    if possible(ampere, volt) or possible(-ampere, volt):
-        return f"{said}: are the columns swapped?"
-    units = [
-        unit
-        for unit, v, a in (
-            ("millivolts", 1e-3 * volt, ampere),
-            ("milliamperes", volt, 1e-3 * ampere),
-            ("millivolts and milliamperes", 1e-3 * volt, 1e-3 * ampere),
-        )
-        if possible(v, a)
-    ]
-    return f"{said}: are these {units[0]}?" if units else said
+    for guess, v, a in (
+        ("are the columns swapped?", abs(ampere), volt),
+        ("are these millivolts?", 1e-3 * volt, ampere),
+        ("are these milliamperes?", volt, 1e-3 * ampere),
+        ("are these millivolts and milliamperes?", 1e-3 * volt, 1e-3 * ampere),
+    ):
+        if low_v <= v <= high_v and abs(a) <= most_a:
+            return f"{said}: {guess}"
+    return said
