@@ -120,13 +120,18 @@ class AskedBoard:
         Raises:
             UserError: There is none.
         """
+
+        def answer_or_text() -> Answer | None:
+            if self._text.described:
+                raise UserError(f"{self._port}: {FrameFault.TEXT.value}; it takes no commands")
+            return answer()
+
         try:
-            answered = _converse(self._line, dialects, answer, patience_s)
+            answered = _converse(self._line, dialects, answer_or_text, patience_s)
         except OSError as error:
             raise UserError(f"{self._port}: lost: {error}") from None
         if answered is None:
-            text = f"{FrameFault.TEXT.value}; it takes no commands" if self._text.described else None
-            raise UserError(f"{self._port}: {text or _silence(dialects)}")
+            raise UserError(f"{self._port}: {_silence(dialects)}")
         return answered
 
 

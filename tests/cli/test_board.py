@@ -99,7 +99,7 @@ def test_a_serial_number_that_the_board_cannot_hold(capsys, serial):
     assert "--serial" in err
 
 
-@pytest.mark.usefixtures("impatient")
+@pytest.mark.usefixtures("patient")
 def test_a_board_that_prints_text_takes_no_commands(capsys):
     with virtual(mode="text") as path:
         code, out, err = board(capsys, path, "--serial", "7")
