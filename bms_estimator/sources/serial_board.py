@@ -114,7 +114,7 @@ class SerialBoard:
     @property
     def clock_ppm(self) -> float | None:
         """How much faster the board's clock runs than the monotonic one."""
-        return self._decoder.clock_ppm
+        return self._dialect.clock_ppm
 
     async def __aenter__(self) -> Self:
         """Begin to open the port; it need not be there yet."""

@@ -50,6 +50,11 @@ class Dialect(ABC):
         """What the device said of itself: ``serial`` where it has a number of its own; empty until it did."""
         return {}
 
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the device's clock runs than that of the arrivals [1e-6]; None while or where unknown."""
+        return None
+
     @abstractmethod
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode one read of the line.

@@ -71,6 +71,11 @@ class BoardDialect(Dialect):
         return self._decoder.board
 
     @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock runs than that of the arrivals."""
+        return self._decoder.clock_ppm
+
+    @property
     def described(self) -> str | None:
         """Firmware, serial number and rate."""
         if self.hello is None:
