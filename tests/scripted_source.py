@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 
 
 class ScriptedSource:
@@ -18,6 +18,7 @@ class ScriptedSource:
         self.message: str | None = None
         self.board: dict[str, str] = {}
         self.clock_ppm: float | None = None
+        self.cells: CellBlock = NO_CELLS
         self._queue: asyncio.Queue[SampleBlock | None] = asyncio.Queue()
 
     async def __aenter__(self) -> Self:

@@ -6,6 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from serial.tools.list_ports_common import ListPortInfo
+
+
+def usb_port(device: str, vid: int = 0x1A86, pid: int = 0x7523, product: str = "USB Serial") -> ListPortInfo:
+    """A port as pyserial lists it; without more a CH340's."""
+    port = ListPortInfo(device)
+    port.vid, port.pid, port.product, port.description = vid, pid, product, product
+    return port
 
 
 class Line:
@@ -29,6 +37,14 @@ class Line:
 
     def write(self, data: bytes) -> None:
         os.write(self._master, data)
+
+    def heard(self) -> bytes:
+        """What the host has sent."""
+        os.set_blocking(self._master, False)
+        try:
+            return os.read(self._master, 1 << 16)
+        except BlockingIOError:
+            return b""
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """``bms-estimator record``: a board's raw bytes with their arrival times."""
 
 import asyncio
+import contextlib
 import time
 from collections import deque
 from pathlib import Path
@@ -16,12 +17,11 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import SensorSettings, Settings
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.service.logs import configure_logs
-from bms_estimator.sources.raw_capture import CaptureWriter, header_of
+from bms_estimator.sources.raw_capture import header_of
+from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.serial_board import SerialBoard
 
 REDRAW_S = 0.25
-SYNC_S = 5.0
-"""The disk has all but the last seconds, even when the power fails [s]."""
 
 
 def record(
@@ -39,60 +39,34 @@ def record(
 ) -> None:
     """Record a board's raw bytes with their arrival times, until Ctrl-C.
 
-    Each read of the line goes to the file at once: whatever kills the recorder, ``replay`` reads all to the last whole
+    Each read of the line goes to the file as it comes: whatever kills the recorder, ``replay`` reads all to the last whole
     frame. Without --pack and --port the only board that is there is taken.
     """
     settings = load_pack(pack)[0] if pack else Settings()
     protocol = "text" if text else None
     sensor = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol).sensor
-    with CaptureWriter(out, header_of(sensor)) as writer:
-        asyncio.run(_record(sensor, Recorder(writer), seconds))
+    with Recording(out, header_of(sensor)) as recording:
+        progress = asyncio.run(_record(sensor, recording, seconds))
+    if isinstance(error := recording.ended.exception(), OSError):
+        raise UserError(f"recording ended: {error.strerror}")
+    typer.echo(progress.summary(), err=True)
 
 
-class Recorder:
-    """Tap of a board: writes, counts, and keeps the error that ended it."""
-
-    def __init__(self, writer: CaptureWriter) -> None:
-        self._writer = writer
-        self.started = asyncio.Event()
-        self.failed = asyncio.Event()
-        self.error: OSError | None = None
-        self.bytes = 0
-
-    def write(self, arrival_s: float, data: bytes) -> None:
-        """Append one read of the line."""
-        try:
-            self._writer.write(arrival_s, data)
-        except OSError as error:
-            self.error = error
-            self.failed.set()
-            raise
-        self.bytes += len(data)
-        self.started.set()
-
-    def sync(self) -> None:
-        """Have the disk take what there is."""
-        self._writer.sync()
-
-
-async def _record(sensor: SensorSettings, recorder: Recorder, seconds: float | None) -> None:
+async def _record(sensor: SensorSettings, recording: Recording, seconds: float | None) -> "Progress":
     """Board -> file, until a signal, the time's end or the disk's."""
     stop = stop_on_signal()
     console, log = Console(stderr=True), deque[str]()
     configure_logs(log if console.is_terminal else None)
-    async with SerialBoard(sensor, tap=recorder) as board:
-        progress = Progress(board, recorder)
+    async with SerialBoard(sensor, tap=recording) as board:
+        progress = Progress(board, recording)
         await until_first_ends(
             stop.wait(),
-            recorder.failed.wait(),
+            _end(recording),
             _drain(board),
-            _time_over(recorder, seconds),
-            _sync_often(recorder),
+            _time_over(recording, seconds),
             _show(console, progress, log),
         )
-    if recorder.error is not None:
-        raise UserError(f"recording ended: {recorder.error.strerror}")
-    typer.echo(progress.summary(), err=True)
+    return progress
 
 
 async def _drain(board: SerialBoard) -> None:
@@ -100,16 +74,16 @@ async def _drain(board: SerialBoard) -> None:
         pass
 
 
-async def _time_over(recorder: Recorder, seconds: float | None) -> None:
+async def _end(recording: Recording) -> None:
+    with contextlib.suppress(OSError):  # said by the caller
+        await asyncio.wrap_future(recording.ended)
+
+
+async def _time_over(recording: Recording, seconds: float | None) -> None:
     """Ends ``seconds`` after the first bytes; with None never."""
-    await recorder.started.wait()
-    await (asyncio.Event().wait() if seconds is None else asyncio.sleep(seconds))
-
-
-async def _sync_often(recorder: Recorder) -> None:
-    while True:
-        await asyncio.sleep(SYNC_S)
-        await asyncio.to_thread(recorder.sync)
+    while seconds is None or not recording.bytes:  # noqa: ASYNC110 - the tap has no event for it
+        await asyncio.sleep(REDRAW_S)
+    await asyncio.sleep(seconds)
 
 
 async def _show(console: Console, progress: "Progress", log: deque[str]) -> None:
@@ -126,8 +100,8 @@ async def _show(console: Console, progress: "Progress", log: deque[str]) -> None
 class Progress:
     """What has been recorded so far."""
 
-    def __init__(self, board: SerialBoard, recorder: Recorder) -> None:
-        self._board, self._recorder = board, recorder
+    def __init__(self, board: SerialBoard, recording: Recording) -> None:
+        self._board, self._recording = board, recording
         self._started_s = time.monotonic()
         self._last = (self._started_s, 0)
         self._rate_hz = 0.0
@@ -144,9 +118,11 @@ class Progress:
     def summary(self) -> str:
         """Of the whole recording."""
         counters = self._board.counters
-        faults = sum(counters[name] for name in ("cobs_errors", "length_errors", "version_errors", "text_errors"))
+        faults = sum(
+            counters.get(name, 0) for name in ("cobs_errors", "length_errors", "version_errors", "text_errors")
+        )
         return (
-            f"{time.monotonic() - self._started_s:.1f} s, {self._recorder.bytes:,} bytes, "
-            f"{counters['frames_received']:,} frames, {counters['frames_lost']:,} lost, "
-            f"{counters['crc_errors']:,} CRC errors, {faults:,} other faults"
+            f"{time.monotonic() - self._started_s:.1f} s, {self._recording.bytes:,} bytes, "
+            f"{counters['frames_received']:,} frames, {counters.get('frames_lost', 0):,} lost, "
+            f"{counters.get('crc_errors', 0):,} CRC errors, {faults:,} other faults"
         )

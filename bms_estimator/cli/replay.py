@@ -102,7 +102,7 @@ async def _replay(settings: Settings, cell: CellModel, source: Replay, table: Ta
             if table:
                 table.write(trace)
             if publisher:
-                publisher.add(trace)
+                publisher.add(block, trace)
                 await asyncio.sleep(0)
             show()
         wall_s = time.perf_counter() - started_s

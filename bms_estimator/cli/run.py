@@ -4,23 +4,17 @@ import asyncio
 import contextlib
 import sys
 from collections import deque
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import structlog
 import typer
 
 from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
-from bms_estimator.cli.record import SYNC_S
-from bms_estimator.model.cell import CellModel
-from bms_estimator.model.settings import Settings
-from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.logs import configure_logs
 from bms_estimator.service.serve import serve
-from bms_estimator.sinks import Sink
 from bms_estimator.sinks.console import ConsoleSink
-from bms_estimator.sources.raw_capture import CaptureWriter, header_of
+from bms_estimator.sources.raw_capture import header_of
+from bms_estimator.sources.recording import Recording
 
 LOG_LINES = 5
 """So many of the log's last lines stay in sight below the live view."""
@@ -44,33 +38,7 @@ def run(
     shown = sys.stdout.isatty() if view is None else view
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if shown and sys.stdout.isatty() else None)
-    recorder = CaptureWriter(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
+    recorder = Recording(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
     sinks = [ConsoleSink(log=log)] if shown else []
-    with recorder as writer:
-        if writer is None:
-            asyncio.run(serve(settings, cell, sinks=sinks))
-        else:
-            asyncio.run(serve_and_record(settings, cell, sinks, writer))
-
-
-async def serve_and_record(settings: Settings, cell: CellModel, sinks: Sequence[Sink], writer: CaptureWriter) -> None:
-    """Serve until a signal; all but the last seconds of the recording outlive a loss of power.
-
-    Args:
-        settings: The pack's settings.
-        cell: The pack as one object.
-        sinks: Further sinks.
-        writer: Gets the board's bytes.
-    """
-    await until_first_ends(serve(settings, cell, sinks=sinks, tap=writer), _sync_often(writer))
-
-
-async def _sync_often(writer: CaptureWriter) -> None:
-    """Have the disk take what there is; one that fails does not end the estimate."""
-    try:
-        while True:
-            await asyncio.sleep(SYNC_S)
-            await asyncio.to_thread(writer.sync)
-    except OSError as error:
-        structlog.get_logger(__name__).warning("recording may not reach the disk", reason=str(error))
-    await asyncio.Event().wait()
+    with recorder as tap:
+        asyncio.run(serve(settings, cell, sinks=sinks, tap=tap))

@@ -25,6 +25,8 @@ class Estimate(Report):
     current_a: float = Field(description="current [A], positive on discharge, mean")
     power_w: float = Field(description="voltage times current [W], positive on discharge, mean of the products")
     temperature_c: float | None = Field(description="temperature [C], mean; null without a sensor")
+    cell_lowest_v: float | None = Field(description="lowest voltage of a single cell [V], last; null without any")
+    cell_highest_v: float | None = Field(description="highest voltage of a single cell [V], last; null without any")
     soc: float | None = Field(description="state of charge, 0..1")
     soc_percent: float | None = Field(description="state of charge [%]")
     soc_std: float | None = Field(description="standard deviation of soc; null without the identifier")

@@ -23,6 +23,12 @@ SAMPLE = np.dtype(
 SampleBlock = NDArray[np.void]
 """Shape (n,), dtype ``SAMPLE``."""
 
+CellBlock = NDArray[np.float64]
+"""Shape (n, m): beside each of a block's n samples the voltages of m cells [V], NaN where one was not told."""
+
+NO_CELLS: CellBlock = np.empty((0, 0))
+"""Of a block without any, however long it is."""
+
 
 class SampleStatus(IntFlag):
     """What the board says of a sample."""

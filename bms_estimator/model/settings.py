@@ -27,6 +27,10 @@ class PackSettings(Strict):
     initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
 
 
+_OWN_PACE_S = {"text": 1.0}
+"""By protocol: boards that print at their own pace are taken to do so at this [s]."""
+
+
 class SensorSettings(Strict):
     """The board, what it resolves, and its sign of current."""
 
@@ -46,8 +50,8 @@ class SensorSettings(Strict):
 
     @property
     def sample_period_s(self) -> float:
-        """Between two samples [s]. A text board prints at its own pace: taken as once a second."""
-        return 1.0 if self.protocol == "text" else 1.0 / self.sample_rate_hz
+        """Between two samples [s]."""
+        return _OWN_PACE_S.get(self.protocol, 1.0 / self.sample_rate_hz)
 
 
 class ObserverSettings(Strict):

@@ -109,7 +109,7 @@ def new_estimator(settings: Settings, cell: CellModel) -> Estimator:
 
 async def _estimate(source: Source, estimator: Estimator, publisher: Publisher) -> None:
     async for block in source:
-        publisher.add(estimator.run(block))
+        publisher.add(block, estimator.run(block))
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
 

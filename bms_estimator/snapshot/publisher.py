@@ -10,9 +10,11 @@ from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.estimate import Estimate, Health, Info, Snapshot
+from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
 from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
 from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
+from bms_estimator.snapshot.impossible import impossible_sample
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.rest import Rest
@@ -71,6 +73,7 @@ class Publisher:
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._sample_s = -math.inf  # monotonic, of the last accepted sample
+        self._impossible = ""  # the last sample that was out of range
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -79,12 +82,14 @@ class Publisher:
         """Until a snapshot is overdue, which tells that no samples come [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
-    def add(self, trace: TraceBlock) -> None:
-        """Take what the estimator made of a block; publish when it is time."""
+    def add(self, block: SampleBlock, trace: TraceBlock) -> None:
+        """Take a block and what the estimator made of it; publish when it is time."""
         now_s = self._clock.monotonic()
         if trace.size:
-            self._window.add(trace, self._clock.wall())
+            self._window.add(trace, self._clock.wall(), self._source.cells)
             self._sample_s = now_s
+        if trace.size < block.size:
+            self._impossible = impossible_sample(block, self._estimator.settings[0]) or self._impossible
         if now_s >= self._due_s:
             self.publish()
 
@@ -164,4 +169,5 @@ class Publisher:
             silent_s = now_s - self._started_s
         counted = sample_counters(self._estimator.state[0]).items()
         dropped = {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}
-        return f"no usable sample for {silent_s:.1f} s; dropped so far: {dropped_text(dropped)}"
+        text = f"no usable sample for {silent_s:.1f} s; dropped so far: {dropped_text(dropped)}"
+        return f"{text}; {self._impossible}" if self._impossible else text

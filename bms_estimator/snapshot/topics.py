@@ -3,6 +3,8 @@
 import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from bms_estimator import __version__
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
@@ -31,6 +33,7 @@ def estimate_report(
     """
     last = window.last
     soc = finite(last["soc"])
+    cells_v = window.cells_v[np.isfinite(window.cells_v)]
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
@@ -39,6 +42,8 @@ def estimate_report(
         current_a=window.current_a,
         power_w=window.power_w,
         temperature_c=finite(window.temperature_c),
+        cell_lowest_v=float(cells_v.min()) if cells_v.size else None,
+        cell_highest_v=float(cells_v.max()) if cells_v.size else None,
         soc=soc,
         soc_percent=None if soc is None else 100.0 * soc,
         soc_std=finite(last["soc_std"]),

@@ -4,9 +4,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.state import TRACE
+from bms_estimator.model.sample import NO_CELLS, CellBlock
 
 WAITING_ROWS = 1024
 """Rows are summed so many at a time: at 1,000 blocks a second, one by one would take as long as the estimate."""
@@ -25,6 +27,7 @@ class WindowSummary:
         temperature_c: Mean [C], NaN without a sensor.
         sample_rate_hz: On the stream's clock [Hz], NaN when it cannot be told.
         last: Row of dtype TRACE.
+        cells_v: Shape (m,): the last voltages of single cells [V], NaN where one was not told; m is 0 without any.
     """
 
     arrival_s: float
@@ -35,6 +38,7 @@ class WindowSummary:
     temperature_c: float
     sample_rate_hz: float
     last: np.void
+    cells_v: NDArray[np.float64]
 
 
 class Window:
@@ -52,14 +56,18 @@ class Window:
         self._first_s = math.nan
         self._last: np.void | None = None
         self._arrival_s = math.nan
+        self._cells = NO_CELLS
 
-    def add(self, trace: TraceBlock, arrival_s: float) -> None:
+    def add(self, trace: TraceBlock, arrival_s: float, cells: CellBlock = NO_CELLS) -> None:
         """Take what the estimator made of one block.
 
         Args:
             trace: Shape (n,), dtype TRACE; n may be 0.
             arrival_s: Wall clock [s since 1970].
+            cells: Beside the block's samples.
         """
+        if cells.size:
+            self._cells = cells[-1:]
         for first in range(0, trace.size, WAITING_ROWS):
             part = trace[first : first + WAITING_ROWS]
             if self._waiting + part.size > WAITING_ROWS:
@@ -101,6 +109,7 @@ class Window:
             temperature_c=self._temperature / self._temperatures if self._temperatures else math.nan,
             sample_rate_hz=steps / span_s if span_s > 0.0 else math.nan,
             last=self._last,
+            cells_v=self._cells.ravel(),
         )
         self._before_s = last_s
         self._clear()

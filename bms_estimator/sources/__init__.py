@@ -4,7 +4,7 @@ from collections.abc import AsyncIterator, Mapping
 from types import TracebackType
 from typing import Protocol, Self
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import CellBlock, SampleBlock
 
 
 class Source(Protocol):
@@ -28,6 +28,10 @@ class Source(Protocol):
     @property
     def clock_ppm(self) -> float | None:
         """How much faster the board's clock runs than the host's [1e-6]; None while unknown."""
+
+    @property
+    def cells(self) -> CellBlock:
+        """Beside the samples of the block that came last; ``NO_CELLS`` where no cells are measured."""
 
     def __aiter__(self) -> AsyncIterator[SampleBlock]:
         """Blocks of samples, none of them empty."""

@@ -18,7 +18,7 @@ from bms_estimator.sources.protocol import Ack, AckResult, Hello, MessageType
 CurrentSign = Literal["discharge_positive", "charge_positive"]
 
 DEAF_BYTES = 512
-"""So many bytes without one whole frame or line, and the line itself is at fault: eight of the longest frames."""
+"""So many bytes without one whole frame, and the line itself is at fault: eight of the longest frames."""
 _MESSAGES = 8
 
 
@@ -27,14 +27,13 @@ class FrameFault(Enum):
 
     WRONG_BAUD = "bytes come, but no valid frame among them: wrong baud rate?"
     TEXT = "the board prints text, not frames: sensor.protocol should be text, --text without a settings file"
-    BINARY = "the board sends bytes that are no text: wrong baud rate, or sensor.protocol should be binary"
     NEWER_PROTOCOL = "the board speaks another version of the protocol: update this program or the firmware"
     NO_HELLO = "frames come, but the board has not told its scaling yet"
 
 
 @dataclass(frozen=True)
 class FrameCounters:
-    """What came over the line since start; the same for frames and for text lines."""
+    """What came over the line since start."""
 
     bytes_received: int = 0
     frames_received: int = 0
@@ -54,8 +53,6 @@ class FrameCounters:
     overruns: int = 0
     """Samples before which the board had no room on the line."""
     resets: int = 0
-    text_errors: int = 0
-    """Lines that are no numbers."""
 
     def as_dict(self) -> dict[str, int]:
         """By name."""
@@ -119,6 +116,11 @@ class FrameDecoder:
         """Since start."""
         state = self._state[0]
         return FrameCounters(**{name: int(state[name]) for name in _COUNTERS})
+
+    @property
+    def heard_at(self) -> int:
+        """``bytes_received`` at the end of the last frame with a right CRC."""
+        return int(self._state["heard_at"][0])
 
     @property
     def fault(self) -> FrameFault | None:

@@ -2,13 +2,33 @@
 
 import errno
 import os
+import re
 import termios
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import serial
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 BY_ID = Path("/dev/serial/by-id")
+
+ANY_PRODUCT = range(0x10000)
+BRIDGE_CHIPS: Mapping[int, Collection[int]] = {
+    0x0403: (0x6001, 0x6010, 0x6011, 0x6014, 0x6015),  # FTDI FT232, FT2232, FT4232, FT232H, FT231X
+    0x067B: (0x2303, 0x23A3, 0x23C3, 0x23D3),  # Prolific PL2303
+    0x10C4: (0xEA60, 0xEA70),  # Silicon Labs CP210x
+    0x1A86: (0x5523, 0x7522, 0x7523, 0x55D3, 0x55D4),  # WCH CH341, CH340, CH343, CH9102
+    0x2341: ANY_PRODUCT,  # Arduino, its ATmega16U2
+    0x2A03: ANY_PRODUCT,  # the other Arduino
+}
+"""USB vendor: products that ``auto`` takes."""
+NO_BOARD = re.compile(
+    r"zig-?bee|z-?wave|openthread|conbee|raspbee|sky ?connect|nabu casa|sonoff|itead|zbt-|zwa-|hubz|slzb|slae|zooz"
+    r"|aeotec|cc(1352|26\d\d)|efr32",
+    re.IGNORECASE,
+)
+"""What radio sticks say of themselves, which have the same chips."""
 
 
 class NoPortError(Exception):
@@ -23,12 +43,6 @@ def stable_names() -> list[Path]:
         return []
 
 
-def board_ports() -> list[str]:
-    """Ports that may be a board: the stable names, else USB serial devices."""
-    names = [str(path) for path in stable_names()]
-    return names or sorted(port.device for port in list_ports.comports() if port.vid is not None)
-
-
 def resolve_port(port: str) -> str:
     """The device path of ``port``, which may be ``auto``.
 
@@ -39,12 +53,23 @@ def resolve_port(port: str) -> str:
         if not Path(port).exists():
             raise NoPortError(f"{port}: it does not exist")
         return port
-    found = board_ports()
-    if not found:
-        raise NoPortError("auto: no USB serial port is there")
-    if len(found) > 1:
+    there = [port for port in list_ports.comports() if port.vid is not None]
+    names = {os.path.realpath(path): str(path) for path in stable_names()}
+    found = sorted(names.get(os.path.realpath(port.device), port.device) for port in there if may_be_board(port))
+    if len(found) == 1:
+        return found[0]
+    if found:
         raise NoPortError(f"auto: {len(found)} serial ports are there; choose one: {', '.join(found)}")
-    return found[0]
+    if there:
+        others = ", ".join(f"{port.device} ({port.product or port.description})" for port in there)
+        raise NoPortError(f"auto: no port of a known board is there; if it is one of these, name it: {others}")
+    raise NoPortError("auto: no USB serial port is there")
+
+
+def may_be_board(port: ListPortInfo) -> bool:
+    """Whether the chip of a port is one that boards have, and nothing it says of itself speaks against it."""
+    named = " ".join(word for word in (port.manufacturer, port.product, port.description) if word)
+    return port.pid in BRIDGE_CHIPS.get(port.vid or 0, ()) and not NO_BOARD.search(named)
 
 
 def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:

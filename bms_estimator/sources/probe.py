@@ -1,23 +1,27 @@
 """Asks whoever is on a serial port, one thing at a time: for a board's hello, and to keep a setting."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.frames import FrameDecoder, FrameFault, is_text
+from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources.dialects import Dialect
+from bms_estimator.sources.dialects.board import ASK_AGAIN_S, BoardDialect
+from bms_estimator.sources.dialects.table import DIALECTS
+from bms_estimator.sources.dialects.text import TextDialect
+from bms_estimator.sources.frames import FrameFault
 from bms_estimator.sources.ports import NoPortError, open_port
-from bms_estimator.sources.protocol import BAUD, AckResult, Hello, hello_command, set_rate_command, unseal
+from bms_estimator.sources.protocol import BAUD, Hello, set_rate_command
+
+if TYPE_CHECKING:
+    import serial
 
 PATIENCE_S = 3.0
 """A board that was reset by the opening of its port spends two seconds in its boot loader [s]."""
-ASK_S = 0.5
-"""What has not been answered for so long is asked again [s]."""
 READ_BYTES = 4096
-TEXT_BYTES = 16
-"""Noise is hardly ever so many printable bytes in a row."""
 REFERENCE_RATE_HZ = 100
 """The firmware's own: the bandgap is measured in every second sample, or in each without an NTC."""
 REFERENCE_SAMPLES = 300
@@ -29,19 +33,21 @@ Answer = TypeVar("Answer")
 
 
 def probe(port: str, baud: int = BAUD) -> str:
-    """What is on ``port``, for people. Leaves the board's settings as they are.
+    """What is on ``port``, for people. Leaves a board's settings as they are; what is not understood is sent nothing.
 
     Args:
         port: Device path; opened for ourselves alone.
         baud: Of the board [1/s].
     """
+    dialects = [make(SensorSettings()) for make in DIALECTS.values()]
     try:
-        with AskedBoard(port, baud) as board:
-            hello = board.hello()
-    except (NoPortError, UserError) as error:
+        with open_port(port, baud, ASK_AGAIN_S) as line:
+            found = _converse(line, dialects, lambda: next((d.described for d in dialects if d.described), None))
+    except NoPortError as error:
         return str(error).removeprefix(f"{port}: ")
-    serial_number = f", serial {hello.serial:08x}" if hello.serial else ""
-    return f"board, firmware {hello.firmware}{serial_number}, {hello.rate_hz} Hz"
+    except OSError as error:
+        return f"lost: {error}"
+    return found or _silence(dialects)
 
 
 class AskedBoard:
@@ -56,9 +62,8 @@ class AskedBoard:
     """
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
-        self._port, self._line = port, open_port(port, baud, ASK_S)
-        self._decoder = FrameDecoder()
-        self._tail = b""
+        self._port, self._line = port, open_port(port, baud, ASK_AGAIN_S)
+        self._board, self._text = BoardDialect(), TextDialect()
 
     def __enter__(self) -> Self:
         """The board."""
@@ -71,13 +76,12 @@ class AskedBoard:
         self._line.close()
 
     def hello(self) -> Hello:
-        """What the board says of itself now.
+        """What the board says of itself, after the last command.
 
         Raises:
             UserError: No board answers; the message says what is there instead.
         """
-        self._decoder.forget_hello()
-        return self._ask(hello_command(), lambda: self._decoder.hello)
+        return self._ask([self._board, self._text], lambda: self._board.hello)
 
     def tell(self, frame: bytes) -> Hello:
         """Give a command that may be given twice. Returns the hello after it.
@@ -85,10 +89,10 @@ class AskedBoard:
         Raises:
             UserError: The board refuses, or does not answer.
         """
-        kind = unseal(frame)[1]
-        ack = self._ask(frame, lambda: next((a for a in self._decoder.take_acks() if a.command == kind), None))
-        if ack.result != AckResult.OK:
-            raise UserError(f"{self._port}: the board refuses: {ack.result.name.lower().replace('_', ' ')}")
+        command = self._board.tell(frame)
+        self._ask([self._board, self._text], lambda: command.done or None)
+        if command.refusal:
+            raise UserError(f"{self._port}: {command.refusal}")
         return self.hello()
 
     def reference_v(self) -> float:
@@ -100,39 +104,62 @@ class AskedBoard:
             UserError: As ``tell``.
         """
         hello = self.tell(set_rate_command(REFERENCE_RATE_HZ))
-        self._decoder = FrameDecoder()
-        self._decoder.feed(0.0, replace(hello, bandgap_sum=0, bandgap_count=0).encode())
-        return self._ask(b"", self._measured, REFERENCE_S)
+        now = BoardDialect()
+        now.feed(0.0, replace(hello, bandgap_sum=0, bandgap_count=0).encode())
 
-    def _measured(self) -> float | None:
-        enough = self._decoder.counters.frames_received >= REFERENCE_SAMPLES
-        return self._decoder.reference_v if enough else None
+        def measured() -> float | None:
+            return now.reference_v if now.counters["frames_received"] >= REFERENCE_SAMPLES else None
 
-    def _ask(self, frame: bytes, answer: Callable[[], Answer | None], patience_s: float | None = None) -> Answer:
-        """Send ``frame`` until what comes is an answer."""
-        now_s = ask_s = time.monotonic()
-        end_s = now_s + (PATIENCE_S if patience_s is None else patience_s)
+        return self._ask([now], measured, REFERENCE_S)
+
+    def _ask(
+        self, dialects: Sequence[Dialect], answer: Callable[[], Answer | None], patience_s: float | None = None
+    ) -> Answer:
+        """The answer.
+
+        Raises:
+            UserError: There is none.
+        """
+
+        def answer_or_text() -> Answer | None:
+            if self._text.described:
+                raise UserError(f"{self._port}: {FrameFault.TEXT.value}; it takes no commands")
+            return answer()
+
         try:
-            while now_s < end_s:
-                if now_s >= ask_s:
-                    self._line.write(frame)
-                    ask_s = now_s + ASK_S
-                self._hear(self._line.read(max(1, min(self._line.in_waiting, READ_BYTES))))
-                if (answered := answer()) is not None:
-                    return answered
-                now_s = time.monotonic()
+            answered = _converse(self._line, dialects, answer_or_text, patience_s)
         except OSError as error:
             raise UserError(f"{self._port}: lost: {error}") from None
-        raise UserError(f"{self._port}: {self._silence()}")
+        if answered is None:
+            raise UserError(f"{self._port}: {_silence(dialects)}")
+        return answered
 
-    def _hear(self, data: bytes) -> None:
-        self._decoder.feed(0.0, data)
-        self._tail = (self._tail + data)[-TEXT_BYTES:]
 
-    def _silence(self) -> str:
-        """Why there is no answer."""
-        if len(self._tail) == TEXT_BYTES and is_text(self._tail):
-            return f"{FrameFault.TEXT.value}; it takes no commands"
-        if self._decoder.fault is not None:
-            return self._decoder.fault.value
-        return "no board answers" if self._decoder.counters.bytes_received else "silent"
+def _converse(
+    line: "serial.Serial",
+    dialects: Sequence[Dialect],
+    answer: Callable[[], Answer | None],
+    patience_s: float | None = None,
+) -> Answer | None:
+    """Have dialects hear and talk until there is an answer; None where none comes.
+
+    Raises:
+        OSError: The port is lost.
+    """
+    end_s = time.monotonic() + (PATIENCE_S if patience_s is None else patience_s)
+    while (now_s := time.monotonic()) < end_s:
+        if (answered := answer()) is not None:
+            return answered
+        for dialect in dialects:
+            line.write(dialect.due(now_s))
+        data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
+        for dialect in dialects:
+            dialect.feed(now_s, data)
+    return answer()
+
+
+def _silence(dialects: Sequence[Dialect]) -> str:
+    """Why none of them knows who is there."""
+    if not dialects[0].counters["bytes_received"]:
+        return "silent"
+    return next((dialect.fault for dialect in dialects if dialect.fault), "no board answers")

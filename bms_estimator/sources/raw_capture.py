@@ -32,6 +32,7 @@ from typing import IO, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES, split_records
 from bms_estimator.model.errors import UserError
@@ -67,6 +68,22 @@ class CaptureHeader:
 def header_of(sensor: SensorSettings) -> CaptureHeader:
     """What a capture of this board's line says of it."""
     return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign)
+
+
+def sensor_of(path: Path) -> SensorSettings:
+    """The board whose line was recorded in ``path``, as far as decoding needs it.
+
+    Raises:
+        UserError: As ``read_header``, or this program does not know the board's protocol.
+    """
+    header = read_header(path)
+    try:
+        return SensorSettings(protocol=header.mode, current_sign=header.current_sign)
+    except ValidationError:
+        raise UserError(
+            f"{path}: recorded from mode {header.mode!r}, current_sign {header.current_sign!r}: "
+            "this program does not know both"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -134,9 +151,11 @@ class CaptureWriter:
     def close(self) -> None:
         """Have the disk take all, and close."""
         if self._descriptor >= 0:
-            self.sync()
-            os.close(self._descriptor)
-            self._descriptor = -1
+            try:
+                self.sync()
+            finally:
+                os.close(self._descriptor)
+                self._descriptor = -1
 
     def __enter__(self) -> Self:
         """The writer."""

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
-from bms_estimator.sources.frames import CurrentSign, FrameDecoder
-from bms_estimator.sources.raw_capture import is_capture, read_capture, read_header
+from bms_estimator.sources.dialects.table import make_dialect
+from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.raw_capture import is_capture, read_capture, sensor_of
 from bms_estimator.sources.table import READERS, ByName, Sign, samples_of, table_reader
-from bms_estimator.sources.text_lines import TextDecoder
 
 TICK_S = 0.05
 """A paced replay hands over what has become due this often [s]."""
@@ -60,10 +60,8 @@ class RawCapture:
     def __init__(
         self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
     ) -> None:
-        header = read_header(path)
-        text = (sensor.protocol if sensor else header.mode) == "text"
-        sign = current_sign or (sensor.current_sign if sensor else header.current_sign)
-        self.decoder = TextDecoder(current_sign=sign) if text else FrameDecoder(current_sign=sign)
+        told = sensor or sensor_of(path)
+        self.decoder = make_dialect(told.model_copy(update={"current_sign": current_sign or told.current_sign}))
         self.damaged, self.unread_bytes = False, 0
         self._path = path
         self._read, self._size = 0, path.stat().st_size
@@ -104,11 +102,12 @@ class Replay:
         self._decoder = capture.decoder if isinstance(capture, RawCapture) else None
         self._speed, self._monotonic = speed, monotonic
         self.samples = 0
+        self.cells: CellBlock = NO_CELLS
 
     @property
     def counters(self) -> Mapping[str, int]:
         """The decoder's; of a table, how many rows came."""
-        return self._decoder.counters.as_dict() if self._decoder else {"frames_received": self.samples}
+        return self._decoder.counters if self._decoder else {"frames_received": self.samples}
 
     @property
     def board(self) -> Mapping[str, str]:
@@ -137,7 +136,12 @@ class Replay:
 
     async def _at_once(self) -> AsyncIterator[SampleBlock]:
         for block in self.capture:
+            self.cells = self._cells()
             yield block
+
+    def _cells(self) -> CellBlock:
+        """Beside the capture's last block."""
+        return self._decoder.cells if self._decoder else NO_CELLS
 
     async def _paced(self, speed: float) -> AsyncIterator[SampleBlock]:
         """Each sample once its time has come; the first comes at once."""
@@ -149,6 +153,7 @@ class Replay:
                 now_s = speed * (self._monotonic() - start_s)
                 end = int(np.searchsorted(due_s, now_s, side="right"))
                 if end > first:
+                    self.cells = self._cells()[first:end]
                     yield block[first:end]
                     first = end
                 else:

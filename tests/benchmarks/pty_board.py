@@ -14,10 +14,12 @@ from wire import hello, sample_frames
 from bms_estimator.sources.protocol import Ack, AckResult, MessageType, ProtocolError, unseal
 
 LONGEST_S = 120
+HELLO_S = 0.1
+"""Between two of its hellos before a host asks [s]."""
 
 
 class PtyBoard:
-    """Says hello when asked, and from then on sends a sample at each tick of its clock.
+    """Says hello until it is asked for it, and from then on sends a sample at each tick of its clock.
 
     Args:
         rate_hz: Samples per second.
@@ -56,8 +58,8 @@ class PtyBoard:
 
     def _live(self) -> None:
         os.set_blocking(self._board, False)
-        while not self._answer() and not self._stop.wait(0.01):
-            pass
+        while not self._answer() and not self._stop.wait(HELLO_S):
+            self._write(b"\0" + hello(self.rate_hz))  # a host asks only who has been heard
         started_s = time.monotonic()
         while not self._stop.wait(max(started_s + (self.sent + 1) / self.rate_hz - time.monotonic(), 0.0)):
             due = min(int((time.monotonic() - started_s) * self.rate_hz), len(self._frames))

@@ -6,12 +6,14 @@ import os
 import threading
 
 import pytest
+from serial.tools import list_ports
 
 from bms_estimator.cli.main import main
-from bms_estimator.sources import ports, probe
+from bms_estimator.sources import probe
 from bms_estimator.sources.virtual_board import VirtualBoard
 from bms_estimator.sources.virtual_converter import BoardParts, Reading
 from tests.patience import LONG_S
+from tests.serial_line import usb_port
 
 
 def board(capsys, *arguments):
@@ -97,7 +99,7 @@ def test_a_serial_number_that_the_board_cannot_hold(capsys, serial):
     assert "--serial" in err
 
 
-@pytest.mark.usefixtures("impatient")
+@pytest.mark.usefixtures("patient")
 def test_a_board_that_prints_text_takes_no_commands(capsys):
     with virtual(mode="text") as path:
         code, out, err = board(capsys, path, "--serial", "7")
@@ -120,9 +122,9 @@ def test_a_port_on_which_nobody_is(capsys):
 def test_a_port_that_is_not_there(capsys, tmp_path, monkeypatch):
     path = tmp_path / "none"
     assert board(capsys, str(path)) == (2, "", f"error: {path}: it does not exist\n")
-    monkeypatch.setattr(ports, "board_ports", list)
+    monkeypatch.setattr(list_ports, "comports", list)
     assert board(capsys) == (2, "", "error: auto: no USB serial port is there\n")
-    monkeypatch.setattr(ports, "board_ports", lambda: ["/dev/a", "/dev/b"])
+    monkeypatch.setattr(list_ports, "comports", lambda: [usb_port("/dev/a"), usb_port("/dev/b")])
     assert board(capsys) == (2, "", "error: auto: 2 serial ports are there; choose one: /dev/a, /dev/b\n")
 
 

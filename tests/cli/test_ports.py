@@ -11,6 +11,7 @@ import pytest
 from serial.tools import list_ports
 
 from bms_estimator.cli.main import main
+from tests.patience import LONG_S
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
@@ -51,12 +52,20 @@ def test_it_names_the_ports_that_are_there_and_no_others(capsys):
         assert out == "no serial port is there; is the board plugged in?\n"
 
 
-def test_a_board_answers_the_probe_and_goes_on(capsys):
-    with simulated("--rate-hz", "50") as (path, process):
+@pytest.mark.parametrize(
+    ("options", "answer"),
+    [
+        (("--rate-hz", "50"), r"board, firmware 0\.1\.0, serial 0*1, 50 Hz"),
+        (("--text", "--load", "constant", "--current-a", "0"), r"prints text, [34]\S* V, \S+ A"),
+    ],
+)
+def test_a_board_answers_the_probe_and_goes_on(capsys, monkeypatch, options, answer):
+    monkeypatch.setattr("bms_estimator.sources.probe.PATIENCE_S", LONG_S)
+    with simulated(*options) as (path, process):
         for _ in range(2):
             code, out = ports(capsys, "--probe", path)
             assert code == 0
-            assert re.search(rf"^ *{path} .* board, firmware 0\.1\.0, serial 0*1, 50 Hz *$", out, re.MULTILINE)
+            assert re.search(rf"^ *{path} .* {answer} *$", out, re.MULTILINE)
             assert f"(pid {process.pid})" in out
         assert process.poll() is None
 

@@ -195,3 +195,38 @@ async def test_a_wrong_baud_rate_reaches_the_published_health(line: Line) -> Non
             if (await asyncio.wait({said}, timeout=0.02))[0]:
                 break
     assert "9600 baud" in (said.result().health.sensor_message or "")
+
+
+@pytest.mark.parametrize(
+    ("sent", "told"),
+    [
+        (b"3800,0.1\n", "the last of them 3800 V, 0.1 A, where 1.5..4.5 V and up to 5 A are possible: are these millivolts?"),
+        (b"V=3.8 I=250\n", "are these milliamperes?"),
+        (b"0.2,3.8\n", "are the columns swapped?"),
+        (b"1e9,0.1\n", "the last of them 1e+09 V, 0.1 A, where 1.5..4.5 V and up to 5 A are possible"),
+    ],
+)  # fmt: skip
+async def test_values_out_of_range_are_told_with_the_range_and_a_guess(line: Line, sent: bytes, told: str) -> None:
+    async with service(line, hello=b"\n", protocol="text") as live:
+        live.line.write(sent)
+        said = await live.until(lambda s: "outside the cell's range" in (s.health.sensor_message or ""))
+    assert (said.health.sensor_message or "").endswith(told)
+
+
+async def test_a_text_board_that_prints_something_else_is_quoted(line: Line) -> None:
+    async with service(line, hello=b"\n", protocol="text") as live:
+        live.line.write(b"Vbat=13.3V only\r\nmore\r\n")
+        said = await live.until(lambda s: "the first: 'Vbat=13.3V only'" in (s.health.sensor_message or ""))
+    assert "baud rate" not in (said.health.sensor_message or "")
+
+
+async def test_lowest_and_highest_cell_reach_the_published_state(line: Line) -> None:
+    async with service(line, hello=b"\n", protocol="text") as live:
+        live.line.write(b"V=3.8 I=0.1\n")
+        without = await live.until(lambda s: s.estimate is not None)
+        live.line.write(b"V=3.8 I=0.1 cells=3.81,3.79,3.80\n")
+        told = await live.until(lambda s: s.estimate is not None and s.estimate.cell_lowest_v is not None)
+    assert without.estimate
+    assert (without.estimate.cell_lowest_v, without.estimate.cell_highest_v) == (None, None)
+    assert told.estimate
+    assert (told.estimate.cell_lowest_v, told.estimate.cell_highest_v) == (3.79, 3.81)

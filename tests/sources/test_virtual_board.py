@@ -12,7 +12,7 @@ import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.model.settings import SensorSettings
-from bms_estimator.sources.decoder import make_decoder
+from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.frames import FrameCounters, FrameDecoder
 from bms_estimator.sources.protocol import (
     AckResult,
@@ -230,7 +230,7 @@ async def test_a_host_that_does_not_read_loses_samples_and_is_told() -> None:
 
 async def test_text_mode_prints_what_a_hobby_sketch_prints() -> None:
     data = await received(board(mode="text"), 50)
-    decoder = make_decoder(SensorSettings(port="x", protocol="text", baud=115_200))
+    decoder = make_dialect(SensorSettings(port="x", protocol="text", baud=115_200))
     block = decoder.feed(0.0, data)
     assert block.size == 50
     assert block["voltage_v"] == pytest.approx(22.2, abs=0.03)

@@ -1,0 +1,19 @@
+"""Which dialect ``sensor.protocol`` asks for."""
+
+from collections.abc import Callable, Mapping
+
+from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources.dialects import Dialect
+from bms_estimator.sources.dialects.board import BoardDialect
+from bms_estimator.sources.dialects.text import TextDialect
+
+DIALECTS: Mapping[str, Callable[[SensorSettings], Dialect]] = {
+    "binary": lambda sensor: BoardDialect(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz),
+    "text": lambda sensor: TextDialect(current_sign=sensor.current_sign),
+}
+"""By the protocol's name in the settings and in the header of a capture."""
+
+
+def make_dialect(sensor: SensorSettings) -> Dialect:
+    """What ``[sensor]`` asks for; it turns the sign of the current."""
+    return DIALECTS[sensor.protocol](sensor)

@@ -1,0 +1,104 @@
+"""What a printed line says of a pack: columns, key=value or JSON."""
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from math import nan
+from typing import NamedTuple
+
+
+class Reading(NamedTuple):
+    """What one line says."""
+
+    voltage_v: float
+    current_a: float
+    """As the board counts it."""
+    temperature_c: float = nan
+    cells_v: tuple[float, ...] = ()
+
+
+_VOLT: Mapping[str, float] = {"": 1.0, "v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3}
+_UNITS: Mapping[str, Mapping[str, float]] = {
+    "voltage_v": _VOLT,
+    "current_a": {"": 1.0, "a": 1.0, "amp": 1.0, "amps": 1.0, "ma": 1e-3},
+    "temperature_c": {"": 1.0, "c": 1.0, "degc": 1.0},
+    "cells_v": _VOLT,
+}
+_NAMES = {
+    "voltage_v": ("V", "v", "U", "u", "volt", "volts", "voltage", "vbat", "vbatt", "bus_voltage", "pack_voltage"),
+    "current_a": ("I", "i", "A", "amp", "amps", "current", "ibat", "ibatt"),
+    "temperature_c": ("T", "temp", "temperature"),  # t may be the time
+    "cells_v": ("cells", "cell_voltages"),
+}
+_KNOWN = {
+    f"{name}_{unit}" if unit else name: (field, unit)
+    for field, names in _NAMES.items()
+    for name in names
+    for unit in _UNITS[field]
+}
+"""Name in a line: what it is, and its unit if the name holds it."""
+
+_SEPARATORS = bytes.maketrans(b",;\t", b"   ")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_PAIR = re.compile(
+    r"(?<![A-Za-z0-9_])([A-Za-z_][A-Za-z0-9_]*)\s*[=:]\s*"
+    rf"({_NUMBER}(?:,{_NUMBER})*)"
+    r"(?:\s*([A-Za-z]{1,8})\b(?!\s*[=:]))?"  # a unit, unless it is the next name
+)
+
+
+def read_line(line: bytes) -> Reading | None:
+    """What a line says; None where it does not tell voltage and current.
+
+    ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
+    ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
+    Other names are passed over; a name that comes twice, or a unit that is none of these, makes the line say nothing.
+    """
+    if b";" in line and b"." not in line:
+        line = line.replace(b",", b".")
+    try:
+        if line.lstrip().startswith(b"{"):
+            return _told(_members(line))
+        if b"=" in line or b":" in line:
+            return _told(_pairs(line.decode("ascii", "replace")))
+        voltage_v, current_a, *others = map(float, line.translate(_SEPARATORS).split())
+        return Reading(voltage_v, current_a, others[0] if others else nan) if len(others) <= 1 else None
+    except (ValueError, OverflowError, RecursionError):
+        return None
+
+
+Said = tuple[str, list[float], str]
+"""Name, values, unit or an empty string."""
+
+
+def _pairs(text: str) -> Iterable[Said]:
+    for name, values, unit in _PAIR.findall(text):
+        yield name, [float(value) for value in values.split(",")], unit
+
+
+def _members(line: bytes) -> Iterable[Said]:
+    for name, value in json.loads(line.decode()).items():
+        values = value if isinstance(value, list) else [value]
+        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+            yield name, [float(v) for v in values], ""
+
+
+def _told(said: Iterable[Said]) -> Reading | None:
+    """The reading of named values.
+
+    Raises:
+        ValueError: A name comes twice, or has an unknown unit or the wrong number of values.
+    """
+    found: dict[str, list[float]] = {}
+    for name, values, unit in said:
+        field, named_unit = _KNOWN.get(name) or _KNOWN.get(name.lower()) or ("", "")
+        if not field:
+            continue
+        factor = _UNITS[field].get((unit or named_unit).lower())
+        if factor is None or field in found or (field != "cells_v" and len(values) != 1):
+            raise ValueError(name)
+        found[field] = [factor * value for value in values]
+    if "voltage_v" not in found or "current_a" not in found:
+        return None
+    (voltage_v,), (current_a,), (temperature_c,) = (found.get(field, [nan]) for field in _UNITS if field != "cells_v")
+    return Reading(voltage_v, current_a, temperature_c, tuple(found.get("cells_v", ())))
