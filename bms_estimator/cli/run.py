@@ -1,4 +1,4 @@
-"""``bms-estimator run``: the service of one pack."""
+"""``bms-estimator run``: the service of one pack, or of several."""
 
 import asyncio
 import contextlib
@@ -14,10 +14,12 @@ import typer
 from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.cli.record import SYNC_S
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.logs import configure_logs
-from bms_estimator.service.serve import serve
+from bms_estimator.service.serve import serve, state_folder
+from bms_estimator.service.several import serve_several
 from bms_estimator.sinks import Sink
 from bms_estimator.sinks.console import ConsoleSink
 from bms_estimator.sources.raw_capture import CaptureWriter, header_of
@@ -27,7 +29,9 @@ LOG_LINES = 5
 
 
 def run(
-    pack: Annotated[Path, typer.Option(help="settings of the pack")] = Path("pack.toml"),
+    packs: Annotated[
+        list[Path] | None, typer.Argument(help="settings of the pack, or of each", show_default="pack.toml")
+    ] = None,
     port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
     mqtt: Annotated[str | None, typer.Option(help="broker in place of mqtt.url, mqtt://host:port")] = None,
     record: Annotated[
@@ -37,18 +41,31 @@ def run(
         bool | None, typer.Option("--view/--no-view", help="live view on stdout; without either: on a terminal")
     ] = None,
 ) -> None:
-    """Estimate live from a board and publish, until SIGINT or SIGTERM."""
-    settings, cell = load_pack(pack)
+    """Estimate live from a board and publish, until SIGINT or SIGTERM.
+
+    Several packs are served in one process, each with its own board and connection to the broker.
+    """
+    loaded = [load_pack(pack) for pack in packs or [Path("pack.toml")]]
+    if mqtt:
+        loaded = [(with_broker(settings, mqtt), cell) for settings, cell in loaded]
+    if len(loaded) == 1:
+        _run_one(*loaded[0], port, record, view=sys.stdout.isatty() if view is None else view)
+        return
+    if port or record or view:
+        raise UserError("--port, --record and --view are for one pack")
+    configure_logs()
+    asyncio.run(serve_several(loaded))
+
+
+def _run_one(settings: Settings, cell: CellModel, port: str | None, record: Path | None, *, view: bool) -> None:
     settings = with_sensor(settings, port=port)
-    settings = with_broker(settings, mqtt) if mqtt else settings
-    shown = sys.stdout.isatty() if view is None else view
     log: deque[str] = deque(maxlen=LOG_LINES)
-    configure_logs(log if shown and sys.stdout.isatty() else None)
+    configure_logs(log if view and sys.stdout.isatty() else None)
     recorder = CaptureWriter(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
-    sinks = [ConsoleSink(log=log)] if shown else []
+    sinks = [ConsoleSink(log=log)] if view else []
     with recorder as writer:
         if writer is None:
-            asyncio.run(serve(settings, cell, sinks=sinks))
+            asyncio.run(serve(settings, cell, sinks=sinks, folder=state_folder(settings)))
         else:
             asyncio.run(serve_and_record(settings, cell, sinks, writer))
 
@@ -62,7 +79,8 @@ async def serve_and_record(settings: Settings, cell: CellModel, sinks: Sequence[
         sinks: Further sinks.
         writer: Gets the board's bytes.
     """
-    await until_first_ends(serve(settings, cell, sinks=sinks, tap=writer), _sync_often(writer))
+    serving = serve(settings, cell, sinks=sinks, tap=writer, folder=state_folder(settings))
+    await until_first_ends(serving, _sync_often(writer))
 
 
 async def _sync_often(writer: CaptureWriter) -> None:

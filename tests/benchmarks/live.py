@@ -113,7 +113,7 @@ async def _measure(folder: Path, board: PtyBoard, server: Broker) -> Run:
         listening = asyncio.create_task(_listen(client, states))
         started_s = time.monotonic()
         with (folder / "log").open("w") as log:
-            service = await asyncio.create_subprocess_exec(PROGRAM, "run", "--pack", pack, stdout=log, stderr=log)
+            service = await asyncio.create_subprocess_exec(PROGRAM, "run", pack, stdout=log, stderr=log)
         try:
             await _first(states, service, folder / "log")
             await asyncio.sleep(SETTLE_S)

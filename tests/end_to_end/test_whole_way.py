@@ -100,7 +100,7 @@ folder = "{folder / "state"}"
 @contextlib.asynccontextmanager
 async def program(pack: Path, *options: str) -> AsyncIterator[asyncio.subprocess.Process]:
     process = await asyncio.create_subprocess_exec(
-        str(PROGRAM), "run", "--pack", str(pack), *options, stdout=asyncio.subprocess.DEVNULL, stderr=None
+        str(PROGRAM), "run", str(pack), *options, stdout=asyncio.subprocess.DEVNULL, stderr=None
     )
     try:
         yield process

@@ -41,7 +41,7 @@ folder = "{folder / "state"}"
 @contextlib.asynccontextmanager
 async def service(pack: Path) -> AsyncIterator[asyncio.subprocess.Process]:
     process = await asyncio.create_subprocess_exec(
-        str(PROGRAM), "run", "--pack", str(pack), stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE
+        str(PROGRAM), "run", str(pack), stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE
     )
     try:
         yield process
