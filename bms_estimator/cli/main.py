@@ -109,8 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _run(arguments)
     except UserError as error:
-        cause = error.__cause__ or error.__context__
-        _end(str(error), 1 if isinstance(cause, OSError) and cause.errno in DISK_FAULTS else 2)
+        _end(str(error), 1 if _is_of_a_disk(error) else 2)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package not in EXTRAS:
@@ -120,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _leave_stdout()
         sys.exit(1)
     except OSError as error:
-        if error.errno not in DISK_FAULTS:
+        if not _is_of_a_disk(error):
             raise
         _leave_stdout()
         _end(f"cannot write{f' {error.filename}' if error.filename else ''}: {error.strerror}", 1)
@@ -136,6 +135,13 @@ def _run(arguments: Sequence[str] | None) -> None:
         if sys.stdout:
             sys.stdout.flush()
         raise
+
+
+def _is_of_a_disk(error: BaseException | None) -> bool:
+    """Whether an error, or what it came from, is that a disk is full or broken."""
+    if error is None or isinstance(error, OSError):
+        return error is not None and error.errno in DISK_FAULTS
+    return _is_of_a_disk(error.__cause__ or error.__context__)
 
 
 def _leave_stdout() -> None:

@@ -71,6 +71,14 @@ def test_a_broker_address_that_is_none(tmp_path, capsys):
     assert "error: --mqtt nonsense: must be" in err
 
 
+@pytest.mark.parametrize("options", [("--port", "/dev/none"), ("--record", "new.bms"), ("--view",)])
+def test_what_is_of_one_board_is_not_for_several_packs(options, tmp_path, capsys):
+    packs = [tmp_path / "one.toml", tmp_path / "two.toml"]
+    for pack in packs:
+        pack.write_text("")
+    assert run(capsys, "run", *packs, *options) == (2, "", "error: --port, --record and --view are for one pack\n")
+
+
 def test_help_lists_every_command_and_the_version_is_the_packages(capsys):
     code, out, _ = run(capsys, "--help")
     assert code == 0

@@ -60,3 +60,7 @@ def test_machine_code_may_be_made_at_run_time(deploy):
     """Import numba fails under MemoryDenyWriteExecute, so it must never be switched on."""
     keys = [line.split("=")[0] for line in (deploy / "bms-estimator.service").read_text().splitlines()]
     assert "MemoryDenyWriteExecute" not in keys
+
+
+def test_a_flood_ends_the_service_and_not_the_machine(deploy):
+    assert "\nMemoryMax=1G\n" in (deploy / "bms-estimator.service").read_text()

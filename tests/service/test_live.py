@@ -17,7 +17,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings
-from bms_estimator.service.live import new_estimator, run_live
+from bms_estimator.service.live import LAG_STEP_S, new_estimator, run_live
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.requests import Requests
 from tests.collector import Collector
@@ -262,8 +262,5 @@ async def test_how_long_something_blocked_the_loop_is_published() -> None:
     async with running() as run:
         await run.sink.until(lambda _: True)
         time.sleep(0.4)  # noqa: ASYNC251 - blocks the loop, as a slow disk or terminal would
-        late = await run.sink.until(lambda s: s.health.loop_lag_s > 0.0 and s.health.uptime_s > 0.4)
-        worst_s = max(s.health.loop_lag_s for s in run.sink.snapshots)
+        await run.sink.until(lambda s: s.health.loop_lag_s > 0.4 - LAG_STEP_S)
         await run.end()
-    assert late.health.loop_lag_s <= worst_s
-    assert worst_s >= 0.3  # what blocks for 0.4 s delays a wake that was due within 0.1 s
