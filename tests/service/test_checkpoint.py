@@ -39,10 +39,15 @@ def edited(section: str, **values: Any) -> Settings:
     return Settings.model_validate(tables | {section: tables[section] | values})
 
 
+def old_state() -> np.ndarray:
+    with np.load(OLD_FILE) as file:
+        return file["state"]
+
+
 def an_old_pack() -> Estimator:
     """An estimator that has learned."""
     estimator = new_estimator(SETTINGS, CELL)
-    assert resume(estimator, dict(fields(np.load(OLD_FILE)["state"])), 0.0) == ""
+    assert resume(estimator, dict(fields(old_state())), 0.0) == ""
     estimator.step(0.0, 0.0, 3.8)  # of the new clock
     assert estimator.record["map"]["weight"].any()
     return estimator
@@ -134,7 +139,7 @@ def test_a_version_with_other_fields_reads_what_it_knows() -> None:
 
 async def test_a_checkpoint_of_the_format_before_is_taken_over(tmp_path: Path) -> None:
     (tmp_path / "pack.npz").write_bytes(OLD_FILE.read_bytes())
-    old = np.load(OLD_FILE)["state"]
+    old = old_state()
     run = await ran(tmp_path, edited("identifier", map_memory_h=100.0), samples=1)
     assert run.health.checkpoint == "restored: SOC 0.5762"
     assert run.health.restarts == 4
