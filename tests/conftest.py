@@ -25,3 +25,11 @@ def shared_data() -> Path:
 def data() -> Path:
     """Folder of the real captures that come with the tests."""
     return DATA
+
+
+@pytest.fixture(autouse=True)
+def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where programs keep their state: not in the home of who runs the tests, nor in that of another test."""
+    folder = tmp_path / "state-home"
+    monkeypatch.setenv("XDG_STATE_HOME", str(folder))
+    return folder

@@ -46,8 +46,8 @@ COMMANDS = {
 
 EXTRAS = {"pyarrow": "parquet", "amqtt": "demo", "matplotlib": "report"}
 """Optional package -> the extra that brings it."""
-CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""What a disk that is full or broken says, whichever file it is."""
+DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""What a disk that is full or broken says. It may have room again: systemd is to start a service anew that ends so."""
 
 
 class LazyGroup(TyperGroup):
@@ -100,8 +100,8 @@ def _root(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process.
 
-    Exit codes: 0 done, 1 a fault of ours (with its traceback) or nobody reads stdout any more (without), 2 something a
-    person can mend, 130 interrupted.
+    Exit codes: 0 done, 1 a fault of ours (with its traceback), or nobody reads stdout any more, or a disk is full or broken
+    (without), 2 something a person can mend, 130 interrupted.
 
     Args:
         arguments: Without the program's name; None: the process's.
@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _run(arguments)
     except UserError as error:
-        _end(str(error))
+        _end(str(error), 1 if _is_of_a_disk(error) else 2)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package not in EXTRAS:
@@ -119,10 +119,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _leave_stdout()
         sys.exit(1)
     except OSError as error:
-        if error.errno not in CANNOT_WRITE:
+        if not _is_of_a_disk(error):
             raise
         _leave_stdout()
-        _end(f"the output cannot be written: {error.strerror}")
+        _end(f"cannot write{f' {error.filename}' if error.filename else ''}: {error.strerror}", 1)
     except KeyboardInterrupt:  # while a command was imported
         sys.exit(130)
 
@@ -137,6 +137,13 @@ def _run(arguments: Sequence[str] | None) -> None:
         raise
 
 
+def _is_of_a_disk(error: BaseException | None) -> bool:
+    """Whether an error, or what it came from, is that a disk is full or broken."""
+    if error is None or isinstance(error, OSError):
+        return error is not None and error.errno in DISK_FAULTS
+    return _is_of_a_disk(error.__cause__ or error.__context__)
+
+
 def _leave_stdout() -> None:
     """Let nothing more fail: the interpreter flushes stdout once again as it ends."""
     if not sys.stdout:
@@ -145,7 +152,7 @@ def _leave_stdout() -> None:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
-def _end(message: str) -> None:
+def _end(message: str, code: int = 2) -> None:
     for line in message.splitlines():
         sys.stderr.write(f"error: {line}\n")
-    sys.exit(2)
+    sys.exit(code)

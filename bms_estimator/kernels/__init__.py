@@ -3,22 +3,30 @@
 numba's disk cache notices a change in a function's own file only, not in the files of the functions it calls, nor in
 those of the constants it compiles in, and would go on running the old ones. So the cache lives in a folder named by the
 content of all of them.
+
+A kernel that cannot be kept there, or cannot be read from there, is compiled at each start: a full disk ends nothing.
 """
 
+import contextlib
 import hashlib
 import os
 import tempfile
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numba
+from numba.core.caching import Cache
+from numba.core.dispatcher import Dispatcher
 
 _HERE = Path(__file__).parent
 COMPILED_IN = (*sorted(_HERE.glob("*.py")), _HERE.parent / "model" / "suspect.py")
 """Files that compiled code is made of."""
 
 
-def _cache_folder() -> Path:
-    """Where compiled kernels go: NUMBA_CACHE_DIR, systemd's CacheDirectory, or the user's cache."""
+def _cache_folder() -> Path | None:
+    """Where compiled kernels go: NUMBA_CACHE_DIR, systemd's CacheDirectory, or the user's cache; None: nowhere."""
     digest = hashlib.sha256()
     for source in COMPILED_IN:
         digest.update(source.read_bytes())
@@ -31,13 +39,36 @@ def _cache_folder() -> Path:
     for candidate in candidates:
         if candidate:
             folder = Path(candidate) / digest.hexdigest()[:16]
-            try:
+            with contextlib.suppress(OSError):
                 folder.mkdir(parents=True, exist_ok=True)
-            except OSError:
-                continue
-            if os.access(folder, os.W_OK):
+                tempfile.TemporaryFile(dir=folder).close()
                 return folder
-    return Path(tempfile.mkdtemp(prefix="bms_estimator-"))  # nowhere to keep them: compile at every start
+    return None
 
 
-numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
+@contextlib.contextmanager
+def _go_on(cache: Any) -> Iterator[None]:
+    """Around each use of a kernel's files: whatever is wrong with them, it costs the compilation only."""
+    try:
+        yield
+    except OSError as error:
+        warnings.warn(f"compiled kernels are not kept: {error.strerror}", RuntimeWarning, stacklevel=1)
+    except Exception as error:  # noqa: BLE001 - a damaged file may raise anything
+        warnings.warn(f"a compiled kernel cannot be read: {error!r}", RuntimeWarning, stacklevel=1)
+        with contextlib.suppress(OSError):
+            cache.flush()
+
+
+def _keep(folder: Path | None) -> None:
+    """Have numba keep compiled kernels in ``folder``."""
+    cache: Any = Cache  # methods of both are replaced, which types do not know
+    kernel: Any = Dispatcher
+    if folder is None:
+        warnings.warn("compiled kernels are not kept: no folder can be written", RuntimeWarning, stacklevel=1)
+        kernel.enable_caching = lambda _: None
+        return
+    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+    cache._guard_against_spurious_io_errors = _go_on  # noqa: SLF001 - numba's place for it, empty but on Windows
+
+
+_keep(_cache_folder())

@@ -81,6 +81,7 @@ class Health(Report):
     publish_time: str = Field(description="when this message was made, ISO 8601, UTC")
     uptime_s: float = Field(description="since the service started [s]")
     rss_mib: float | None = Field(description="resident memory [MiB]")
+    loop_lag_s: float = Field(description="how late the event loop woke at worst since the last health [s]")
     restarts: int = Field(description="starts that found a checkpoint of an earlier run")
     reconnects: int = Field(description="times the source was opened again")
     sensor_online: bool = Field(description="a valid frame came within 3 publish or sample periods")

@@ -153,7 +153,8 @@ class StateSettings(Strict):
     """What outlives a restart."""
 
     folder: Path | None = Field(
-        default=None, description="where checkpoints go; systemd's StateDirectory when left out"
+        default=None,
+        description="where checkpoints go; systemd's StateDirectory when left out, else the user's XDG state folder",
     )
     checkpoint_s: Annotated[float, Field(ge=1)] = 60.0
 

@@ -1,93 +1,115 @@
-"""Checkpoints: the estimator's state on disk, taken up again only when it belongs to the same pack and is sane."""
+"""Checkpoints: the estimator's state on disk, taken up again only when it belongs to the same pack and is sane.
+
+One file for each meaning that a state can have (``pack_identity``), its fields under their own names: settings may be
+edited, and versions that know other fields may come, without what was learned being lost.
+"""
 
 import hashlib
 import io
 import os
-from collections.abc import Callable, Mapping
+import re
+import stat
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.identifier_state import IDENTIFIER_COUNTERS, IDENTIFIER_STATE
-from bms_estimator.kernels.state import OBSERVER_STATE
-from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell import CellModel, ChenMoraOcv
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.moment import Moment, moment
 
-FORMAT = 4
-"""Raise it to make all older checkpoints invalid."""
+FORMAT = 5
+"""Raise it when a field of an old name gets another meaning."""
+NAMELESS_FORMAT = 4
+"""The format before: one record with the layout of its version, one file for each pack. Read for a while."""
 LONGEST_FILE = 1 << 20
 """A checkpoint has some kilobytes; a longer file is none [bytes]."""
+KEPT = 8
+"""So many files of one pack are kept, those saved last."""
 REFUSED = "refused: "
 """A reason that begins so tells why a file that was found is not taken up."""
 
-_DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
-COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
-"""Fields of the state that count since start."""
-_SEEN = tuple(name for name in IDENTIFIER_STATE.names or () if name.startswith("seen_"))
-
 
 def pack_identity(settings: Settings, cell: CellModel) -> str:
-    """Hash of all that gives the state its meaning: pack, cell, sensor, observer, identifier, the record's layout."""
-    digest = hashlib.sha256()
-    sensor = {"current_sign", "voltage_resolution_v", "voltage_noise_v"}
-    digest.update(
-        settings.model_dump_json(
-            include={"pack": True, "sensor": sensor, "observer": True, "identifier": True}
-        ).encode()
-    )
-    for part in (cell.model_dump_json(), str(ESTIMATOR_STATE)):
-        digest.update(b"\0" + part.encode())
-    return digest.hexdigest()
+    """Hash of what gives the state its meaning: cells in series, capacity, open-circuit voltage, sign of the current.
+
+    Plain numbers and not the sections of the settings: a description, a tuning value or a setting that a later version
+    adds leave the meaning as it is.
+    """
+    ocv = cell.ocv
+    curve = ocv.a if isinstance(ocv, ChenMoraOcv) else (*ocv.soc, *ocv.ocv_v)
+    meaning = (cell.cell.series_count, cell.cell.capacity_ah, settings.sensor.current_sign, *curve)
+    return hashlib.sha256(repr(meaning).encode()).hexdigest()
+
+
+def _observer_identity(settings: Settings, cell: CellModel) -> str:
+    """Hash of what the observer's parameters and gain rest on; under other settings it begins anew, within seconds."""
+    parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+    """Each field of a structured array, as a view, under its name; those of its parts as ``part.field``."""
+    for name in record.dtype.names or ():
+        if record[name].dtype.names:
+            yield from fields(record[name], f"{part}{name}.")
+        else:
+            yield f"{part}{name}", record[name]
 
 
 @dataclass(frozen=True)
 class Restored:
     """What a checkpoint file held."""
 
-    state: NDArray[np.void] | None
-    """Shape (1,), dtype ESTIMATOR_STATE; None when it was refused."""
+    state: Mapping[str, NDArray[Any]]
+    """Fields of ESTIMATOR_STATE by their names, as ``fields`` gives them; empty when it was refused."""
     unseen_s: float
     """Since it was saved [s]; infinite when nobody knows."""
     restarts: int
     """Starts that found a checkpoint, this one included."""
     reason: str
-    """What was taken up, or why not."""
+    """Why it is not taken up; empty when it may be."""
 
 
 class CheckpointFile:
-    """One pack's checkpoint.
+    """One pack's checkpoint, ``<pack.name>-<identity>.npz``.
 
     Args:
-        path: The file; its folder must exist.
-        identity: ``pack_identity``.
+        folder: Where it is; must exist.
+        settings: The pack's settings.
+        cell: The pack as one object.
         now: The present moment.
     """
 
-    def __init__(self, path: Path, identity: str, now: Callable[[], Moment] = moment) -> None:
-        self.path = path
-        self._identity, self._now = identity, now
+    def __init__(self, folder: Path, settings: Settings, cell: CellModel, now: Callable[[], Moment] = moment) -> None:
+        self._name, self._now = settings.pack.name, now
+        self._identity, self._observer = pack_identity(settings, cell), _observer_identity(settings, cell)
+        self._range_v = cell.cell.voltage_min_v, cell.cell.voltage_max_v
+        self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
         self.thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
         """Where to call ``save``: a call that nobody waits for any more still ends before the next one begins."""
 
     def save(self, state: NDArray[np.void], restarts: int) -> None:
         """Write atomically: after a power cut there is the old file or the new one.
 
+        Args:
+            state: Shape (1,), dtype ESTIMATOR_STATE.
+            restarts: Starts that found a checkpoint.
+
         Raises:
             OSError: The file cannot be written.
         """
         content = io.BytesIO()
-        fields: dict[str, Any] = asdict(self._now()) | {"identity": self._identity, "restarts": restarts}
-        np.savez(content, format=FORMAT, state=state, **fields)
+        named: dict[str, Any] = {f"state.{name}": field for name, field in fields(state)} | asdict(self._now())
+        np.savez(content, format=FORMAT, identity=self._identity, observer=self._observer, restarts=restarts, **named)
         new = self.path.with_suffix(".new")
-        with new.open("wb") as file:
-            file.write(content.getvalue())
+        new.unlink(missing_ok=True)
+        with open(new, "xb", opener=_private) as file:
+            file.write(content.getbuffer())
             file.flush()
             os.fsync(file.fileno())
         new.replace(self.path)
@@ -96,102 +118,82 @@ class CheckpointFile:
             os.fsync(folder)
         finally:
             os.close(folder)
+        self._remove_oldest()
 
-    def load(self, cell: CellModel) -> Restored:
-        """Read and check; what is wrong is a reason, not an exception. A file that is refused is set aside.
+    def load(self) -> Restored:
+        """Read; what is wrong is a reason, not an exception.
 
-        One set aside earlier is taken up again when it is good: a setting that was wrong for a while costs nothing.
+        The file of the format before is taken over by its name: it is of the settings that were used last. What it
+        hashed, whole sections of the settings, cannot be made again by a version that knows others.
         """
-        found = self._load(self.path, cell)
-        if found.state is not None:
-            return found
-        refused = found.reason.startswith(REFUSED)
-        aside, new = self.path.with_suffix(".refused.npz"), self.path.with_suffix(".new")
-        earlier = self._load(aside, cell)
+        before = self.path.with_name(f"{self._name}.npz")
         try:
-            if refused:
-                self.path.replace(new)
-            if earlier.state is not None:
-                aside.replace(self.path)
-            if refused:
-                new.replace(aside)
-        except OSError as error:
-            return replace(found, reason=f"{found.reason}; it cannot be set aside: {error}")
-        if earlier.state is not None:
-            return replace(earlier, reason=f"{earlier.reason}, set aside earlier")
-        return replace(found, reason=f"{found.reason}; set aside as {aside.name}") if refused else found
-
-    def _load(self, path: Path, cell: CellModel) -> Restored:
-        try:
-            with np.load(io.BytesIO(_read(path)), allow_pickle=False) as file:
-                return self._checked(file, cell)
+            if not self.path.exists() and before.exists():
+                before.replace(self.path)
+            with np.load(io.BytesIO(_read(self.path)), allow_pickle=False) as file:
+                return self._checked(file)
         except FileNotFoundError:
-            return Restored(None, 0.0, 0, "none found")
+            return Restored({}, 0.0, 0, "none found")
         except _RefusedError as error:
-            return Restored(None, 0.0, 0, f"{REFUSED}{error}")
+            return Restored({}, 0.0, 0, f"{REFUSED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return Restored(None, 0.0, 0, f"{REFUSED}unreadable ({type(error).__name__}: {error})")
+            return Restored({}, 0.0, 0, f"{REFUSED}unreadable ({type(error).__name__}: {error})")
 
-    def _checked(self, file: Mapping[str, np.ndarray], cell: CellModel) -> Restored:
-        if int(file["format"]) != FORMAT:
-            raise _RefusedError(f"format {int(file['format'])}, this version reads {FORMAT}")
-        if str(file["identity"]) != self._identity:
-            raise _RefusedError("it belongs to another pack, cell or setting")
-        state, restarts = file["state"], int(file["restarts"]) + 1
-        insane = _insane(state, cell)
-        if insane:
-            return Restored(None, 0.0, restarts, f"{REFUSED}{insane}")
+    def set_aside(self) -> str:
+        """Keep a file that was refused out of the way of the next save. Returns what was done, for people."""
+        aside = self.path.with_name(f"{self._name}.refused.npz")
+        try:
+            self.path.replace(aside)
+        except OSError as error:
+            return f"it cannot be set aside: {error}"
+        return f"set aside as {aside.name}"
+
+    def _checked(self, file: Mapping[str, NDArray[Any]]) -> Restored:
+        version = int(file["format"])
+        if version not in (NAMELESS_FORMAT, FORMAT):
+            raise _RefusedError(f"format {version}, this version reads {FORMAT}")
+        if version == NAMELESS_FORMAT:
+            state = dict(fields(file["state"]))
+            low, high = self._range_v
+            if not low <= state["observer.voltage_estimate_v"][0] <= high:
+                raise _RefusedError("its voltage is none of this pack")
+        elif str(file["identity"]) != self._identity:
+            raise _RefusedError("it belongs to another pack or cell")
+        else:
+            state = {name.removeprefix("state."): file[name] for name in file if name.startswith("state.")}
+        if version == NAMELESS_FORMAT or str(file["observer"]) != self._observer:
+            kept = ("observer.soc", "observer.soc_coulomb", "observer.started")
+            state = {name: v for name, v in state.items() if name in kept or not name.startswith("observer.")}
         saved = Moment(float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"]))
-        return Restored(
-            state,
-            self._now().since(saved),
-            restarts,
-            f"restored: SOC {float(state['observer']['soc'][0]):.4f}",
-        )
+        return Restored(state, self._now().since(saved), int(file["restarts"]) + 1, "")
+
+    def _remove_oldest(self) -> None:
+        """Of the pack's files leave those saved last: whoever tries settings leaves one for each."""
+        ours = re.compile(rf"{re.escape(self._name)}-[0-9a-f]{{8}}\.npz")
+        others = [path for path in self.path.parent.iterdir() if ours.fullmatch(path.name) and path != self.path]
+        others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
+        for path in others[KEPT - 1 :]:
+            path.unlink(missing_ok=True)
 
 
 class _RefusedError(Exception):
     """Why a checkpoint is not taken up."""
 
 
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
+
+
 def _read(path: Path) -> bytes:
-    if path.stat().st_size > LONGEST_FILE:
-        raise _RefusedError("file too long")
-    return path.read_bytes()
+    """A whole file, but not through a link nor from what is no file.
 
-
-def _insane(state: NDArray[np.void], cell: CellModel) -> str:
-    """Why a state cannot be used; empty when it can."""
-    if state.dtype != ESTIMATOR_STATE or state.shape != (1,):
-        return f"state has dtype of {state.dtype.itemsize} bytes and shape {state.shape}"
-    for part in ("observer", "identifier", "map"):
-        for name in ESTIMATOR_STATE[part].names or ():
-            if not np.isfinite(state[part][name]).all():
-                return f"{name} of the {part} is not finite"
-    s = state[0]["observer"]
-    if not s["started"]:
-        return "no sample was taken"
-    ranges = {
-        "soc": (0.0, 1.0),
-        "v_ts": (-cell.cell.voltage_max_v, cell.cell.voltage_max_v),
-        "v_tl": (-cell.cell.voltage_max_v, cell.cell.voltage_max_v),
-        "k": (0.0, np.inf),
-    }
-    for name, (low, high) in ranges.items():
-        if not low <= s[name] <= high:
-            return f"{name} = {s[name]} is outside {low}..{high}"
-    variances = np.diagonal(state[0]["identifier"]["covariance"])
-    for name, good in (("a parameter a1..a15", s["a"][1:16] > 0.0), ("a variance", variances >= 0.0)):
-        if not good.all():
-            return f"{name} is not positive"
-    return ""
-
-
-def resume(estimator: Estimator, state: NDArray[np.void], unseen_s: float) -> None:
-    """Go on from a checkpoint's state, saved ``unseen_s`` ago, on the board's new clock. The counters count from this start."""
-    estimator.record[...] = state
-    estimator.resume(unseen_s)
-    for name in COUNTERS:
-        estimator.state[name] = 0
-    for name in (*IDENTIFIER_COUNTERS, *_SEEN):
-        estimator.record["identifier"][name] = 0
+    Raises:
+        _RefusedError: It is too long or no file.
+        OSError: It cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    with open(descriptor, "rb") as file:  # noqa: PTH123 - a descriptor has no Path
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or found.st_size > LONGEST_FILE:
+            raise _RefusedError("no file, or too long")
+        return file.read()

@@ -14,13 +14,17 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.checkpoint import CheckpointFile, resume
+from bms_estimator.service.checkpoint import REFUSED, CheckpointFile
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
+from bms_estimator.service.resume import resume
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources import Source
+
+LAG_STEP_S = 0.1
+"""How often the loop's lag is measured [s]: what blocks it for longer is always seen."""
 
 log = structlog.get_logger(__name__)
 
@@ -57,10 +61,11 @@ async def run_live(
     Returns:
         The estimator as the last sample left it.
     """
-    notifier, clock = notifier or Notifier(), clock or Clock()
+    name, clock = settings.pack.name, clock or Clock()
+    notifier = notifier or Notifier([name])
     log.info("loading kernels; a first start compiles them, which takes some tens of seconds")
     estimator = new_estimator(settings, cell)
-    restarts, restored = _restore(estimator, checkpoint, cell)
+    restarts, restored = _restore(estimator, checkpoint)
     publisher = Publisher(
         settings,
         cell,
@@ -78,15 +83,19 @@ async def run_live(
         for sink in sinks:
             await stack.enter_async_context(sink)
         await stack.enter_async_context(source)
-        notifier.send("READY=1", f"STATUS=estimating {settings.pack.name}")
-        tasks = [_estimate(source, estimator, publisher), _keep_alive(publisher, notifier)]
+        notifier.ready(name)
+        tasks = [
+            _estimate(source, estimator, publisher),
+            _keep_alive(publisher, notifier, name),
+            _measure_lag(publisher),
+        ]
         if checkpoint:
             tasks.append(_save_often(checkpoint, estimator, publisher, settings.state.checkpoint_s, restarts))
         await until_first_ends(*tasks, stop.wait())
-        notifier.send("STOPPING=1")
+        notifier.stopping(name)
+        if checkpoint:  # before the sinks part, which may take seconds: who stops us may not wait for them
+            await _save(checkpoint, estimator, publisher, restarts)
         publisher.publish_last()
-    if checkpoint:
-        await _save(checkpoint, estimator, publisher, restarts)
     return estimator
 
 
@@ -113,25 +122,38 @@ async def _estimate(source: Source, estimator: Estimator, publisher: Publisher) 
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
 
-async def _keep_alive(publisher: Publisher, notifier: Notifier) -> None:
+async def _keep_alive(publisher: Publisher, notifier: Notifier, name: str) -> None:
     """Publish that nothing comes, and pat the watchdog."""
     longest_s = notifier.watchdog_s / 3.0 or publisher.period_s
     while True:
-        notifier.send("WATCHDOG=1")
+        notifier.alive(name)
         await asyncio.sleep(min(max(publisher.wait_s, 0.01), longest_s))
         if publisher.wait_s == 0.0:
             publisher.publish()
 
 
-def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, cell: CellModel) -> tuple[int, str]:
+async def _measure_lag(publisher: Publisher) -> None:
+    """Tell the publisher how late the loop wakes: so long samples and answers may wait for what blocks it."""
+    loop = asyncio.get_running_loop()
+    while True:
+        due_s = loop.time() + LAG_STEP_S
+        await asyncio.sleep(LAG_STEP_S)
+        publisher.add_lag(loop.time() - due_s)
+
+
+def _restore(estimator: Estimator, checkpoint: CheckpointFile | None) -> tuple[int, str]:
     """Go on from the checkpoint where there is a good one. Returns how many starts found one, and what was done."""
     if checkpoint is None:
         return 0, "off"
-    found = checkpoint.load(cell)
-    if found.state is not None:
-        resume(estimator, found.state, found.unseen_s)
-    log.info("checkpoint", file=str(checkpoint.path), outcome=found.reason)
-    return found.restarts, found.reason
+    found = checkpoint.load()
+    outcome = found.reason
+    if not outcome:
+        wrong = resume(estimator, found.state, found.unseen_s)
+        outcome = f"{REFUSED}{wrong}" if wrong else f"restored: SOC {estimator.state['soc'][0]:.4f}"
+    if outcome.startswith(REFUSED):
+        outcome = f"{outcome}; {checkpoint.set_aside()}"
+    log.info("checkpoint", file=str(checkpoint.path), outcome=outcome)
+    return found.restarts, outcome
 
 
 async def _save_often(

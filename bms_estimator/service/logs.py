@@ -1,8 +1,9 @@
 """Log lines: JSON for a journal or a pipe, readable on a terminal. On stderr; stdout belongs to results."""
 
+import contextlib
 import os
 import sys
-from collections.abc import MutableSequence
+from collections.abc import Callable, MutableSequence
 from typing import Any
 
 import structlog
@@ -23,22 +24,30 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
     )
     structlog.configure(
         processors=[
+            structlog.contextvars.merge_contextvars,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso" if wide else "%H:%M:%SZ", utc=True),
             *last,
         ],
-        logger_factory=structlog.PrintLoggerFactory(file=sys.stderr) if lines is None else lambda *_: _Lines(lines),
+        logger_factory=lambda *_: _Lines(_print if lines is None else lines.append),
         cache_logger_on_first_use=True,
     )
 
 
-class _Lines:
-    """A logger of structlog that appends to a sequence."""
+def _print(message: str) -> None:
+    """A line on stderr; where a full disk does not take it, it is lost and nothing else."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write(f"{message}\n")
+        sys.stderr.flush()
 
-    def __init__(self, lines: MutableSequence[str]) -> None:
-        self._append = lines.append
+
+class _Lines:
+    """A logger of structlog that hands on lines."""
+
+    def __init__(self, take: Callable[[str], object]) -> None:
+        self._take = take
 
     def msg(self, message: str) -> None:
-        self._append(message)
+        self._take(message)
 
     debug = info = warning = error = critical = exception = msg

@@ -1,5 +1,6 @@
 """Moments that outlive the process: how long nobody measured."""
 
+import ctypes
 import math
 import os
 import time
@@ -7,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
-"""Is there once systemd-timesyncd has set the wall clock."""
+TIME_ERROR = 5
+"""What adjtimex(2) returns while nothing sets the wall clock."""
+TIMEX_BYTES = 512
+"""More than a ``struct timex`` has anywhere."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +38,18 @@ class Moment:
         return passed_s if passed_s >= 0.0 and self.synchronised and before.synchronised else math.inf
 
 
+def synchronised() -> bool:
+    """Whether the kernel holds the wall clock for right: it does not matter who sets it (timesyncd, chrony, ntpsec)."""
+    only_read = ctypes.create_string_buffer(TIMEX_BYTES)
+    return int(ctypes.CDLL(None).adjtimex(only_read)) in range(TIME_ERROR)
+
+
 def moment() -> Moment:
     """Now. The unit hides /proc/sys and says in ``BMS_BOOT_ID`` which start of the machine this is."""
     boot = os.environ.get("BMS_BOOT_ID") or (BOOT_ID.read_text(encoding="ascii") if BOOT_ID.exists() else "")
     return Moment(
         wall_s=time.time(),
-        synchronised=SYNCHRONISED.exists(),
+        synchronised=synchronised(),
         boot_s=time.clock_gettime(time.CLOCK_BOOTTIME),
         boot=boot.strip().replace("-", ""),
     )

@@ -2,30 +2,55 @@
 
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 
 class Notifier:
     """Sends states to the socket of ``NOTIFY_SOCKET``; silent where there is none.
 
+    One process may serve several packs. Systemd knows one service: a state is sent when all of them have it, since it was
+    sent last. So it is ready with the last of them, and alive while each is.
+
     Args:
+        packs: Names of the packs.
         environment: Where ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC`` are looked up.
     """
 
-    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+    def __init__(self, packs: Collection[str], environment: Mapping[str, str] = os.environ) -> None:
+        self._packs = frozenset(packs)
+        self._awaited: dict[str, set[str]] = {}
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.watchdog_s = float(environment.get("WATCHDOG_USEC", "0")) / 1e6 if for_us else 0.0
         """Time after which systemd takes us for dead [s]; 0: it does not watch."""
 
-    def send(self, *lines: str) -> None:
-        """Send ``READY=1``, ``WATCHDOG=1``, ``STOPPING=1``, ``STATUS=...``; a deaf systemd is no reason to fail."""
+    def ready(self, pack: str) -> None:
+        """The pack's loop runs."""
+        self._send_with_last(pack, f"READY=1\nSTATUS=estimating {', '.join(sorted(self._packs))}")
+
+    def alive(self, pack: str) -> None:
+        """The pack's loop turns."""
+        self._send_with_last(pack, "WATCHDOG=1")
+
+    def stopping(self, pack: str) -> None:
+        """The pack's loop has ended."""
+        self._send_with_last(pack, "STOPPING=1")
+
+    def _send_with_last(self, pack: str, state: str) -> None:
+        awaited = self._awaited.setdefault(state, set(self._packs))
+        awaited.discard(pack)
+        if not awaited:
+            del self._awaited[state]
+            self._send(state)
+
+    def _send(self, state: str) -> None:
+        """A deaf systemd is no reason to fail."""
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel:
             channel.setblocking(False)
             try:
-                channel.sendto("\n".join(lines).encode(), self._address)
+                channel.sendto(state.encode(), self._address)
             except OSError:
                 return

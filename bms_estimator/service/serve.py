@@ -2,9 +2,8 @@
 
 import asyncio
 import contextlib
-import fcntl
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import structlog
@@ -14,9 +13,11 @@ from bms_estimator.estimator.plausible import implausible
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
+from bms_estimator.service.alone import alone
+from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import run_live
+from bms_estimator.service.notify import Notifier
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
@@ -32,6 +33,8 @@ async def serve(
     sinks: Sequence[Sink] = (),
     tap: Tap | None = None,
     stop: asyncio.Event | None = None,
+    folder: Path | None = None,
+    notifier: Notifier | None = None,
 ) -> Estimator:
     """Run until SIGINT or SIGTERM.
 
@@ -41,6 +44,8 @@ async def serve(
         sinks: Further sinks, such as the console.
         tap: Gets all bytes of the board with their arrival times.
         stop: Set by someone else to end as a signal does.
+        folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
+        notifier: Who hears that the loop is ready and alive.
 
     Returns:
         The estimator as the last sample left it.
@@ -58,8 +63,8 @@ async def serve(
         sample_period_s = settings.sensor.sample_period_s
         mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, sample_period_s=sample_period_s)
         all_sinks.append(mqtt)
-    checkpoint = _checkpoint(settings, cell)
-    with alone(checkpoint.path.with_suffix(".lock")) if checkpoint else contextlib.nullcontext():
+    checkpoint = CheckpointFile(folder, settings, cell) if folder else None
+    with alone(folder / f"{settings.pack.name}.lock") if folder else contextlib.nullcontext():
         return await run_live(
             settings,
             cell,
@@ -70,46 +75,25 @@ async def serve(
             requests=requests,
             delivery=delivery,
             current_zero=board.current_zero,
+            notifier=notifier,
         )
 
 
-@contextlib.contextmanager
-def alone(path: Path) -> Iterator[None]:
-    """Serve a pack alone: two services would overwrite each other's checkpoint and availability.
+def state_folder(settings: Settings) -> Path:
+    """Where checkpoints go: the folder of the settings, else systemd's StateDirectory, else the user's XDG state folder.
 
-    Args:
-        path: Lock file, made where it is not there; the system frees it however the process ends.
+    Made where it is not there; where it cannot be made, what is saved there later says so.
 
     Raises:
-        UserError: Another process holds it.
+        UserError: The folder of the settings cannot be made.
     """
-    with contextlib.ExitStack() as held:
-        try:
-            file = held.enter_context(path.open("a+"))
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            file.truncate(0)
-            file.write(f"{os.getpid()}\n")
-            file.flush()
-        except BlockingIOError:
-            holder = path.read_text(encoding="ascii").strip() or "?"
-            raise UserError(f"{path}: this pack is served already, by process {holder}") from None
-        except OSError as error:  # nor will the checkpoint be written, which health says
-            log.warning("cannot make sure that this pack is served once", file=str(path), reason=error.strerror)
-        yield
-
-
-def _checkpoint(settings: Settings, cell: CellModel) -> CheckpointFile | None:
-    """The pack's checkpoint in the folder of the settings, else in systemd's StateDirectory, else none.
-
-    Raises:
-        UserError: The folder cannot be made.
-    """
-    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-    folder = settings.state.folder or (Path(given) if given else None)
-    if folder is None:
-        return None
+    systemd = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    home = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    folder = settings.state.folder or Path(systemd or f"{home}/bms-estimator").expanduser()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"state.folder = {folder}: {error.strerror}") from None
-    return CheckpointFile(folder / f"{settings.pack.name}.npz", pack_identity(settings, cell))
+        if settings.state.folder:
+            raise UserError(f"state.folder = {folder}: {error.strerror}") from error
+        log.warning("the state cannot outlive a restart", folder=str(folder), reason=error.strerror)
+    return folder

@@ -53,6 +53,7 @@ def health_report(
     *,
     now_s: float,
     uptime_s: float,
+    loop_lag_s: float = 0.0,
     restarts: int,
     checkpoint: str,
     sensor_message: str | None,
@@ -66,6 +67,7 @@ def health_report(
         line: The source's counters.
         now_s: Wall clock [s since 1970].
         uptime_s: Since the service started [s].
+        loop_lag_s: By how much the event loop woke too late at worst since the last report [s].
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the last checkpoint.
         sensor_message: Why values are not fresh; None when they are.
@@ -76,6 +78,7 @@ def health_report(
     return Health(
         publish_time=iso_utc(now_s),
         uptime_s=uptime_s,
+        loop_lag_s=loop_lag_s,
         rss_mib=resident_mib(),
         restarts=restarts,
         reconnects=line.get("reconnects", 0),

@@ -70,6 +70,7 @@ class Publisher:
         self.period_s = 1.0 / settings.publish.rate_hz
         self._fresh_s = FRESH_PERIODS * max(self.period_s, settings.sensor.sample_period_s)
         self._window = Window()
+        self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._sample_s = -math.inf  # monotonic, of the last accepted sample
@@ -92,6 +93,10 @@ class Publisher:
             self._impossible = impossible_sample(block, self._estimator.settings[0]) or self._impossible
         if now_s >= self._due_s:
             self.publish()
+
+    def add_lag(self, lag_s: float) -> None:
+        """Take by how much the loop woke too late [s]."""
+        self._lag_s = max(self._lag_s, lag_s)
 
     def publish(self) -> None:
         """Publish now."""
@@ -142,11 +147,13 @@ class Publisher:
         return estimate_report(window, remaining, self._source.counters, wall_s)
 
     def _health(self, now_s: float, message: str | None) -> Health:
+        lag_s, self._lag_s = self._lag_s, 0.0
         return health_report(
             self._estimator.record[0],
             self._source.counters,
             now_s=self._clock.wall(),
             uptime_s=now_s - self._started_s,
+            loop_lag_s=lag_s,
             restarts=self._restarts,
             checkpoint=self.checkpoint,
             sensor_message=message,

@@ -6,9 +6,10 @@ from itertools import chain
 import capture
 import kernel
 import live
+import packs
 from table import show
 
-GROUPS = {"kernel": kernel.rows, "capture": capture.rows, "live": live.rows}
+GROUPS = {"kernel": kernel.rows, "capture": capture.rows, "live": live.rows, "packs": packs.rows}
 
 
 def main() -> None:

@@ -29,7 +29,7 @@ SETTLE_S, MEASURE_S, PATIENCE_S = 2.0, 20.0, 30.0
 
 PACK = """
 [pack]
-name = "bench"
+name = "{name}"
 cell = "{cell}"
 
 [sensor]
@@ -41,6 +41,9 @@ rate_hz = {publish_rate_hz}
 
 [mqtt]
 url = "{url}"
+
+[state]
+folder = "{folder}"
 """
 
 
@@ -104,18 +107,23 @@ def broker(folder: Path) -> Iterator[Broker]:
         server.stop()
 
 
+def pack_file(folder: Path, name: str, board: PtyBoard, server: Broker, publish_rate_hz: float) -> Path:
+    """Settings of a pack behind ``board``."""
+    values = {"name": name, "cell": CELL, "port": board.port, "rate_hz": board.rate_hz, "url": server.url}
+    path = folder / f"{name}.toml"
+    path.write_text(PACK.format(**values, publish_rate_hz=publish_rate_hz, folder=folder))
+    return path
+
+
 async def _measure(folder: Path, board: PtyBoard, server: Broker) -> Run:
-    pack = folder / "pack.toml"
-    pack.write_text(
-        PACK.format(cell=CELL, port=board.port, rate_hz=board.rate_hz, url=server.url, publish_rate_hz=PUBLISH_RATE_HZ)
-    )
+    pack = pack_file(folder, "bench", board, server, PUBLISH_RATE_HZ)
     states: list[State] = []
     async with aiomqtt.Client("127.0.0.1", server.port) as client:
         await client.subscribe("bms/bench/state", qos=0)
         listening = asyncio.create_task(_listen(client, states))
         started_s = time.monotonic()
         with (folder / "log").open("w") as log:
-            service = await asyncio.create_subprocess_exec(PROGRAM, "run", "--pack", pack, stdout=log, stderr=log)
+            service = await asyncio.create_subprocess_exec(PROGRAM, "run", pack, stdout=log, stderr=log)
         try:
             await _first(states, service, folder / "log")
             await asyncio.sleep(SETTLE_S)

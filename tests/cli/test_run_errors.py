@@ -28,7 +28,7 @@ def program(*arguments):
 
 
 def test_a_pack_file_that_is_not_there(tmp_path):
-    ended = program("run", "--pack", tmp_path / "none.toml")
+    ended = program("run", tmp_path / "none.toml")
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr == f"error: {tmp_path / 'none.toml'}: cannot be read: No such file or directory\n"
 
@@ -37,7 +37,7 @@ def test_a_capture_that_exists_is_not_written_over(tmp_path):
     pack, capture = tmp_path / "pack.toml", tmp_path / "kept.bms"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
     capture.write_bytes(b"kept")
-    ended = program("run", "--pack", pack, "--record", capture)
+    ended = program("run", pack, "--record", capture)
     assert ended.returncode == 2
     assert ended.stderr == f"error: {capture}: exists already; a capture is never overwritten\n"
     assert capture.read_bytes() == b"kept"
@@ -56,7 +56,7 @@ def test_a_capture_that_exists_is_not_written_over(tmp_path):
 def test_a_pack_file_that_is_no_pack_file(content, said, tmp_path, capsys):
     pack = tmp_path / "pack.toml"
     pack.write_bytes(content)
-    code, out, err = run(capsys, "run", "--pack", pack)
+    code, out, err = run(capsys, "run", pack)
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
     assert err.startswith("error: ")
@@ -66,9 +66,17 @@ def test_a_pack_file_that_is_no_pack_file(content, said, tmp_path, capsys):
 def test_a_broker_address_that_is_none(tmp_path, capsys):
     pack = tmp_path / "pack.toml"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
-    code, _, err = run(capsys, "run", "--pack", pack, "--mqtt", "nonsense")
+    code, _, err = run(capsys, "run", pack, "--mqtt", "nonsense")
     assert code == 2
     assert "error: --mqtt nonsense: must be" in err
+
+
+@pytest.mark.parametrize("options", [("--port", "/dev/none"), ("--record", "new.bms"), ("--view",)])
+def test_what_is_of_one_board_is_not_for_several_packs(options, tmp_path, capsys):
+    packs = [tmp_path / "one.toml", tmp_path / "two.toml"]
+    for pack in packs:
+        pack.write_text("")
+    assert run(capsys, "run", *packs, *options) == (2, "", "error: --port, --record and --view are for one pack\n")
 
 
 def test_help_lists_every_command_and_the_version_is_the_packages(capsys):
@@ -96,8 +104,8 @@ def test_an_output_that_cannot_be_written(arguments, unbuffered):
         ended = subprocess.run(
             [PROGRAM, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False
         )
-    assert ended.stderr == "error: the output cannot be written: No space left on device\n"
-    assert ended.returncode == 2
+    assert ended.stderr == "error: cannot write: No space left on device\n"
+    assert ended.returncode == 1
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

@@ -28,7 +28,7 @@ def report(tmp_path_factory) -> str:
 
 def test_the_service_runs(report):
     assert "ActiveState=active\n" in report, report
-    assert "StatusText=estimating boot" in report
+    assert "StatusText=estimating pack" in report
     assert "NRestarts=0" in report
 
 
@@ -41,6 +41,15 @@ def test_it_has_no_rights(report):
 
 def test_it_is_told_which_start_of_the_machine_this_is(report):
     assert re.search(r"^BMS_BOOT_ID=[0-9a-f]{32}$", report, re.MULTILINE), report
+
+
+def test_it_can_ask_whether_the_clock_is_set(report):
+    assert re.search(r"^adjtimex [0-5]$", report, re.MULTILINE), report
+
+
+def test_a_second_pack_has_a_unit_of_its_own_and_shares_the_kernels(report):
+    _, _, second = report.partition("StatusText=estimating second\n")
+    assert second.startswith("pack.lock\nsecond.lock\n1\n"), report
 
 
 def test_kernels_are_compiled_into_the_cache_folder(report):

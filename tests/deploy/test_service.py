@@ -35,7 +35,7 @@ class Systemd:
             "STATE_DIRECTORY": str(self.state),
         }
         self.process = subprocess.Popen(
-            [PROGRAM, "run", "--pack", folder / "pack.toml"],
+            [PROGRAM, "run", folder / "pack.toml"],
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -111,7 +111,7 @@ def test_a_kernel_that_the_cache_lacks_is_compiled_into_it_once(tmp_path):
 
 def test_a_wrong_setting_ends_with_code_2_which_systemd_does_not_restart(tmp_path, deploy):
     (tmp_path / "pack.toml").write_text("[pack]\nseries = 0\n")
-    command = [PROGRAM, "run", "--pack", tmp_path / "pack.toml"]
+    command = [PROGRAM, "run", tmp_path / "pack.toml"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert done.returncode == 2
     assert "pack.series = 0" in done.stderr

@@ -10,15 +10,19 @@ import pytest
 HIGHEST_EXPOSURE = 2.5
 
 
-@pytest.fixture
-def unit(deploy, tmp_path) -> Path:
-    """The unit with a program that exists here."""
-    text = (deploy / "bms-estimator.service").read_text()
-    text, changed = re.subn(r"(?m)^ExecStart=\S+", f"ExecStart={sys.executable}", text)
-    assert changed == 1
-    path = tmp_path / "bms-estimator.service"
-    path.write_text(text)
-    return path
+@pytest.fixture(params=["bms-estimator.service", "bms-estimator@house.service"])
+def unit(request, deploy, tmp_path) -> Path:
+    """The unit with a program that exists here: of one pack, or the instance of a template for one of several."""
+    template = request.param.replace("house", "")
+    files = [deploy / template, *deploy.glob(f"{template}.d/*.conf")]
+    assert len(files) == (2 if "@" in template else 1)
+    for file in files:
+        text, changed = re.subn(r"(?m)^ExecStart=/\S+", f"ExecStart={sys.executable}", file.read_text())
+        assert changed == 1
+        path = tmp_path / file.relative_to(deploy)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    return tmp_path / request.param
 
 
 def verify(systemd_analyze: str, unit: Path) -> str:
@@ -31,7 +35,8 @@ def test_systemd_finds_nothing_wrong_in_the_unit(program, unit):
 
 
 def test_systemd_would_find_a_misspelled_key(program, unit):
-    unit.write_text(unit.read_text().replace("ProtectHome=", "ProtectHomes="))
+    file = unit.with_name(unit.name.replace("house", ""))
+    file.write_text(file.read_text().replace("ProtectHome=", "ProtectHomes="))
     assert "ProtectHomes" in verify(program("systemd-analyze", "systemd"), unit)
 
 
@@ -57,6 +62,5 @@ def test_machine_code_may_be_made_at_run_time(deploy):
     assert "MemoryDenyWriteExecute" not in keys
 
 
-def test_the_memory_that_a_flood_may_take_is_limited(deploy):
-    settings = dict(line.partition("=")[::2] for line in (deploy / "bms-estimator.service").read_text().splitlines())
-    assert settings["MemoryMax"] == "1G"
+def test_a_flood_ends_the_service_and_not_the_machine(deploy):
+    assert "\nMemoryMax=1G\n" in (deploy / "bms-estimator.service").read_text()

@@ -1,10 +1,16 @@
-"""The folder of compiled kernels is named by all that goes into them."""
+"""Where compiled kernels are kept: a folder named by all that goes into them, or nowhere where there is no room."""
 
 import ast
+import os
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 import bms_estimator
 from bms_estimator import kernels
+from tests.patience import LONG_S
 
 PACKAGE = Path(bms_estimator.__file__).parent
 
@@ -20,3 +26,34 @@ def test_every_file_that_a_kernel_imports_is_in_the_caches_name() -> None:
     found = set().union(*(imported(source) for source in kernels.COMPILED_IN))
     assert PACKAGE / "model" / "suspect.py" in found
     assert found <= set(kernels.COMPILED_IN)
+
+
+def crc16_with_cache_in(folder: Path) -> str:
+    """Have another process compile a kernel, and check what it says. Returns what was written on stderr."""
+    homes = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), str(folder))
+    script = "import numpy; from bms_estimator.kernels.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, env=os.environ | homes, capture_output=True, text=True, timeout=LONG_S, check=False)
+    assert (done.returncode, done.stdout) == (0, "33984\n"), done.stderr
+    return done.stderr
+
+
+def test_a_kernel_runs_where_there_is_no_room_to_keep_it(full_disk: Path) -> None:
+    said = crc16_with_cache_in(full_disk)
+    assert "RuntimeWarning: compiled kernels are not kept: No space left on device" in said
+
+
+def test_a_kernel_runs_where_no_folder_can_be_made_to_keep_it_in(disk_without_files: Path) -> None:
+    said = crc16_with_cache_in(disk_without_files)
+    assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in said
+
+
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_a_kept_kernel_that_was_damaged_is_compiled_and_kept_again(tmp_path: Path, kind: str) -> None:
+    assert crc16_with_cache_in(tmp_path) == ""
+    (kept,) = tmp_path.rglob(f"*.{kind}")
+    whole = kept.stat().st_size
+    kept.write_bytes(kept.read_bytes()[:20])
+    assert "RuntimeWarning: a compiled kernel cannot be read" in crc16_with_cache_in(tmp_path)
+    assert kept.stat().st_size == whole
+    assert crc16_with_cache_in(tmp_path) == ""

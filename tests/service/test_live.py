@@ -1,8 +1,7 @@
 import asyncio
 import json
-import os
 import socket
-import threading
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -19,10 +18,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.model.settings import PackSettings, PublishSettings, SensorSettings, Settings
-from bms_estimator.service.checkpoint import FORMAT, CheckpointFile, pack_identity
-from bms_estimator.service.live import new_estimator, run_live
+from bms_estimator.service.live import LAG_STEP_S, new_estimator, run_live
 from bms_estimator.service.notify import Notifier
-from bms_estimator.service.serve import alone
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.snapshot.rest import WATCHED_S
@@ -325,138 +322,6 @@ async def test_a_parameter_says_where_it_comes_from_and_a_negative_capacitance_w
     assert "is not above delta_1" in (missing.reason or "")
 
 
-def checkpoint(path: Path, settings: Settings = SETTINGS, cell: CellModel = CELL) -> CheckpointFile:
-    return CheckpointFile(path, pack_identity(settings, cell))
-
-
-async def test_a_restart_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
-    file = tmp_path / "pack.npz"
-    async with running(checkpoint=checkpoint(file)) as run:
-        run.source.give(*((float(i), 0.275, 3.8) for i in range(361)))  # a tenth of the capacity
-        first = await run.end()
-    assert first.state["soc_coulomb"][0] == pytest.approx(0.4)
-    async with running(checkpoint=checkpoint(file)) as run:
-        run.source.give((5.0, 0.275, 3.8), (6.0, 0.275, 3.8))  # the board's clock has started anew
-        second = await run.end()
-    assert second.state["soc_coulomb"][0] == pytest.approx(0.4 - 1.0 / 3600.0, abs=1e-9)
-    assert second.state["samples"][0] == 2
-    health = run.sink.snapshots[-1].health
-    assert health.restarts == 1
-    assert health.checkpoint == f"restored: SOC {first.state['soc'][0]:.4f}"
-
-
-@pytest.mark.parametrize("damage", ["other pack", "other cell", "nan", "range", "truncated", "garbage", "format"])
-async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason(
-    tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "pack.npz"
-    (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
-    estimator = new_estimator(SETTINGS, CELL)
-    estimator.step(0.0, 0.1, 3.8)
-    settings, cell = SETTINGS, CELL
-    reason = "refused: it belongs to another pack"
-    if damage == "nan":
-        estimator.state["a"][0][3], reason = np.nan, "refused: a of the observer is not finite"
-    if damage == "range":
-        estimator.state["soc"], reason = 1.7, r"refused: soc = 1.7 is outside 0.0..1.0"
-    checkpoint(file).save(estimator.record, restarts=0)
-    if damage == "other pack":
-        settings = SETTINGS.model_copy(update={"pack": PackSettings(name="other", initial_soc=0.5)})
-    if damage == "other cell":
-        cell = CELL.pack(2, 1)
-    if damage in ("truncated", "garbage"):
-        content = file.read_bytes()[:500] if damage == "truncated" else bytes(range(256)) * 8
-        file.write_bytes(content)
-        reason = "refused: unreadable"
-    if damage == "format":
-        monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", FORMAT + 1)
-        reason = f"refused: format {FORMAT}, this version reads {FORMAT + 1}"
-    found = file.read_bytes()
-    async with running(settings, cell, checkpoint=checkpoint(file, settings, cell)) as run:
-        snapshot = await run.sink.until(lambda _: True)
-        run.source.give((0.0, 0.0, 3.8 * cell.cell.series_count))
-        estimator = await run.end()
-    assert snapshot.health.checkpoint.startswith(reason)
-    assert snapshot.health.checkpoint.endswith("; set aside as pack.refused.npz")
-    assert (tmp_path / "pack.refused.npz").read_bytes() == found
-    assert estimator.state["soc_coulomb"][0] == 0.5
-
-
-async def test_a_setting_that_was_wrong_for_a_while_costs_no_checkpoint(tmp_path: Path) -> None:
-    file, wrong = tmp_path / "pack.npz", CELL.pack(2, 1)
-    for cell, soc, restarts in ((CELL, 0.5, 0), (wrong, 0.5, 0), (CELL, 0.4, 1), (wrong, 0.4, 1)):
-        async with running(cell=cell, checkpoint=checkpoint(file, SETTINGS, cell)) as run:
-            run.source.give(*((float(i), 0.275, 3.8 * cell.cell.series_count) for i in range(361)))  # a tenth
-            estimator = await run.end()
-        assert estimator.state["soc_coulomb"][0] == pytest.approx(soc - 0.1, abs=1e-6)
-        assert run.sink.snapshots[-1].health.restarts == restarts
-    assert run.sink.snapshots[0].health.checkpoint.endswith(", set aside earlier")
-
-
-async def test_a_wrong_setting_under_which_nothing_was_saved_costs_no_checkpoint(tmp_path: Path) -> None:
-    file = tmp_path / "pack.npz"
-    async with running(checkpoint=checkpoint(file)) as run:
-        run.source.give((0.0, 0.1, 3.8))
-        await run.end()
-    wrong = CELL.pack(2, 1)
-    async with running(cell=wrong, checkpoint=checkpoint(file, SETTINGS, wrong)) as run:
-        await run.sink.until(lambda _: True)
-        await run.end()
-    assert not file.exists()
-    async with running(checkpoint=checkpoint(file)) as run:
-        snapshot = await run.sink.until(lambda _: True)
-        await run.end()
-    assert snapshot.health.checkpoint == "restored: SOC 0.5000, set aside earlier"
-
-
-def test_a_pack_is_served_once_at_a_time(tmp_path: Path) -> None:
-    served = pytest.raises(UserError, match=f"served already, by process {os.getpid()}")
-    with alone(tmp_path / "pack.lock"), served, alone(tmp_path / "pack.lock"):
-        pass
-    with alone(tmp_path / "pack.lock"), alone(tmp_path / "other.lock"):
-        pass
-
-
-async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_path: Path) -> None:
-    slow, began, release, saves = threading.Lock(), threading.Event(), threading.Event(), []
-
-    class SlowDisk(CheckpointFile):
-        def save(self, state: Any, restarts: int) -> None:
-            assert slow.acquire(blocking=False), "two saves at once"
-            began.set()
-            assert release.wait(LONG_S)
-            super().save(state, restarts)
-            saves.append(int(state["observer"]["samples"][0]))
-            slow.release()
-
-    often = SETTINGS.model_copy(update={"state": SETTINGS.state.model_copy(update={"checkpoint_s": 0.02})})
-    file = SlowDisk(tmp_path / "pack.npz", pack_identity(often, CELL))
-    async with running(often, checkpoint=file) as run:
-        run.source.give((0.0, 0.1, 3.8))
-        assert await asyncio.to_thread(began.wait, LONG_S)
-        run.source.give((1.0, 0.1, 3.8))
-        await run.sink.until(lambda s: s.health.samples["samples"] == 2)
-        run.source.finish()
-        await asyncio.sleep(0.1)
-        assert not run.task.done()
-        release.set()
-        last = await asyncio.wait_for(run.task, LONG_S)
-    assert saves == [1, 2]
-    state = file.load(CELL).state
-    assert state is not None
-    assert state.tobytes() == last.record.tobytes()
-
-
-async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes_on(tmp_path: Path) -> None:
-    often = SETTINGS.model_copy(update={"state": SETTINGS.state.model_copy(update={"checkpoint_s": 0.02})})
-    async with running(often, checkpoint=checkpoint(tmp_path / "absent" / "pack.npz")) as run:
-        run.source.give((0.0, 0.1, 3.8))
-        await run.sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved: "))
-        run.source.give((1.0, 0.1, 3.8))
-        state = await run.end()
-    assert state.state["samples"][0] == 2
-
-
 async def test_systemd_hears_ready_watchdog_and_stopping(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
@@ -469,7 +334,7 @@ async def test_systemd_hears_ready_watchdog_and_stopping(tmp_path: Path) -> None
                 heard.append((await asyncio.get_running_loop().sock_recv(systemd, 4096)).decode())
 
         async with asyncio.timeout(LONG_S):
-            async with running(notifier=Notifier(environment)) as run:
+            async with running(notifier=Notifier([SETTINGS.pack.name], environment)) as run:
                 await hear("WATCHDOG=1", times=3)
                 await run.end()
             await hear("STOPPING=1", times=1)
@@ -500,3 +365,11 @@ async def test_a_fault_of_the_source_is_raised_not_swallowed() -> None:
 
     with pytest.raises(ZeroDivisionError):
         await run_live(SETTINGS, CELL, source=Broken(), sinks=[], stop=asyncio.Event())
+
+
+async def test_how_long_something_blocked_the_loop_is_published() -> None:
+    async with running() as run:
+        await run.sink.until(lambda _: True)
+        time.sleep(0.4)  # noqa: ASYNC251 - blocks the loop, as a slow disk or terminal would
+        await run.sink.until(lambda s: s.health.loop_lag_s > 0.4 - LAG_STEP_S)
+        await run.end()

@@ -1,5 +1,6 @@
 """How long nobody measured: across restarts of the service and of the machine."""
 
+import ctypes
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -8,9 +9,9 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.checkpoint import CheckpointFile, pack_identity
+from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.live import new_estimator
-from bms_estimator.service.moment import Moment, moment
+from bms_estimator.service.moment import Moment, moment, synchronised
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()
 SAVED = Moment(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, boot="one")
@@ -30,16 +31,21 @@ SAVED = Moment(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, boot="o
 def test_a_checkpoint_is_as_old_as_the_clock_that_can_be_trusted_says(
     tmp_path: Path, changes: dict[str, float | str | bool], unseen_s: float
 ) -> None:
-    estimator, identity = new_estimator(SETTINGS, CELL), pack_identity(SETTINGS, CELL)
+    estimator = new_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
-    CheckpointFile(tmp_path / "pack.npz", identity, lambda: SAVED).save(estimator.record, restarts=0)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record, restarts=0)
     later = replace(SAVED, **changes)
-    assert CheckpointFile(tmp_path / "pack.npz", identity, lambda: later).load(CELL).unseen_s == unseen_s
+    assert CheckpointFile(tmp_path, SETTINGS, CELL, lambda: later).load().unseen_s == unseen_s
 
 
 def test_a_wall_clock_that_was_wrong_when_it_was_saved_tells_nothing_after_a_reboot() -> None:
     later = replace(SAVED, boot="two", wall_s=SAVED.wall_s + 5.0)
     assert later.since(replace(SAVED, synchronised=False)) == math.inf
+
+
+def test_a_clock_is_right_when_the_kernel_says_so_whoever_sets_it() -> None:
+    """The C library's ntp_gettime tells the same, without the settings."""
+    assert synchronised() == (ctypes.CDLL(None).ntp_gettime(ctypes.create_string_buffer(128)) != 5)
 
 
 def test_the_machine_tells_its_start(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,8 +5,10 @@ import contextlib
 import json
 import signal
 import sys
+from asyncio.subprocess import Process
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import IO, Any
 
 import pytest
 
@@ -17,11 +19,12 @@ from tests.serial_line import Line
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 
-def pack_file(folder: Path, line: Line, broker: Broker) -> Path:
-    path = folder / "pack.toml"
+def pack_file(folder: Path, line: Line, broker: Broker, name: str = "pack", state: str = "") -> Path:
+    path = folder / f"{name}.toml"
     path.write_text(
         f"""
 [pack]
+name = "{name}"
 cell = "chen_mora"
 initial_soc = 0.5
 [sensor]
@@ -32,17 +35,16 @@ baud = 115200
 rate_hz = 10
 [mqtt]
 url = "{broker.url}"
-[state]
-folder = "{folder / "state"}"
+{state}
 """
     )
     return path
 
 
 @contextlib.asynccontextmanager
-async def service(pack: Path) -> AsyncIterator[asyncio.subprocess.Process]:
+async def service(*packs: Path, stderr: int | IO[str] = asyncio.subprocess.PIPE) -> AsyncIterator[Process]:
     process = await asyncio.create_subprocess_exec(
-        str(PROGRAM), "run", "--pack", str(pack), stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE
+        str(PROGRAM), "run", *map(str, packs), stdout=asyncio.subprocess.DEVNULL, stderr=stderr
     )
     try:
         yield process
@@ -50,6 +52,19 @@ async def service(pack: Path) -> AsyncIterator[asyncio.subprocess.Process]:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
         await process.wait()
+
+
+def checkpoints(state_home: Path) -> list[Path]:
+    return list((state_home / "bms-estimator").glob("*.npz"))
+
+
+async def ended(process: Process) -> list[Any]:
+    """Ask it to end. Returns its log."""
+    process.send_signal(signal.SIGTERM)
+    assert process.stderr
+    log = await asyncio.wait_for(process.stderr.read(), LONG_S)
+    assert await asyncio.wait_for(process.wait(), LONG_S) == 0, log
+    return [json.loads(line) for line in log.decode().splitlines()]  # a pipe gets JSON
 
 
 async def feed(line: Line) -> None:
@@ -60,7 +75,7 @@ async def feed(line: Line) -> None:
 
 
 async def test_a_killed_service_is_offline_by_its_will_and_one_that_is_asked_says_so_itself(
-    tmp_path: Path, line: Line, broker: Broker
+    tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     line.plug()
     board = asyncio.create_task(feed(line))
@@ -75,11 +90,85 @@ async def test_a_killed_service_is_offline_by_its_will_and_one_that_is_asked_say
         before = len(live.messages)
         async with service(pack) as process:
             await live.wait("bms/pack/state", skip=before)
-            process.send_signal(signal.SIGTERM)
-            assert await asyncio.wait_for(process.wait(), LONG_S) == 0
-            assert process.stderr
-            lines = (await process.stderr.read()).decode().splitlines()
+            lines = await ended(process)
         await live.wait("bms/pack/availability", lambda p: p == b"offline", skip=before)
     board.cancel()
-    assert all(json.loads(line)["level"] for line in lines)  # a pipe gets JSON
-    assert (tmp_path / "state" / "pack.npz").exists()
+    (kept,) = checkpoints(state_home)  # nobody has named a folder
+    assert str(kept) in {line.get("file") for line in lines}
+
+
+async def test_a_full_disk_does_not_end_the_service(
+    tmp_path: Path, line: Line, broker: Broker, full_disk: Path
+) -> None:
+    """It takes neither checkpoints nor the log, and the estimate goes on."""
+    line.plug()
+    board = asyncio.create_task(feed(line))
+    pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{full_disk}"\ncheckpoint_s = 1\n')
+    async with Listener(broker) as live:
+        with (full_disk / "log").open("w") as log:
+            async with service(pack, stderr=log) as process:
+                said = "cannot be saved: [Errno 28] No space left on device"
+                health = await live.wait_json("bms/pack/health", lambda h: h["checkpoint"] == said)
+                await live.wait_json("bms/pack/health", lambda h: h["uptime_s"] > health["uptime_s"] + 2.0)
+                process.send_signal(signal.SIGTERM)
+                assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+    board.cancel()
+
+
+async def test_a_disk_without_room_for_a_folder_is_no_error_that_a_service_is_given_up_for(
+    tmp_path: Path, line: Line, broker: Broker, disk_without_files: Path
+) -> None:
+    folder = disk_without_files / "state"
+    async with service(pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{folder}"')) as process:
+        assert process.stderr
+        said = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
+        assert await process.wait() == 1  # 2 is never restarted
+    assert said == f"error: state.folder = {folder}: No space left on device\n"
+
+
+async def test_two_packs_are_served_by_one_process_each_with_its_own_board_topics_log_and_checkpoint(
+    tmp_path: Path, line: Line, broker: Broker, state_home: Path
+) -> None:
+    other = Line(tmp_path / "other board")
+    packs = [pack_file(tmp_path, line, broker, "house"), pack_file(tmp_path, other, broker, "shed")]
+    line.plug()
+    boards = [asyncio.create_task(feed(line))]
+    async with Listener(broker) as live, service(*packs) as process:
+        house = await live.wait_json("bms/house/health", lambda h: h["sensor_online"])
+        shed = await live.wait_json("bms/shed/health", lambda h: "does not exist" in (h["sensor_message"] or ""))
+        assert house["samples"]["samples"] > 0 == shed["samples"]["samples"]
+        other.plug()
+        boards.append(asyncio.create_task(feed(other)))
+        await live.wait_json("bms/shed/state")
+        lines = await ended(process)
+        for name in ("house", "shed"):
+            await live.wait(f"bms/{name}/availability", lambda p: p == b"offline")
+    for board in boards:
+        board.cancel()
+    other.unplug()
+    assert {line.get("pack") for line in lines} == {"house", "shed"}
+    assert {line["pack"] for line in lines if line["event"] == "no samples"} == {"shed"}
+    assert {path.name.split("-")[0] for path in checkpoints(state_home)} == {"house", "shed"}
+
+
+@pytest.mark.parametrize(
+    ("names", "change", "said"),
+    [
+        (("a", "a"), "", "pack.name = a: 2 of the packs have it; give each its own"),
+        (("a", "b"), "", "sensor.port = {port}: 2 of the packs have it; give each its own"),
+        (("a", "b"), 'password_file = "/none"', "b: mqtt.password_file = /none: cannot be read"),
+    ],
+)
+async def test_one_of_several_packs_that_cannot_be_served_is_named(
+    tmp_path: Path, line: Line, broker: Broker, names: tuple[str, str], change: str, said: str
+) -> None:
+    second = Line(tmp_path / "second") if change else line
+    packs = []
+    for folder, name, port in zip(("one", "two"), names, (line, second), strict=True):
+        (tmp_path / folder).mkdir()
+        packs.append(pack_file(tmp_path / folder, port, broker, name, state=change if name == "b" else ""))
+    async with service(*packs) as process:
+        assert process.stderr
+        log = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
+        assert await process.wait() == 2
+    assert f"error: {said.format(port=line.path)}" in log.splitlines()[-1]

@@ -11,7 +11,8 @@ from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import IdentifierSettings
-from bms_estimator.service.checkpoint import resume
+from bms_estimator.service.checkpoint import fields
+from bms_estimator.service.resume import resume
 from bms_estimator.snapshot.health import identifier_counters, suspicions
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
@@ -102,7 +103,7 @@ def test_what_the_identifier_did_not_believe_is_counted_since_the_start() -> Non
     block["voltage_v"][3000:3003] = 2.9
     estimator.run(block)
     assert identifier_counters(estimator.record[0])["gated"] == 3
-    resume(estimator, estimator.record.copy(), 1.0)
+    resume(estimator, dict(fields(estimator.record.copy())), 1.0)
     assert set(identifier_counters(estimator.record[0]).values()) == {0}
     assert suspicions(estimator.record[0]) == []
 

@@ -1,0 +1,53 @@
+"""Several packs in one process: a board and a connection to the broker each, one event loop, one service to systemd."""
+
+import asyncio
+from collections.abc import Sequence
+
+from structlog.contextvars import bind_contextvars
+
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.interrupt import stop_on_signal
+from bms_estimator.service.notify import Notifier
+from bms_estimator.service.serve import serve, state_folder
+
+
+async def serve_several(packs: Sequence[tuple[Settings, CellModel]]) -> None:
+    """Serve packs until SIGINT or SIGTERM. When one ends, all end in good order: who starts us starts all again.
+
+    Args:
+        packs: The settings of each pack, and the pack as one object.
+
+    Raises:
+        UserError: A setting that cannot be used, with the pack's name before it; or two packs share a name or a port.
+    """
+    names = [settings.pack.name for settings, _ in packs]
+    _differ("pack.name", names)
+    _differ("sensor.port", [settings.sensor.port for settings, _ in packs])
+    stop, notifier = stop_on_signal(), Notifier(names)
+
+    async def serve_one(settings: Settings, cell: CellModel) -> None:
+        bind_contextvars(pack=settings.pack.name)
+        try:
+            await serve(settings, cell, stop=stop, folder=state_folder(settings), notifier=notifier)
+        except UserError as error:
+            raise UserError(f"{settings.pack.name}: {error}") from error
+        finally:
+            stop.set()
+
+    results = await asyncio.gather(*(serve_one(*pack) for pack in packs), return_exceptions=True)
+    for result in results:
+        if isinstance(result, BaseException):
+            raise result
+
+
+def _differ(key: str, values: Sequence[str]) -> None:
+    """Have each pack a value of its own.
+
+    Raises:
+        UserError: Two have the same.
+    """
+    for value in values:
+        if values.count(value) > 1:
+            raise UserError(f"{key} = {value}: {values.count(value)} of the packs have it; give each its own")

@@ -1,0 +1,70 @@
+"""Many packs in one process: boards on pseudo-terminals, the real service, Mosquitto, each a process of its own."""
+
+import asyncio
+import contextlib
+import json
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import psutil
+from live import MEASURE_S, MOSQUITTO, PATIENCE_S, PROGRAM, SETTLE_S, Broker, broker, pack_file
+from pty_board import PtyBoard
+from table import Row
+
+PACKS, RATE_HZ, PUBLISH_RATE_HZ = 20, 10, 1.0
+MOST_CPU, MOST_MIB = 0.25, 400.0
+
+
+def rows() -> Iterator[Row]:
+    """Processor time and memory of one process that serves twenty packs."""
+    if MOSQUITTO is None:
+        yield Row(f"{PACKS} packs", "-", "mosquitto is not installed", None)
+        return
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        server = stack.enter_context(broker(folder))
+        boards = [stack.enter_context(PtyBoard(RATE_HZ)) for _ in range(PACKS)]
+        cpu, health = asyncio.run(_measure(folder, boards, server))
+    fresh = sum(h["sensor_online"] for h in health.values())
+    rss_mib, lag_s = (max(h[name] for h in health.values()) for name in ("rss_mib", "loop_lag_s"))
+    yield Row(f"{PACKS} packs at {RATE_HZ} Hz in one process", "all live", f"{fresh} live", fresh == PACKS)
+    yield Row("  its processor time", f"below {MOST_CPU:.0%} of a core", f"{cpu:.1%}", cpu < MOST_CPU)
+    yield Row("  its memory", f"below {MOST_MIB:.0f} MiB", f"{rss_mib:.0f} MiB", rss_mib < MOST_MIB)
+    yield Row("  its loop's lag (the machine's)", "-", f"{1e3 * lag_s:.1f} ms", None)
+
+
+async def _measure(folder: Path, boards: list[PtyBoard], server: Broker) -> tuple[float, dict[str, Any]]:
+    """Part of one core that the service takes once all packs are live, and the last health of each."""
+    packs = [pack_file(folder, f"pack{i}", board, server, PUBLISH_RATE_HZ) for i, board in enumerate(boards)]
+    health: dict[str, Any] = {}
+    all_live = asyncio.Event()
+    async with aiomqtt.Client("127.0.0.1", server.port) as client:
+        await client.subscribe("bms/+/health")
+        listening = asyncio.create_task(_listen(client, health, all_live))
+        with (folder / "log").open("w") as log:
+            service = await asyncio.create_subprocess_exec(PROGRAM, "run", *packs, stdout=log, stderr=log)
+        try:
+            await asyncio.wait_for(all_live.wait(), PACKS * PATIENCE_S)
+            await asyncio.sleep(SETTLE_S)
+            process, begin_s = psutil.Process(service.pid), time.monotonic()
+            before_s = sum(process.cpu_times()[:2])
+            await asyncio.sleep(MEASURE_S)
+            cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
+            measured = dict(health)
+        finally:
+            service.send_signal(signal.SIGINT)
+            await asyncio.wait_for(service.wait(), PATIENCE_S)
+            listening.cancel()
+    return cpu, measured
+
+
+async def _listen(client: aiomqtt.Client, health: dict[str, Any], all_live: asyncio.Event) -> None:
+    async for message in client.messages:
+        health[message.topic.value] = json.loads(message.payload)
+        if sum(h["sensor_online"] for h in health.values()) == PACKS:
+            all_live.set()

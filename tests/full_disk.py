@@ -1,0 +1,32 @@
+"""A real file system without room."""
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def full_disk(tmp_path: Path) -> Iterator[Path]:
+    """Folder of a file system in which no byte can be written; empty files and folders can."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can mount a file system")
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "none", disk], check=False).returncode != 0:
+        pytest.skip("no file system can be mounted here")
+    try:
+        (disk / "file").write_bytes(bytes(4096))
+        yield disk
+    finally:
+        subprocess.run(["umount", "--lazy", disk], check=True)
+
+
+@pytest.fixture
+def disk_without_files(full_disk: Path) -> Path:
+    """As ``full_disk``, and not even a folder can be made."""
+    inodes = os.statvfs(full_disk).f_files - os.statvfs(full_disk).f_ffree
+    subprocess.run(["mount", "-o", f"remount,nr_inodes={inodes}", full_disk], check=True)
+    return full_disk

@@ -1,0 +1,323 @@
+"""What outlives a restart: taken up when it is of the same pack, whatever else was edited or has come with a version."""
+
+import asyncio
+import math
+import os
+import stat
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, ELEMENTS, LN_R_S
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.estimate import Health
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.alone import alone
+from bms_estimator.service.checkpoint import FORMAT, KEPT, CheckpointFile, fields, pack_identity
+from bms_estimator.service.live import new_estimator, run_live
+from bms_estimator.service.resume import resume
+from tests.collector import Collector
+from tests.patience import LONG_S
+from tests.scripted_source import ScriptedSource
+
+CELL = load_cell("chen_mora")
+SETTINGS = Settings.model_validate({"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}})
+OLD_FILE = Path(__file__).with_name("checkpoint_format_4.npz")
+"""Of the version before: half an hour of a simulated chen_mora under random steps, SOC 0.576."""
+
+
+def edited(section: str, **values: Any) -> Settings:
+    tables = SETTINGS.model_dump(by_alias=True, exclude_none=True)
+    return Settings.model_validate(tables | {section: tables[section] | values})
+
+
+def old_state() -> np.ndarray:
+    with np.load(OLD_FILE) as file:
+        return file["state"]
+
+
+def an_old_pack() -> Estimator:
+    """An estimator that has learned."""
+    estimator = new_estimator(SETTINGS, CELL)
+    assert resume(estimator, dict(fields(old_state())), 0.0) == ""
+    estimator.step(0.0, 0.0, 3.8)  # of the new clock
+    assert estimator.record["map"]["weight"].any()
+    return estimator
+
+
+@dataclass
+class Ended:
+    """What came of a run."""
+
+    estimator: Estimator
+    health: Health
+    """The first that was published: it says what became of the checkpoint."""
+
+
+async def ran(
+    folder: Path, settings: Settings = SETTINGS, cell: CellModel = CELL, current_a: float = 0.275, samples: int = 361
+) -> Ended:
+    """A run of one sample a second at ``current_a``: by default a tenth of the capacity."""
+    source, sink = ScriptedSource(), Collector()
+    source.give(*((float(i), current_a, 3.8 * cell.cell.series_count) for i in range(samples)))
+    source.finish()
+    checkpoint = CheckpointFile(folder, settings, cell)
+    running = run_live(settings, cell, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    estimator = await asyncio.wait_for(running, LONG_S)
+    return Ended(estimator, sink.snapshots[0].health)
+
+
+async def test_a_restart_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
+    first = await ran(tmp_path)
+    assert first.estimator.state["soc_coulomb"][0] == pytest.approx(0.4)
+    second = await ran(tmp_path, samples=2)  # the board's clock has started anew
+    assert second.estimator.state["soc_coulomb"][0] == pytest.approx(0.4 - 1.0 / 3600.0, abs=1e-9)
+    assert second.estimator.state["samples"][0] == 2
+    assert second.health.restarts == 1
+    assert second.health.checkpoint == f"restored: SOC {first.estimator.state['soc'][0]:.4f}"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        edited("observer", lock_time_s=20.0),
+        edited("observer", law="scheme-1"),
+        edited("identifier", map_memory_h=100.0),
+        edited("identifier", current_offset_std_a=0.1),
+        edited("sensor", voltage_noise_v=0.01),
+        edited("sensor", port="/dev/ttyUSB7"),
+        edited("pack", initial_soc=0.9),
+    ],
+    ids=lambda settings: str(settings.model_dump(exclude_defaults=True)),
+)
+async def test_an_edited_setting_costs_nothing_that_was_learned(tmp_path: Path, settings: Settings) -> None:
+    learned = an_old_pack()
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, restarts=0)
+    run = await ran(tmp_path, settings, samples=1)
+    assert run.health.checkpoint == "restored: SOC 0.5762"
+    assert run.estimator.record["map"].tobytes() == learned.record["map"].tobytes()
+
+
+async def test_an_edited_description_costs_nothing_that_was_learned(tmp_path: Path) -> None:
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(an_old_pack().record, restarts=0)
+    described = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"name": "mine", "description": "new"})})
+    assert (await ran(tmp_path, cell=described, samples=2)).health.checkpoint == "restored: SOC 0.5762"
+
+
+def test_only_what_gives_the_state_its_meaning_is_the_identity() -> None:
+    known = pack_identity(SETTINGS, CELL)
+    larger = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"capacity_ah": 3.0})})
+    curve = CELL.model_copy(update={"ocv": CELL.ocv.model_copy(update={"constant_v": 3.7})})
+    turned = edited("sensor", current_sign="charge_positive")
+    others = [pack_identity(SETTINGS, cell) for cell in (larger, curve, CELL.pack(2, 1), CELL.pack(1, 2))]
+    assert len({known, *others, pack_identity(turned, CELL)}) == 6
+
+
+def test_a_version_with_other_fields_reads_what_it_knows() -> None:
+    saved, fresh, estimator = an_old_pack(), new_estimator(SETTINGS, CELL), new_estimator(SETTINGS, CELL)
+    fresh.step(0.0, 0.0, CELL.cell.nominal_voltage_v)
+    later = {name: field for name, field in fields(saved.record) if name not in ("identifier.misfit", "map.dwell_s")}
+    later |= {"identifier.mean": np.zeros((1, 99)), "map.of_a_later_version": np.ones(3)}
+    assert resume(estimator, later, 0.0) == ""
+    assert estimator.state["soc"][0] == saved.state["soc"][0]
+    assert (estimator.record["map"]["weight"] == saved.record["map"]["weight"]).all()
+    assert estimator.record["identifier"]["misfit"] == fresh.record["identifier"]["misfit"] == 1.0
+    assert not estimator.record["map"]["dwell_s"].any()
+    elements = slice(LN_R_S, LN_R_S + ELEMENTS)
+    assert (
+        estimator.record["identifier"]["mean"][0, elements] == fresh.record["identifier"]["mean"][0, elements]
+    ).any()
+
+
+async def test_a_checkpoint_of_the_format_before_is_taken_over(tmp_path: Path) -> None:
+    (tmp_path / "pack.npz").write_bytes(OLD_FILE.read_bytes())
+    old = old_state()
+    run = await ran(tmp_path, edited("identifier", map_memory_h=100.0), samples=1)
+    assert run.health.checkpoint == "restored: SOC 0.5762"
+    assert run.health.restarts == 4
+    assert (run.estimator.record["map"]["weight"] == old["map"]["weight"]).all()
+    assert not (tmp_path / "pack.npz").exists()
+    assert (await ran(tmp_path, samples=1)).health.restarts == 5
+
+
+async def test_a_checkpoint_of_the_format_before_of_another_voltage_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "pack.npz").write_bytes(OLD_FILE.read_bytes())
+    run = await ran(tmp_path, cell=CELL.pack(3, 1), samples=2)
+    assert run.health.checkpoint == "refused: its voltage is none of this pack; set aside as pack.refused.npz"
+    assert (tmp_path / "pack.refused.npz").read_bytes() == OLD_FILE.read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["other cell", "nan", "range", "truncated", "garbage", "format", "pipe"])
+async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason(
+    tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = CheckpointFile(tmp_path, SETTINGS, CELL)
+    (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
+    estimator = new_estimator(SETTINGS, CELL)
+    estimator.step(0.0, 0.1, 3.8)
+    reason = "refused: unreadable"
+    if damage == "nan":
+        estimator.state["a"][0][3], reason = np.nan, "refused: a of the observer is not finite"
+    if damage == "range":
+        estimator.state["soc"], reason = 1.7, r"refused: soc = 1.7 is outside 0.0..1.0"
+    file.save(estimator.record, restarts=0)
+    if damage == "other cell":
+        other = CheckpointFile(tmp_path, SETTINGS, CELL.pack(2, 1))
+        other.save(estimator.record, restarts=0)
+        other.path.replace(file.path)
+        reason = "refused: it belongs to another pack or cell"
+    if damage in ("truncated", "garbage"):
+        file.path.write_bytes(file.path.read_bytes()[:500] if damage == "truncated" else bytes(range(256)) * 8)
+    if damage == "format":
+        monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", FORMAT + 1)
+        file.save(estimator.record, restarts=0)
+        monkeypatch.undo()
+        reason = f"refused: format {FORMAT + 1}, this version reads {FORMAT}"
+    if damage == "pipe":  # whoever opens it for reading waits for a writer
+        file.path.unlink()
+        os.mkfifo(file.path)
+        reason = "refused: no file"
+    inode = file.path.stat().st_ino
+    run = await ran(tmp_path, current_a=0.0, samples=1)
+    assert run.health.checkpoint.startswith(reason)
+    assert run.health.checkpoint.endswith("; set aside as pack.refused.npz")
+    assert (tmp_path / "pack.refused.npz").stat().st_ino == inode
+    assert run.estimator.state["soc_coulomb"][0] == 0.5
+
+
+async def test_each_of_several_cells_that_were_tried_finds_its_own_checkpoint(tmp_path: Path) -> None:
+    tried = [CELL, CELL.pack(2, 1), CELL.pack(3, 1), CELL]
+    runs = [await ran(tmp_path, cell=cell) for cell in tried]
+    assert [run.health.restarts for run in runs] == [0, 0, 0, 1]
+    assert runs[-1].estimator.state["soc_coulomb"][0] == pytest.approx(0.3, abs=1e-6)
+
+
+def test_the_checkpoints_of_a_pack_are_bounded_in_number(tmp_path: Path) -> None:
+    estimator = new_estimator(SETTINGS, CELL)
+    (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
+    for series in range(1, KEPT + 4):
+        file = CheckpointFile(tmp_path, SETTINGS, CELL.pack(series, 1))
+        file.save(estimator.record, restarts=0)
+        os.utime(file.path, (series, series))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert len(names) == KEPT + 1
+    assert {file.path.name, "pack-2-0123abcd.npz"} <= names
+    assert CheckpointFile(tmp_path, SETTINGS, CELL).path.name not in names
+
+
+def test_what_is_written_is_private_and_goes_through_no_planted_link(tmp_path: Path) -> None:
+    file, victim = CheckpointFile(tmp_path, SETTINGS, CELL), tmp_path / "victim"
+    victim.write_text("precious")
+    file.path.with_suffix(".new").symlink_to(victim)
+    (tmp_path / "pack.lock").symlink_to(victim)
+    file.save(new_estimator(SETTINGS, CELL).record, restarts=0)
+    with alone(tmp_path / "pack.lock"):
+        pass
+    assert victim.read_text() == "precious"
+    assert stat.S_IMODE(file.path.lstat().st_mode) == 0o600
+
+
+def test_an_offset_that_may_be_learned_from_now_on_begins_as_configured() -> None:
+    before = new_estimator(SETTINGS, CELL)
+    before.step(0.0, 0.1, 3.8)
+    after = new_estimator(edited("identifier", current_offset_std_a=0.1), CELL)
+    assert resume(after, dict(fields(before.record)), 1.0) == ""
+    assert after.record["identifier"]["covariance"][0, CURRENT_OFFSET, CURRENT_OFFSET] == pytest.approx(0.01)
+    after.step(0.0, 0.1, 3.8)
+    assert resume(before, dict(fields(after.record)), 1.0) == ""
+    assert not before.record["identifier"]["covariance"][0, CURRENT_OFFSET].any()
+
+
+def test_an_identifier_that_is_switched_on_begins_at_the_soc_that_was_counted() -> None:
+    counted = new_estimator(edited("identifier", enabled=False), CELL)
+    counted.step(0.0, 0.1, 3.8)
+    identifying = new_estimator(SETTINGS, CELL)
+    assert resume(identifying, dict(fields(counted.record)), 1.0) == ""
+    for i in range(3):
+        identifying.step(float(i), 0.0, 3.8)
+    assert identifying.state["soc"][0] == pytest.approx(0.5, abs=0.15)
+    assert 0.01 < math.sqrt(identifying.record["identifier"]["covariance"][0, 0, 0]) < 0.35
+
+
+def test_a_pack_is_served_once_at_a_time(tmp_path: Path) -> None:
+    served = pytest.raises(UserError, match=f"served already, by process {os.getpid()}")
+    with alone(tmp_path / "pack.lock"), served, alone(tmp_path / "pack.lock"):
+        pass
+    with alone(tmp_path / "pack.lock"), alone(tmp_path / "other.lock"):
+        pass
+
+
+@asynccontextmanager
+async def often(checkpoint: CheckpointFile) -> AsyncIterator[tuple[ScriptedSource, Collector, Any]]:
+    """A run that saves every 20 ms."""
+    settings = SETTINGS.model_copy(update={"state": SETTINGS.state.model_copy(update={"checkpoint_s": 0.02})})
+    source, sink = ScriptedSource(), Collector()
+    task = asyncio.create_task(
+        run_live(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    yield source, sink, task
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
+async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_path: Path) -> None:
+    slow, began, release, saves = threading.Lock(), threading.Event(), threading.Event(), []
+
+    class SlowDisk(CheckpointFile):
+        def save(self, state: Any, restarts: int) -> None:
+            assert slow.acquire(blocking=False), "two saves at once"
+            began.set()
+            assert release.wait(LONG_S)
+            super().save(state, restarts)
+            saves.append(int(state["observer"]["samples"][0]))
+            slow.release()
+
+    file = SlowDisk(tmp_path, SETTINGS, CELL)
+    async with often(file) as (source, sink, task):
+        source.give((0.0, 0.1, 3.8))
+        assert await asyncio.to_thread(began.wait, LONG_S)
+        source.give((1.0, 0.1, 3.8))
+        await sink.until(lambda s: s.health.samples["samples"] == 2)
+        source.finish()
+        await asyncio.sleep(0.1)
+        assert not task.done()
+        release.set()
+        last = await asyncio.wait_for(task, LONG_S)
+    assert saves == [1, 2]
+    state = file.load().state
+    for name, field in fields(last.record):
+        assert state[name].tobytes() == field.tobytes()
+
+
+async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes_on(tmp_path: Path) -> None:
+    file = CheckpointFile(tmp_path / "absent", SETTINGS, CELL)
+    async with often(file) as (source, sink, _):
+        source.give((0.0, 0.1, 3.8))
+        await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved: "))
+        source.give((1.0, 0.1, 3.8))
+        await sink.until(lambda s: s.health.samples["samples"] == 2)
+
+
+async def test_the_last_checkpoint_does_not_wait_for_a_broker_that_parts_slowly(tmp_path: Path) -> None:
+    saved = []
+
+    class SlowBroker(Collector):
+        async def __aexit__(self, *_: object) -> None:
+            saved.append(file.path.exists())
+
+    source, sink = ScriptedSource(), SlowBroker()
+    source.give((0.0, 0.1, 3.8))
+    source.finish()
+    file = CheckpointFile(tmp_path, SETTINGS, CELL)
+    running = run_live(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=file)
+    await asyncio.wait_for(running, LONG_S)
+    assert saved == [True]
+    assert sink.snapshots[-1].health.checkpoint == "saved"
