@@ -22,6 +22,8 @@ HISTORY = 256
 """Publications that the curves of voltage and current remember: the width of a very wide screen."""
 WAITING_LINES = 1000
 """So many lines wait for a pipe that nobody reads; then the oldest goes. Of screens only the newest is worth waiting."""
+END_LINES = 4
+"""Below the view that stays there is room for what is said in the end, and for the prompt."""
 CLOSE_S = 2.0
 """For so long the last view waits for a terminal that takes none [s]."""
 
@@ -109,7 +111,7 @@ class ConsoleSink:
                 live.update(View(scene), refresh=True)
                 self._closing.wait(REDRAW_S)
         if scene is not None:
-            self._console.print(View(scene))
+            self._console.print(View(scene), height=max(self._console.height - END_LINES, 1))
 
     def _write_lines(self) -> None:
         for scene in self._scenes():

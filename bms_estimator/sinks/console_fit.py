@@ -44,9 +44,9 @@ def fitted(blocks: Sequence[Block], console: Console, options: ConsoleOptions) -
 
     Where they are higher than the room there is, those of the highest rank are left out, the lowest on the screen first.
     """
-    free = options.update(height=None)
+    free = options.reset_height()
     shown = [(block.rank, console.render_lines(block.content, free, pad=False)) for block in blocks]
-    while options.height is not None and sum(len(lines) for _, lines in shown) > options.height and len(shown) > 1:
+    while sum(len(lines) for _, lines in shown) > options.max_height and len(shown) > 1:
         del shown[max(range(len(shown)), key=lambda j: (shown[j][0], j))]
     for _, lines in shown:
         for row in lines:

@@ -39,6 +39,8 @@ ELEMENT_UNITS = {
     "e_o_v": ("E_o", 1.0, "V"),
 }
 """Element -> name, factor and unit on the screen."""
+WORN = {"capacity": "capacity", "r_s": "R_s"}
+"""What tells of wear -> name on the screen."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class View:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Rich's protocol: as wide and at most as high as the options say."""
-        wide = options.max_width >= WIDE_CELLS and (options.height is None or options.height >= WIDE_LINES)
+        wide = options.max_width >= WIDE_CELLS and options.max_height >= WIDE_LINES
         yield from fitted(_blocks(self._scene, options.max_width, wide=wide), console, options)
 
 
@@ -106,14 +108,13 @@ def _blocks(scene: Scene, width: int, *, wide: bool) -> list[Block]:
         Block(2, Text(scene.hint, style="cyan")),
     ]
     header, elements = Block(1, _header(snapshot, wide=wide)), _elements(snapshot.parameters.elements)
-    measured = _measured(e)
     if not wide:
         sparks = Block(7, _sparks(scene, width))
-        return [header, *charge, Block(0, Flow(*measured)), health, sparks, Block(8, elements), *below]
+        return [header, *charge, Block(0, Flow(*_measured(e))), health, sparks, Block(8, elements), *below]
     columns = Table.grid(expand=True)
     columns.add_column(ratio=1)
     columns.add_column(ratio=1)
-    left = Group(*measured, _sparks(scene, width // 2 - PANEL_CELLS))
+    left = Group(*_measured(e, VALUE_CELLS), _sparks(scene, width // 2 - PANEL_CELLS))
     columns.add_row(_panel(left, "Measured"), _panel(elements, "Elements at this SOC"))
     soc = _panel(Group(*(block.content for block in charge)), "State of charge")
     return [header, Block(0, soc), health, Block(0, columns), *below]
@@ -181,15 +182,15 @@ def _left(e: Estimate | None) -> Flow:
     return Flow(Text(lasts), Text(f"{_number(ah, '.3f')} Ah"), Text(f"{_number(wh, '.2f')} Wh left"))
 
 
-def _measured(e: Estimate | None) -> list[Text]:
-    """Means of the publish window."""
+def _measured(e: Estimate | None, cells: int = 0) -> list[Text]:
+    """Means of the publish window, each number right-aligned in ``cells``."""
     v, i, p, t = (e.voltage_v, e.current_a, e.power_w, e.temperature_c) if e else (None,) * 4
     way = "" if i is None else " discharge" if i > 0.0 else " charge" if i < 0.0 else ""
     return [
-        Text.assemble((f"{_number(v, '.3f'):>{VALUE_CELLS}}", "bold"), (" V", "dim")),
-        Text.assemble((f"{_number(i, '+.3f'):>{VALUE_CELLS}}", "bold"), (f" A{way}", "dim")),
-        Text.assemble(f"{_number(p, '+.2f'):>{VALUE_CELLS}}", (" W", "dim")),
-        Text.assemble(f"{_number(t, '.1f'):>{VALUE_CELLS}}", (" °C", "dim")),
+        Text.assemble((f"{_number(v, '.3f'):>{cells}}", "bold"), (" V", "dim")),
+        Text.assemble((f"{_number(i, '+.3f'):>{cells}}", "bold"), (f" A{way}", "dim")),
+        Text.assemble(f"{_number(p, '+.2f'):>{cells}}", (" W", "dim")),
+        Text.assemble(f"{_number(t, '.1f'):>{cells}}", (" °C", "dim")),
     ]
 
 
@@ -224,7 +225,7 @@ def _health(health: Health, parameters: ParameterReport) -> Flow:
     if wrong:
         return Flow(*wrong)
     worn = parameters.state_of_health.items()
-    known = [f"{name} {p.value:.2f} ± {p.std:.2f} of new" for name, p in worn if p.valid and p.value and p.std]
+    known = [f"{WORN[name]} {p.value:.2f} ± {p.std:.2f} of new" for name, p in worn if p.valid and p.value and p.std]
     return Flow(Text.assemble(("health ", "dim"), ("good", "bold green")), *map(Text, known))
 
 
@@ -245,17 +246,18 @@ def _observer(e: Estimate | None) -> Flow:
 def _link(e: Estimate | None, health: Health) -> Flow:
     """The line and the service; faults are red."""
     dropped = sum(count for name, count in health.samples.items() if name.startswith("dropped_"))
-    faults = {
-        "lost": health.line.get("frames_lost", 0),
-        "CRC": health.line.get("crc_errors", 0),
-        "dropped": dropped,
+    counts = {
+        "frames lost": health.line.get("frames_lost", 0),
+        "CRC errors": health.line.get("crc_errors", 0),
+        "samples dropped": dropped,
         "reconnects": health.reconnects,
         "lock losses": health.lock_losses,
     }
+    faults = [Text(f"{count:,} {name}", style="bold red") for name, count in counts.items() if count]
     return Flow(
         Text.assemble(("link ", "dim"), f"{health.line.get('frames_received', 0):,} frames"),
         Text(f"{_number(e.sample_rate_hz if e else None, '.1f')} Hz"),
-        *(Text(f"{count:,} {name}", style="bold red" if count else "") for name, count in faults.items()),
+        *(faults or [Text("no faults")]),
         Text(f"up {health.uptime_s:,.0f} s"),
         Text(f"{_number(health.rss_mib, '.0f')} MiB"),
     )
