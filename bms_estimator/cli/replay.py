@@ -65,7 +65,8 @@ def replay(
     if out is not None:
         check_out(out, [capture], force=force)
     with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
-        source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
+        with compiling_shown():
+            source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
         result = asyncio.run(_replay(settings, model, Replay(source, speed=speed), table_sink(out) if out else None))
         if isinstance(source, RawCapture):
             for warning in _unread(source, result.duration_s or 0.0):
@@ -88,7 +89,7 @@ def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
 
 async def _replay(settings: Settings, cell: CellModel, source: Replay, table: TableSink | None) -> Result:
     """Source -> estimator -> table, summary, broker."""
-    with Console(stderr=True).status("loading kernels; a first start compiles them"):
+    with compiling_shown():
         estimator, summary = new_estimator(settings, cell), Summary()
     async with AsyncExitStack() as stack:
         publisher = await _publisher(stack, settings, cell, estimator, source)

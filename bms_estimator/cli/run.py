@@ -11,6 +11,7 @@ from typing import Annotated
 import structlog
 import typer
 
+from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.cli.record import SYNC_S
 from bms_estimator.model.cell import CellModel
@@ -18,6 +19,7 @@ from bms_estimator.model.settings import Settings
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.logs import configure_logs
 from bms_estimator.service.serve import serve
+from bms_estimator.service.warm_up import load_kernels
 from bms_estimator.sinks import Sink
 from bms_estimator.sinks.console import ConsoleSink
 from bms_estimator.sources.raw_capture import CaptureWriter, header_of
@@ -47,6 +49,8 @@ def run(
     recorder = CaptureWriter(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
     sinks = [ConsoleSink(log=log)] if shown else []
     with recorder as writer:
+        with compiling_shown(structlog.get_logger(__name__).info):
+            load_kernels()
         if writer is None:
             asyncio.run(serve(settings, cell, sinks=sinks))
         else:

@@ -54,7 +54,6 @@ async def run_live(
         The estimator as the last sample left it.
     """
     notifier, clock = notifier or Notifier(), clock or Clock()
-    log.info("loading kernels; a first start compiles them, which takes some tens of seconds")
     estimator = new_estimator(settings, cell)
     restarts, restored = _restore(estimator, checkpoint, cell)
     publisher = Publisher(

@@ -6,6 +6,7 @@ important parts are left out: SOC with its band, voltage, current and what is wr
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 from rich import box
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -162,16 +163,17 @@ def _bar(e: Estimate | None, true_soc: float | None, cells: int) -> Text:
     soc = e.soc if e and e.soc is not None else 0.0
     band = BAND_STDS * e.soc_std if e and e.soc_std is not None else 0.0
     colour = "green" if soc > LOW_SOC else "yellow"
-    bar = Text()
-    for cell in range(cells):
+
+    def part(cell: int) -> tuple[str, str]:
         low, high = cell / cells, (cell + 1) / cells
         if true_soc is not None and low <= true_soc < high:
-            bar.append("┃", style="bold magenta")
-        elif low < soc + band and high > soc - band and band > 0.0:
-            bar.append("▒", style=colour)
-        else:
-            bar.append(*(("█", colour) if high <= soc else ("░", "bright_black")))
-    return bar
+            return "┃", "bold magenta"
+        if band > 0.0 and low < soc + band and high > soc - band:
+            return "▒", colour
+        return ("█", colour) if high <= soc else ("░", "bright_black")
+
+    parts = groupby(part(cell) for cell in range(cells))
+    return Text.assemble(*((mark * len(list(same)), style) for (mark, style), same in parts))
 
 
 def _left(e: Estimate | None) -> Flow:

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import aiomqtt
 import pytest
 
-from bms_estimator.cli.demo import FIRMWARE_BUILD
 from bms_estimator.cli.main import main
+from bms_estimator.demo.board import FIRMWARE_BUILD
 from bms_estimator.sources.firmware_board import FirmwareBoard
 from tests.mosquitto import Listener, free_port
 from tests.patience import LONG_S
@@ -71,7 +71,12 @@ async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
     assert health["line"]
     assert f"mosquitto_sub -p {port} -t 'bms/#' -v" in out
     assert ("firmware in simavr" if board == "firmware" else "board in Python") in out
-    assert re.search(r"\d+\.\d s: \d+ frames, 0 lost, 0 CRC errors; SOC .*, lock\n$", out)
+    assert re.search(r" soc \d+\.\d\d ± \d+\.\d\d %  true \d+\.\d\d %  ", out)
+    assert re.search(
+        r"\d+\.\d s: \d+ frames, 0 lost, 0 CRC errors; SOC at first -20\.00% wrong, at last [+-]\d\.\d\d%: "
+        r"the truth \d+\.\d\d% lies inside \d+\.\d\d% ± \d+\.\d\d% \(2 std\); lock\n$",
+        out,
+    )
     assert "Traceback" not in err
 
 
