@@ -49,7 +49,7 @@ async def running_board(build: Path | None, truth: Truth, *, rate_hz: int, speed
     """
     if build is None:
         with VirtualBoard(truth, rate_hz=rate_hz, speed=speed) as virtual:
-            async with _running(virtual.run()):
+            async with _running(virtual.run_for_host()):
                 yield Board("board in Python", virtual.path)
     else:
         with FirmwareBoard(build, truth, speed=speed) as simulated:

@@ -144,6 +144,16 @@ class VirtualBoard:
             loop.remove_reader(self._master)
             loop.remove_writer(self._master)
 
+    async def run_for_host(self) -> None:
+        """``run`` from when a host first asks something: what is sent before is lost on nobody."""
+        loop, asked = asyncio.get_running_loop(), asyncio.Event()
+        loop.add_reader(self._master, asked.set)
+        try:
+            await asked.wait()
+        finally:
+            loop.remove_reader(self._master)
+        await self.run()
+
     async def _drain(self) -> None:
         """Until the line has taken all."""
         while self._line:
