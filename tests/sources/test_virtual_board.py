@@ -222,14 +222,18 @@ async def test_text_mode_prints_what_a_hobby_sketch_prints() -> None:
 
 
 async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_is_asked() -> None:
-    with VirtualBoard(lambda _: STEADY) as board:
+    sampled = asyncio.Event()
+
+    def signal(_: float) -> Reading:
+        sampled.set()
+        return STEADY
+
+    with VirtualBoard(signal) as board:
         running = asyncio.create_task(board.run_for_host())
-        host = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        host = os.open(board.path, os.O_RDWR | os.O_NOCTTY)
         await asyncio.sleep(0)
-        assert board.samples == 0
+        assert not sampled.is_set()
         os.write(host, hello_command())
-        async with asyncio.timeout(LONG_S):
-            while board.samples < 3:
-                await asyncio.sleep(0.005)
+        await asyncio.wait_for(sampled.wait(), LONG_S)
         running.cancel()
         os.close(host)
