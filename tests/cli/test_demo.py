@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import re
 import sys
+from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -78,6 +79,25 @@ async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
         out,
     )
     assert "Traceback" not in err
+
+
+async def test_a_board_whose_time_passes_faster_takes_the_estimate_with_it():
+    port = free_port()
+    async with demo("--python-board", "--speed", 5, "--port", port):
+        listener = await listening(port)
+        try:
+            info = await listener.wait_json("bms/demo/info")
+            started = datetime.fromisoformat(info["started"])
+
+            def faster(state):
+                since_s = (datetime.fromisoformat(state["publish_time"]) - started).total_seconds()
+                return state["board_time_s"] > 2.0 * since_s
+
+            state = await listener.wait_json("bms/demo/state", faster)
+        finally:
+            await listener.__aexit__(None, None, None)
+    assert state["sample_rate_hz"] == pytest.approx(100.0, rel=0.01)
+    assert state["lock"] is True
 
 
 async def test_a_port_that_is_taken_is_said():
