@@ -118,10 +118,12 @@ class ConsoleSink:
             self._console.file.write(line(scene) + "\n")
 
     def _scenes(self) -> Iterable[Scene]:
-        """What waits, until all is closed."""
-        while not self._closing.is_set():
+        """What waits, until all is closed and nothing waits any more."""
+        ended = False
+        while not ended:
             self._due.wait()
             self._due.clear()
+            ended = self._closing.is_set()
             while self._waiting:
                 yield self._waiting.popleft()
 
