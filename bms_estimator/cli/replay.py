@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from bms_estimator.cli.captures import AsJson, Force, SignOfCurrent, check_out
+from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import pack_or_cell, with_broker, with_pack
 from bms_estimator.cli.summary import Result, Summary
 from bms_estimator.estimator import Estimator
