@@ -1,20 +1,20 @@
 """The real firmware in simavr: its serial line is a PTY. Needs avr-gcc and libsimavr, else the tests skip and say so."""
 
 import functools
-import math
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any
 
 import pytest
+
+from bms_estimator.sources.firmware_board import FirmwareBoard
 
 ROOT = Path(__file__).parents[1]
 FIRMWARE = ROOT / "firmware"
 ELF = FIRMWARE / "build" / "bms_board.elf"
 SIMULATOR = FIRMWARE / "build" / "board_sim"
-STOP_S = 10.0
 
 
 @functools.cache
@@ -42,48 +42,14 @@ def write_readings(path: Path, readings: Iterable[tuple[float, ...]]) -> Path:
     return path
 
 
-class SimavrBoard:
-    """The firmware's ELF in simavr, fed from a file of readings. It powers up when its line is first opened.
+class SimavrBoard(FirmwareBoard):
+    """The firmware's ELF in simavr, fed from a file of readings; leaving it asserts the clean end."""
 
-    Args:
-        readings: File with time_s,current_a,voltage_v[,temperature_c], each line held until the next.
-        speed: Board seconds per second; ``math.inf``: as fast as the host reads.
-        avcc_mv: Supply and reference of its converter.
-        noise_lsb: Noise of its converter [steps].
-        loop: Begin again after the last reading; else it is held.
-        seed: Of the noise.
-    """
-
-    def __init__(
-        self,
-        readings: Path,
-        *,
-        speed: float = 1.0,
-        avcc_mv: int = 5000,
-        noise_lsb: float = 0.5,
-        loop: bool = False,
-        seed: int = 1,
-    ) -> None:
-        self._command = [
-            *(str(SIMULATOR), str(ELF), "--readings", str(readings)),
-            *("--speed", "inf" if math.isinf(speed) else str(speed), "--avcc-mv", str(avcc_mv)),
-            *("--noise-lsb", str(noise_lsb), "--seed", str(seed)),
-            *(["--loop"] if loop else []),
-        ]
-        self.path = ""
-        """Of the PTY."""
-
-    def __enter__(self) -> Self:
-        self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE, text=True)
-        assert self._process.stdout
-        self.path = self._process.stdout.readline().strip()
-        assert self.path, "the simulator did not start"
-        return self
+    def __init__(self, readings: Path, **options: Any) -> None:
+        super().__init__(FIRMWARE / "build", readings, **options)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._process.terminate()
-        assert self._process.stdout
-        self._process.stdout.close()
-        assert self._process.wait(STOP_S) == 0, "the simulator did not end cleanly"
+        super().__exit__(kind, error, trace)
+        assert self.exit_code == 0, "the simulator did not end cleanly"

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from bms_estimator.cli.captures import AsJson, Force, SignOfCurrent, check_out
+from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import pack_or_cell, with_broker, with_pack
 from bms_estimator.cli.summary import Result, Summary
 from bms_estimator.estimator import Estimator
@@ -66,7 +67,8 @@ def replay(
     if out is not None:
         check_out(out, [capture], force=force)
     with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
-        source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
+        with compiling_shown():
+            source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
         result = asyncio.run(_replay(settings, model, Replay(source, speed=speed), table_sink(out) if out else None))
         if isinstance(source, RawCapture):
             for warning in _unread(source, result.duration_s or 0.0):
@@ -89,7 +91,7 @@ def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
 
 async def _replay(settings: Settings, cell: CellModel, source: Replay, table: TableSink | None) -> Result:
     """Source -> estimator -> table, summary, broker."""
-    with Console(stderr=True).status("loading kernels; a first start compiles them"):
+    with compiling_shown():
         estimator, summary = new_estimator(settings, cell), Summary()
     async with AsyncExitStack() as stack:
         publisher = await _publisher(stack, settings, cell, estimator, source)

@@ -7,8 +7,10 @@ from collections import deque
 from pathlib import Path
 from typing import Annotated
 
+import structlog
 import typer
 
+from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
@@ -16,6 +18,7 @@ from bms_estimator.model.settings import Settings
 from bms_estimator.service.logs import configure_logs
 from bms_estimator.service.serve import serve, state_folder
 from bms_estimator.service.several import serve_several
+from bms_estimator.service.warm_up import load_kernels
 from bms_estimator.sinks.console import ConsoleSink
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
@@ -50,6 +53,7 @@ def run(
     if port or record or view:
         raise UserError("--port, --record and --view are for one pack")
     configure_logs()
+    _load_kernels()
     asyncio.run(serve_several(loaded))
 
 
@@ -60,4 +64,10 @@ def _run_one(settings: Settings, cell: CellModel, port: str | None, record: Path
     recorder = Recording(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
     sinks = [ConsoleSink(log=log)] if view else []
     with recorder as tap:
+        _load_kernels()
         asyncio.run(serve(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings)))
+
+
+def _load_kernels() -> None:
+    with compiling_shown(structlog.get_logger(__name__).info):
+        load_kernels()

@@ -63,7 +63,6 @@ async def run_live(
     """
     name, clock = settings.pack.name, clock or Clock()
     notifier = notifier or Notifier([name])
-    log.info("loading kernels; a first start compiles them, which takes some tens of seconds")
     estimator = new_estimator(settings, cell)
     restarts, restored = _restore(estimator, checkpoint)
     publisher = Publisher(

@@ -1,24 +1,35 @@
-"""How a snapshot looks on a terminal of 80 x 24: pure functions from values to renderables."""
+"""How a snapshot looks on a terminal: pure functions from values to renderables.
 
-from collections.abc import Iterable, Sequence
+A large terminal gets two columns of panels, on a smaller one everything flows in one. On a low screen the least
+important parts are left out: SOC with its band, voltage, current and what is wrong go last.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
 
 from rich import box
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from bms_estimator.model.estimate import Estimate, Health, Info, Parameter, Snapshot
+from bms_estimator.model.estimate import Estimate, Health, Parameter, ParameterReport, Snapshot
+from bms_estimator.sinks.console_fit import Block, Flow, fitted
 
-BAR_CELLS = 60
-SPARK_CELLS = 32
-VALUE_CELLS = 9
+WIDE_CELLS, WIDE_LINES = 76, 18
+"""Two columns of panels need so much room."""
+PANEL_CELLS = 4
+"""Of its border and padding."""
+VALUE_CELLS = 8
 """Numbers change their length; columns must not dance."""
 SPARKS = "▁▂▃▄▅▆▇█"
-MESSAGE_LINES = 2
+LOG_LINES = 2
 NARROW_MARGIN = 0.05
 """A stability margin below is shown as a warning."""
 LOW_SOC = 0.2
+BAND_STDS = 2.0
+"""Of the band around the SOC: it holds the truth 19 times out of 20."""
 
 ELEMENT_UNITS = {
     "r_s_ohm": ("R_s", 1e3, "mΩ"),
@@ -29,42 +40,40 @@ ELEMENT_UNITS = {
     "e_o_v": ("E_o", 1.0, "V"),
 }
 """Element -> name, factor and unit on the screen."""
+WORN = {"capacity": "capacity", "r_s": "R_s"}
+"""What tells of wear -> name on the screen."""
 
 
-def view(
-    snapshot: Snapshot,
-    latest: Estimate | None,
-    voltage_v: Sequence[float],
-    current_a: Sequence[float],
-    log: Iterable[str] = (),
-    hint: str = "",
-) -> RenderableType:
-    """The whole screen.
+@dataclass(frozen=True)
+class Scene:
+    """All that is shown at one moment."""
 
-    Args:
-        snapshot: What was published last.
-        latest: The last estimate there was; the snapshot's may be missing.
-        voltage_v: Voltages of the last publications, oldest first.
-        current_a: Currents of the same.
-        log: The last log lines, ANSI colours allowed.
-        hint: The last line.
-    """
-    grid = Table.grid(expand=True)
-    grid.add_column(ratio=1)
-    grid.add_column(ratio=1)
-    grid.add_row(_measured(latest, voltage_v, current_a), _observer(latest, snapshot.info))
-    grid.add_row(_elements(snapshot.parameters.elements), _link(latest, snapshot.health))
-    return Group(_header(snapshot), _charge(latest), grid, _messages(snapshot.health, log, hint))
+    snapshot: Snapshot
+    """What was published last."""
+    latest: Estimate | None
+    """The last estimate there was; the snapshot's may be missing."""
+    voltage_v: Sequence[float] = ()
+    """Voltages of the last publications, oldest first."""
+    current_a: Sequence[float] = ()
+    """Currents of the same."""
+    log: Sequence[str] = ()
+    """Log lines, the last ones are shown; ANSI colours allowed."""
+    hint: str = ""
+    """The last line."""
+    true_soc: float | None = None
+    """SOC 0..1 of a simulated pack at the last sample."""
 
 
-def line(snapshot: Snapshot) -> str:
+def line(scene: Scene) -> str:
     """One line for a file or a pipe."""
-    e = snapshot.estimate
+    snapshot = scene.snapshot
+    e, device = snapshot.estimate, snapshot.info.device
     if e is None:
-        return f"{snapshot.health.publish_time} {snapshot.info.device}: {snapshot.health.sensor_message or 'no sample'}"
+        return f"{snapshot.health.publish_time} {device}: {snapshot.health.sensor_message or 'no sample'}"
+    truth = "" if scene.true_soc is None else f"  true {100.0 * scene.true_soc:.2f} %"
     return (
-        f"{e.time} {snapshot.info.device}: soc {_number(e.soc_percent, '.2f')} %  {e.voltage_v:.3f} V  "
-        f"{e.current_a:+.3f} A  {e.power_w:+.2f} W  margin {_number(e.stability_margin, '.4f')}  "
+        f"{e.time} {device}: soc {_number(e.soc_percent, '.2f')}{_band_text(e)} %{truth}  "
+        f"{e.voltage_v:.3f} V  {e.current_a:+.3f} A  {e.power_w:+.2f} W  margin {_number(e.stability_margin, '.4f')}  "
         f"delta1 {_number(e.delta_1, '.4f')}  delta2 {_number(e.delta_2, '.4f')}  "
         f"N {_number(e.nussbaum_gain, '.4f')}  k {_number(e.adaptive_gain_k, '.3g')}  "
         f"innovation {_number(e.innovation_v, '+.2f', 1e3)} mV  {'lock' if e.lock else 'NO LOCK'}  "
@@ -72,7 +81,47 @@ def line(snapshot: Snapshot) -> str:
     )
 
 
-def sparkline(values: Sequence[float], cells: int = SPARK_CELLS) -> str:
+class View:
+    """The whole screen."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Rich's protocol: as wide and at most as high as the options say."""
+        wide = options.max_width >= WIDE_CELLS and options.max_height >= WIDE_LINES
+        yield from fitted(_blocks(self._scene, options.max_width, wide=wide), console, options)
+
+
+def _blocks(scene: Scene, width: int, *, wide: bool) -> list[Block]:
+    """The parts of the screen from top to bottom, each with its rank."""
+    snapshot, e = scene.snapshot, scene.latest
+    charge = [
+        Block(0, _soc(e, scene.true_soc)),
+        Block(4, _bar(e, scene.true_soc, width - PANEL_CELLS if wide else width)),
+        Block(3, _left(e)),
+    ]
+    health = Block(0, _health(snapshot.health, snapshot.parameters))
+    below = [
+        Block(5, _observer(e)),
+        Block(6, _link(e, snapshot.health)),
+        Block(9, _log(scene.log)),
+        Block(2, Text(scene.hint, style="cyan")),
+    ]
+    header, elements = Block(1, _header(snapshot, wide=wide)), _elements(snapshot.parameters.elements)
+    if not wide:
+        sparks = Block(7, _sparks(scene, width))
+        return [header, *charge, Block(0, Flow(*_measured(e))), health, sparks, Block(8, elements), *below]
+    columns = Table.grid(expand=True)
+    columns.add_column(ratio=1)
+    columns.add_column(ratio=1)
+    left = Group(*_measured(e, VALUE_CELLS), _sparks(scene, width // 2 - PANEL_CELLS))
+    columns.add_row(_panel(left, "Measured"), _panel(elements, "Elements at this SOC"))
+    soc = _panel(Group(*(block.content for block in charge)), "State of charge")
+    return [header, Block(0, soc), health, Block(0, columns), *below]
+
+
+def sparkline(values: Sequence[float], cells: int) -> str:
     """The last ``cells`` values as blocks from their lowest to their highest."""
     shown = values[-cells:]
     if not shown:
@@ -82,150 +131,163 @@ def sparkline(values: Sequence[float], cells: int = SPARK_CELLS) -> str:
     return "".join(SPARKS[round((value - low) * scale)] for value in shown)
 
 
-def gauge(fraction: float, cells: int, style: str, marks: Sequence[float] = ()) -> Text:
-    """A bar filled to ``fraction`` 0..1, with red ticks at ``marks``."""
-    filled = round(min(max(fraction, 0.0), 1.0) * cells)
-    bar = Text("█" * filled, style=style) + Text("░" * (cells - filled), style="bright_black")
-    for mark in marks:
-        if 0.0 <= mark <= 1.0:
-            place = min(int(mark * cells), cells - 1)
-            bar = bar[:place] + Text("┃", style="bold red") + bar[place + 1 :]
-    return bar
-
-
-def _header(snapshot: Snapshot) -> RenderableType:
+def _header(snapshot: Snapshot, *, wide: bool) -> RenderableType:
     info, health = snapshot.info, snapshot.health
-    cells = f"{info.series_count} cell{'s' if info.series_count > 1 else ''}"
-    left = Text.assemble(
-        (f" {info.device} ", "bold reverse"),
-        f"  {info.cell}, {cells} in series, {info.nominal_voltage_v:.4g} V, {info.capacity_ah:.4g} Ah",
-        overflow="ellipsis",
-    )
+    left = Text.assemble((f" {info.device} ", "bold reverse"), overflow="ellipsis")
+    if wide:
+        cells = f"{info.series_count} cell{'s' if info.series_count > 1 else ''}"
+        left += Text(f"  {info.cell}, {cells} in series, {info.nominal_voltage_v:.4g} V, {info.capacity_ah:.4g} Ah")
     state = Text("● live", style="bold green") if health.sensor_online else Text("● stale", style="bold red")
     row = Table.grid(expand=True)
     row.add_column(no_wrap=True)
     row.add_column(justify="right", no_wrap=True)
-    row.add_row(left, state + Text(f"  {health.publish_time[11:19]}Z ", style="dim"))
+    row.add_row(left, state + Text(f"  {health.publish_time[11:19]}Z", style="dim"))
     return row
 
 
-def _charge(e: Estimate | None) -> Panel:
-    """SOC with delta1 and delta2 marked in it, and the margin between."""
-    rows = Table.grid(padding=(0, 1), expand=True)
-    rows.add_column(width=6, style="dim", no_wrap=True)
-    rows.add_column(width=BAR_CELLS, no_wrap=True)
-    rows.add_column(justify="right", no_wrap=True)
-    soc, margin = (e.soc, e.stability_margin) if e else (None, None)
-    marks = [d for d in (e.delta_1, e.delta_2) if d is not None] if e else []
-    colour = "green" if soc is not None and soc > LOW_SOC else "yellow"
-    narrow = margin is None or margin < NARROW_MARGIN
-    std = Text(f" ± {e.soc_std:.2%}", style="dim") if e and e.soc_std is not None else Text()
-    rows.add_row("SOC", gauge(soc or 0.0, BAR_CELLS, colour, marks), Text(_number(soc, ".2%"), style="bold") + std)
-    rows.add_row(
-        "margin",
-        gauge(margin or 0.0, BAR_CELLS, "red" if narrow else "cyan"),
-        Text(_number(margin, ".4f"), style="bold red" if narrow else "bold"),
-    )
-    delta_1, delta_2 = (e.delta_1, e.delta_2) if e else (None, None)
-    title = f"State of charge   δ1 {_number(delta_1, '.4f')}   δ2 {_number(delta_2, '.4f')}"
-    return Panel(rows, title=title, title_align="left", box=box.ROUNDED, border_style="dim")
+def _soc(e: Estimate | None, true_soc: float | None) -> Flow:
+    """The estimate with its band; beside it the truth, where it is known."""
+    soc = e.soc if e else None
+    texts = [
+        Text.assemble(("SOC ", "dim"), (f"{_number(soc, '.2%')}{_band_text(e, '%')}", "bold"), (" (2 std)", "dim"))
+    ]
+    if true_soc is not None:
+        texts.append(Text.assemble(("true ", "dim"), (f"{true_soc:.2%}", "bold magenta")))
+        if soc is not None:
+            texts.append(Text.assemble(("error ", "dim"), f"{soc - true_soc:+.2%}"))
+    return Flow(*texts)
 
 
-def _measured(e: Estimate | None, voltage_v: Sequence[float], current_a: Sequence[float]) -> Panel:
-    """Means of the publish window; below, how voltage and current went over the last publications."""
-    table = _rows()
+def _bar(e: Estimate | None, true_soc: float | None, cells: int) -> Text:
+    """Filled to the SOC, its band hatched, a tick where the truth is."""
+    soc = e.soc if e and e.soc is not None else 0.0
+    band = BAND_STDS * e.soc_std if e and e.soc_std is not None else 0.0
+    colour = "green" if soc > LOW_SOC else "yellow"
+
+    def part(cell: int) -> tuple[str, str]:
+        low, high = cell / cells, (cell + 1) / cells
+        if true_soc is not None and low <= true_soc < high:
+            return "┃", "bold magenta"
+        if band > 0.0 and low < soc + band and high > soc - band:
+            return "▒", colour
+        return ("█", colour) if high <= soc else ("░", "bright_black")
+
+    parts = groupby(part(cell) for cell in range(cells))
+    return Text.assemble(*((mark * len(list(same)), style) for (mark, style), same in parts))
+
+
+def _left(e: Estimate | None) -> Flow:
+    """What is left, and how long it lasts."""
+    seconds = e.time_to_empty_s if e else None
+    lasts = "empty in - : no load" if seconds is None else f"empty in {_duration(seconds)} at this load"
+    ah, wh = (e.remaining_capacity_ah, e.remaining_energy_wh) if e else (None, None)
+    return Flow(Text(lasts), Text(f"{_number(ah, '.3f')} Ah"), Text(f"{_number(wh, '.2f')} Wh left"))
+
+
+def _measured(e: Estimate | None, cells: int = 0) -> list[Text]:
+    """Means of the publish window, each number right-aligned in ``cells``."""
     v, i, p, t = (e.voltage_v, e.current_a, e.power_w, e.temperature_c) if e else (None,) * 4
     way = "" if i is None else " discharge" if i > 0.0 else " charge" if i < 0.0 else ""
-    table.add_row("voltage", _number(v, ".3f"), "V")
-    table.add_row("current", _number(i, "+.3f"), "A" + way)
-    table.add_row("power", _number(p, "+.2f"), "W")
-    table.add_row("temperature", _number(t, ".1f"), "°C")
-    sparks = Text.assemble(
-        ("V ", "dim"), (sparkline(voltage_v), "cyan"), "\n", ("A ", "dim"), (sparkline(current_a), "magenta")
-    )
-    return _panel(Group(table, sparks), "Measured")
+    return [
+        Text.assemble((f"{_number(v, '.3f'):>{cells}}", "bold"), (" V", "dim")),
+        Text.assemble((f"{_number(i, '+.3f'):>{cells}}", "bold"), (f" A{way}", "dim")),
+        Text.assemble(f"{_number(p, '+.2f'):>{cells}}", (" W", "dim")),
+        Text.assemble(f"{_number(t, '.1f'):>{cells}}", (" °C", "dim")),
+    ]
 
 
-def _observer(e: Estimate | None, info: Info) -> Panel:
-    table = _rows()
-    estimate, innovation, gain, k = (
-        (e.voltage_estimate_v, e.innovation_v, e.nussbaum_gain, e.adaptive_gain_k) if e else (None,) * 4
-    )
-    table.add_row("estimate", _number(estimate, ".3f"), "V")
-    table.add_row("innovation", _number(innovation, "+.2f", 1e3), "mV")
-    table.add_row("gain N(k)", _number(gain, ".4f"), "")
-    table.add_row("k", _number(k, ".4g"), "V²s")
-    table.add_row("state", _flag(e.lock if e else None, "lock", "NO LOCK"), "")
-    table.add_row("", _flag(e.converged if e else None, "converged", "converging"), "")
-    return _panel(table, f"Observer: {info.observer}")
+def _sparks(scene: Scene, width: int) -> Text:
+    """How voltage and current went over the last publications."""
+    cells = width - 2
+    voltage, current = sparkline(scene.voltage_v, cells), sparkline(scene.current_a, cells)
+    return Text.assemble(("V ", "dim"), (voltage, "cyan"), ("\nA ", "dim"), (current, "magenta"))
 
 
-def _elements(elements: dict[str, Parameter]) -> Panel:
+def _elements(elements: dict[str, Parameter]) -> Table:
     """Each element with its standard deviation and where it comes from; bold where it is valid."""
-    table = _rows()
-    table.add_column(style="dim", no_wrap=True)
-    for key, (name, factor, unit) in ELEMENT_UNITS.items():
-        parameter = elements.get(key)
-        value = parameter.value if parameter else None
-        known = parameter is not None and parameter.valid
-        std = f"± {parameter.std * factor:.2g} " if parameter and parameter.std is not None else ""
-        value_style = "bold" if known else ""
-        table.add_row(
-            name,
-            Text(_number(value, ".4g", factor), style=value_style),
-            f"{std}{unit}",
-            parameter.source if parameter else "",
-        )
-    return _panel(table, "Elements at this SOC")
-
-
-def _link(e: Estimate | None, health: Health) -> Panel:
-    table = _rows()
-    lost = health.line.get("frames_lost", 0)
-    crc = health.line.get("crc_errors", 0)
-    dropped = sum(count for name, count in health.samples.items() if name.startswith("dropped_"))
-    table.add_row(
-        "frames", f"{health.line.get('frames_received', 0):,}", f"{_number(e.sample_rate_hz if e else None, '.1f')} Hz"
-    )
-    table.add_row("lost, CRC", _bad(lost) + Text(", ") + _bad(crc), "")
-    table.add_row("samples dropped", _bad(dropped), "")
-    table.add_row("reconnects", _bad(health.reconnects), "")
-    table.add_row("lock losses", _bad(health.lock_losses), "")
-    table.add_row("up, memory", f"{health.uptime_s:,.0f}", f"s, {_number(health.rss_mib, '.0f')} MiB")
-    return _panel(table, "Link and service")
-
-
-def _messages(health: Health, log: Iterable[str], hint: str) -> Text:
-    """Why values are stale or suspected, then the last of the log, then the hint."""
-    why = [Text(f" {health.sensor_message}", style="bold red")] if health.sensor_message else []
-    why += [Text(f" suspected: {suspect}", style="bold yellow") for suspect in health.suspects]
-    lines = why + [Text.from_ansi(f" {entry}") for entry in list(log)[-max(MESSAGE_LINES - len(why), 1) :]]
-    lines += [Text(f" {hint}", style="cyan")] if hint else []
-    text = Text("\n").join(lines)
-    text.no_wrap, text.overflow = True, "ellipsis"
-    return text
-
-
-def _rows() -> Table:
     table = Table.grid(padding=(0, 1))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(justify="right", no_wrap=True, min_width=VALUE_CELLS)
     table.add_column(style="dim", no_wrap=True)
+    table.add_column(style="dim", no_wrap=True)
+    for key, (name, factor, unit) in ELEMENT_UNITS.items():
+        parameter = elements.get(key)
+        value = parameter.value if parameter else None
+        std = f"± {_short(parameter.std * factor)} " if parameter and parameter.std is not None else ""
+        style = "bold" if parameter and parameter.valid else ""
+        source = parameter.source if parameter else ""
+        table.add_row(name, Text(_number(value, ".4g", factor), style=style), f"{std}{unit}", source)
     return table
 
 
+def _health(health: Health, parameters: ParameterReport) -> Flow:
+    """What is wrong, in full; else how worn the pack is."""
+    wrong = [Text(health.sensor_message, style="bold red")] if health.sensor_message else []
+    wrong += [Text(f"suspected: {suspect}", style="bold yellow") for suspect in health.suspects]
+    if wrong:
+        return Flow(*wrong)
+    worn = parameters.state_of_health.items()
+    known = [f"{WORN[name]} {p.value:.2f} ± {p.std:.2f} of new" for name, p in worn if p.valid and p.value and p.std]
+    return Flow(Text.assemble(("health ", "dim"), ("good", "bold green")), *map(Text, known))
+
+
+def _observer(e: Estimate | None) -> Flow:
+    """The thesis's observer: where its model stays stable, its gain, and whether it tracks."""
+    margin = e.stability_margin if e else None
+    narrow = margin is not None and margin < NARROW_MARGIN
+    return Flow(
+        Text.assemble(("observer ", "dim"), ("lock", "green") if e and e.lock else ("NO LOCK", "bold red")),
+        Text(f"δ1 {_number(e.delta_1 if e else None, '.4f')}"),
+        Text(f"δ2 {_number(e.delta_2 if e else None, '.4f')}"),
+        Text(f"margin {_number(margin, '.4f')}", style="bold red" if narrow else ""),
+        Text(f"N {_number(e.nussbaum_gain if e else None, '.4f')}"),
+        Text(f"k {_number(e.adaptive_gain_k if e else None, '.3g')}"),
+    )
+
+
+def _link(e: Estimate | None, health: Health) -> Flow:
+    """The line and the service; faults are red."""
+    dropped = sum(count for name, count in health.samples.items() if name.startswith("dropped_"))
+    counts = {
+        "frames lost": health.line.get("frames_lost", 0),
+        "CRC errors": health.line.get("crc_errors", 0),
+        "samples dropped": dropped,
+        "reconnects": health.reconnects,
+        "lock losses": health.lock_losses,
+    }
+    faults = [Text(f"{count:,} {name}", style="bold red") for name, count in counts.items() if count]
+    return Flow(
+        Text.assemble(("link ", "dim"), f"{health.line.get('frames_received', 0):,} frames"),
+        Text(f"{_number(e.sample_rate_hz if e else None, '.1f')} Hz"),
+        *(faults or [Text("no faults")]),
+        Text(f"up {health.uptime_s:,.0f} s"),
+        Text(f"{_number(health.rss_mib, '.0f')} MiB"),
+    )
+
+
+def _log(entries: Sequence[str]) -> Text:
+    text = Text("\n").join(Text.from_ansi(entry) for entry in entries[-LOG_LINES:])
+    text.no_wrap, text.overflow = True, "ellipsis"
+    return text
+
+
 def _panel(content: RenderableType, title: str) -> Panel:
-    return Panel(content, title=title, title_align="left", box=box.ROUNDED, border_style="dim", height=8)
+    return Panel(content, title=title, title_align="left", box=box.ROUNDED, border_style="dim")
 
 
-def _flag(value: bool | None, good: str, bad: str) -> Text:
-    if value is None:
-        return Text("-")
-    return Text(good, style="bold green") if value else Text(bad, style="bold red")
+def _band_text(e: Estimate | None, unit: str = "") -> str:
+    return "" if e is None or e.soc_std is None else f" ± {100.0 * BAND_STDS * e.soc_std:.2f}{unit}"
 
 
-def _bad(count: int) -> Text:
-    return Text(f"{count:,}", style="bold red" if count else "")
+def _duration(seconds: float) -> str:
+    """Hours and minutes, or minutes."""
+    minutes = round(seconds / 60.0)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02} min"
+
+
+def _short(value: float) -> str:
+    """Two digits, in full from a hundred on."""
+    return f"{value:.0f}" if value >= 100.0 else f"{value:.2g}"
 
 
 def _number(value: float | None, form: str, factor: float = 1.0) -> str:

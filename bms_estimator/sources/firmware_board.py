@@ -1,16 +1,18 @@
-"""The board's own firmware in the simulator simavr, with a simulated pack at its pins; its serial line is a PTY."""
+"""The board's own firmware in the simulator simavr, with readings at its pins; its serial line is a PTY."""
 
 import asyncio
-import contextlib
+import math
+import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.simulated_pack import SimulatedPack
+from bms_estimator.sources.virtual_converter import Reading
 
 READINGS_HZ = 50
-"""The pack's readings; each is held until the next."""
+"""Of a signal; each reading is held until the next."""
 LINES_AT_ONCE = 50
 STOP_S = 5.0
 
@@ -20,65 +22,97 @@ class FirmwareBoard:
 
     Args:
         build: Folder of the built firmware.
-        pack: What is at its pins.
+        readings: What is at its pins: by time [s], or a file with ``time_s,current_a,voltage_v[,temperature_c]``, each
+            line held until the next.
+        speed: Board seconds per second; ``math.inf``: as fast as the host reads.
+        avcc_mv: Supply and reference of its converter.
+        noise_lsb: Noise of its converter [steps].
+        loop: Begin a file again after its last line; else that is held.
+        seed: Of the noise.
 
     Attributes:
         path: Of the pseudo-terminal.
+        exit_code: Of the simulator, once it has ended; below zero where it had to be killed.
     """
 
-    def __init__(self, build: Path, pack: SimulatedPack) -> None:
-        self._command = (str(build / "board_sim"), str(build / "bms_board.elf"), "--readings", "-")
-        self._pack = pack
+    def __init__(
+        self,
+        build: Path,
+        readings: Path | Callable[[float], Reading],
+        *,
+        speed: float = 1.0,
+        avcc_mv: int = 5000,
+        noise_lsb: float = 0.5,
+        loop: bool = False,
+        seed: int = 1,
+    ) -> None:
+        self._readings, self._fed = readings, 0
+        self._command = [
+            *(str(build / "board_sim"), str(build / "bms_board.elf")),
+            *("--readings", str(readings) if isinstance(readings, Path) else "-"),
+            *("--speed", "inf" if math.isinf(speed) else str(speed), "--avcc-mv", str(avcc_mv)),
+            *("--noise-lsb", str(noise_lsb), "--seed", str(seed)),
+            *(["--loop"] if loop else []),
+        ]
         self.path = ""
+        self.exit_code: int | None = None
 
     @staticmethod
     def is_built(build: Path) -> bool:
         """Whether ``build`` holds the firmware and its simulator."""
         return all((build / name).is_file() for name in ("board_sim", "bms_board.elf"))
 
-    async def __aenter__(self) -> Self:
+    def __enter__(self) -> Self:
         """Start the simulator.
 
         Raises:
             UserError: It does not run.
         """
-        pipe = asyncio.subprocess.PIPE
         # a session of its own: Ctrl-C is for the program that ends it
-        self._process = await asyncio.create_subprocess_exec(
-            *self._command, stdin=pipe, stdout=pipe, start_new_session=True
+        self._process = subprocess.Popen(  # noqa: S603 - the project's own program
+            self._command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )
-        assert self._process.stdin  # noqa: S101
         assert self._process.stdout  # noqa: S101
-        self._process.stdin.write(b"".join(self._readings()))
-        self.path = (await self._process.stdout.readline()).decode().strip()
+        self._feed()
+        self.path = self._process.stdout.readline().decode().strip()
         if not self.path:
+            self.__exit__(None, None, None)
             raise UserError(f"{self._command[0]} does not start; build it anew: make firmware")
         return self
 
-    async def __aexit__(
+    def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the simulator."""
-        with contextlib.suppress(ProcessLookupError):
-            self._process.terminate()
+        self._process.terminate()
         try:
-            await asyncio.wait_for(self._process.wait(), STOP_S)
-        except TimeoutError:
+            self._process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
             self._process.kill()
+        self.exit_code = self._process.wait()
+        assert self._process.stdin  # noqa: S101
+        assert self._process.stdout  # noqa: S101
+        self._process.stdin.close()
+        self._process.stdout.close()
 
     async def run(self) -> None:
-        """Have the pack's readings at its pins for as long as it runs: the pipe takes them as it needs them."""
-        assert self._process.stdin  # noqa: S101
-        while True:
-            self._process.stdin.writelines(self._readings())
-            await self._process.stdin.drain()
+        """Have a signal's readings at its pins for as long as it runs: the pipe takes them as it needs them."""
+        while await asyncio.to_thread(self._feed):
+            pass
 
-    def _readings(self) -> list[bytes]:
-        """Lines of the next readings."""
-        lines = []
-        for _ in range(LINES_AT_ONCE):
-            now = self._pack(self._pack.time_s + 1.0 / READINGS_HZ)
-            lines.append(
-                b"%.4f,%.6f,%.6f,%.2f\n" % (self._pack.time_s, now.current_a, now.voltage_v, now.temperature_c)
-            )
-        return lines
+    def _feed(self) -> bool:
+        """Give the next readings of a signal. Returns whether the simulator takes more."""
+        if isinstance(self._readings, Path):
+            return False
+        lines = b"".join(self._line(self._readings) for _ in range(LINES_AT_ONCE))
+        assert self._process.stdin  # noqa: S101
+        try:
+            self._process.stdin.write(lines)
+        except BrokenPipeError:
+            return False
+        return True
+
+    def _line(self, signal: Callable[[float], Reading]) -> bytes:
+        self._fed += 1
+        time_s = self._fed / READINGS_HZ
+        return b"%.4f,%.6f,%.6f,%.2f\n" % (time_s, *signal(time_s))

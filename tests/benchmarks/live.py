@@ -14,10 +14,12 @@ from pathlib import Path
 import aiomqtt
 import numpy as np
 import psutil
-from load import CELL
+from load import CELL, pulses
 from numpy.typing import NDArray
-from pty_board import PtyBoard
 from table import Row
+
+from bms_estimator.sources.virtual_board import VirtualBoard
+from bms_estimator.sources.virtual_converter import Reading
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.mosquitto import MOSQUITTO, Broker
@@ -26,6 +28,8 @@ PROGRAM = Path(sys.executable).with_name("bms-estimator")
 PUBLISH_RATE_HZ = 10
 """The highest that the settings allow: each message holds the newest sample of its window."""
 SETTLE_S, MEASURE_S, PATIENCE_S = 2.0, 20.0, 30.0
+LONGEST_S = 120
+"""A signal is prepared for so long [s]."""
 
 PACK = """
 [pack]
@@ -67,9 +71,26 @@ class Run:
     cpu: float
     """Part of one core that the service took while measured."""
     latency_s: NDArray[np.float64]
-    """From the bytes of a sample written to the estimate of that sample received [s]."""
+    """From a sample taken to the estimate of that sample received [s]."""
     sent: int
     last: State
+
+
+class Signal:
+    """What is at a board's sensors, sample by sample.
+
+    Attributes:
+        taken_s: Monotonic time at which each sample so far was taken, whose bytes leave at once [s].
+    """
+
+    def __init__(self, rate_hz: int) -> None:
+        block = pulses(LONGEST_S * rate_hz, rate_hz)
+        self._readings = [Reading(*row) for row in zip(block["current_a"], block["voltage_v"], strict=True)]
+        self.taken_s: list[float] = []
+
+    def __call__(self, _time_s: float) -> Reading:
+        self.taken_s.append(time.monotonic())
+        return self._readings[len(self.taken_s) - 1]
 
 
 def rows() -> Iterator[Row]:
@@ -93,8 +114,9 @@ def rows() -> Iterator[Row]:
 
 def measure(rate_hz: int) -> Run:
     """Run board, broker, service and subscriber."""
-    with tempfile.TemporaryDirectory() as folder, PtyBoard(rate_hz) as board, broker(Path(folder)) as server:
-        return asyncio.run(_measure(Path(folder), board, server))
+    sensors, folder = Signal(rate_hz), tempfile.TemporaryDirectory()
+    with folder as path, VirtualBoard(sensors, rate_hz=rate_hz) as board, broker(Path(path)) as server:
+        return asyncio.run(_measure(Path(path), board, rate_hz, sensors, server))
 
 
 @contextmanager
@@ -107,17 +129,18 @@ def broker(folder: Path) -> Iterator[Broker]:
         server.stop()
 
 
-def pack_file(folder: Path, name: str, board: PtyBoard, server: Broker, publish_rate_hz: float) -> Path:
-    """Settings of a pack behind ``board``."""
-    values = {"name": name, "cell": CELL, "port": board.port, "rate_hz": board.rate_hz, "url": server.url}
+def pack_file(folder: Path, name: str, port: str, rate_hz: int, server: Broker, publish_rate_hz: float) -> Path:
+    """Settings of a pack behind the board on ``port``."""
+    values = {"name": name, "cell": CELL, "port": port, "rate_hz": rate_hz, "url": server.url}
     path = folder / f"{name}.toml"
     path.write_text(PACK.format(**values, publish_rate_hz=publish_rate_hz, folder=folder))
     return path
 
 
-async def _measure(folder: Path, board: PtyBoard, server: Broker) -> Run:
-    pack = pack_file(folder, "bench", board, server, PUBLISH_RATE_HZ)
+async def _measure(folder: Path, board: VirtualBoard, rate_hz: int, sensors: Signal, server: Broker) -> Run:
+    pack = pack_file(folder, "bench", board.path, rate_hz, server, PUBLISH_RATE_HZ)
     states: list[State] = []
+    running = asyncio.create_task(board.run_for_host())
     async with aiomqtt.Client("127.0.0.1", server.port) as client:
         await client.subscribe("bms/bench/state", qos=0)
         listening = asyncio.create_task(_listen(client, states))
@@ -131,16 +154,16 @@ async def _measure(folder: Path, board: PtyBoard, server: Broker) -> Run:
             before_s = sum(process.cpu_times()[:2])
             await asyncio.sleep(MEASURE_S)
             cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
-            measured = states[heard:]
-            board.stop()
+            published = states[heard:]
+            running.cancel()
             await asyncio.sleep(5.0 / PUBLISH_RATE_HZ)
         finally:
             service.send_signal(signal.SIGINT)
             await asyncio.wait_for(service.wait(), PATIENCE_S)
             listening.cancel()
-    samples = np.rint(np.array([s.board_time_s for s in measured]) * board.rate_hz).astype(int)
-    latency_s = np.array([s.arrival_s for s in measured]) - board.sent_s[samples]
-    return Run(states[0].arrival_s - started_s, cpu, latency_s, board.sent, states[-1])
+    samples = np.rint(np.array([s.board_time_s for s in published]) * rate_hz).astype(int)
+    latency_s = np.array([s.arrival_s for s in published]) - np.array(sensors.taken_s)[samples]
+    return Run(states[0].arrival_s - started_s, cpu, latency_s, len(sensors.taken_s), states[-1])
 
 
 async def _listen(client: aiomqtt.Client, states: list[State]) -> None:

@@ -12,9 +12,10 @@ from typing import Any
 
 import aiomqtt
 import psutil
-from live import MEASURE_S, MOSQUITTO, PATIENCE_S, PROGRAM, SETTLE_S, Broker, broker, pack_file
-from pty_board import PtyBoard
+from live import MEASURE_S, MOSQUITTO, PATIENCE_S, PROGRAM, SETTLE_S, Broker, Signal, broker, pack_file
 from table import Row
+
+from bms_estimator.sources.virtual_board import VirtualBoard
 
 PACKS, RATE_HZ, PUBLISH_RATE_HZ = 20, 10, 1.0
 MOST_CPU, MOST_MIB = 0.25, 400.0
@@ -28,7 +29,7 @@ def rows() -> Iterator[Row]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         server = stack.enter_context(broker(folder))
-        boards = [stack.enter_context(PtyBoard(RATE_HZ)) for _ in range(PACKS)]
+        boards = [stack.enter_context(VirtualBoard(Signal(RATE_HZ), rate_hz=RATE_HZ)) for _ in range(PACKS)]
         cpu, health = asyncio.run(_measure(folder, boards, server))
     fresh = sum(h["sensor_online"] for h in health.values())
     rss_mib, lag_s = (max(h[name] for h in health.values()) for name in ("rss_mib", "loop_lag_s"))
@@ -38,9 +39,12 @@ def rows() -> Iterator[Row]:
     yield Row("  its loop's lag (the machine's)", "-", f"{1e3 * lag_s:.1f} ms", None)
 
 
-async def _measure(folder: Path, boards: list[PtyBoard], server: Broker) -> tuple[float, dict[str, Any]]:
+async def _measure(folder: Path, boards: list[VirtualBoard], server: Broker) -> tuple[float, dict[str, Any]]:
     """Part of one core that the service takes once all packs are live, and the last health of each."""
-    packs = [pack_file(folder, f"pack{i}", board, server, PUBLISH_RATE_HZ) for i, board in enumerate(boards)]
+    packs = [
+        pack_file(folder, f"pack{i}", board.path, RATE_HZ, server, PUBLISH_RATE_HZ) for i, board in enumerate(boards)
+    ]
+    running = [asyncio.create_task(board.run_for_host()) for board in boards]
     health: dict[str, Any] = {}
     all_live = asyncio.Event()
     async with aiomqtt.Client("127.0.0.1", server.port) as client:
@@ -59,7 +63,8 @@ async def _measure(folder: Path, boards: list[PtyBoard], server: Broker) -> tupl
         finally:
             service.send_signal(signal.SIGINT)
             await asyncio.wait_for(service.wait(), PATIENCE_S)
-            listening.cancel()
+            for task in (listening, *running):
+                task.cancel()
     return cpu, measured
 
 

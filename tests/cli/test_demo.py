@@ -4,14 +4,15 @@ import asyncio
 import contextlib
 import re
 import sys
+from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 
 import aiomqtt
 import pytest
 
-from bms_estimator.cli.demo import FIRMWARE_BUILD
 from bms_estimator.cli.main import main
+from bms_estimator.demo.board import FIRMWARE_BUILD
 from bms_estimator.sources.firmware_board import FirmwareBoard
 from tests.mosquitto import Listener, free_port
 from tests.patience import LONG_S
@@ -71,8 +72,32 @@ async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
     assert health["line"]
     assert f"mosquitto_sub -p {port} -t 'bms/#' -v" in out
     assert ("firmware in simavr" if board == "firmware" else "board in Python") in out
-    assert re.search(r"\d+\.\d s: \d+ frames, 0 lost, 0 CRC errors; SOC .*, lock\n$", out)
+    assert re.search(r" soc \d+\.\d\d ± \d+\.\d\d %  true \d+\.\d\d %  ", out)
+    assert re.search(
+        r"\d+\.\d s: \d+ frames, 0 lost, 0 CRC errors; SOC at first -20\.00% wrong, at last [+-]\d\.\d\d%: "
+        r"the truth \d+\.\d\d% lies inside \d+\.\d\d% ± \d+\.\d\d% \(2 std\); lock\n$",
+        out,
+    )
     assert "Traceback" not in err
+
+
+async def test_a_board_whose_time_passes_faster_takes_the_estimate_with_it():
+    port = free_port()
+    async with demo("--python-board", "--speed", 5, "--port", port):
+        listener = await listening(port)
+        try:
+            info = await listener.wait_json("bms/demo/info")
+            started = datetime.fromisoformat(info["started"])
+
+            def faster(state):
+                since_s = (datetime.fromisoformat(state["publish_time"]) - started).total_seconds()
+                return state["board_time_s"] > 2.0 * since_s
+
+            state = await listener.wait_json("bms/demo/state", faster)
+        finally:
+            await listener.__aexit__(None, None, None)
+    assert state["sample_rate_hz"] == pytest.approx(100.0, rel=0.01)
+    assert state["lock"] is True
 
 
 async def test_a_port_that_is_taken_is_said():

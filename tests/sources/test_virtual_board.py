@@ -236,3 +236,21 @@ async def test_text_mode_prints_what_a_hobby_sketch_prints() -> None:
     assert block["voltage_v"] == pytest.approx(22.2, abs=0.03)
     assert block["current_a"] == pytest.approx(2.5, abs=0.06)
     assert block["temperature_c"] == pytest.approx(25.0, abs=0.3)
+
+
+async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_is_asked() -> None:
+    sampled = asyncio.Event()
+
+    def signal(_: float) -> Reading:
+        sampled.set()
+        return STEADY
+
+    with VirtualBoard(signal) as board:
+        running = asyncio.create_task(board.run_for_host())
+        host = os.open(board.path, os.O_RDWR | os.O_NOCTTY)
+        await asyncio.sleep(0)
+        assert not sampled.is_set()
+        os.write(host, hello_command())
+        await asyncio.wait_for(sampled.wait(), LONG_S)
+        running.cancel()
+        os.close(host)

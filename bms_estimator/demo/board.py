@@ -1,0 +1,67 @@
+"""The demo's board: the firmware in its simulator, or its stand-in in Python."""
+
+import asyncio
+from collections.abc import AsyncIterator, Coroutine
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import bms_estimator
+from bms_estimator.demo.truth import Truth
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.firmware_board import FirmwareBoard
+from bms_estimator.sources.virtual_board import VirtualBoard
+
+FIRMWARE_BUILD = Path(bms_estimator.__file__).parents[1] / "firmware" / "build"
+
+
+class Board(NamedTuple):
+    """A board that runs."""
+
+    name: str
+    path: str
+    """Of its pseudo-terminal."""
+
+
+def find_build(given: Path | None) -> Path | None:
+    """Folder of the built firmware; None where it is not built and none was asked for.
+
+    Raises:
+        UserError: Nothing is built in the folder that was given.
+    """
+    folder = FIRMWARE_BUILD if given is None else given
+    if FirmwareBoard.is_built(folder):
+        return folder
+    if given is not None:
+        raise UserError(f"--firmware {given}: no built firmware and simulator there; make firmware, or --python-board")
+    return None
+
+
+@asynccontextmanager
+async def running_board(build: Path | None, truth: Truth, *, rate_hz: int, speed: float) -> AsyncIterator[Board]:
+    """The firmware in its simulator where ``build`` holds it, else the board in Python.
+
+    Args:
+        build: Folder of the built firmware.
+        truth: What is at the board's pins.
+        rate_hz: Samples per second of its time.
+        speed: Its seconds per second.
+    """
+    if build is None:
+        with VirtualBoard(truth, rate_hz=rate_hz, speed=speed) as virtual:
+            async with _running(virtual.run_for_host()):
+                yield Board("board in Python", virtual.path)
+    else:
+        with FirmwareBoard(build, truth, speed=speed) as simulated:
+            async with _running(simulated.run()):
+                yield Board("firmware in simavr", simulated.path)
+
+
+@asynccontextmanager
+async def _running(work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    task = asyncio.create_task(work)
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

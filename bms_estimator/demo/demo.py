@@ -1,0 +1,77 @@
+"""The demo: broker, board and the real service in one process. The estimator is told a wrong SOC and finds the true one."""
+
+import asyncio
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from bms_estimator.demo.board import running_board
+from bms_estimator.demo.broker import DemoBroker
+from bms_estimator.demo.totals import Totals
+from bms_estimator.demo.truth import Truth
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.settings import (
+    MqttSettings,
+    ObserverSettings,
+    PackSettings,
+    PublishSettings,
+    SensorSettings,
+    Settings,
+)
+from bms_estimator.service.interrupt import stop_on_signal
+from bms_estimator.service.serve import serve
+from bms_estimator.sinks.console import ConsoleSink
+from bms_estimator.sources.simulated_pack import SimulatedPack, random_steps
+
+CELL = "chen_mora"
+LOAD_A = 0.5
+"""Steps up to twice the capacity per hour: SOC falls by more than a percent in a minute [A]."""
+TRUE_SOC, TOLD_SOC = 0.9, 0.7
+"""At the start. The estimator takes what it is told for right within 0.2, one standard deviation."""
+RESOLUTION_V = 5e-3
+"""Of a mean of many noisy conversions, a fifth of the converter's step [V]."""
+PUBLISH_RATE_HZ = 4.0
+LAMBDA = 1e4
+"""Of the gain (3.10): what takes k hours with the usual 1 is to be seen within minutes."""
+
+
+async def run_demo(
+    build: Path | None, *, rate_hz: int, speed: float, port: int | None, seconds: float | None, log: Iterable[str]
+) -> str:
+    """Run until a signal or the time's end.
+
+    Args:
+        build: Folder of the built firmware; None: the board in Python.
+        rate_hz: Samples per second of the board's time.
+        speed: The board's seconds per second.
+        port: Of the broker; None: 1883, or a free one.
+        seconds: How long; None: until a signal.
+        log: Log lines for the live view.
+
+    Returns:
+        What came of it, in a line.
+    """
+    stop = stop_on_signal()
+    cell = load_cell(CELL)
+    truth = Truth(SimulatedPack(cell, random_steps(LOAD_A), soc=TRUE_SOC))
+    totals = Totals(TOLD_SOC - TRUE_SOC, truth.soc)
+    async with DemoBroker(port) as broker, running_board(build, truth, rate_hz=rate_hz, speed=speed) as board:
+        hint = f"{board.name}; in a second terminal: {broker.look_command}"
+        if not sys.stdout.isatty():
+            sys.stdout.write(f"{hint}\n")
+        if seconds is not None:
+            asyncio.get_running_loop().call_later(seconds, stop.set)
+        settings = _settings(board.path, broker.url, rate_hz)
+        view = ConsoleSink(log=log, hint=hint, true_soc=truth.soc)
+        await serve(settings, cell, sinks=[view, totals], tap=truth, stop=stop)  # no state: it begins anew each time
+    return totals.summary()
+
+
+def _settings(path: str, url: str, rate_hz: int) -> Settings:
+    return Settings(
+        pack=PackSettings(name="demo", cell=CELL, initial_soc=TOLD_SOC),
+        sensor=SensorSettings(port=path, sample_rate_hz=rate_hz, voltage_resolution_v=RESOLUTION_V),
+        observer=ObserverSettings.model_validate({"lambda": LAMBDA}),
+        publish=PublishSettings(rate_hz=PUBLISH_RATE_HZ),
+        mqtt=MqttSettings(url=url),
+    )

@@ -1,0 +1,63 @@
+"""What a simulated pack's SOC was when the board took the sample that the host has just decoded."""
+
+from collections import deque
+
+from bms_estimator.sources.protocol import (
+    DELIMITER,
+    MODULUS,
+    MessageType,
+    ProtocolError,
+    SampleMessage,
+    unseal,
+)
+from bms_estimator.sources.simulated_pack import SimulatedPack
+from bms_estimator.sources.virtual_converter import Reading
+
+TAIL_BYTES = 256
+"""The end of what came holds a whole sample's frame, whatever else is there."""
+
+
+class Truth:
+    """A pack's signal for a board, and a tap on the board's line: the board's clock in a frame says when it was taken.
+
+    Args:
+        pack: Read at times that may run ahead of the board's, as a simulator reads from a pipe.
+    """
+
+    missed_reads = 0
+    """It waits for nothing."""
+
+    def __init__(self, pack: SimulatedPack) -> None:
+        self._pack = pack
+        self._ahead: deque[tuple[float, float]] = deque([(0.0, pack.soc)])
+        self._tail = b""
+        self._board_us = 0
+
+    def __call__(self, time_s: float) -> Reading:
+        """What is at the pack's terminals at ``time_s`` [s]."""
+        reading = self._pack(time_s)
+        self._ahead.append((time_s, self._pack.soc))
+        return reading
+
+    def write(self, _arrival_s: float, data: bytes) -> None:
+        """Take a read of the line."""
+        self._tail = (self._tail + data)[-TAIL_BYTES:]
+
+    def soc(self) -> float:
+        """The pack's, 0..1, at the last sample that came; at the start before any has."""
+        for frame in reversed(self._tail.split(DELIMITER)[:-1]):
+            if (board_us := _board_us(frame)) is not None:
+                self._board_us += (board_us - self._board_us) % MODULUS
+                break
+        while len(self._ahead) > 1 and self._ahead[1][0] <= 1e-6 * self._board_us:
+            self._ahead.popleft()
+        return self._ahead[0][1]
+
+
+def _board_us(frame: bytes) -> int | None:
+    """The board's clock at a sample [us]; None for what is no frame of a sample."""
+    try:
+        packet = unseal(frame)
+    except ProtocolError:
+        return None
+    return SampleMessage.decode(packet).board_us if packet[1] == MessageType.SAMPLE else None

@@ -1,0 +1,26 @@
+"""Everything a live run computes with, called once before it begins: nothing compiles once samples come."""
+
+import numpy as np
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.live import new_estimator
+from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.snapshot.remaining import remaining_charge
+from bms_estimator.sources.frames import FrameDecoder
+
+CELL = "chen_mora"
+"""Any: kernels are the same for all."""
+
+
+def load_kernels() -> None:
+    """Load the kernels of decoder, estimator and reports; a first start compiles them."""
+    FrameDecoder()
+    cell = load_cell(CELL)
+    estimator = new_estimator(Settings(), cell)
+    sample = np.zeros(1, dtype=SAMPLE)
+    sample["voltage_v"] = cell.cell.nominal_voltage_v
+    estimator.run(sample)
+    parameter_report(estimator, 0.0)
+    remaining_charge(estimator, 0.0)

@@ -1,0 +1,40 @@
+"""A first start says what it is at: whatever computes tells which kernel is being compiled."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.patience import LONG_S
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+
+
+@pytest.mark.parametrize("command", ["demo", "replay", "run"])
+def test_a_first_start_says_which_kernel_it_compiles_and_can_be_interrupted(command: str, tmp_path: Path) -> None:
+    pack, table = tmp_path / "pack.toml", tmp_path / "table.csv"
+    pack.write_text('[sensor]\nport = "/dev/none"\n')
+    table.write_text("time_s,current_a,voltage_v\n0,0,3.7\n1,0,3.7\n")
+    arguments = {
+        "demo": ["--python-board"],
+        "replay": [table, "--cell", "ncr18650"],
+        "run": [pack],
+    }
+    cold = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    with subprocess.Popen(
+        [PROGRAM, command, *arguments[command]], env=cold, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stderr
+            first = next(line for line in process.stderr if "compiling kernels" in line)
+            process.send_signal(signal.SIGINT)
+            rest = process.stderr.read()
+            assert process.wait(LONG_S) == 130
+        finally:
+            process.kill()
+    assert "Traceback" not in rest
+    assert "compiling kernels, once: 1/" in first
+    assert ('"level": "info"' in first) == (command == "run")

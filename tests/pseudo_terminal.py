@@ -1,0 +1,80 @@
+"""The program on a pseudo-terminal of any size, whose screen is read or left alone."""
+
+import fcntl
+import os
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from tests.patience import LONG_S
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+HOME, ALTERNATE, BACK, CURSOR = "\x1b[H", "\x1b[?1049h", "\x1b[?1049l", "\x1b[?25h"
+"""Control sequences: begin of a screen, its taking and giving back, the cursor shown again."""
+
+
+class PseudoTerminal:
+    """``bms-estimator ARGUMENTS`` with a terminal as standard output and standard error.
+
+    Attributes:
+        output: All that was read so far.
+        process: The program.
+    """
+
+    def __init__(self, *arguments: str, columns: int = 80, rows: int = 24) -> None:
+        self._arguments = arguments
+        self.output = ""
+        self._master, self._slave = os.openpty()
+        self.resize(columns, rows)
+
+    def __enter__(self) -> Self:
+        self.settings = termios.tcgetattr(self._slave)
+        command = [PROGRAM, *self._arguments]
+        # its size is the terminal's, whatever the shell says that started the tests
+        env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+        self.process = subprocess.Popen(
+            command, stdin=self._slave, stdout=self._slave, stderr=self._slave, env=env | {"TERM": "xterm-256color"}
+        )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def resize(self, columns: int, rows: int) -> None:
+        fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("4H", rows, columns, 0, 0))
+
+    def read(self) -> None:
+        """Take what has come, or wait a little for it."""
+        if select.select([self._master], [], [], 0.1)[0]:
+            self.output += os.read(self._master, 1 << 16).decode(errors="replace")
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + LONG_S
+        while not condition():
+            assert time.monotonic() < deadline, f"the terminal never showed it: {self.screen()}"
+            self.read()
+
+    def ended(self) -> bool:
+        return self.process.poll() is not None
+
+    def screen(self) -> list[str]:
+        """Lines of the last whole screen, without colours; empty before one has come."""
+        screens = self.output.split(HOME)
+        return re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", screens[-2]).split("\r\n") if len(screens) > 2 else []
+
+    def is_as_before(self) -> bool:
+        """Whether the program has left the terminal as it found it."""
+        return termios.tcgetattr(self._slave) == self.settings
