@@ -9,6 +9,7 @@ import itertools
 import math
 import os
 import random
+import select
 import struct
 import tty
 from collections import deque
@@ -59,8 +60,8 @@ _WAKE_S = 0.002
 """Samples that fall due within so short a time leave together, as on USB [s]."""
 _PATIENCE_S = 1.0
 """For so long the last bytes wait for a host that may not read [s]."""
-_HELLO_S = 0.1
-"""Between two hellos before a host asks [s]."""
+_LOOK_S = 0.01
+"""How often it looks whether a host has come [s]."""
 _BURST = 256
 _BOOT_READINGS = 256
 _NEAR_MIDDLE = 0.1
@@ -182,19 +183,14 @@ class VirtualBoard:
             loop.remove_writer(self._master)
 
     async def run_for_host(self) -> None:
-        """``run``, of a binary board, from when a host first asks something; until then it says hello and takes no samples."""
-        loop, asked = asyncio.get_running_loop(), asyncio.Event()
-        loop.add_reader(self._master, asked.set)
-        try:
-            while not asked.is_set():
-                if not self._line:
-                    self.send(DELIMITER + self._hello().encode())  # a host asks only who has been heard
-                with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(_HELLO_S):
-                        await asked.wait()
-        finally:
-            loop.remove_reader(self._master)
-            loop.remove_writer(self._master)
+        """``run`` from when a host opens the line: samples before would be lost."""
+        os.close(self._slave)  # the line hangs up while nobody has it open
+        self._slave, line = -1, select.poll()
+        line.register(self._master, 0)
+        while line.poll(0):  # noqa: ASYNC110 - the system tells nobody when a line is opened
+            await asyncio.sleep(_LOOK_S)
+        self._slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(self._slave)
         await self.run()
 
     async def _drain(self) -> None:

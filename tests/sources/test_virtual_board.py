@@ -238,7 +238,7 @@ async def test_text_mode_prints_what_a_hobby_sketch_prints() -> None:
     assert block["temperature_c"] == pytest.approx(25.0, abs=0.3)
 
 
-async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_is_asked() -> None:
+async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_opens_the_line() -> None:
     sampled = asyncio.Event()
 
     def signal(_: float) -> Reading:
@@ -247,10 +247,9 @@ async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_is_asked
 
     with VirtualBoard(signal) as board:
         running = asyncio.create_task(board.run_for_host())
-        host = os.open(board.path, os.O_RDWR | os.O_NOCTTY)
-        await asyncio.sleep(0)
+        await asyncio.sleep(0.05)
         assert not sampled.is_set()
-        os.write(host, hello_command())
+        host = os.open(board.path, os.O_RDWR | os.O_NOCTTY)
         await asyncio.wait_for(sampled.wait(), LONG_S)
         running.cancel()
         os.close(host)
