@@ -5,12 +5,20 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.compile_kernels import compile_kernels
+
 # compilation and shared machines make times meaningless
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")
 
 DATA = Path(__file__).parent / "data"
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile before workers would each do it, and before a test reads what a program says of it."""
+    if not hasattr(session.config, "workerinput"):
+        compile_kernels()
 
 
 @pytest.fixture(scope="session")
