@@ -36,7 +36,7 @@ def snapshot() -> Snapshot:
     block = np.zeros(100, dtype=SAMPLE)
     block["time_s"], block["voltage_v"], block["current_a"] = np.arange(100) / 100.0, 24.123, 12.5
     block["temperature_c"] = np.nan
-    publisher.add(estimator.run(block))
+    publisher.add(block, estimator.run(block))
     publisher.publish()
     return next(each for each in sink.snapshots if each.estimate)
 
