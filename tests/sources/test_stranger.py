@@ -133,6 +133,19 @@ async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(22.2, abs=0.1)
 
 
+async def test_auto_says_what_comes_in_place_of_its_own_board(auto: Path) -> None:
+    source = SerialBoard(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
+    async with taken(source, []):
+        async with plugged_in(auto, serial=1):
+            await until(lambda: source._door.serial)
+        await until(lambda: source.message)
+        with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, linked(auto, other.path):
+            task = asyncio.create_task(other.run())
+            await until(lambda: source.message and "prints text" in source.message)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
 async def test_a_port_that_was_named_may_hold_another_board(auto: Path) -> None:
     blocks = list[SampleBlock]()
     source = SerialBoard(SensorSettings(port=str(auto)), first_retry_s=0.05)
