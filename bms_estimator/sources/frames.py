@@ -79,6 +79,7 @@ class FrameDecoder:
         self._acks: list[Ack] = []
         self._printable = 0
         self._decode(np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0)  # compiles
+        clock_ppm(self._state[0])  # so does this
 
     @property
     def hello(self) -> Hello | None:
