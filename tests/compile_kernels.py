@@ -9,7 +9,7 @@ from bms_estimator.sources.frames import FrameDecoder
 def compile_kernels() -> None:
     """Those of the service."""
     new_estimator(Settings(), load_cell("chen_mora"))
-    _ = FrameDecoder().clock_ppm
+    FrameDecoder()
 
 
 if __name__ == "__main__":

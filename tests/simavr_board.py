@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.sources.firmware_board import FirmwareBoard
+from bms_estimator.simulation.firmware_board import FirmwareBoard
 
 ROOT = Path(__file__).parents[1]
 FIRMWARE = ROOT / "firmware"

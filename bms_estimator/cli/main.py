@@ -33,7 +33,7 @@ COMMANDS = {
     "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),
     "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
     "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
-    "board": Entry("bms_estimator.cli.board:board", "Show a board, set its bandgap and its serial number."),
+    "board": Entry("bms_estimator.cli.board:board", "Show a board, set its bandgap, gains and serial number."),
     "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
     "ocv": Entry("bms_estimator.cli.ocv:ocv", "Open-circuit voltage from relaxation tests, into a cell file."),
     "identify": Entry(

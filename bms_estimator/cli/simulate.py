@@ -8,8 +8,8 @@ import typer
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
-from bms_estimator.sources.simulated_pack import LOADS, LoadName, SimulatedPack
-from bms_estimator.sources.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
+from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
+from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
 DEFAULT_LOAD_C = 3.0
 """A load of so many times the capacity per hour moves SOC while one looks."""

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import bms_estimator
 from bms_estimator.demo.truth import Truth
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.firmware_board import FirmwareBoard
-from bms_estimator.sources.virtual_board import VirtualBoard
+from bms_estimator.simulation.firmware_board import FirmwareBoard
+from bms_estimator.simulation.virtual_board import VirtualBoard
 
 FIRMWARE_BUILD = Path(bms_estimator.__file__).parents[1] / "firmware" / "build"
 

@@ -20,8 +20,8 @@ from bms_estimator.model.settings import (
 )
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.serve import serve
+from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from bms_estimator.sinks.console import ConsoleSink
-from bms_estimator.sources.simulated_pack import SimulatedPack, random_steps
 
 CELL = "chen_mora"
 LOAD_A = 0.5

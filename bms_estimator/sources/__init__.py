@@ -1,4 +1,4 @@
-"""Where samples come from: serial boards, captures, tables, the virtual board."""
+"""Where samples come from: serial boards, captures, tables."""
 
 from collections.abc import AsyncIterator, Mapping
 from types import TracebackType

@@ -19,6 +19,8 @@ CurrentSign = Literal["discharge_positive", "charge_positive"]
 
 DEAF_BYTES = 512
 """So many bytes without one whole frame, and the line itself is at fault: eight of the longest frames."""
+PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
+"""What printed lines are made of."""
 _MESSAGES = 8
 
 
@@ -79,6 +81,7 @@ class FrameDecoder:
         self._acks: list[Ack] = []
         self._printable = 0
         self._decode(np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0)  # compiles
+        clock_ppm(self._state[0])  # so does this
 
     @property
     def hello(self) -> Hello | None:
@@ -209,7 +212,4 @@ _COUNTERS = [field.name for field in fields(FrameCounters) if field.name in (DEC
 
 def is_text(data: bytes) -> bool:
     """Whether bytes could be printed lines."""
-    return all(byte in _TEXT for byte in data)
-
-
-_TEXT = frozenset(b"\t\r\n" + bytes(range(0x20, 0x7F)))
+    return not data.translate(None, PRINTABLE)

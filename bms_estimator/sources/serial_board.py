@@ -13,6 +13,7 @@ import structlog
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
 from bms_estimator.sources.line import FIRST_RETRY_S, Line, Read
@@ -161,11 +162,15 @@ class SerialBoard:
             self._line.lost.set()
             return ()
 
+    @property
+    def _listener(self) -> Dialect:
+        """Who hears the device that has been heard last."""
+        return self._door.stranger or self._dialect
+
     def _send_due(self) -> None:
         """Send what is due to the device that has been heard last, if it is the one on the port now."""
         if self._openings == self._line.openings and not self._line.lost.is_set():
-            dialect = self._door.stranger or self._dialect
-            self._line.send(dialect.due(self._line.now_s))
+            self._line.send(self._listener.due(self._line.now_s))
 
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         if self._tap is not None:
@@ -224,7 +229,7 @@ class SerialBoard:
                     self._door.serial = self.board.get("serial", "")
             elif self._refused:
                 continue
-            elif fault := self._dialect.fault:
+            elif fault := self._listener.fault:
                 self._say(f"{path} at {self._settings.baud} baud: {fault}")
             elif now_s - heard_s >= self._silent_s:
                 self._say(f"{path}: open, but silent")

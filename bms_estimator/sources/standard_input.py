@@ -23,8 +23,10 @@ def standard_input() -> Iterator[Path]:
     """All of stdin as a file, named for what its first bytes say it is; gone when left.
 
     Raises:
-        UserError: As raised while it is used, its folder left out of the message.
+        UserError: It is closed; or as raised while it is used, its folder left out of the message.
     """
+    if not sys.stdin:
+        raise UserError(f"{NAME}: closed; nothing can be read from it")
     with TemporaryDirectory() as folder:
         plain = Path(folder) / NAME
         with plain.open("wb") as file:

@@ -22,7 +22,7 @@ from bms_estimator.sources.frames import CurrentSign
 BLOCK_ROWS = 65_536
 
 
-class Dialect(NamedTuple):
+class Spelling(NamedTuple):
     """How a table calls the columns of ``SAMPLE``, and which sign its current has."""
 
     time_s: str
@@ -33,9 +33,9 @@ class Dialect(NamedTuple):
     """What it calls positive; None: that is not laid down."""
 
 
-DIALECTS = (
-    Dialect("time_s", "current_a", "voltage_v", "temperature_c", None),
-    Dialect("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", "charge_positive"),
+SPELLINGS = (
+    Spelling("time_s", "current_a", "voltage_v", "temperature_c", None),
+    Spelling("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", "charge_positive"),
 )
 """Ours, and the Battery Data Format."""
 
@@ -48,9 +48,9 @@ class Sign(NamedTuple):
     otherwise: CurrentSign = "discharge_positive"
     """Where neither ``given`` nor the names of the columns tell."""
 
-    def of(self, dialect: Dialect) -> float:
+    def of(self, spelling: Spelling) -> float:
         """Factor that makes discharge positive."""
-        return 1.0 if (self.given or dialect.current_sign or self.otherwise) == "discharge_positive" else -1.0
+        return 1.0 if (self.given or spelling.current_sign or self.otherwise) == "discharge_positive" else -1.0
 
 
 class ByName(Protocol):
@@ -238,7 +238,7 @@ def _header(path: Path, text: TextIOWrapper) -> tuple[list[str], int]:
     for number, line in enumerate(iter(text.readline, ""), 1):
         if _is_data(line):
             return [name.strip() for name in next(csv.reader([line]))], number
-    raise UserError(f"{path}: empty: the first line must name the columns, {_wanted(DIALECTS[0])}")
+    raise UserError(f"{path}: empty: the first line must name the columns, {_wanted(SPELLINGS[0])}")
 
 
 def _columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
@@ -247,19 +247,19 @@ def _columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
     Raises:
         UserError: Some are missing; the message says which, and what there is.
     """
-    dialect = max(DIALECTS, key=lambda d: sum(name in header for name in d[:3]))
-    missing = [name for name in dialect[:3] if name not in header]
+    spelling = max(SPELLINGS, key=lambda d: sum(name in header for name in d[:3]))
+    missing = [name for name in spelling[:3] if name not in header]
     if missing:
         raise UserError(
             f"{path}: no column {' nor '.join(missing)}; found {', '.join(header)}; "
-            f"needed: {_wanted(DIALECTS[0])}, or {_wanted(DIALECTS[1])} (Battery Data Format)"
+            f"needed: {_wanted(SPELLINGS[0])}, or {_wanted(SPELLINGS[1])} (Battery Data Format)"
         )
-    names = tuple(name for name in dialect[:4] if name in header)
-    return _Columns(tuple(header.index(name) for name in names), names, sign.of(dialect))
+    names = tuple(name for name in spelling[:4] if name in header)
+    return _Columns(tuple(header.index(name) for name in names), names, sign.of(spelling))
 
 
-def _wanted(dialect: Dialect) -> str:
-    return f"{','.join(dialect[:3])}[,{dialect.temperature_c}]"
+def _wanted(spelling: Spelling) -> str:
+    return f"{','.join(spelling[:3])}[,{spelling.temperature_c}]"
 
 
 def _block(values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns: _Columns) -> SampleBlock:

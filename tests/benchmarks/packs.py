@@ -15,7 +15,7 @@ import psutil
 from live import MEASURE_S, MOSQUITTO, PATIENCE_S, PROGRAM, SETTLE_S, Broker, Signal, broker, pack_file
 from table import Row
 
-from bms_estimator.sources.virtual_board import VirtualBoard
+from bms_estimator.simulation.virtual_board import VirtualBoard
 
 PACKS, RATE_HZ, PUBLISH_RATE_HZ = 20, 10, 1.0
 MOST_CPU, MOST_MIB = 0.25, 400.0

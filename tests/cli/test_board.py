@@ -9,9 +9,9 @@ import pytest
 from serial.tools import list_ports
 
 from bms_estimator.cli.main import main
+from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.simulation.virtual_converter import BoardParts, Reading
 from bms_estimator.sources import probe
-from bms_estimator.sources.virtual_board import VirtualBoard
-from bms_estimator.sources.virtual_converter import BoardParts, Reading
 from tests.patience import LONG_S
 from tests.serial_line import usb_port
 

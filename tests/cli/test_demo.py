@@ -13,7 +13,7 @@ import pytest
 
 from bms_estimator.cli.main import main
 from bms_estimator.demo.board import FIRMWARE_BUILD
-from bms_estimator.sources.firmware_board import FirmwareBoard
+from bms_estimator.simulation.firmware_board import FirmwareBoard
 from tests.mosquitto import Listener, free_port
 from tests.patience import LONG_S
 

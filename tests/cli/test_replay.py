@@ -287,6 +287,15 @@ def test_a_capture_comes_from_stdin_as_from_a_file(form, capture, monkeypatch, c
     assert json.loads(out)["samples"] == SAMPLES
 
 
+def test_a_closed_stdin_is_told(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdin", None)
+    assert run(capsys, "replay", "-", "--cell", "ncr18650") == (
+        2,
+        "",
+        "error: stdin: closed; nothing can be read from it\n",
+    )
+
+
 def test_what_is_wrong_on_stdin_is_named_without_a_path(monkeypatch, capsys):
     for data, said in [
         (b"time_s,current_a,voltage_v\n0,none,3.7\n", "stdin: line 2: current_a = 'none': must be a number"),

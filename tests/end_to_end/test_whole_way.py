@@ -16,11 +16,11 @@ from bms_estimator.cli.pack import load_pack
 from bms_estimator.model.cell import load_cell
 from bms_estimator.service.checkpoint import CheckpointFile, fields
 from bms_estimator.service.live import new_estimator
+from bms_estimator.simulation.simulated_pack import SimulatedPack, pulses
+from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
+from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources.protocol import ResetCause
 from bms_estimator.sources.replay import RawCapture
-from bms_estimator.sources.simulated_pack import SimulatedPack, pulses
-from bms_estimator.sources.virtual_board import BoardFault, VirtualBoard
-from bms_estimator.sources.virtual_converter import Reading
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.simavr_board import SimavrBoard, write_readings

@@ -13,6 +13,7 @@ import pytest
 
 from bms_estimator.model.sample import SampleStatus
 from bms_estimator.model.settings import SensorSettings
+from bms_estimator.simulation.virtual_converter import aux_readings_of, window_of
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.protocol import (
     PROTOCOL_VERSION,
@@ -34,7 +35,6 @@ from bms_estimator.sources.protocol import (
     zero_current_command,
 )
 from bms_estimator.sources.serial_board import SerialBoard
-from bms_estimator.sources.virtual_converter import aux_readings_of, window_of
 from tests.firmware.host import Host
 from tests.simavr_board import FIRMWARE, SimavrBoard, write_readings
 

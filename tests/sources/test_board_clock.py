@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -95,3 +97,11 @@ async def test_a_replay_finds_the_same_rate_to_the_last_bit(tmp_path: Path) -> N
     async for _ in replay:
         pass
     assert ppm(replay) == ppm(fed(iter(recorded)))
+
+
+def test_nothing_of_the_clock_compiles_once_samples_come() -> None:
+    program = (
+        "from bms_estimator.kernels.board_clock import clock_ppm; from bms_estimator.sources.frames import FrameDecoder; "
+        "FrameDecoder(); assert clock_ppm.signatures"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

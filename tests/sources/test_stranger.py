@@ -13,11 +13,11 @@ from serial.tools import list_ports
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
+from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources import ports, probe
 from bms_estimator.sources.protocol import hello_command
 from bms_estimator.sources.serial_board import SerialBoard
-from bms_estimator.sources.virtual_board import VirtualBoard
-from bms_estimator.sources.virtual_converter import Reading
 from tests.patience import LONG_S
 from tests.serial_line import Line, usb_port
 
@@ -131,6 +131,19 @@ async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -
             await until(lambda: len(blocks) > taken_before)
         assert source.board["serial"] == "00000001"
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(22.2, abs=0.1)
+
+
+async def test_auto_says_what_comes_in_place_of_its_own_board(auto: Path) -> None:
+    source = SerialBoard(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
+    async with taken(source, []):
+        async with plugged_in(auto, serial=1):
+            await until(lambda: source._door.serial)
+        await until(lambda: source.message)
+        with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, linked(auto, other.path):
+            task = asyncio.create_task(other.run())
+            await until(lambda: source.message and "prints text" in source.message)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_a_port_that_was_named_may_hold_another_board(auto: Path) -> None:

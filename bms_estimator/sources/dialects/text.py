@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.dialects import Dialect, cell_block
-from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.frames import PRINTABLE, CurrentSign
 from bms_estimator.sources.text_line import Reading, read_line
 
 LINE_BYTES = 1024
 """A longer line is noise: 96 cells of seven characters fit."""
 SHOWN_BYTES = 60
 """So much of a line that says nothing is shown."""
-_PRINTABLE = bytes(range(0x20, 0x7F)) + b"\t\r\n"
 
 
 class TextDialect(Dialect):
@@ -53,7 +52,7 @@ class TextDialect(Dialect):
         if self._bad is None:
             return None
         shown = repr(self._bad[:SHOWN_BYTES])[1:] + ("..." if len(self._bad) > SHOWN_BYTES else "")
-        if 4 * len(self._bad.translate(None, _PRINTABLE)) > len(self._bad):
+        if 4 * len(self._bad.translate(None, PRINTABLE)) > len(self._bad):
             return (
                 f"bytes that are no text come: wrong baud rate, or sensor.protocol should be binary? They begin {shown}"
             )

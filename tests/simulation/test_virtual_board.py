@@ -12,6 +12,8 @@ import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.model.settings import SensorSettings
+from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
+from bms_estimator.simulation.virtual_converter import BoardParts, Reading, window_of
 from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.frames import FrameCounters, FrameDecoder
 from bms_estimator.sources.protocol import (
@@ -29,8 +31,6 @@ from bms_estimator.sources.protocol import (
     set_serial_command,
     zero_current_command,
 )
-from bms_estimator.sources.virtual_board import BoardFault, VirtualBoard
-from bms_estimator.sources.virtual_converter import BoardParts, Reading, window_of
 from tests.patience import LONG_S
 
 STEADY = Reading(2.5, 22.2, 25.0)

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.virtual_converter import Reading
+from bms_estimator.simulation.virtual_converter import Reading
 
 READINGS_HZ = 50
 """Of a signal; each reading is held until the next."""

@@ -18,6 +18,14 @@ from enum import Enum
 from types import TracebackType
 from typing import Literal, Self
 
+from bms_estimator.simulation.virtual_converter import (
+    FULL_SCALE,
+    BoardParts,
+    Reading,
+    VirtualConverter,
+    aux_readings_of,
+    window_of,
+)
 from bms_estimator.sources.protocol import (
     DELIMITER,
     LEAST_BANDGAP_V,
@@ -39,14 +47,6 @@ from bms_estimator.sources.protocol import (
     ResetCause,
     SampleMessage,
     unseal,
-)
-from bms_estimator.sources.virtual_converter import (
-    FULL_SCALE,
-    BoardParts,
-    Reading,
-    VirtualConverter,
-    aux_readings_of,
-    window_of,
 )
 
 Signal = Callable[[float], Reading] | Iterable[Reading]
