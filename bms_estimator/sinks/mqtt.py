@@ -268,18 +268,21 @@ class MqttSink:
                 return
 
     async def _correct(self, client: "_Client") -> None:
-        """Put the availabilities right, if it is time."""
+        """Put the availabilities right, if it is time.
+
+        Counted when the broker has taken it: one that ends says our will, and takes none.
+        """
         now_s = asyncio.get_running_loop().time()
         since_s = now_s - self._corrected_s
         if not self._forged or since_s < CORRECTION_S:
             return
         self._forged, self._corrected_s = False, now_s
+        await self._publish(client, self._messages.availability(self._sent))
         self._delivery.corrections += 1
         if since_s > BURST_S:
             log.warning(
                 "somebody else wrote an availability of this pack: put right", so_far=self._delivery.corrections
             )
-        await self._publish(client, self._messages.availability(self._sent))
 
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Answer requests, hear Home Assistant's birth, watch over the availabilities."""
