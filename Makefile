@@ -51,7 +51,7 @@ firmware: ## the board's firmware and its simulator, where the compilers are ins
 	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
 
 kernels: venv
-	$(BIN)/python -m tests.compile_kernels
+	$(BIN)/python -c 'from bms_estimator.service.warm_up import load_kernels; load_kernels()'
 
 lock: ## write requirements.lock anew after a change of dependencies (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --no-annotate --universal pyproject.toml -o requirements.lock

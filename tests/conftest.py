@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.compile_kernels import compile_kernels
+from bms_estimator.service.warm_up import load_kernels
 
 # compilation and shared machines make times meaningless
 settings.register_profile("project", deadline=None)
@@ -18,7 +18,7 @@ SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile before workers would each do it, and before a test reads what a program says of it."""
     if not hasattr(session.config, "workerinput"):
-        compile_kernels()
+        load_kernels()
 
 
 @pytest.fixture(scope="session")

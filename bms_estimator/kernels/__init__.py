@@ -34,12 +34,12 @@ def _cache_folder() -> Path | None:
     candidates = [
         os.environ.get("NUMBA_CACHE_DIR"),
         os.environ.get("CACHE_DIRECTORY"),
-        str(Path(home_cache, "bms_estimator").expanduser()),
+        f"{home_cache}/bms_estimator",
     ]
     for candidate in candidates:
         if candidate:
-            folder = Path(candidate) / digest.hexdigest()[:16]
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, RuntimeError):  # the latter of a user without a home
+                folder = Path(candidate).expanduser() / digest.hexdigest()[:16]
                 folder.mkdir(parents=True, exist_ok=True)
                 tempfile.TemporaryFile(dir=folder).close()
                 return folder

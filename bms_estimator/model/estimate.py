@@ -87,7 +87,7 @@ class Health(Report):
     sensor_online: bool = Field(description="a valid frame came within 3 publish or sample periods")
     sensor_message: str | None = Field(description="why the sensor is not online; null when it is")
     clock_ppm: float | None = Field(
-        default=None, description="how much faster the board's clock runs than the host's [1e-6]; null while unknown"
+        description="how much faster the board's clock runs than the host's [1e-6]; null while unknown"
     )
     line: dict[str, int] = Field(description="frames and faults of the line by kind, since start")
     samples: dict[str, int] = Field(description="samples accepted and dropped by kind, since start")
@@ -97,7 +97,7 @@ class Health(Report):
     suspects: list[str] = Field(description="what the identifier suspects of its input, and what to do; empty: nothing")
     lock_losses: int = Field(description="times the observer lost track")
     gain_rearms: int = Field(description="times k was started again before the gain turned")
-    publish_drops: int = Field(description="messages replaced before a sink could take them")
+    publish_drops: int = Field(description="states that the broker could not take in time")
     refused_topics: list[str] = Field(description="what the broker denies, as far as it can be told; empty: nothing")
     availability_corrections: int = Field(description="times somebody else wrote an availability and was put right")
     requests: dict[str, int] = Field(description="by what became of them, since start")

@@ -92,6 +92,8 @@ class CheckpointFile:
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
         self.thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
         """Where to call ``save``: a call that nobody waits for any more still ends before the next one begins."""
+        self.saved: tuple[int, float] | None = None
+        """Samples and SOC of the state that was saved last; None: none was by this run."""
 
     def save(self, state: NDArray[np.void], restarts: int) -> None:
         """Write atomically: after a power cut there is the old file or the new one.

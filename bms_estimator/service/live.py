@@ -90,10 +90,12 @@ async def run_live(
         ]
         if checkpoint:
             tasks.append(_save_often(checkpoint, estimator, publisher, settings.state.checkpoint_s, restarts))
-        await until_first_ends(*tasks, stop.wait())
-        notifier.stopping(name)
-        if checkpoint:  # before the sinks part, which may take seconds: who stops us may not wait for them
-            await _save(checkpoint, estimator, publisher, restarts)
+        try:
+            await until_first_ends(*tasks, stop.wait())
+        finally:  # a fault ends the loop, too
+            notifier.stopping(name)
+            if checkpoint:  # before the sinks part, which may take seconds: who stops us may not wait for them
+                await _save(checkpoint, estimator, publisher, restarts)
         publisher.publish_last()
     return estimator
 
@@ -164,13 +166,17 @@ async def _save_often(
 
 
 async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, restarts: int) -> None:
-    """Save what samples have taught; writing waits for the disk in a thread."""
-    if not (estimator.state["started"][0] and estimator.state["samples"][0]):
+    """Save what samples have taught; writing waits for the disk in a thread.
+
+    What is saved already is not saved again: it would seem to be of now, and not of before nobody measured.
+    """
+    state = estimator.record.copy()
+    taught = int(state["observer"]["samples"][0]), float(state["observer"]["soc"][0])
+    if not taught[0] or taught == checkpoint.saved:
         return
     try:
-        state = estimator.record.copy()
         await asyncio.get_running_loop().run_in_executor(checkpoint.thread, checkpoint.save, state, restarts)
-        publisher.checkpoint = "saved"
+        publisher.checkpoint, checkpoint.saved = "saved", taught
     except OSError as error:
         publisher.checkpoint = f"cannot be saved: {error}"
         log.warning("checkpoint cannot be saved", file=str(checkpoint.path), error=str(error))

@@ -89,11 +89,13 @@ def state_folder(settings: Settings) -> Path:
     """
     systemd = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
     home = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
-    folder = settings.state.folder or Path(systemd or f"{home}/bms-estimator").expanduser()
+    folder = settings.state.folder or Path(systemd or f"{home}/bms-estimator")
     try:
+        folder = folder.expanduser()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # the latter of a user without a home
+        reason = error.strerror if isinstance(error, OSError) else str(error)
         if settings.state.folder:
-            raise UserError(f"state.folder = {folder}: {error.strerror}") from error
-        log.warning("the state cannot outlive a restart", folder=str(folder), reason=error.strerror)
+            raise UserError(f"state.folder = {folder}: {reason}") from error
+        log.warning("the state cannot outlive a restart", folder=str(folder), reason=reason)
     return folder

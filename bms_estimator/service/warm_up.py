@@ -16,7 +16,7 @@ CELL = "chen_mora"
 
 def load_kernels() -> None:
     """Load the kernels of decoder, estimator and reports; a first start compiles them."""
-    FrameDecoder()
+    _ = FrameDecoder().clock_ppm
     cell = load_cell(CELL)
     estimator = new_estimator(Settings(), cell)
     sample = np.zeros(1, dtype=SAMPLE)

@@ -172,10 +172,10 @@ class MqttSink:
                 raise
             await self._serve(ProtocolVersion.V311)
 
-    def _client(self, protocol: ProtocolVersion) -> aiomqtt.Client:
+    def _client(self, protocol: ProtocolVersion) -> "_Client":
         limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
         limit.MaximumPacketSize = MOST_BYTES
-        return aiomqtt.Client(
+        return _Client(
             **self._connection,
             protocol=protocol,
             properties=limit if protocol is ProtocolVersion.V5 else None,
@@ -204,7 +204,7 @@ class MqttSink:
                 raise  # the broker publishes the will
             except* Exception:  # a fault of ours: the client parts in good order, which withholds the will
                 with contextlib.suppress(aiomqtt.MqttError):
-                    await _publish(client, self._messages.farewell())
+                    await self._publish(client, self._messages.farewell())
                 raise
 
     async def _subscribe(self, client: aiomqtt.Client, protocol: ProtocolVersion) -> None:
@@ -226,49 +226,63 @@ class MqttSink:
                 self._say_refused(topic, "not allowed to read it")
 
     async def _expect_echo(self) -> None:
-        """Find out a broker that denies us without a word, as Mosquitto does by its access list."""
+        """Find out a broker that denies us without a word, as Mosquitto does with what may not be read."""
         topic = self._topic(AVAILABILITY)
         try:
             async with asyncio.timeout(self._echo_s):
                 await self._echoed.wait()
         except TimeoutError:
-            if topic not in self._delivery.refused_topics:
-                self._say_refused(topic, "it does not come back: not allowed to write or to read it")
+            if topic in self._delivery.refused_topics:
+                return
+            self._say_refused(topic, "it does not come back: not allowed to read it, or the broker is slow")
+            await self._echoed.wait()
+            self._delivery.refused_topics.remove(topic)
+
+    async def _publish(self, client: "_Client", messages: Iterable[Message]) -> None:
+        """Publish one after the other; only one task does at a time."""
+        for message in messages:
+            client.denied = False
+            await client.publish(*message)
+            if client.denied and message.topic not in self._delivery.refused_topics:
+                self._say_refused(message.topic, "not allowed to write it")
 
     def _say_refused(self, topic: str, why: str) -> None:
         self._delivery.refused_topics.append(topic)
         log.warning("broker refuses a topic; see its access list", topic=topic, reason=why)
 
-    async def _send(self, client: aiomqtt.Client) -> None:
+    async def _send(self, client: "_Client") -> None:
         while True:
             await self._wake.wait()
             self._wake.clear()
             if self._again:
                 self._again, self._forged, self._sent = False, False, Sent()
-                await _publish(client, self._messages.greeting())
+                await self._publish(client, self._messages.greeting())
             await self._correct(client)
             snapshot, self._slot = self._slot, None
             if snapshot is not None:
                 now_s = asyncio.get_running_loop().time()
                 messages, self._sent = self._messages.due(self._sent, snapshot, now_s)
-                await _publish(client, messages)
+                await self._publish(client, messages)
             if self._closing:
-                await _publish(client, self._messages.farewell())
+                await self._publish(client, self._messages.farewell())
                 return
 
-    async def _correct(self, client: aiomqtt.Client) -> None:
-        """Put the availabilities right, if it is time."""
+    async def _correct(self, client: "_Client") -> None:
+        """Put the availabilities right, if it is time.
+
+        Counted when the broker has taken it: one that ends says our will, and takes none.
+        """
         now_s = asyncio.get_running_loop().time()
         since_s = now_s - self._corrected_s
         if not self._forged or since_s < CORRECTION_S:
             return
         self._forged, self._corrected_s = False, now_s
+        await self._publish(client, self._messages.availability(self._sent))
         self._delivery.corrections += 1
         if since_s > BURST_S:
             log.warning(
                 "somebody else wrote an availability of this pack: put right", so_far=self._delivery.corrections
             )
-        await _publish(client, self._messages.availability(self._sent))
 
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Answer requests, hear Home Assistant's birth, watch over the availabilities."""
@@ -310,6 +324,17 @@ class MqttSink:
         return f"{self._messages.root}/{name}"
 
 
+class _Client(aiomqtt.Client):
+    """Hears what the broker answers to a message of QoS 1, which MQTT 5 has; the base throws it away."""
+
+    denied = False
+    """Set when a message was refused."""
+
+    def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Any) -> None:
+        self.denied |= reason_code.is_failure
+        super()._on_publish(client, userdata, mid, reason_code, properties)
+
+
 class _Inbox(asyncio.Queue[aiomqtt.Message]):
     """What waits to be read; bounded in bytes, too, and without a log line for each message that is lost.
 
@@ -331,11 +356,6 @@ class _Inbox(asyncio.Queue[aiomqtt.Message]):
             self._requests.refuse("overflow", topic[:MOST_SHOWN])
         else:
             super().put_nowait(item)
-
-
-async def _publish(client: aiomqtt.Client, messages: Iterable[Message]) -> None:
-    for message in messages:
-        await client.publish(*message)
 
 
 def broker_arguments(settings: MqttSettings) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def health_report(
     *,
     now_s: float,
     uptime_s: float,
-    loop_lag_s: float = 0.0,
+    loop_lag_s: float,
     restarts: int,
     checkpoint: str,
     sensor_message: str | None,

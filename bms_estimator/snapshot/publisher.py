@@ -108,6 +108,8 @@ class Publisher:
         if self.snapshot.estimate is not None:
             self.latest = self.snapshot.estimate
             self._rest.add(self.latest, now_s)
+        elif not self.snapshot.health.sensor_online:
+            self._rest.forget()
         for sink in self._sinks:
             sink.publish(self.snapshot)
 

@@ -7,7 +7,7 @@ import numba
 from numba.core.caching import _CacheLocator
 
 from bms_estimator import kernels
-from tests.compile_kernels import compile_kernels
+from bms_estimator.service.warm_up import load_kernels
 
 KERNELS = Path(kernels.__file__)
 LEFT_OUT = "sample_step.run-"
@@ -16,7 +16,7 @@ LEFT_OUT = "sample_step.run-"
 
 def fill(cache: Path, sources: Path = KERNELS) -> None:
     """Fill a cache for kernels that will lie where ``sources`` says."""
-    compile_kernels()
+    load_kernels()
     compiled = Path(numba.config.CACHE_DIR)
     named = _CacheLocator.get_suitable_cache_subpath  # by the folder of the sources
     shutil.copytree(

@@ -48,6 +48,10 @@ def test_a_kernel_runs_where_no_folder_can_be_made_to_keep_it_in(disk_without_fi
     assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in said
 
 
+def test_a_kernel_runs_for_a_user_without_a_home() -> None:
+    assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in crc16_with_cache_in(Path("~"))
+
+
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 def test_a_kept_kernel_that_was_damaged_is_compiled_and_kept_again(tmp_path: Path, kind: str) -> None:
     assert crc16_with_cache_in(tmp_path) == ""

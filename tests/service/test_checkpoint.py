@@ -306,6 +306,39 @@ async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes
         await sink.until(lambda s: s.health.samples["samples"] == 2)
 
 
+async def test_a_checkpoint_is_of_the_last_sample_and_not_of_a_later_time_without_any(tmp_path: Path) -> None:
+    states = []
+
+    class Counting(CheckpointFile):
+        def save(self, state: Any, restarts: int) -> None:
+            super().save(state, restarts)
+            states.append(state["observer"]["samples"][0])
+
+    async with often(Counting(tmp_path, SETTINGS, CELL)) as (source, sink, _):
+        for second in range(2):
+            source.give((float(second), 0.1, 3.8))
+            source.give((float(second), 0.1, 9.9))  # dropped: nothing is learned from it
+            await sink.until(lambda s, n=second + 1: s.health.checkpoint == "saved" and n in states)
+            at_s = sink.snapshots[-1].health.uptime_s
+            await sink.until(lambda s, at_s=at_s: s.health.uptime_s > at_s + 1.0)
+    assert states == [1, 2]
+
+
+async def test_what_was_learned_is_saved_when_a_fault_ends_the_loop(tmp_path: Path) -> None:
+    class Broken(ScriptedSource):
+        async def __aiter__(self) -> AsyncIterator[Any]:
+            async for block in super().__aiter__():
+                yield block
+            raise ZeroDivisionError
+
+    source, file = Broken(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    source.give((0.0, 0.1, 3.8))
+    source.finish()
+    with pytest.raises(ZeroDivisionError):
+        await run_live(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=file)
+    assert file.load().state["observer.samples"] == 1
+
+
 async def test_the_last_checkpoint_does_not_wait_for_a_broker_that_parts_slowly(tmp_path: Path) -> None:
     saved = []
 

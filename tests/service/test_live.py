@@ -301,6 +301,18 @@ async def test_the_present_current_is_not_taken_as_zero_while_it_flows(
     assert zero.times == 0
 
 
+async def test_what_was_seen_before_the_board_was_silent_is_no_rest() -> None:
+    zero = Zeroed()
+    async with running(current_zero=zero, clock=zero.clock) as run:
+        await zero.watch(run, AT_REST)
+        zero.now_s += WATCHED_S
+        await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
+        await zero.watch(run, AT_REST[:2])
+        with pytest.raises(UserError, match="watched for"):
+            await run.ask("current_zero")
+    assert zero.times == 0
+
+
 async def test_a_source_without_a_zero_says_so() -> None:
     async with running() as run:
         await run.sink.until(lambda _: True)

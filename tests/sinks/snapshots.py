@@ -34,6 +34,7 @@ def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None
             {"frames_received": 2},
             now_s=NOW,
             uptime_s=1.0,
+            loop_lag_s=0.0,
             restarts=0,
             checkpoint="off",
             sensor_message=sensor_message,

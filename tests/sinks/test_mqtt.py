@@ -179,6 +179,24 @@ async def test_an_availability_that_somebody_else_wrote_is_put_right(
     assert sink.delivery.corrections == 1
 
 
+async def test_a_broker_that_ends_and_publishes_our_will_is_not_somebody_else(broker: Broker) -> None:
+    with structlog.testing.capture_logs() as logs:
+
+        def connections() -> int:
+            return sum(line["event"] == "broker connected" for line in logs)
+
+        async with Sink(broker.url) as sink:
+            async with Listener(broker) as live:
+                sink.mqtt.publish(ONE)
+                await live.wait(f"bms/pack/{RETAINED[-1]}")  # the last of them all
+            await asyncio.to_thread(broker.stop)
+            await until(lambda: any(line["event"] == "broker not reachable" for line in logs))
+            await asyncio.to_thread(broker.start)
+            await until(lambda: connections() == 2)
+    assert sink.delivery.corrections == 0
+    assert not [line for line in logs if "somebody else" in line["event"]]
+
+
 async def test_somebody_who_keeps_writing_an_availability_is_not_answered_each_time(broker: Broker) -> None:
     loop = asyncio.get_running_loop()
     async with Listener(broker) as live, Sink(broker.url) as sink:
@@ -190,9 +208,9 @@ async def test_somebody_who_keeps_writing_an_availability_is_not_answered_each_t
         await until(
             lambda: (heard := live.all("bms/pack/availability")).count(b"offline") == 200 and heard[-1] == b"online"
         )
-        assert 1 <= sink.delivery.corrections <= 1 + (loop.time() - began_s) / CORRECTION_S
         async with Listener(broker) as late:
             assert await late.wait("bms/pack/availability") == b"online"
+    assert 1 <= sink.delivery.corrections <= 1 + (loop.time() - began_s) / CORRECTION_S
 
 
 async def test_a_request_comes_back_as_a_response(broker: Broker, url: str) -> None:
@@ -298,7 +316,7 @@ async def test_the_demo_s_broker_which_knows_no_mqtt_5_is_served() -> None:
 
 @pytest.fixture
 def mute_broker(tmp_path: Path) -> Iterator[Broker]:
-    """Its access list gives the estimator no right at all, which Mosquitto does not say."""
+    """Its access list gives the estimator no right at all, which Mosquitto says to who writes by MQTT 5 only."""
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     (tmp_path / "acl").write_text("topic read nothing\n")
@@ -309,9 +327,30 @@ def mute_broker(tmp_path: Path) -> Iterator[Broker]:
 
 async def test_a_broker_that_denies_everything_without_a_word_is_found_out(mute_broker: Broker) -> None:
     with structlog.testing.capture_logs() as logs:
-        async with Sink(mute_broker.url, echo_s=0.5) as sink:
+        async with Proxy(mute_broker.port, knows_5=False) as proxy, Sink(proxy.url, echo_s=0.5) as sink:
             await until(lambda: sink.delivery.refused_topics)
             assert snapshot(delivery=sink.delivery).health.refused_topics == ["bms/pack/availability"]
+    assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/availability"]
+
+
+async def test_each_retained_topic_that_must_not_be_written_is_named_once_where_the_broker_says_so(
+    mute_broker: Broker,
+) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Sink(mute_broker.url) as sink:
+            sink.mqtt.publish(ONE)
+            await until(lambda: len(sink.delivery.refused_topics) > len(RETAINED))
+            sink.mqtt.publish(snapshot())
+    named = [line["topic"] for line in logs if line["log_level"] == "warning"]
+    assert sorted(named) == sorted([*(f"bms/pack/{topic}" for topic in RETAINED), DISCOVERY])
+    assert sink.delivery.refused_topics == named
+
+
+async def test_a_broker_that_gives_back_late_is_not_called_one_that_refuses_for_good(broker: Broker) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Sink(broker.url, echo_s=0.0) as sink, Listener(broker) as live:
+            await live.wait("bms/pack/availability")
+            await until(lambda: not sink.delivery.refused_topics)
     assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/availability"]
 
 
