@@ -36,9 +36,10 @@ async def test_a_service_ends_when_told_though_nobody_reads_its_terminal(
 [sensor]
 port = "{line.path}"
 protocol = "text"
+[publish]
+rate_hz = 10
 [mqtt]
 url = "{broker.url}"
-publish_rate_hz = 10
 [state]
 folder = "{tmp_path / "state"}"
 """)
