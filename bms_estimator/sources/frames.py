@@ -1,6 +1,5 @@
 """The binary board's bytes to samples: ``kernels.framing`` with its state, its messages and its counters."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import Enum
@@ -21,6 +20,8 @@ DEAF_BYTES = 512
 """So many bytes without one whole frame, and the line itself is at fault: eight of the longest frames."""
 PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
 """What printed lines are made of."""
+MOST_CLOCK_PPM = 20_000.0
+"""No resonator is so far off: the host slept meanwhile, or the board is a simulated one in a hurry [1e-6]."""
 _MESSAGES = 8
 
 
@@ -107,12 +108,12 @@ class FrameDecoder:
 
     @property
     def clock_ppm(self) -> float | None:
-        """How much faster the board's clock runs than that of the arrivals [1e-6]; None before a minute has told.
+        """How much faster the board's clock runs than that of the arrivals [1e-6]; None before a minute has told, and where it cannot be.
 
         To 0.1. It changes no time stamp.
         """
         ppm = clock_ppm(self._state[0])
-        return None if math.isnan(ppm) else round(ppm, 1)
+        return round(ppm, 1) if abs(ppm) < MOST_CLOCK_PPM else None
 
     @property
     def counters(self) -> FrameCounters:

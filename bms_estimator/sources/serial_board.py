@@ -29,7 +29,8 @@ JUNK_LOG_S = 30.0
 ANSWER_S = 4.0
 """A board measures for a second before it answers a command [s]."""
 
-_NO_FAULTS = ("bytes_received", "frames_received")
+_NO_FAULTS = ("bytes_received", "frames_received", "before_hello")
+"""Samples before the hello are usual where opening the port does not reset the board."""
 
 log = structlog.get_logger(__name__)
 

@@ -71,6 +71,11 @@ def test_samples_that_all_came_at_once_tell_nothing_of_the_clock() -> None:
     assert decoder.clock_ppm is None
 
 
+def test_a_rate_that_no_resonator_has_is_none() -> None:
+    slept = ((START_S + 0.9 * (at_s - START_S), data) for at_s, data in reads(120.0))
+    assert fed(slept).clock_ppm is None
+
+
 def test_it_begins_anew_after_a_reset_of_the_board() -> None:
     before, later_s = reads(120.0), START_S + 300.0
     assert fed(before, reads(50.0, boot_id=2, start_s=later_s)).clock_ppm is None

@@ -92,6 +92,16 @@ def test_a_command_that_was_given_up_is_not_sent() -> None:
     assert dialect.due(0.0) == b""
 
 
+def test_a_command_is_not_given_to_a_board_that_comes_after_the_line_was_lost() -> None:
+    dialect = talking()
+    command = dialect.command("current_zero")
+    dialect.due(0.0)
+    dialect.opened()
+    dialect.feed(1.0, b"\0" + HELLO.encode())
+    assert dialect.due(1.0) == b""
+    assert (command.done, "the line was lost" in (command.refusal or "")) == (True, True)
+
+
 def test_another_command_there_is_not() -> None:
     with pytest.raises(UserError, match="no command fly"):
         BoardDialect().command("fly")

@@ -89,9 +89,12 @@ class BoardDialect(Dialect):
         return self._decoder.reference_v
 
     def opened(self) -> None:
-        """There is no hello until the next comes; samples keep the scaling of the last."""
+        """There is no hello until the next comes, nor is a command given again; samples keep the scaling of the last."""
         self._decoder.forget_hello()
         self._unheard_at = self._decoder.heard_at
+        if self._told is not None and not self._told.done:
+            self._told.refusal = "the line was lost before the board answered, and another board may be there now"
+            self._told.done = True
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode one read of the line; ``time_s`` is as ``FrameDecoder.feed`` says."""
