@@ -62,6 +62,8 @@ _PATIENCE_S = 1.0
 """For so long the last bytes wait for a host that may not read [s]."""
 _LOOK_S = 0.01
 """How often it looks whether a host has come [s]."""
+_BOOT_S = 0.2
+"""Opening the port resets a board; it starts when the host has long thrown away what it found on the line [s]."""
 _BURST = 256
 _BOOT_READINGS = 256
 _NEAR_MIDDLE = 0.1
@@ -191,6 +193,8 @@ class VirtualBoard:
             await asyncio.sleep(_LOOK_S)
         self._slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._slave)
+        await asyncio.sleep(_BOOT_S)
+        self.send(self._hello().encode())
         await self.run()
 
     async def _drain(self) -> None:
