@@ -6,17 +6,14 @@ import re
 import select
 import struct
 import subprocess
-import sys
 import termios
 import time
 from collections.abc import Callable
-from pathlib import Path
-from types import TracebackType
 from typing import Self
 
+from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOME, ALTERNATE, BACK, CURSOR = "\x1b[H", "\x1b[?1049h", "\x1b[?1049l", "\x1b[?25h"
 """Control sequences: begin of a screen, its taking and giving back, the cursor shown again."""
 
@@ -45,9 +42,7 @@ class PseudoTerminal:
         )
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.process.kill()
         self.process.wait()
         os.close(self._master)

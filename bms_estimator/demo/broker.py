@@ -8,7 +8,6 @@ import contextlib
 import errno
 import logging
 import socket
-from types import TracebackType
 from typing import Self
 
 from amqtt.adapters import StreamReaderAdapter, StreamWriterAdapter
@@ -104,9 +103,7 @@ class DemoBroker:
         await self._broker.start()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Part from all clients."""
         await self._broker.shutdown()
 

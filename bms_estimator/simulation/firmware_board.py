@@ -5,7 +5,6 @@ import math
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from bms_estimator.model.errors import UserError
@@ -80,9 +79,7 @@ class FirmwareBoard:
             raise UserError(f"{self._command[0]} does not start; build it anew: make firmware")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End the simulator."""
         self._process.terminate()
         try:

@@ -15,7 +15,6 @@ import tty
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
-from types import TracebackType
 from typing import Literal, Self
 
 from bms_estimator.simulation.virtual_converter import (
@@ -162,9 +161,7 @@ class VirtualBoard:
         self.path = os.ttyname(self._slave)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Pull the plug: the host's descriptor dies."""
         for descriptor in (self._master, self._slave):
             if descriptor >= 0:

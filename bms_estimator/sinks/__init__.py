@@ -5,7 +5,6 @@ All sinks are peers: async context managers whose ``publish`` neither blocks nor
 
 from collections import Counter
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Protocol, Self
 
 from bms_estimator.model.estimate import Snapshot
@@ -37,7 +36,5 @@ class Sink(Protocol):
     async def __aenter__(self) -> Self:
         """Start."""
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Hand over what is pending and end."""

@@ -7,7 +7,6 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
-from types import TracebackType
 from typing import IO, Self, cast
 
 from rich.console import Console
@@ -58,9 +57,7 @@ class ConsoleSink:
         self._thread.start()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Give the screen back and leave the last view on it."""
         self._closing.set()
         self._due.set()

@@ -14,7 +14,6 @@ import socket
 import ssl
 from collections.abc import Iterable
 from functools import partial
-from types import TracebackType
 from typing import Any, Self
 from urllib.parse import urlsplit
 
@@ -124,9 +123,7 @@ class MqttSink:
         self._task = asyncio.create_task(self._stay_connected(), name="mqtt")
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_error: object) -> None:
         """Publish what is pending and ``offline``, then part from the broker."""
         if self._task is None:
             return

@@ -7,7 +7,6 @@ import gzip
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, Protocol, Self, cast
 
 import numpy as np
@@ -28,9 +27,7 @@ class TableSink(Protocol):
     def __enter__(self) -> Self:
         """Nothing to open yet."""
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Complete the file."""
 
     def write(self, trace: NDArray[np.void]) -> None:
@@ -58,9 +55,7 @@ class CsvSink:
         """Nothing to open yet."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Complete the file."""
         self._files.close()
 
@@ -98,9 +93,7 @@ class ParquetSink:
         """Nothing to open yet."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Complete the file."""
         self._files.close()
 

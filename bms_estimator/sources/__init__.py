@@ -1,7 +1,6 @@
 """Where samples come from: serial boards, captures, tables."""
 
 from collections.abc import AsyncIterator, Mapping
-from types import TracebackType
 from typing import Protocol, Self
 
 from bms_estimator.model.sample import CellBlock, SampleBlock
@@ -39,7 +38,5 @@ class Source(Protocol):
     async def __aenter__(self) -> Self:
         """Open."""
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close."""

@@ -5,7 +5,6 @@ import queue
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import structlog
@@ -71,9 +70,7 @@ class Recording:
         """The recording."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Have the disk take all that waits, and close."""
         self._waiting.put(None)
         self._thread.shutdown()

@@ -5,7 +5,6 @@ import math
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol, Self, get_args
 
 import numpy as np
@@ -123,9 +122,7 @@ class Replay:
         """Nothing to open: iterating does."""
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Nothing to close."""
 
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:

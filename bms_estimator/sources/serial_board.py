@@ -5,7 +5,6 @@ import contextlib
 import math
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from types import TracebackType
 from typing import Protocol, Self
 
 import structlog
@@ -124,9 +123,7 @@ class SerialBoard:
         self._task.add_done_callback(lambda _: self._line.end())
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close the port."""
         if self._task is not None:
             self._task.cancel()

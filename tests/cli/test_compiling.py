@@ -3,14 +3,12 @@
 import os
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.command_line import PROGRAM
 from tests.patience import LONG_S
-
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 
 @pytest.mark.parametrize("command", ["demo", "replay", "run"])

@@ -4,18 +4,10 @@ import tomllib
 
 import pytest
 
-from bms_estimator.cli.main import main
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.settings import Settings, load_settings
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, stderr of the command line."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
+from tests.command_line import run
 
 
 @pytest.fixture

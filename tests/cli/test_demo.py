@@ -3,9 +3,7 @@
 import asyncio
 import contextlib
 import re
-import sys
 from datetime import datetime
-from pathlib import Path
 from types import SimpleNamespace
 
 import aiomqtt
@@ -14,10 +12,9 @@ import pytest
 from bms_estimator.cli.main import main
 from bms_estimator.demo.board import FIRMWARE_BUILD
 from bms_estimator.simulation.firmware_board import FirmwareBoard
+from tests.command_line import PROGRAM
 from tests.mosquitto import Listener, free_port
 from tests.patience import LONG_S
-
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 
 @contextlib.asynccontextmanager

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from bms_estimator.cli.main import main
 from bms_estimator.model.cell import load_cell
 from tests.calibration.simulated_load import TRUTH, capture, steps
+from tests.command_line import run
 
 ERRORS = ["samples", "voltage_rms_mv", "mean_abs_percent", "max_abs_percent"]
 
@@ -26,14 +26,6 @@ def tables(tmp_path_factory):
             fmt="%.6f",
         )
     return folder
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, stderr of the command line."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
 
 
 def test_identify_writes_a_cell_that_validates_on_another_capture(tables, tmp_path, capsys):

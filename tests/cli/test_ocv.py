@@ -3,19 +3,11 @@ import json
 import numpy as np
 import pytest
 
-from bms_estimator.cli.main import main
 from bms_estimator.model.cell import ChenMoraOcv, TableOcv, load_cell
 from tests.calibration.simulated_relaxation import BAD, relaxation
+from tests.command_line import run
 
 REAL = "cell5_relaxation_c2.csv.gz"
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, stderr of the command line."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
 
 
 def save(path, samples):

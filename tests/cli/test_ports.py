@@ -4,16 +4,13 @@ import contextlib
 import os
 import re
 import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from serial.tools import list_ports
 
 from bms_estimator.cli.main import main
+from tests.command_line import PROGRAM
 from tests.patience import LONG_S
-
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 
 @pytest.fixture(autouse=True)

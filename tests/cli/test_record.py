@@ -5,9 +5,7 @@ import json
 import re
 import signal
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +14,10 @@ from bms_estimator.cli.main import main
 from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.raw_capture import MAGIC, read_capture, read_header
+from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 from tests.serial_line import Line, line  # noqa: F401
 
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 LENGTH_AT = 8
 DATA_AT = 12
 """In a record, after time and length [bytes]."""

@@ -16,8 +16,8 @@ from pyarrow import BufferOutputStream, parquet
 from pyarrow.csv import read_csv
 
 from bms_estimator import estimate, load_capture, load_cell
-from bms_estimator.cli.main import main
 from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
+from tests.command_line import run
 
 SUMMARY = {
     "samples",
@@ -50,14 +50,6 @@ COLUMNS = [
     "tau_tl_s",
 ]
 SAMPLES = 600
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, stderr of the command line."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
 
 
 @pytest.fixture

@@ -2,24 +2,14 @@
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from bms_estimator import __version__
-from bms_estimator.cli.main import COMMANDS, main
+from bms_estimator.cli.main import COMMANDS
+from tests.command_line import PROGRAM, run
 from tests.patience import LONG_S
-
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, stderr of the command line."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
 
 
 def program(*arguments):

@@ -6,7 +6,6 @@ import re
 import select
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -16,9 +15,9 @@ import pytest
 from bms_estimator.cli.main import main
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.protocol import set_rate_command
+from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 RATE_HZ = 50
 
 

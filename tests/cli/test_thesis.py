@@ -8,6 +8,7 @@ import pytest
 
 from bms_estimator.cli.main import main
 from tests.calibration.simulated_relaxation import relaxation
+from tests.command_line import run
 
 TABLES = [str(n) for n in range(2, 14)]
 FIGURES = [str(n) for n in (*range(3, 9), 10, *range(13, 18), *range(19, 24), *range(26, 40), 41, 42)]
@@ -68,14 +69,6 @@ class Page(HTMLParser):
             self._here["heads"][-1] += data
         else:
             self._here[self._field] += data
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, stderr of the command line."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
 
 
 @pytest.fixture(scope="module")

@@ -5,15 +5,14 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from tests.command_line import PROGRAM
 from tests.deploy import kernel_cache
 from tests.patience import LONG_S
 
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 PACK = '[pack]\ncell = "chen_mora"\n[sensor]\nport = "/dev/bms/absent"\n'
 
 

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import json
 import signal
-import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,11 +20,11 @@ from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources.protocol import ResetCause
 from bms_estimator.sources.replay import RawCapture
+from tests.command_line import PROGRAM
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.simavr_board import SimavrBoard, write_readings
 
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 LSB_V, LSB_A = 25.0 / 1024.0, 5.0 / 1024.0 / 0.1
 START_SOC = 0.9
 LOAD_A = 0.3

@@ -4,7 +4,6 @@ import os
 import select
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 from bms_estimator.sources.protocol import (
@@ -39,9 +38,7 @@ class Host:
         self.until(lambda: bool(self.hellos))  # before that the board does not listen
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         os.close(self._fd)
 
     def send(self, data: bytes) -> None:

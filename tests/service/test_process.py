@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import json
 import signal
-import sys
 from asyncio.subprocess import Process
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -12,11 +11,10 @@ from typing import IO, Any
 
 import pytest
 
+from tests.command_line import PROGRAM
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.serial_line import Line
-
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 
 def pack_file(folder: Path, line: Line, broker: Broker, name: str = "pack", state: str = "") -> Path:
