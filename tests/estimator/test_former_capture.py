@@ -1,0 +1,20 @@
+"""What was recorded by the first version gives the estimates that it gave."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bms_estimator import estimate, load_capture, load_cell
+
+ROUNDING = 1e-9
+"""Relative: another processor may round the last bits otherwise."""
+
+
+def test_a_capture_of_the_first_version_gives_the_estimates_it_gave(data: Path) -> None:
+    recorded = data / "simulated" / "board_0_1_0.bms"
+    then = json.loads(recorded.with_suffix(".json").read_text())
+    now = estimate(load_capture(recorded), load_cell("chen_mora"))
+    assert now.rows == then["samples"]
+    for row, place in zip(then["rows"], (0, now.rows // 2, now.rows - 1), strict=True):
+        assert {name: float(now[name][place]) for name in row} == pytest.approx(row, rel=ROUNDING)
