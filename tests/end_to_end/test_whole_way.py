@@ -192,7 +192,7 @@ async def test_the_loop_goes_on_when_the_board_is_unplugged_and_when_the_broker_
             async with Listener(broker, "bms/#") as later:
                 after = await later.wait_json("bms/pack/state")
                 assert await later.wait("bms/pack/availability") == b"online"
-            assert after["frames_received"] > again["frames_received"] + 50, "samples went on while the broker was away"
+            assert after["frames_received"] > again["frames_received"] + 80, "samples went on while the broker was away"
             assert after["frames_lost"] == again["frames_lost"]
 
 
