@@ -4,9 +4,10 @@ The values describe ``series_count`` cells in series as one two-terminal object;
 scales them to packs of such objects in series and parallel.
 """
 
+import itertools
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.toml_file import Strict, read_toml
 
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 
 ELEMENTS = {
     "r_ts": (1, "amplitude_ohm", "offset_ohm"),  # (2.5)
@@ -71,11 +73,19 @@ class ChenMoraOcv(Strict):
 
 
 class TableOcv(Strict):
-    """E_o(SOC) through measured points, monotone between them (PCHIP)."""
+    """E_o(SOC) at 25 C through measured points, monotone between them (PCHIP), and what else is known of it there."""
 
     form: Literal["table"]
     soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=4, description="increasing, from 0 to 1")
-    ocv_v: tuple[Positive, ...] = Field(min_length=4, description="increasing, one for each SOC")
+    ocv_v: tuple[Positive, ...] = Field(
+        min_length=4,
+        description="increasing, one for each SOC; after discharge, or with hysteresis_v midway to that after charge",
+    )
+    error_v: tuple[Positive, ...] | None = Field(default=None, description="standard deviation of ocv_v")
+    hysteresis_v: tuple[NotNegative, ...] | None = Field(
+        default=None, description="half of what ocv_v is higher after charge than after discharge"
+    )
+    per_kelvin_v: tuple[float, ...] | None = Field(default=None, description="growth of ocv_v with temperature [V/K]")
 
     @model_validator(mode="after")
     def _increasing(self) -> Self:
@@ -86,6 +96,44 @@ class TableOcv(Strict):
             if not (steps > 0).all():
                 i = int(np.argmax(steps <= 0))
                 raise ValueError(f"{name} must increase, but {values[i + 1]} follows {values[i]} at point {i + 2}")
+        for name in ("error_v", "hysteresis_v", "per_kelvin_v"):
+            column = getattr(self, name)
+            if column is not None and len(column) != len(self.soc):
+                raise ValueError(f"{len(self.soc)} SOCs but {len(column)} of {name}: give one for each SOC")
+        return self
+
+
+class Ladder(Strict):
+    """Overpotential as a series resistance and RC branches of fixed time constants (``kernels.ladder.TAU_S``).
+
+    R(SOC, T) = weak + strong, each with the Arrhenius factor of its own activation energy, both given at 25 C.
+    """
+
+    soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=2, description="increasing")
+    weak_ohm: tuple[tuple[NotNegative, ...], ...] = Field(
+        min_length=7, max_length=7, description="series resistance, then each branch's, one for each SOC; at 25 C"
+    )
+    strong_ohm: tuple[tuple[NotNegative, ...], ...] = Field(
+        min_length=7, max_length=7, description="the same of the part that grows strongly in the cold"
+    )
+    std: Positive = Field(
+        description="relative standard deviation of the resistances, as a whole, on another such cell"
+    )
+    error_v: Positive = Field(
+        description="RMS of what the ladder leaves of the captures that it was fitted to, at 25 C"
+    )
+    temperature_c: tuple[float, float] = Field(description="lowest and highest cell temperature of those captures")
+
+    @model_validator(mode="after")
+    def _of_one_shape(self) -> Self:
+        if any(b <= a for a, b in itertools.pairwise(self.soc)):
+            raise ValueError("soc must increase")
+        for name in ("weak_ohm", "strong_ohm"):
+            for row in getattr(self, name):
+                if len(row) != len(self.soc):
+                    raise ValueError(f"{len(self.soc)} SOCs but {len(row)} values in a row of {name}")
+        if self.temperature_c[0] > self.temperature_c[1]:
+            raise ValueError("temperature_c: the lowest temperature comes first")
         return self
 
 
@@ -149,6 +197,7 @@ class CellModel(Strict):
     c_tl: Capacitance
     r_s: Resistance
     ocv: Annotated[ChenMoraOcv | TableOcv, Field(discriminator="form")]
+    ladder: Ladder | None = Field(default=None, description="made of the elements when left out")
     adaptation: dict[str, Bounds] = Field(default_factory=dict, description="bounds by parameter, keys a1 to a15")
 
     @model_validator(mode="after")
@@ -191,10 +240,8 @@ def _scaled(model: CellModel, series: int, parallel: int) -> CellModel:
         table = part.model_dump()
         for key, value in table.items():
             unit = key.rsplit("_", 1)[-1]
-            if unit in factor:
-                table[key] = (
-                    tuple(v * factor[unit] for v in value) if isinstance(value, tuple) else value * factor[unit]
-                )
+            if unit in factor and value is not None:
+                table[key] = _product(value, factor[unit])
         return table
 
     factor = {"ohm": ohm, "farad": farad, "v": float(series), "a": float(parallel), "ah": float(parallel)}
@@ -206,9 +253,15 @@ def _scaled(model: CellModel, series: int, parallel: int) -> CellModel:
         table = bounds.model_dump()
         adaptation[name] = table | {k: table[k] * scale for k in ("upper", "lower", "initial") if table[k] is not None}
     cell = times(model.cell, factor) | {"series_count": model.cell.series_count * series}
+    ladder = None if model.ladder is None else times(model.ladder, factor)
     return CellModel.model_validate(
-        {"cell": cell, "ocv": times(model.ocv, factor), "adaptation": adaptation, **elements}
+        {"cell": cell, "ocv": times(model.ocv, factor), "ladder": ladder, "adaptation": adaptation, **elements}
     )
+
+
+def _product(value: Any, factor: float) -> Any:
+    """A number, or each of a table's, times ``factor``."""
+    return tuple(_product(v, factor) for v in value) if isinstance(value, tuple) else value * factor
 
 
 def shipped_cells() -> list[str]:

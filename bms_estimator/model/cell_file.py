@@ -70,6 +70,13 @@ def _value(value: object) -> object:
     """As TOML shows it: rounded; a long list over several lines."""
     if isinstance(value, list):
         array = tomlkit.array()
+        if value and isinstance(value[0], list):  # a table: one row, one line
+            for row in value:
+                line = tomlkit.array()
+                line.extend(_value(x) for x in row)
+                array.add_line(line)
+            array.add_line(indent="")
+            return array
         for i in range(0, len(value), 8):
             array.add_line(*(_value(x) for x in value[i : i + 8]))
         array.add_line(indent="")
