@@ -21,8 +21,13 @@ from numba.core.caching import Cache
 from numba.core.dispatcher import Dispatcher
 
 _HERE = Path(__file__).parent
-COMPILED_IN = (*sorted(_HERE.glob("*.py")), _HERE.parent / "model" / "suspect.py")
-"""Files that compiled code is made of."""
+_PACKAGE = _HERE.parent
+COMPILED_IN = (
+    *sorted(_HERE.glob("*.py")),
+    *sorted((_PACKAGE / "sources" / "wire").glob("*.py")),
+    _PACKAGE / "model" / "suspect.py",
+)
+"""Files that compiled code is made of: the kernels, what decodes the line, and what they take constants from."""
 
 
 def _cache_folder() -> Path | None:

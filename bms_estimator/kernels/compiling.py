@@ -3,11 +3,12 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FunctionType
 
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
-PACKAGE = __name__.rpartition(".")[0]
+PACKAGE = __name__.partition(".")[0]
 
 Tell = Callable[[str, int, int], None]
 """Gets a kernel's name, how many kernels have begun with it, and how many there are at most."""
@@ -20,29 +21,28 @@ def compiling_told(tell: Tell) -> Iterator[None]:
         yield
 
 
-def _kernels() -> set[str]:
+def _kernels() -> set[FunctionType]:
     modules = [module for name, module in sys.modules.items() if name.startswith(f"{PACKAGE}.")]
-    return {_name(each) for module in modules for each in vars(module).values() if isinstance(each, Dispatcher)}
+    return {each.py_func for module in modules for each in vars(module).values() if isinstance(each, Dispatcher)}
 
 
-def _name(kernel: Dispatcher) -> str:
+def _name(kernel: FunctionType) -> str:
     """``file: function`` in words."""
-    function = kernel.py_func
-    return f"{function.__module__.removeprefix(f'{PACKAGE}.')}: {function.__name__}".replace("_", " ")
+    return f"{kernel.__module__.rpartition('.')[2]}: {kernel.__name__}".replace("_", " ")
 
 
 class _Listener(event.Listener):
     """numba tells which function it begins to compile; one that comes from the cache is not told."""
 
-    def __init__(self, kernels: set[str], tell: Tell) -> None:
+    def __init__(self, kernels: set[FunctionType], tell: Tell) -> None:
         self._waiting, self._all, self._tell = kernels, len(kernels), tell
 
     def on_start(self, event: event.Event) -> None:
         """A function, ours or numba's own; inner ones come after those that call them."""
-        name = _name(event.data["dispatcher"])
-        if name in self._waiting:  # a kernel is compiled anew for each kind of argument
-            self._waiting.remove(name)
-            self._tell(name, self._all - len(self._waiting), self._all)
+        kernel = event.data["dispatcher"].py_func
+        if kernel in self._waiting:  # a kernel is compiled anew for each kind of argument
+            self._waiting.remove(kernel)
+            self._tell(_name(kernel), self._all - len(self._waiting), self._all)
 
     def on_end(self, event: event.Event) -> None:
         """Nobody asks."""

@@ -1,4 +1,4 @@
-"""The binary board's bytes to samples: ``kernels.framing`` with its state, its messages and its counters."""
+"""The binary board's bytes to samples: ``wire.framing`` with its state, its messages and its counters."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.board_clock import clock_ppm
-from bms_estimator.kernels.framing import DECODER, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
-from bms_estimator.kernels.scaling import SCALING, reference
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.protocol import Ack, AckResult, Hello, MessageType
+from bms_estimator.sources.wire.board_clock import clock_ppm
+from bms_estimator.sources.wire.framing import DECODER, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
+from bms_estimator.sources.wire.scaling import SCALING, reference
 
 CurrentSign = Literal["discharge_positive", "charge_positive"]
 
@@ -195,7 +195,7 @@ class FrameDecoder:
         position: int,
         count: int,
     ) -> tuple[int, int, int]:
-        """``kernels.framing.decode`` from ``position`` on, behind the ``count`` samples that are there."""
+        """``wire.framing.decode`` from ``position`` on, behind the ``count`` samples that are there."""
         out = self._samples[count:]
         return decode(data, position, ends, arrivals_s, self._state, self._scaling, out, self._messages)
 

@@ -1,6 +1,6 @@
 """The messages of the serial line, one at a time (firmware/PROTOCOL.md): commands to the board, its hello and its acks.
 
-Samples in bulk are decoded by ``kernels.framing``; this codec is for what is rare, for the virtual board and for tests.
+Samples in bulk are decoded by ``wire.framing``; this codec is for what is rare, for the virtual board and for tests.
 """
 
 import binascii

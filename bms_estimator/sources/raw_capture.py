@@ -33,10 +33,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES, split_records
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.wire.capture_records import RECORD_OVERHEAD_BYTES, split_records
 
 MAGIC = b"BMSRAW1\n"
 VERSION = 1

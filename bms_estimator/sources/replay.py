@@ -10,7 +10,6 @@ from typing import Protocol, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
@@ -19,6 +18,7 @@ from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.raw_capture import is_capture, read_capture, sensor_of
 from bms_estimator.sources.table import READERS, ByName, Sign, samples_of, table_reader
+from bms_estimator.sources.wire.capture_records import RECORD_OVERHEAD_BYTES
 
 TICK_S = 0.05
 """A paced replay hands over what has become due this often [s]."""

@@ -16,9 +16,9 @@ from numba import njit
 from table import Row
 from wire import hello, sample_frames
 
-from bms_estimator.kernels.framing import SAMPLE_FRAME_BYTES, crc16
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
+from bms_estimator.sources.wire.framing import SAMPLE_FRAME_BYTES, crc16
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOURS = (4, 16)

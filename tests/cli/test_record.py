@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.cli.main import main
-from bms_estimator.kernels.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.raw_capture import MAGIC, read_capture, read_header
+from bms_estimator.sources.wire.capture_records import RECORD_OVERHEAD_BYTES
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 from tests.serial_line import Line, line  # noqa: F401

@@ -96,7 +96,7 @@ def make_root(root: Path) -> None:
     (root / "etc/systemd/system/judge.service").write_text(JUDGE)
     private = root / "var/cache/private"
     private.mkdir(mode=0o700, parents=True)  # as systemd wants it
-    kernel_cache.fill(private / "bms-estimator", Path("/opt/project/bms_estimator/kernels/__init__.py"))
+    kernel_cache.fill(private / "bms-estimator", Path("/opt/project/bms_estimator"))
 
 
 def boot(root: Path, systemd_nspawn: str, timeout_s: float) -> str:

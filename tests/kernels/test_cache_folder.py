@@ -2,6 +2,7 @@
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +23,12 @@ def imported(source: Path) -> set[Path]:
     return {path for path in paths if path.is_relative_to(PACKAGE) and path.is_file()}
 
 
+def test_every_file_with_compiled_code_is_in_the_caches_name() -> None:
+    compiled = {path for path in PACKAGE.rglob("*.py") if re.search(r"^@njit\b", path.read_text(), re.MULTILINE)}
+    assert PACKAGE / "sources" / "wire" / "framing.py" in compiled
+    assert compiled <= set(kernels.COMPILED_IN)
+
+
 def test_every_file_that_a_kernel_imports_is_in_the_caches_name() -> None:
     found = set().union(*(imported(source) for source in kernels.COMPILED_IN))
     assert PACKAGE / "model" / "suspect.py" in found
@@ -31,7 +38,9 @@ def test_every_file_that_a_kernel_imports_is_in_the_caches_name() -> None:
 def crc16_with_cache_in(folder: Path) -> str:
     """Have another process compile a kernel, and check what it says. Returns what was written on stderr."""
     homes = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), str(folder))
-    script = "import numpy; from bms_estimator.kernels.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
+    script = (
+        "import numpy; from bms_estimator.sources.wire.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
+    )
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, env=os.environ | homes, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert (done.returncode, done.stdout) == (0, "33984\n"), done.stderr

@@ -5,6 +5,7 @@ from numba import njit
 from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.kernels import margins
 from bms_estimator.kernels.compiling import compiling_told
+from bms_estimator.sources.wire import scaling
 
 
 def fresh():
@@ -24,6 +25,14 @@ def test_each_kernel_is_told_once_with_its_number_and_what_is_compiled_already_i
     with compiling_told(lambda *what: told.append(what)):
         kernel(0.6, 1.0, 2.0)
     assert len(told) == 1
+
+
+def test_what_decodes_the_line_is_told_as_well() -> None:
+    told = []
+    with compiling_told(lambda *what: told.append(what)):
+        njit(scaling.running_mean.py_func)(0.0, 0.0, 1.0, 1.0, 0.0)
+    [(name, _, _)] = told
+    assert name == "scaling: running mean"
 
 
 def test_nobody_is_told_after_the_end() -> None:

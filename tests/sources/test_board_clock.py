@@ -106,7 +106,7 @@ async def test_a_replay_finds_the_same_rate_to_the_last_bit(tmp_path: Path) -> N
 
 def test_nothing_of_the_clock_compiles_once_samples_come() -> None:
     program = (
-        "from bms_estimator.kernels.board_clock import clock_ppm; from bms_estimator.sources.frames import FrameDecoder; "
+        "from bms_estimator.sources.wire.board_clock import clock_ppm; from bms_estimator.sources.frames import FrameDecoder; "
         "FrameDecoder(); assert clock_ppm.signatures"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

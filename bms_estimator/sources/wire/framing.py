@@ -8,8 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.board_clock import CLOCK_WINDOWS, forget_clock, take_arrival
-from bms_estimator.kernels.scaling import (
+from bms_estimator.kernels.state import Record
+from bms_estimator.sources.wire.board_clock import CLOCK_WINDOWS, forget_clock, take_arrival
+from bms_estimator.sources.wire.scaling import (
     current,
     forget_readings,
     reference,
@@ -18,7 +19,6 @@ from bms_estimator.kernels.scaling import (
     temperature,
     voltage,
 )
-from bms_estimator.kernels.state import Record
 
 Bytes = NDArray[np.uint8]
 Records = NDArray[np.void]

@@ -1,10 +1,10 @@
-"""Records of a raw capture (docs: ``sources.raw_capture``) taken apart, a megabyte at a time."""
+"""Records of a raw capture (``sources.raw_capture`` has the format) taken apart, a megabyte at a time."""
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.framing import Bytes, crc16, take
+from bms_estimator.sources.wire.framing import Bytes, crc16, take
 
 ARRIVAL_BYTES = 8
 LENGTH_BYTES = 4
