@@ -25,7 +25,7 @@ _PACKAGE = _HERE.parent
 COMPILED_IN = (
     *sorted(_HERE.glob("*.py")),
     *sorted((_PACKAGE / "sources" / "wire").glob("*.py")),
-    _PACKAGE / "model" / "suspect.py",
+    *(_PACKAGE / constants for constants in ("model/sample.py", "model/suspect.py", "sources/protocol.py")),
 )
 """Files that compiled code is made of: the kernels, what decodes the line, and what they take constants from."""
 

@@ -9,6 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.state import Record
+from bms_estimator.model.sample import SampleStatus
+from bms_estimator.sources.protocol import MODULUS, PROTOCOL_VERSION, BoardStatus, MessageType
 from bms_estimator.sources.wire.board_clock import CLOCK_WINDOWS, forget_clock, take_arrival
 from bms_estimator.sources.wire.scaling import (
     current,
@@ -23,10 +25,9 @@ from bms_estimator.sources.wire.scaling import (
 Bytes = NDArray[np.uint8]
 Records = NDArray[np.void]
 
-PROTOCOL_VERSION = 1
-MESSAGE_SAMPLE = 0x01
-MESSAGE_HELLO = 0x02
-MESSAGE_ACK = 0x03
+MESSAGE_SAMPLE = int(MessageType.SAMPLE)
+MESSAGE_HELLO = int(MessageType.HELLO)
+MESSAGE_ACK = int(MessageType.ACK)
 SAMPLE_BYTES = 24
 HELLO_BYTES = 62
 ACK_BYTES = 10
@@ -75,18 +76,18 @@ DECODER = np.dtype(
     align=True,
 )
 
-_MODULUS = 1 << 32
-_MASK = _MODULUS - 1
-_HALF = 1 << 31
+_MASK = MODULUS - 1
+_HALF = MODULUS >> 1
 _REORDER_WINDOW = 64  # a sample further behind comes from a board that counts anew
 _US = 1e-6
-_WRAP_S = _MODULUS * _US
+_WRAP_S = MODULUS * _US
 
-_SATURATED_OR_OVERRUN = 0x07  # the same bits on the line and in SampleStatus
-_OVERRUN = 0x04
-_AUX_IS_NTC = 0x08  # on the line
-_RESET = 8  # SampleStatus.RESET
-_GAP = 16  # SampleStatus.GAP
+_OVERRUN = int(BoardStatus.OVERRUN)
+_SATURATED_OR_OVERRUN = int(BoardStatus.VOLTAGE_SATURATED | BoardStatus.CURRENT_SATURATED | BoardStatus.OVERRUN)
+"""The same bits on the line and in SampleStatus."""
+_AUX_IS_NTC = int(BoardStatus.AUX_IS_NTC)
+_RESET = int(SampleStatus.RESET)
+_GAP = int(SampleStatus.GAP)
 
 
 def _crc_table() -> NDArray[np.uint16]:
@@ -211,7 +212,7 @@ def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> None:
     step_us = (board_us - d.board_us) & _MASK
     if lost > 0:
         turns = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
-        step_us += max(turns, 0) * _MODULUS
+        step_us += max(turns, 0) * MODULUS
     d.elapsed_us += step_us
     d.time_s = d.origin_s + d.elapsed_us * _US
 
@@ -235,7 +236,7 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
         d.started = 1
     else:
         ahead = (sequence - d.expected) & _MASK
-        behind = _MODULUS - ahead if ahead >= _HALF else 0
+        behind = MODULUS - ahead if ahead >= _HALF else 0
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
                 d.boot_id = -1  # its hello was lost: the next one is no further reset

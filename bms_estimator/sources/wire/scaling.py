@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from bms_estimator.kernels.state import Record
+from bms_estimator.sources.protocol import MODULUS
 
 SCALING = np.dtype(
     [
@@ -33,7 +34,7 @@ SCALING = np.dtype(
 # At the firmware's own rate these are 512 and 32 readings: 0.5 LSB of noise becomes 0.02 LSB in the bandgap's mean.
 _BANDGAP_US = 5_120_000  # time constant; twice that where NTC and bandgap are read by turns
 _NTC_US = 640_000
-_CLOCK_MASK = (1 << 32) - 1
+_CLOCK_MASK = MODULUS - 1
 _RAIL = 0.01  # an NTC this near to either end of the range is open or shorted
 _RATIOMETRIC_V = 5.0  # supply at which the data sheet of a ratiometric sensor gives its slope
 _ZERO_C_K = 273.15
