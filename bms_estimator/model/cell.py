@@ -5,6 +5,7 @@ scales them to packs of such objects in series and parallel.
 """
 
 import itertools
+import math
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -233,7 +234,7 @@ class CellModel(Strict):
         return _scaled(self, series, parallel)
 
 
-def _scaled(model: CellModel, series: int, parallel: int) -> CellModel:
+def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
     ohm, farad = series / parallel, parallel / series
 
     def times(part: Strict, factor: dict[str, float]) -> dict[str, object]:
@@ -244,7 +245,7 @@ def _scaled(model: CellModel, series: int, parallel: int) -> CellModel:
                 table[key] = _product(value, factor[unit])
         return table
 
-    factor = {"ohm": ohm, "farad": farad, "v": float(series), "a": float(parallel), "ah": float(parallel)}
+    factor = {"ohm": ohm, "farad": farad, "v": float(series), "a": parallel, "ah": parallel}
     elements = {name: times(getattr(model, name), factor) for name in ELEMENTS}
     adaptation = {}
     for name, bounds in model.adaptation.items():
@@ -265,24 +266,55 @@ def _product(value: Any, factor: float) -> Any:
 
 
 def shipped_cells() -> list[str]:
-    """Names of the cell files that come with the package."""
-    folder = resources.files("bms_estimator.model") / "cells"
-    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    """Names of the cells whose files come with the package."""
+    return _names("cells")
 
 
-def load_cell(name_or_path: str | Path) -> CellModel:
-    """A shipped cell by name, or a cell file by path.
+def generic_cells() -> list[str]:
+    """Names of the chemistries that there is a generic cell of."""
+    return _names("cells/generic")
+
+
+def _names(folder: str) -> list[str]:
+    entries = (resources.files("bms_estimator.model") / folder).iterdir()
+    return sorted(Path(entry.name).stem for entry in entries if entry.name.endswith(".toml"))
+
+
+def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> CellModel:
+    """A generic or a shipped cell by name, or a cell file by path.
+
+    Args:
+        name_or_path: As in ``generic_cells`` or ``shipped_cells``, else a path.
+        capacity_ah: What it holds [Ah]. A generic cell needs it and is scaled by it: resistances go down and
+            capacitances up with it. In any other it replaces the capacity alone: there it is the cell's own, faded
+            with age or measured better, and its resistances were measured on it.
 
     Raises:
-        UserError: No such cell or file, or a value in it that is not allowed.
+        UserError: No such cell or file, or a value in it that is not allowed; a capacity that is missing or cannot be.
     """
     text = str(name_or_path)
-    if text in shipped_cells():
-        with resources.as_file(resources.files("bms_estimator.model") / "cells" / f"{text}.toml") as path:
-            return read_toml(path, CellModel)
+    if capacity_ah is not None and not 0.0 < capacity_ah < math.inf:
+        raise UserError(f"capacity_ah = {capacity_ah}: must be above 0 (what the cell holds, in ampere-hours)")
+    if text in generic_cells():
+        if capacity_ah is None:
+            raise UserError(f"{text} is a generic cell: give its capacity, capacity_ah of [pack] or --capacity-ah")
+        return _scaled(_packaged(f"cells/generic/{text}.toml"), 1, capacity_ah)
+    cell = _packaged(f"cells/{text}.toml") if text in shipped_cells() else _from_file(text)
+    if capacity_ah is None:
+        return cell
+    return cell.model_copy(update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah})})
+
+
+def _packaged(name: str) -> CellModel:
+    with resources.as_file(resources.files("bms_estimator.model") / name) as path:
+        return read_toml(path, CellModel)
+
+
+def _from_file(text: str) -> CellModel:
     path = Path(text)
     if not text or not path.exists():
         raise UserError(
-            f"{text or 'a cell of no name'}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())})"
+            f"{text or 'a cell of no name'}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())}), "
+            f"nor a generic one ({', '.join(generic_cells())})"
         )
     return read_toml(path, CellModel)

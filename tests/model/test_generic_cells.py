@@ -1,0 +1,155 @@
+"""Generic cells: one file for each chemistry, of any size; and a capacity in place of a cell file's."""
+
+import csv
+
+import numpy as np
+import pytest
+from scipy.interpolate import PchipInterpolator
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.lemma import failed
+from bms_estimator.estimator.plausible import implausible
+from bms_estimator.kernels.sample_step import Verdict
+from bms_estimator.model.cell import TableOcv, generic_cells, load_cell, shipped_cells
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import PackSettings, SensorSettings, Settings
+from bms_estimator.sources.replay import load_capture
+
+OHM_AH_10_S = {"lfp": 0.045, "nmc": 0.13, "nca": 0.13, "lco": 0.13, "lmo": 0.08, "lto": 0.016}
+"""Resistance after ten seconds at half charge [ohm Ah], to a fifth: 100 Ah of LFP have 0.45 mohm."""
+TAU_S = np.array([1.0, 6.0, 30.0, 120.0, 500.0, 2000.0])
+
+
+def curve(name):
+    ocv = load_cell(name, 1.0).ocv
+    assert isinstance(ocv, TableOcv)
+    return ocv
+
+
+def test_there_is_one_of_each_chemistry_beside_the_shipped_ones():
+    assert generic_cells() == ["lco", "lfp", "lmo", "lto", "nca", "nmc"]
+    assert set(generic_cells()).isdisjoint(shipped_cells())
+
+
+@pytest.mark.parametrize("name", generic_cells())
+def test_it_steps_and_nothing_of_it_is_odd(name):
+    cell = load_cell(name, 100.0)
+    assert cell.cell.capacity_ah == 100.0
+    assert cell.cell.voltage_min_v < cell.ocv.ocv_v[0]
+    assert cell.ocv.ocv_v[-1] < cell.cell.voltage_max_v
+    settings = Settings(pack=PackSettings(cell=name, capacity_ah=100.0), sensor=SensorSettings(protocol="text"))
+    assert implausible(settings, cell) == []
+    assert failed(cell) == []
+    assert Estimator(cell, identifier=None).step(0.0, 0.0, cell.cell.nominal_voltage_v) is Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("name", generic_cells())
+def test_its_curve_rises_and_says_how_sure_it_is(name):
+    ocv = curve(name)
+    soc = np.array(ocv.soc)
+    assert (soc[0], soc[-1]) == (0.0, 1.0)
+    fine = PchipInterpolator(soc, ocv.ocv_v)(np.linspace(0.0, 1.0, 1001))
+    assert (np.diff(fine) > 0).all()
+    middle = (soc >= 0.2) & (soc <= 0.9)
+    error_v = np.array(ocv.error_v)[middle]
+    # no curve of a chemistry is sure to a few millivolts, none is useless
+    assert error_v.min() >= 0.01
+    assert error_v.max() <= 0.1
+    assert max(ocv.hysteresis_v) <= 0.02
+
+
+@pytest.mark.parametrize("name", generic_cells())
+def test_its_two_branches_are_those_of_its_ladder(name):
+    """r_s: the ladder's first; r_ts, r_tl: the sums of three branches each, their time constants the means."""
+    cell = load_cell(name, 1.0)
+    ladder = np.array(cell.ladder.weak_ohm) + np.array(cell.ladder.strong_ohm)
+    soc = np.array(cell.ladder.soc)
+    for section, rows in ((cell.r_s, ladder[:1]), (cell.r_ts, ladder[1:4]), (cell.r_tl, ladder[4:])):
+        a, b, c = section.a
+        assert rows.sum(axis=0) == pytest.approx(a * np.exp(-b * soc) + c, rel=2e-3)
+    for r, c, rows, tau_s in (
+        (cell.r_ts, cell.c_ts, ladder[1:4], TAU_S[:3]),
+        (cell.r_tl, cell.c_tl, ladder[4:], TAU_S[3:]),
+    ):
+        assert r.offset_ohm * c.offset_farad == pytest.approx(tau_s @ rows[:, -1] / rows[:, -1].sum(), rel=2e-3)
+
+
+@pytest.mark.parametrize("name", generic_cells())
+def test_its_resistance_is_that_of_cells_on_sale(name):
+    ladder = load_cell(name, 1.0).ladder
+    half = ladder.soc.index(0.5)
+    ohm = np.array([weak[half] + strong[half] for weak, strong in zip(ladder.weak_ohm, ladder.strong_ohm, strict=True)])
+    assert ohm[0] + ohm[1:] @ -np.expm1(-10.0 / TAU_S) == pytest.approx(OHM_AH_10_S[name], rel=0.2)
+
+
+@pytest.mark.parametrize("name", generic_cells())
+def test_its_capacity_scales_it_as_cells_in_parallel_do(name):
+    assert load_cell(name, 100.0) == load_cell(name, 1.0).pack(1, 100)
+    small, large = load_cell(name, 2.0), load_cell(name, 200.0)
+    assert large.a[[1, 3, 13]] == pytest.approx(small.a[[1, 3, 13]] / 100)
+    assert large.a[[7, 9, 12]] == pytest.approx(small.a[[7, 9, 12]] * 100)
+    assert np.array(large.ladder.weak_ohm) == pytest.approx(np.array(small.ladder.weak_ohm) / 100)
+    assert large.cell.current_max_a == pytest.approx(100 * small.cell.current_max_a)
+    assert large.ocv == small.ocv
+    assert (large.ladder.std, large.ladder.error_v) == (small.ladder.std, small.ladder.error_v)
+
+
+def within(name, soc, ocv_v):
+    """Distances of a real cell's curve from the generic one, in standard deviations."""
+    ocv = curve(name)
+    return np.abs(ocv_v - PchipInterpolator(ocv.soc, ocv.ocv_v)(soc)) / np.interp(soc, ocv.soc, ocv.error_v)
+
+
+def branch(path, sign):
+    """Charge since the first sample of a load of this sign [Ah], and voltage [V]."""
+    capture = load_capture(path)
+    charge_ah = np.cumsum(capture["current_a"] * np.diff(capture["time_s"], prepend=capture["time_s"][0])) / 3600
+    under = np.sign(np.round(capture["current_a"], 3)) == sign
+    return np.abs(charge_ah[under] - charge_ah[under][0]), capture["voltage_v"][under]
+
+
+def test_error_covers_the_leaf_and_the_lg_m50(data):
+    with (data / "lgm50" / "ocv_25c.csv").open() as file:
+        soc, ocv_v = np.array([(float(row["soc"]), float(row["ocv_v"])) for row in csv.DictReader(file)]).T
+    leaf = load_cell("leaf").ocv
+    for apart, least in ((within("nmc", soc, ocv_v), 0.95), (within("lmo", np.array(leaf.soc), leaf.ocv_v), 0.9)):
+        assert (apart <= 2.0).mean() >= least
+        assert apart.mean() > 0.3  # and is not so wide that it says nothing
+
+
+@pytest.mark.parametrize(
+    ("name", "discharge", "charge"),
+    [
+        ("nca", "panasonic18650pf/25_c20", "panasonic18650pf/25_c20"),
+        ("nca", "ncr18650/cell1_discharge_c20", "ncr18650/cell1_charge_c20"),
+        ("lfp", "a123/c30_dis_p25", "a123/c30_chg_p25"),
+    ],
+)
+def test_error_covers_cells_that_the_curve_was_not_made_of(name, discharge, charge, shared_data):
+    """Means of slow discharge and charge, SOC by each branch's own charge."""
+    soc = np.linspace(0.0, 1.0, 101)
+    down_ah, down_v = branch(shared_data / f"{discharge}.csv.gz", 1)
+    up_ah, up_v = branch(shared_data / f"{charge}.csv.gz", -1)
+    ocv_v = (np.interp(1 - soc, down_ah / down_ah[-1], down_v) + np.interp(soc, up_ah / up_ah[-1], up_v)) / 2
+    apart = within(name, soc, ocv_v)
+    assert (apart <= 2.0).mean() >= 0.95
+    assert apart.mean() > 0.3
+
+
+def test_generic_cell_without_its_capacity_says_what_to_give():
+    with pytest.raises(UserError, match=r"lfp is a generic cell: give its capacity.*--capacity-ah"):
+        load_cell("lfp")
+
+
+@pytest.mark.parametrize("capacity_ah", [0.0, -3.0, float("nan"), float("inf")])
+def test_capacity_that_cannot_be_is_refused(capacity_ah):
+    with pytest.raises(UserError, match=r"capacity_ah = .*: must be above 0"):
+        load_cell("leaf", capacity_ah)
+
+
+def test_capacity_replaces_that_of_a_cell_file_and_nothing_else():
+    """An aged cell: what it holds is less, its resistances are those that were measured."""
+    aged, new = load_cell("leaf", 24.0), load_cell("leaf")
+    assert aged.cell.capacity_ah == 24.0
+    assert aged.model_copy(update={"cell": new.cell}) == new
+    assert aged.cell.model_copy(update={"capacity_ah": new.cell.capacity_ah}) == new.cell
