@@ -10,7 +10,12 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.frames import CurrentSign
 
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
-CellName = Annotated[str, typer.Option(help="shipped cell's name or a cell file", show_default=False)]
+CELL_HELP = "lfp, nmc, nca, lco, lmo, lto: generic; else a shipped cell's name or a cell file"
+CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
+CapacityAh = Annotated[
+    float | None,
+    typer.Option(help="what the cell holds; a generic one needs it, else the cell file's", show_default=False),
+]
 NewCellFile = Annotated[Path, typer.Option(help="cell file to write", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="replace the file of --out")]
 SignOfCurrent = Annotated[

@@ -13,7 +13,16 @@ from rich.table import Table
 
 from bms_estimator.calibration.identifiability import Verdict
 from bms_estimator.calibration.identify import Identification, identify
-from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
+from bms_estimator.cli.captures import (
+    CELL_HELP,
+    AsJson,
+    CapacityAh,
+    Force,
+    NewCellFile,
+    SignOfCurrent,
+    check_out,
+    name_of,
+)
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.sources.replay import load_capture
@@ -26,10 +35,9 @@ def identify_command(
     captures: Annotated[
         list[Path], typer.Argument(help="recorded captures, CSV (.gz) or Parquet, each from rest", show_default=False)
     ],
-    cell: Annotated[
-        str, typer.Option(help="shipped cell's name or a cell file: capacity, OCV, start", show_default=False)
-    ],
+    cell: Annotated[str, typer.Option(help=f"{CELL_HELP}; its capacity, OCV, start", show_default=False)],
     out: NewCellFile,
+    capacity_ah: CapacityAh = None,
     keep_ocv: Annotated[bool, typer.Option(help="leave the open-circuit voltage as it is")] = False,
     current_sign: SignOfCurrent = None,
     force: Force = False,
@@ -41,13 +49,14 @@ def identify_command(
     does not tell keeps about the value of --cell, and is named.
     """
     check_out(out, captures, force=force)
-    model = load_cell(cell)
+    model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     started_s = time.perf_counter()
     found = identify(loaded, model, refine_ocv=not keep_ocv)
     seconds = time.perf_counter() - started_s
     renamed = found.cell.model_copy(update={"cell": found.cell.cell.model_copy(update={"name": name_of(out)})})
-    write_cell(out, renamed, _remarks(cell, found))
+    start = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
+    write_cell(out, renamed, _remarks(start, found))
     if as_json:
         sys.stdout.write(json.dumps(_json(out, found, seconds)) + "\n")
     else:

@@ -21,24 +21,35 @@ def load_pack(path: Path) -> tuple[Settings, CellModel]:
         UserError: As ``read_toml``; or there is no such cell.
     """
     settings = load_settings(path)
-    beside = path.parent / settings.pack.cell
-    cell = load_cell(beside if beside.is_file() else settings.pack.cell)
-    return settings, cell.pack(settings.pack.series, settings.pack.parallel)
+    return settings, _model(settings, _found(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
-def pack_or_cell(pack: Path | None, cell: str | None) -> tuple[Settings, CellModel]:
-    """The settings of ``pack``, and ``cell`` in place of its cell where one is given.
+def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None) -> tuple[Settings, CellModel]:
+    """The settings of ``pack``; ``cell`` and ``capacity_ah`` [Ah] in place of its own where they are given.
 
     Raises:
-        UserError: Neither is given, or as ``load_pack``.
+        UserError: Neither ``pack`` nor ``cell`` is given, or as ``load_pack``.
     """
     if pack is None and cell is None:
         raise UserError("give --cell NAME|CELL.toml or --pack pack.toml")
-    if cell is None and pack is not None:
-        return load_pack(pack)
     settings = load_settings(pack) if pack else Settings(sensor=SensorSettings(voltage_resolution_v=TABLE_RESOLUTION_V))
-    model = load_cell(settings.pack.cell if cell is None else cell).pack(settings.pack.series, settings.pack.parallel)
-    return with_pack(settings, cell=cell), model
+    if cell is None and pack is not None:
+        cell = _found(pack, settings.pack.cell)
+    if capacity_ah is None:
+        capacity_ah = settings.pack.capacity_ah
+    model = _model(settings, str(cell), capacity_ah)
+    return with_pack(settings, cell=cell, capacity_ah=capacity_ah), model
+
+
+def _found(pack: Path, cell: str) -> str:
+    """The cell file beside a pack file where there is one, else what may be a name or lie elsewhere."""
+    beside = pack.parent / cell
+    return str(beside) if beside.is_file() else cell
+
+
+def _model(settings: Settings, cell: str, capacity_ah: float | None) -> CellModel:
+    """The pack as one object, made of ``cell``."""
+    return load_cell(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
 
 
 def with_pack(settings: Settings, **changes: object) -> Settings:

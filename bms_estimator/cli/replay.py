@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bms_estimator.cli.captures import AsJson, Force, SignOfCurrent, check_out
+from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, Force, SignOfCurrent, check_out
 from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import pack_or_cell, with_broker, with_pack
 from bms_estimator.cli.summary import Result, Summary
@@ -40,7 +40,8 @@ def replay(
     capture: Annotated[
         Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet; -: from stdin", show_default=False)
     ],
-    cell: Annotated[str | None, typer.Option(help="shipped cell's name or a cell file", show_default=False)] = None,
+    cell: Annotated[str | None, typer.Option(help=CELL_HELP, show_default=False)] = None,
+    capacity_ah: CapacityAh = None,
     pack: Annotated[Path | None, typer.Option(help="settings of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="SOC at the first sample; else from the OCV")
@@ -60,7 +61,7 @@ def replay(
 
     The same estimator as in live operation: a capture that ``record`` made gives the same estimates to the last bit.
     """
-    settings, model = pack_or_cell(pack, cell)
+    settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:
         settings = with_pack(settings, initial_soc=soc)
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from bms_estimator.cli.captures import CELL_HELP, CapacityAh
 from bms_estimator.model.cell import load_cell
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
@@ -23,7 +24,8 @@ def _finite(value: float | None) -> float | None:
 
 
 def simulate(
-    cell: Annotated[str, typer.Option(help="shipped cell's name or a cell file")] = "chen_mora",
+    cell: Annotated[str, typer.Option(help=CELL_HELP)] = "chen_mora",
+    capacity_ah: CapacityAh = None,
     series: Annotated[int, typer.Option(min=1, help="of them in series")] = 1,
     load: Annotated[LoadName, typer.Option(help="what it is under")] = LoadName.RANDOM,
     current_a: Annotated[
@@ -47,7 +49,7 @@ def simulate(
     Prints the path of the pseudo-terminal, for ``run --port PATH``. The board speaks the firmware's protocol; a
     simulated pack with a 10-bit converter is at its pins.
     """
-    model = load_cell(cell).pack(series, 1)
+    model = load_cell(cell, capacity_ah).pack(series, 1)
     ampere = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
     pack = SimulatedPack(model, LOADS[load](ampere, seed), soc=soc)
     board = VirtualBoard(

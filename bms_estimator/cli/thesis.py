@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bms_estimator.cli.captures import SignOfCurrent, name_of
+from bms_estimator.cli.captures import CELL_HELP, CapacityAh, SignOfCurrent, name_of
 from bms_estimator.cli.pack import TABLE_RESOLUTION_V
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
@@ -33,7 +33,8 @@ def thesis(
         list[Path] | None,
         typer.Argument(help="for chapter 5: recorded captures, CSV (.gz) or Parquet; else a simulated 6S pack"),
     ] = None,
-    cell: Annotated[str | None, typer.Option(help="of the captures: shipped cell's name or a cell file")] = None,
+    cell: Annotated[str | None, typer.Option(help=f"of the captures: {CELL_HELP}", show_default=False)] = None,
+    capacity_ah: CapacityAh = None,
     resolution_v: Annotated[
         float, typer.Option(min=1e-9, help="one step of the captures' voltage [V]")
     ] = TABLE_RESOLUTION_V,
@@ -47,7 +48,7 @@ def thesis(
     Chapters 2 to 4 are simulated. Chapter 5 runs on the captures: at least one voltage relaxation test and one
     constant load, all from the same type of cell.
     """
-    recorded = _recorded(captures, cell, resolution_v, current_sign) if captures else None
+    recorded = _recorded(captures, cell, capacity_ah, resolution_v, current_sign) if captures else None
     started_s = time.perf_counter()
     with _progress() as show:
         report = build(recorded, table=table, figure=figure, progress=show)
@@ -63,12 +64,14 @@ def thesis(
     typer.echo(f"{path}: written in {time.perf_counter() - started_s:.1f} s")
 
 
-def _recorded(captures: list[Path], cell: str | None, resolution_v: float, current_sign: SignOfCurrent) -> Recorded:
+def _recorded(
+    captures: list[Path], cell: str | None, capacity_ah: float | None, resolution_v: float, current_sign: SignOfCurrent
+) -> Recorded:
     if cell is None:
         raise UserError("captures need --cell NAME|CELL.toml: its capacity, limits and bounds")
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     named = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
-    return Recorded(load_cell(cell), named, resolution_v)
+    return Recorded(load_cell(cell, capacity_ah), named, resolution_v)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.validate import Errors, Validation, validate
-from bms_estimator.cli.captures import AsJson, CellName, SignOfCurrent
+from bms_estimator.cli.captures import AsJson, CapacityAh, CellName, SignOfCurrent
 from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.replay import load_capture
 
@@ -20,6 +20,7 @@ from bms_estimator.sources.replay import load_capture
 def validate_command(
     capture: Annotated[Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet", show_default=False)],
     cell: CellName,
+    capacity_ah: CapacityAh = None,
     soc: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="SOC at the first sample; else from the first rest's voltage")
     ] = None,
@@ -30,7 +31,7 @@ def validate_command(
 
     Open loop: the parameters are frozen and the voltage is not used, except the first rest's for the initial SOC.
     """
-    model = load_cell(cell)
+    model = load_cell(cell, capacity_ah)
     found = validate(load_capture(capture, current_sign=current_sign), model, initial_soc=soc)
     for line in found.warnings:
         typer.echo(f"warning: {line}", err=True)

@@ -29,7 +29,8 @@ def _capacity(settings: Settings, cell: CellModel) -> str | None:
     capacity_ah = cell.cell.capacity_ah / settings.pack.parallel
     if capacity_ah <= LARGEST_AH:
         return None
-    return f"cell.capacity_ah = {capacity_ah:g}: no cell holds more than {LARGEST_AH:g} Ah; is it in mAh?"
+    section = "cell" if settings.pack.capacity_ah is None else "pack"
+    return f"{section}.capacity_ah = {capacity_ah:g}: no cell holds more than {LARGEST_AH:g} Ah; is it in mAh?"
 
 
 def _counted_twice(settings: Settings, cell: CellModel) -> str | None:

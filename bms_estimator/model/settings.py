@@ -20,7 +20,11 @@ class PackSettings(Strict):
 
     name: DeviceName = Field(default="pack", description="device in topic names: letters, digits, _ and -")
     cell: Annotated[str, Field(min_length=1)] = Field(
-        default="ncr18650", description="a shipped cell's name or the path of a cell file"
+        default="ncr18650",
+        description="lfp, nmc, nca, lco, lmo, lto: generic, give capacity_ah; else a shipped cell's name or a cell file's path",
+    )
+    capacity_ah: Positive | None = Field(
+        default=None, description="what one cell-file object holds; that of the cell file when left out"
     )
     series: Annotated[int, Field(ge=1, le=10_000)] = Field(default=1, description="cell-file objects in series")
     parallel: Annotated[int, Field(ge=1, le=10_000)] = Field(default=1, description="cell-file objects in parallel")

@@ -63,7 +63,9 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ("[identifier]\nmap_memory_h = 0.5\n", ["identifier.map_memory_h = 0.5", "greater than or equal to 1"]),
         ('[mqtt]\nbase_topic = "/bms"\n', ["mqtt.base_topic = '/bms'", "no / at either end"]),
         ('[mqtt]\nbase_topic = "home/bms/"\n', ["mqtt.base_topic = 'home/bms/'", "no / at either end"]),
-        ('[pack]\ncell = "nonsense"\n', ["nonsense", "ncr18650"]),
+        ('[pack]\ncell = "nonsense"\n', ["nonsense", "ncr18650", "lfp"]),
+        ('[pack]\ncell = "lfp"\n', ["lfp is a generic cell", "capacity_ah of [pack]"]),
+        ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "holds"]),
     ],
 )
 def test_what_is_wrong_is_named_with_what_is_allowed(text, said, pack, capsys):
@@ -72,7 +74,7 @@ def test_what_is_wrong_is_named_with_what_is_allowed(text, said, pack, capsys):
         code, out, err = run(capsys, "config", command, pack)
         assert (code, out) == (2, "")
         assert [part for part in said if part not in err] == [], err
-        if "nonsense" not in text:
+        if "nonsense" not in text and "generic" not in err:
             assert err.startswith(f"error: {pack}: ")
 
 
@@ -140,6 +142,7 @@ def cell_file(tmp_path):
     ("cell", "settings", "said"),
     [
         ({"capacity_ah": 1e5}, "", "cell.capacity_ah = 100000: no cell holds more than 2000 Ah"),
+        ({}, "capacity_ah = 2900", "pack.capacity_ah = 2900: no cell holds more than 2000 Ah; is it in mAh?"),
         ({"series_count": 4}, "series = 4", "pack.series = 4: the cell file is of 4 cells in series already"),
         ({"nominal_voltage_v": 14.4, "voltage_max_v": 17.0}, "", "14.4 V nominal of 1 in series: 14.4 V a cell"),
         ({}, "series = 14", "14 in series of 3 Ah: a single row of small cells; is pack.parallel right?"),
@@ -165,6 +168,7 @@ def test_check_warns_of_what_cannot_be(cell, settings, said, cell_file, pack, ca
         'cell = "ncr18650"\nseries = 14\nparallel = 4\n[sensor]\nvoltage_resolution_v = 0.06',
         'cell = "ncr18650"\nseries = 14\nparallel = 4\n[sensor]\nprotocol = "text"',
         'cell = "leaf"\nseries = 4\nparallel = 2',
+        'cell = "lfp"\ncapacity_ah = 100\nseries = 4',
     ],
 )
 def test_check_has_nothing_to_say_of_a_pack_that_may_be(settings, pack, capsys):
@@ -196,3 +200,10 @@ def test_check_fails_on_a_password_file_that_is_nowhere(pack, tmp_path, capsys):
     assert code == 2
     assert "mqtt.password_file" in err
     assert "cannot be read" in err
+
+
+def test_generic_cell_is_of_the_size_that_the_pack_says(pack, capsys):
+    pack.write_text('[pack]\ncell = "lfp"\ncapacity_ah = 100\nseries = 4\nparallel = 2\n')
+    code, out, _ = run(capsys, "config", "check", pack)
+    assert code == 0
+    assert "lfp, 4 in series, 13 V, 200 Ah" in out

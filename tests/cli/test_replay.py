@@ -161,6 +161,9 @@ def test_what_a_person_can_mend_ends_with_code_2_and_names_it(capture, tmp_path,
         ((wrong, *cell), ["wrong.csv", "voltage_v"]),
         ((words, *cell), ["words.csv", "line 3", "current_a", "none"]),
         ((capture,), ["--cell", "--pack"]),
+        ((capture, "--cell", "nmc"), ["nmc is a generic cell", "--capacity-ah"]),
+        ((capture, *cell, "--capacity-ah", "-3"), ["capacity_ah = -3.0", "above 0"]),
+        ((capture, *cell, "--capacity-ah", "nan"), ["capacity_ah = nan", "above 0"]),
         ((capture, *cell, "--out", tmp_path / "out.xlsx"), ["out.xlsx", ".csv", ".parquet"]),
         ((capture, *cell, "--out", tmp_path / "no" / "out.csv"), ["out.csv", "No such file"]),
         ((capture, *cell, "--mqtt", "nonsense"), ["--mqtt", "nonsense"]),
@@ -170,6 +173,17 @@ def test_what_a_person_can_mend_ends_with_code_2_and_names_it(capture, tmp_path,
         assert [name for name in named if name not in err] == [], err
         assert "Traceback" not in err
     assert other.read_text() == "kept as it is\n"
+
+
+@pytest.mark.parametrize("given", ["option", "pack", "option over pack"])
+def test_generic_cell_has_the_capacity_that_is_given(given, capture, tmp_path, capsys):
+    pack, out = tmp_path / "pack.toml", tmp_path / "out.csv"
+    in_file = {"pack": "capacity_ah = 3\n", "option over pack": "capacity_ah = 50\n"}.get(given, "")
+    pack.write_text(f'[pack]\ncell = "nmc"\n{in_file}')
+    option = () if given == "pack" else ("--capacity-ah", "3")
+    assert run(capsys, "replay", capture, "--pack", pack, "--soc", "0.6", *option, "--out", out)[0] == 0
+    drawn_ah = columns_of_csv(out)["soc_coulomb"][[0, -1]] @ [3.0, -3.0]
+    assert drawn_ah == pytest.approx(SAMPLES / 2 / 3600, rel=0.02)  # 1 A for half of the time
 
 
 def test_the_capture_is_never_written_over(capture, tmp_path, capsys):
