@@ -13,17 +13,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.ocv import (
-    NAMES,
-    ChenMoraFit,
-    Points,
-    TableFit,
-    fit_chen_mora,
-    fit_table,
-    max_v,
-    pooled,
-    rms_v,
-)
+from bms_estimator.calibration.ocv import NAMES, ChenMoraFit, fit_chen_mora
+from bms_estimator.calibration.ocv_points import Points, max_v, pooled, rms_v
+from bms_estimator.calibration.ocv_table import TableFit, fit_table
 from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, without_glitches
 from bms_estimator.calibration.rest_elements import rest_elements
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
@@ -38,6 +30,9 @@ LOWEST, HIGHEST = 0.55, 1.06
 """Limits of a good sample: of the median voltage, of the full one."""
 CURRENT_MAX_C = 5.0
 """Limit of a good sample when the capture itself has no larger current [1/h]."""
+
+
+TENTHS = np.linspace(0.0, 1.0, 11)
 
 
 class Form(StrEnum):
@@ -61,6 +56,7 @@ class OcvResult:
     remaining_v: list[float]  # what was left to relax at the end of each rest
     rms_mv: float  # points less curve
     max_mv: float
+    error_mv: list[float]  # standard deviation of the table at SOC 0, 0.1 ... 1; none for (2.10)
     parameters: dict[str, dict[str, float | None]]  # a16..a21: value, std (None at a bound); none for a table
     captures: dict[str, dict[str, float]]
     rejected: list[str]
@@ -74,7 +70,7 @@ def ocv(
         float, typer.Option(min=1e-6, help="capacity SOC is counted against [Ah]", show_default=False)
     ],
     out: NewCellFile,
-    form: Annotated[Form, typer.Option(help="the polynomial (2.10), or a monotone table")] = Form.CHEN_MORA,
+    form: Annotated[Form, typer.Option(help="a smooth table, or the polynomial (2.10)")] = Form.TABLE,
     soc: Annotated[float, typer.Option(min=0.0, max=1.0, help="at the first sample of each capture")] = 1.0,
     series: Annotated[
         int | None, typer.Option(min=1, help="cells in series; else by 3.7 V each", show_default=False)
@@ -133,6 +129,7 @@ def _result(
         remaining_v=remaining_v.tolist(),
         rms_mv=1e3 * rms_v(fit.residual_v),
         max_mv=1e3 * max_v(fit.residual_v),
+        error_mv=(1e3 * fit.error_at(TENTHS)).tolist() if isinstance(fit, TableFit) else [],
         parameters=parameters,
         captures={t.name: {"rests": len(t.rests), "glitches": t.glitches, "soc_final": t.end_soc} for t in tests},
         rejected=[line for t in tests for line in t.rejected],
@@ -160,7 +157,8 @@ def _cell(
         current_max_a=round(max(CURRENT_MAX_C * capacity_ah, 1.5 * largest_a), 3),
     )
     elements = rest_elements(samples[0], test, capacity_ah).sections
-    return CellModel.model_validate({"cell": cell, "ocv": fit.ocv, **elements})
+    ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table()
+    return CellModel.model_validate({"cell": cell, "ocv": ocv, **elements})
 
 
 def _remarks(captures: list[Path], result: OcvResult) -> list[str]:
@@ -188,6 +186,8 @@ def _table(out: Path, result: OcvResult, tests: list[RelaxationTest]) -> Table:
         "points less curve": f"{result.rms_mv:.2f} mV RMS, at most {result.max_mv:.2f} mV",
         "cells in series": f"{result.series_count}",
     }
+    if result.error_mv:
+        rows["error of the curve at SOC 0, 0.1 ... 1"] = " ".join(f"{mv:.0f}" for mv in result.error_mv) + " mV"
     for name, parameter in result.parameters.items():
         std = parameter["std"]
         rows[name] = f"{parameter['value']:.5g} " + ("at its bound" if std is None else f"± {std:.2g}")

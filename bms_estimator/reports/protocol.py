@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.adaptive import AdaptiveRun, adaptive_run
-from bms_estimator.calibration.ocv import ChenMoraFit, TableFit, fit_chen_mora, fit_table, pooled
+from bms_estimator.calibration.ocv import ChenMoraFit, fit_chen_mora
+from bms_estimator.calibration.ocv_points import pooled
+from bms_estimator.calibration.ocv_table import TableFit, fit_table
 from bms_estimator.calibration.prediction import Prediction, predict, static_elements
 from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, rest_current_a, without_glitches
 from bms_estimator.calibration.series_resistance import (

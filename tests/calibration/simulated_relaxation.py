@@ -61,7 +61,6 @@ def small_span():
 BAD = {
     "no rests": (without_rests, 3.0, "no rests in 1.94 h: the current never falls below 1.500 A"),
     "short rests": (rests_too_short, 3.0, "1 usable rests, at least 6 are needed; 19 others were too short"),
-    "charging": (charging_inside, 3.0, "charges inside, 0.167 Ah from 8000 s on"),
     "wrong sign": (wrong_sign, 3.0, "current has the wrong sign or the capture charges: 0.000 Ah out, 2.9"),
     "capacity": (relaxation, 2.0, "SOC runs from 1.000 to -0.4"),
     "few rests": (too_few_rests, 3.0, "5 usable rests, at least 6 are needed"),

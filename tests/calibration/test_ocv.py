@@ -1,20 +1,13 @@
-"""(2.10) and the monotone table through points whose curve is known."""
+"""(2.10) through points whose curve is known."""
 
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.ocv import (
-    Points,
-    average,
-    chen_mora,
-    fit_chen_mora,
-    fit_table,
-    max_v,
-    pooled,
-    rms_v,
-)
+from bms_estimator.calibration.ocv import average, chen_mora, fit_chen_mora
+from bms_estimator.calibration.ocv_points import Points, max_v, pooled, rms_v
+from bms_estimator.calibration.ocv_table import fit_table
 from bms_estimator.calibration.relaxation import relaxation_test
-from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.printed import TABLE_1, TABLE_8
 from tests.calibration.simulated_load import TRUTH
@@ -90,49 +83,6 @@ def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
     assert (np.diff(both.soc) >= 0.0).all()
     assert both.full_v == pytest.approx(0.5 * (tests[0].full_v + tests[1].full_v))
     assert np.isnan(both.empty_v)  # neither runs empty
-
-
-@pytest.mark.parametrize("noise_v", [0.0, 3e-3])
-def test_table_is_monotone_invertible_and_near_its_points(noise_v):
-    rng, soc = np.random.default_rng(6), np.linspace(0.02, 0.99, 40)
-    fit = fit_table(points(soc, chen_mora(np.array(TABLE_1), soc) + noise_v * rng.standard_normal(40), noise_v + 1e-4))
-    assert (fit.soc[0], fit.soc[-1]) == (0.0, 1.0)
-    assert (np.diff(fit.ocv_v) > 0.0).all()
-    assert (np.diff(fit(GRID)) > 0.0).all()
-    assert max_v(fit.residual_v) <= 1e-9 + 3.0 * noise_v
-    assert isinstance(fit.ocv, TableOcv)
-    assert np.interp(fit(np.array([0.4])), fit(GRID), GRID)[0] == pytest.approx(0.4, abs=1e-3)
-
-
-def test_table_levels_a_falling_stretch():
-    soc = np.linspace(0.0, 1.0, 11)
-    ocv_v = 3.4 + 0.7 * soc
-    ocv_v[5] = ocv_v[4] - 0.02
-    fit = fit_table(points(soc, ocv_v))
-    assert (np.diff(fit.ocv_v) > 0.0).all()
-    assert fit.residual_v[[0, 1, 2, 3, 6, 7, 8, 9, 10]] == pytest.approx(np.zeros(9), abs=1e-12)
-    assert fit.residual_v[4] == pytest.approx(0.01, abs=1e-4)  # both move by half
-    assert fit.residual_v[5] == pytest.approx(-0.01, abs=1e-4)
-
-
-def test_table_merges_points_that_share_their_soc_by_their_certainty():
-    soc = np.r_[np.linspace(0.0, 1.0, 11), 0.5005]
-    ocv_v = 3.4 + 0.7 * soc
-    ocv_v[-1] += 0.03
-    std_v = np.full(12, 1e-3)
-    std_v[-1] = 5e-3
-    order = np.argsort(soc)
-    fit = fit_table(Points(soc[order], ocv_v[order], std_v[order]))
-    assert fit.soc.size == 11
-    assert fit(np.array([0.5]))[0] == pytest.approx(3.75 + 0.03 / 26.0, abs=5e-4)
-
-
-def test_table_reaches_its_ends_by_what_is_known_else_by_a_line():
-    soc = np.linspace(0.1, 0.9, 9)
-    known = fit_table(points(soc, 3.4 + 0.7 * soc, empty_v=3.0, full_v=4.2))
-    assert known.ocv_v[[0, -1]] == pytest.approx([3.0, 4.2])
-    line = fit_table(points(soc, 3.4 + 0.7 * soc))
-    assert line.ocv_v[[0, -1]] == pytest.approx([3.4, 4.1], abs=1e-9)
 
 
 @pytest.mark.parametrize("fit", [fit_chen_mora, fit_table])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.ocv import fit_chen_mora, pooled
+from bms_estimator.calibration.ocv import fit_chen_mora
+from bms_estimator.calibration.ocv_points import pooled
 from bms_estimator.calibration.relaxation import relaxation_test, soc_by_counting, without_glitches
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv

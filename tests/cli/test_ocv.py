@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.model.cell import ChenMoraOcv, TableOcv, load_cell
 from tests.calibration.simulated_relaxation import BAD, relaxation
@@ -55,7 +56,9 @@ def test_real_cell(tmp_path, capsys, shared_data, form, limit_mv):
     else:
         assert found["parameters"] == {}
         assert isinstance(cell.ocv, TableOcv)
-        assert np.interp(soc, cell.ocv.soc, cell.ocv.ocv_v) == pytest.approx(ocv_v, abs=2e-3)
+        assert PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v)(soc) == pytest.approx(ocv_v, abs=3e-3)
+        assert cell.ocv.error_v is not None
+        assert 1e-3 < np.median(cell.ocv.error_v) < 0.01
         assert (np.diff(cell.ocv.ocv_v) > 0.0).all()
 
 
@@ -78,8 +81,13 @@ def test_for_people(captures, tmp_path, capsys):
     out = tmp_path / "c.toml"
     code, text, _ = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", out)
     assert code == 0
-    for words in ("points", "SOC 0.050 to 1.000", "left to relax at a rest's end", "mV RMS", "a16", "a21"):
+    for words in ("points", "SOC 0.050 to 1.000", "left to relax at a rest's end", "mV RMS", "error of the curve"):
         assert words in text
+    _, text, _ = run(
+        capsys, "ocv", captures[0], "--capacity-ah", "3", "--form", "chen-mora", "--out", tmp_path / "d.toml"
+    )
+    assert "a16" in text
+    assert "a21" in text
 
 
 def test_cells_in_series_are_counted_by_their_voltage(tmp_path, capsys):
