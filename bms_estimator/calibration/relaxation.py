@@ -112,6 +112,11 @@ class RelaxationTest:
     full_v: float
 
     @property
+    def temperature_c(self) -> float:
+        """Mean of the rests [C]; NaN without a sensor."""
+        return float(np.mean([rest.temperature_c for rest in self.rests]))
+
+    @property
     def soc(self) -> Floats:
         """SOC of the points, 0..1."""
         return np.array([rest.soc for rest in self.rests])
@@ -189,7 +194,7 @@ def relaxation_test(
     """
     good = without_glitches(samples, name)
     soc = soc_by_counting(good, capacity_ah, initial_soc)
-    resting = _resting(good, capacity_ah)
+    resting = resting_samples(good, capacity_ah)
     _check_charge(name, good, soc, resting, capacity_ah)
     rests, rejected = [], []
     for first, last in runs(resting):
@@ -250,7 +255,19 @@ def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: NDArray[np
         )
 
 
-def _resting(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
+def initial_rest_v(samples: SampleBlock, name: str, capacity_ah: float) -> float:
+    """Voltage at the end of the rest that a capture starts with [V]; NaN when it starts under load.
+
+    Raises:
+        UserError: As ``without_glitches``.
+    """
+    good = without_glitches(samples, name)
+    resting = resting_samples(good, capacity_ah)
+    first, last = next(iter(runs(resting)), (1, 1))
+    return float(good["voltage_v"][last - 1]) if first == 0 else float("nan")
+
+
+def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     """Which samples belong to a rest; blips of the current sensor do not end one."""
     resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
     time_s = good["time_s"]

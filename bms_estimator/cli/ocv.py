@@ -1,7 +1,8 @@
-"""``bms-estimator ocv``: open-circuit voltage from relaxation tests, into a cell file."""
+"""``bms-estimator ocv``: open-circuit voltage from rests, slow curves and given curves, into a cell file."""
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -14,14 +15,15 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.calibration.ocv import NAMES, ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv_points import Points, max_v, pooled, rms_v
+from bms_estimator.calibration.ocv_points import REFERENCE_C, Points, max_v, rms_v
+from bms_estimator.calibration.ocv_sources import GivenCurve, Recording, Sources, find_sources
 from bms_estimator.calibration.ocv_table import TableFit, fit_table
-from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, without_glitches
-from bms_estimator.calibration.rest_elements import rest_elements
+from bms_estimator.calibration.relaxation import RelaxationTest, without_glitches
+from bms_estimator.calibration.rest_elements import rest_elements, typical_elements
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
 from bms_estimator.model.cell import Cell, CellModel
 from bms_estimator.model.cell_file import write_cell
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.sources.curve import read_curve
 from bms_estimator.sources.replay import load_capture
 
 CELL_VOLTAGE_V = 3.7
@@ -43,35 +45,57 @@ class Form(StrEnum):
 
 
 @dataclass(frozen=True)
+class SourceResult:
+    """What one source was found to be and how it fits, as ``--json`` prints it."""
+
+    name: str
+    kind: str
+    points: int
+    temperature_c: float | None
+    off_mv: float | None  # RMS of what the source is off as a whole; None for (2.10)
+    hysteresis_mv: float | None  # mean over SOC
+    notes: list[str]
+
+
+@dataclass(frozen=True)
 class OcvResult:
     """The outcome, as ``--json`` prints it."""
 
     form: str
     capacity_ah: float
+    capacity_measured_ah: float | None  # by a slow discharge from full to empty
     series_count: int
     points: int
     soc: list[float]
-    ocv_v: list[float]  # extrapolated to infinite rest
+    ocv_v: list[float]  # of rests extrapolated to infinite time
     std_v: list[float]
-    remaining_v: list[float]  # what was left to relax at the end of each rest
     rms_mv: float  # points less curve
     max_mv: float
     error_mv: list[float]  # standard deviation of the table at SOC 0, 0.1 ... 1; none for (2.10)
     parameters: dict[str, dict[str, float | None]]  # a16..a21: value, std (None at a bound); none for a table
-    captures: dict[str, dict[str, float]]
+    sources: list[SourceResult]
+    captures: dict[str, dict[str, float]]  # those with rests
+    remaining_v: list[float]  # what was left to relax at the end of each rest
     rejected: list[str]
 
 
 def ocv(
     captures: Annotated[
-        list[Path], typer.Argument(help="relaxation tests: recorded captures, CSV (.gz) or Parquet", show_default=False)
-    ],
-    capacity_ah: Annotated[
-        float, typer.Option(min=1e-6, help="capacity SOC is counted against [Ah]", show_default=False)
+        list[Path],
+        typer.Argument(
+            help="captures (CSV, .gz, Parquet): relaxation tests or HPPC, slow discharges and charges; or curves (CSV)",
+            show_default=False,
+        ),
     ],
     out: NewCellFile,
+    capacity_ah: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-6, help="capacity SOC is counted against [Ah]; else by a slow discharge", show_default=False
+        ),
+    ] = None,
     form: Annotated[Form, typer.Option(help="a smooth table, or the polynomial (2.10)")] = Form.TABLE,
-    soc: Annotated[float, typer.Option(min=0.0, max=1.0, help="at the first sample of each capture")] = 1.0,
+    soc: Annotated[float, typer.Option(min=0.0, max=1.0, help="at the first sample of the fullest captures")] = 1.0,
     series: Annotated[
         int | None, typer.Option(min=1, help="cells in series; else by 3.7 V each", show_default=False)
     ] = None,
@@ -79,113 +103,146 @@ def ocv(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the open-circuit voltage in relaxation tests and write a cell file.
+    """Find the open-circuit voltage and write a cell file.
 
-    A relaxation test discharges a full cell in steps with a rest after each (thesis 5.2.1). Several tests are fitted
-    jointly. The file's elements are a first idea, one value each from the rests: `identify` makes them good.
+    From captures with rests (relaxation tests, thesis 5.2.1, or HPPC), from slow discharges with or without their charges,
+    and from curves with columns soc, ocv_v[, hysteresis_v], at any temperatures, fitted jointly. What each is, is found out.
+    The file's elements are a first idea, one value each from the rests: `identify` makes them good.
     """
     check_out(out, captures, force=force)
-    samples = [load_capture(path, current_sign=current_sign).rows for path in captures]
-    good = [without_glitches(s, path.name) for s, path in zip(samples, captures, strict=True)]
-    middle_v = float(np.median(np.concatenate([s["voltage_v"] for s in good])))
+    recordings, curves = [], []
+    for path in captures:
+        columns = read_curve(path)
+        if columns is None:
+            recordings.append(Recording(path.name, load_capture(path, current_sign=current_sign).rows))
+        else:
+            curves.append(GivenCurve(path.name, *columns))
+    good = [without_glitches(one.samples, one.name)["voltage_v"] for one in recordings]
+    middle_v = float(np.median(np.concatenate([*good, *(curve.ocv_v for curve in curves)])))
     count = series or max(round(middle_v / CELL_VOLTAGE_V), 1)
-    tests = [
-        relaxation_test(s, capacity_ah, initial_soc=soc, series_count=count, name=path.name)
-        for s, path in zip(samples, captures, strict=True)
-    ]
-    points = pooled(tests)
+    found = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
+    points = found.points
     fit = fit_table(points) if form is Form.TABLE else fit_chen_mora(points)
-    result = _result(form, capacity_ah, count, points, fit, tests)
-    cell = _cell(name_of(out), capacity_ah, count, fit, tests[0], good)
-    write_cell(out, cell, _remarks(captures, result))
+    result = _result(form, count, points, fit, found)
+    write_cell(out, _cell(name_of(out), count, fit, found, recordings), _remarks(captures, result))
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
-        Console().print(_table(out, result, tests))
+        console = Console()
+        console.print(_table(out, result, found))
+        console.print(_sources_table(result))
 
 
-def _result(
-    form: Form,
-    capacity_ah: float,
-    series_count: int,
-    points: Points,
-    fit: ChenMoraFit | TableFit,
-    tests: list[RelaxationTest],
-) -> OcvResult:
-    order = np.argsort(np.concatenate([t.soc for t in tests]), kind="stable")
-    remaining_v = np.concatenate([[rest.remaining_v for rest in t.rests] for t in tests])[order]
+def _result(form: Form, series_count: int, points: Points, fit: ChenMoraFit | TableFit, found: Sources) -> OcvResult:
+    tests = found.tests
     parameters: dict[str, dict[str, float | None]] = {}
     if isinstance(fit, ChenMoraFit):
         for name, value, std in zip(NAMES, fit.a, fit.std, strict=True):
             parameters[name] = {"value": float(value), "std": float(std) if np.isfinite(std) else None}
     return OcvResult(
         form=form.value,
-        capacity_ah=capacity_ah,
+        capacity_ah=found.capacity_ah,
+        capacity_measured_ah=_or_none(found.measured_ah),
         series_count=series_count,
         points=points.soc.size,
         soc=points.soc.tolist(),
         ocv_v=points.ocv_v.tolist(),
         std_v=points.std_v.tolist(),
-        remaining_v=remaining_v.tolist(),
         rms_mv=1e3 * rms_v(fit.residual_v),
         max_mv=1e3 * max_v(fit.residual_v),
         error_mv=(1e3 * fit.error_at(TENTHS)).tolist() if isinstance(fit, TableFit) else [],
         parameters=parameters,
+        sources=_source_results(fit, found),
         captures={t.name: {"rests": len(t.rests), "glitches": t.glitches, "soc_final": t.end_soc} for t in tests},
+        remaining_v=[rest.remaining_v for test in tests for rest in test.rests],
         rejected=[line for t in tests for line in t.rejected],
     )
 
 
+def _source_results(fit: ChenMoraFit | TableFit, found: Sources) -> list[SourceResult]:
+    return [
+        SourceResult(
+            name=source.name,
+            kind=source.kind,
+            points=source.points.soc.size,
+            temperature_c=_or_none(source.temperature_c),
+            off_mv=1e3 * float(fit.deviation_v[i]) if isinstance(fit, TableFit) else None,
+            hysteresis_mv=None if source.hysteresis_v is None else 1e3 * float(source.hysteresis_v.mean()),
+            notes=list(source.notes),
+        )
+        for i, source in enumerate(found.sources)
+    ]
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
 def _cell(
     name: str,
-    capacity_ah: float,
     series_count: int,
     fit: ChenMoraFit | TableFit,
-    test: RelaxationTest,
-    samples: list[SampleBlock],
+    found: Sources,
+    recordings: list[Recording],
 ) -> CellModel:
     """The cell with its open-circuit voltage, and limits of what a good sample is."""
     middle_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
-    largest_a = max(float(np.max(np.abs(s["current_a"]))) for s in samples)
+    lowest_v = float(fit(np.array([0.0]))[0])
+    largest_a = max((float(np.nanmax(np.abs(one.samples["current_a"]))) for one in recordings), default=0.0)
     cell = Cell(
         name=name,
-        capacity_ah=capacity_ah,
+        capacity_ah=round(found.capacity_ah, 4),
         series_count=series_count,
         nominal_voltage_v=round(middle_v, 2),
-        voltage_min_v=round(LOWEST * middle_v, 2),
+        voltage_min_v=round(min(LOWEST * middle_v, lowest_v), 2),
         voltage_max_v=round(HIGHEST * full_v, 2),
-        current_max_a=round(max(CURRENT_MAX_C * capacity_ah, 1.5 * largest_a), 3),
+        current_max_a=round(max(CURRENT_MAX_C * found.capacity_ah, 1.5 * largest_a), 3),
     )
-    elements = rest_elements(samples[0], test, capacity_ah).sections
-    ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table()
-    return CellModel.model_validate({"cell": cell, "ocv": ocv, **elements})
+    test = _warmest(found.tests)
+    if test is None:
+        elements = typical_elements(found.capacity_ah, series_count)
+    else:
+        samples = next(one.samples for one in recordings if one.name == test.name)
+        elements = rest_elements(samples, test, found.capacity_ah)
+    ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(found.hysteresis_v)
+    return CellModel.model_validate({"cell": cell, "ocv": ocv, **elements.sections})
+
+
+def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
+    """The one nearest to 25 C; the first of those that do not say."""
+    return min(tests, key=lambda test: abs(test.temperature_c - REFERENCE_C), default=None)
 
 
 def _remarks(captures: list[Path], result: OcvResult) -> list[str]:
     names = ", ".join(path.name for path in captures)
+    rests = "one value each from the rests of one capture" if result.captures else "typical of cells of this capacity"
     return [
-        f"OCV: {result.points} rests of {names}, extrapolated to infinite rest;",
-        f"the {result.form} form lies {result.rms_mv:.2f} mV RMS off them, {result.max_mv:.2f} mV at most.",
-        "Elements: one value each from the rests of the first capture, a start for identify.",
+        f"OCV: {', '.join(source.kind for source in result.sources)} of {names};",
+        f"the {result.form} form lies {result.rms_mv:.2f} mV RMS off the points, {result.max_mv:.2f} mV at most.",
+        f"Elements: {rests}, a start for identify.",
     ]
 
 
-def _table(out: Path, result: OcvResult, tests: list[RelaxationTest]) -> Table:
+def _table(out: Path, result: OcvResult, found: Sources) -> Table:
     """The outcome for people."""
     table = Table(title=f"{out}: written", title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column(justify="right")
-    left_mv = 1e3 * np.abs(result.remaining_v)
     std_mv = 1e3 * np.array(result.std_v)
+    measured = result.capacity_measured_ah
     rows = {
         "points": f"{result.points}, SOC {result.soc[0]:.3f} to {result.soc[-1]:.3f}",
-        "rests that gave none": f"{len(result.rejected)}",
-        "glitches left out": f"{sum(test.glitches for test in tests)}",
-        "left to relax at a rest's end": f"{np.median(left_mv):.2f} mV, at most {left_mv.max():.2f} mV",
+        "capacity": f"{result.capacity_ah:.4g} Ah"
+        + ("" if measured is None else f", a slow discharge {measured:.4g} Ah"),
+        "cells in series": f"{result.series_count}",
         "std of a point": f"{np.median(std_mv):.2f} mV, at most {std_mv.max():.2f} mV",
         "points less curve": f"{result.rms_mv:.2f} mV RMS, at most {result.max_mv:.2f} mV",
-        "cells in series": f"{result.series_count}",
     }
+    if result.captures:
+        left_mv = 1e3 * np.abs(result.remaining_v)
+        rows["left to relax at a rest's end"] = f"{np.median(left_mv):.2f} mV, at most {left_mv.max():.2f} mV"
+        rows["rests that gave none"] = f"{len(result.rejected)}"
+        rows["glitches left out"] = f"{sum(test.glitches for test in found.tests)}"
     if result.error_mv:
         rows["error of the curve at SOC 0, 0.1 ... 1"] = " ".join(f"{mv:.0f}" for mv in result.error_mv) + " mV"
     for name, parameter in result.parameters.items():
@@ -193,4 +250,18 @@ def _table(out: Path, result: OcvResult, tests: list[RelaxationTest]) -> Table:
         rows[name] = f"{parameter['value']:.5g} " + ("at its bound" if std is None else f"± {std:.2g}")
     for name, value in rows.items():
         table.add_row(name, value)
+    return table
+
+
+def _sources_table(result: OcvResult) -> Table:
+    """What each source was found to be."""
+    table = Table("source", "found to be", "C", "off", "hysteresis", box=box.SIMPLE_HEAD)
+    for source in result.sources:
+        table.add_row(
+            source.name,
+            "\n".join([source.kind, *source.notes]),
+            "" if source.temperature_c is None else f"{source.temperature_c:.0f}",
+            "" if source.off_mv is None else f"{source.off_mv:.1f} mV",
+            "" if source.hysteresis_mv is None else f"{source.hysteresis_mv:.1f} mV",
+        )
     return table

@@ -1,0 +1,226 @@
+"""What each capture or table says of the open-circuit voltage: rests, a slow curve, or a curve that is given."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.ocv_points import REFERENCE_C, Points, joined, points_of
+from bms_estimator.calibration.ocv_table import NODES, TableFit, fit_table
+from bms_estimator.calibration.relaxation import (
+    RelaxationTest,
+    initial_rest_v,
+    relaxation_test,
+    without_glitches,
+)
+from bms_estimator.calibration.slow_curve import (
+    GRID,
+    Branch,
+    SlowCurve,
+    measured_capacity_ah,
+    slow_branches,
+    slow_curves,
+)
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+
+Floats = NDArray[np.float64]
+
+STARTS_ALIKE_V = 0.02
+"""Captures whose first rests differ by less start at the same SOC: a full charge ends no more alike, per cell [V]."""
+GIVEN_V, GIVEN_COMMON_V = 1e-3, 2e-3
+"""Standard deviation of each point of a given curve, and of what it is off as a whole, per cell [V]."""
+REST_SHARE, REST_SHARE_STD = 0.5, 0.3
+"""Part of the hysteresis of slow curves that a rest after a discharge keeps, and its standard deviation: 0.3 to 1 seen."""
+OTHER_CAPACITY = 0.05
+"""A capacity that differs by more from what a slow discharge measured is remarked on, relative."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A capture: its name and raw samples, dtype ``SAMPLE``."""
+
+    name: str
+    samples: SampleBlock
+
+
+@dataclass(frozen=True)
+class GivenCurve:
+    """A curve that somebody else found: soc 0..1, ocv_v [V], hysteresis_v [V] or None; shape (n,) each."""
+
+    name: str
+    soc: Floats
+    ocv_v: Floats
+    hysteresis_v: Floats | None
+
+
+@dataclass(frozen=True)
+class Source:
+    """One source of points.
+
+    Attributes:
+        name: Of its captures.
+        kind: What it was found to be, such as "38 rests".
+        points: Its points.
+        temperature_c: Mean [C]; NaN where it is not known.
+        hysteresis_v: At ``GRID`` [V]; None where it does not tell.
+        notes: What is to be known of it.
+    """
+
+    name: str
+    kind: str
+    points: Points
+    temperature_c: float
+    hysteresis_v: Floats | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Sources:
+    """All of them.
+
+    Attributes:
+        capacity_ah: Given, else measured [Ah].
+        measured_ah: By a whole slow discharge [Ah]; NaN when there is none.
+        sources: Slow curves, given curves, rests.
+        tests: Those captures that are relaxation tests, as ``sources`` has them.
+        hysteresis_v: At ``NODES`` [V], of the source nearest to 25 C that tells; None when none does.
+    """
+
+    capacity_ah: float
+    measured_ah: float
+    sources: tuple[Source, ...]
+    tests: tuple[RelaxationTest, ...]
+    hysteresis_v: Floats | None
+
+    @property
+    def points(self) -> Points:
+        """Of all sources."""
+        return joined([source.points for source in self.sources])
+
+
+def find_sources(
+    recordings: Sequence[Recording],
+    curves: Sequence[GivenCurve],
+    *,
+    capacity_ah: float | None,
+    initial_soc: float = 1.0,
+    series_count: int = 1,
+) -> Sources:
+    """Find out what each capture is, and what it says.
+
+    Args:
+        recordings: Captures.
+        curves: Given curves.
+        capacity_ah: Capacity that rests are counted against [Ah]; None: as a whole slow discharge measures it. Slow curves
+            are counted against their own.
+        initial_soc: SOC at the first sample, 0..1, of those captures that start at the highest voltage.
+        series_count: Cells in series.
+
+    Raises:
+        UserError: A capture is neither kind, or no capacity is known.
+    """
+    good = [Recording(one.name, without_glitches(one.samples, one.name)) for one in recordings]
+    branches = {one.name: slow_branches(one.samples, one.name) for one in good}
+    every = [branch for found in branches.values() for branch in found]
+    measured_ah = measured_capacity_ah(every) / initial_soc if initial_soc > 0.0 else float("nan")
+    known_ah = measured_ah if capacity_ah is None else capacity_ah
+    if not np.isfinite(known_ah):
+        raise UserError(
+            "--capacity-ah: not given, and no capture is a slow discharge from full to empty that measures it"
+        )
+    slow_ah = measured_ah if np.isfinite(measured_ah) else known_ah
+    slow = slow_curves(every, slow_ah, initial_soc=initial_soc, series_count=series_count)
+    sources = [_of_slow(curve, slow_ah, known_ah) for curve in slow] + [_of_given(one, series_count) for one in curves]
+    rests = [one for one in recordings if not branches[one.name]]
+    hysteresis_v = _hysteresis(sources)
+    tests, of_rests = _rests(rests, sources, every, known_ah, initial_soc, series_count, hysteresis_v)
+    at_nodes = None if hysteresis_v is None else np.interp(NODES, GRID, hysteresis_v)
+    return Sources(known_ah, measured_ah, (*sources, *of_rests), tuple(tests), at_nodes)
+
+
+def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
+    first, *others = curve.branches
+    kind = f"{first.label}, {first.ah[-1]:.3f} Ah"
+    name = first.name
+    if others:
+        kind = f"{first.label} and charge, {first.ah[-1]:.3f} and {others[0].ah[-1]:.3f} Ah"
+        name = first.name if others[0].name == first.name else f"{first.name}, {others[0].name}"
+    notes = curve.notes
+    if abs(slow_ah / capacity_ah - 1.0) > OTHER_CAPACITY:
+        notes = (*notes, f"counted against its own {slow_ah:.3f} Ah, not {capacity_ah:g} Ah")
+    return Source(name, kind, curve.points, first.temperature_c, curve.hysteresis_v, notes)
+
+
+def _of_given(curve: GivenCurve, series_count: int) -> Source:
+    everywhere = np.full(curve.soc.size, float(series_count))
+    points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, common_v=GIVEN_COMMON_V * everywhere)
+    hysteresis_v = None
+    if curve.hysteresis_v is not None:
+        hysteresis_v = np.clip(np.interp(GRID, curve.soc, curve.hysteresis_v), 0.0, None)
+    return Source(curve.name, f"given curve, {curve.soc.size} points", points, float("nan"), hysteresis_v, ())
+
+
+def _hysteresis(sources: Sequence[Source]) -> Floats | None:
+    """Of the source nearest to 25 C that tells, at ``GRID`` [V]."""
+    telling = [source for source in sources if source.hysteresis_v is not None]
+    if not telling:
+        return None
+    return min(
+        telling, key=lambda one: abs(np.nan_to_num(one.temperature_c, nan=REFERENCE_C) - REFERENCE_C)
+    ).hysteresis_v
+
+
+def _rests(
+    recordings: Sequence[Recording],
+    sources: Sequence[Source],
+    branches: Sequence[Branch],
+    capacity_ah: float,
+    initial_soc: float,
+    series_count: int,
+    hysteresis_v: Floats | None,
+) -> tuple[list[RelaxationTest], list[Source]]:
+    """Relaxation tests and their points; a capture that starts lower than the others gets its SOC from their curve."""
+    starts = [initial_rest_v(one.samples, one.name, capacity_ah) for one in recordings]
+    highest_v = np.nanmax([*starts, *(branch.start_v for branch in branches if not branch.charge), -np.inf])
+    low = [start < highest_v - STARTS_ALIKE_V * series_count for start in starts]
+
+    def test(one: Recording, soc: float) -> tuple[RelaxationTest, Points]:
+        found = relaxation_test(one.samples, capacity_ah, initial_soc=soc, series_count=series_count, name=one.name)
+        return found, _amid_hysteresis(points_of(found, series_count), found, hysteresis_v)
+
+    found = {one.name: test(one, initial_soc) for one, lower in zip(recordings, low, strict=True) if not lower}
+    if any(low):
+        curve = fit_table(joined([*(source.points for source in sources), *(points for _, points in found.values())]))
+        for one, start_v, lower in zip(recordings, starts, low, strict=True):
+            if lower:
+                found[one.name] = test(one, _soc_at(curve, start_v))
+    tests = [found[one.name][0] for one in recordings]
+    return tests, [_of_test(test, points) for test, points in found.values()]
+
+
+def _soc_at(curve: TableFit, voltage_v: float) -> float:
+    grid = np.linspace(0.0, 1.0, 1001)
+    return float(np.interp(voltage_v, curve(grid), grid))
+
+
+def _amid_hysteresis(points: Points, test: RelaxationTest, hysteresis_v: Floats | None) -> Points:
+    """Rests moved to halfway between discharge and charge."""
+    if hysteresis_v is None:
+        return points
+    size_v = np.interp(points.soc, GRID, hysteresis_v)
+    after_charge = np.array([rest.after_charge for rest in test.rests])[np.argsort(test.soc, kind="stable")]
+    return replace(
+        points,
+        ocv_v=points.ocv_v + np.where(after_charge, 0.0, REST_SHARE * size_v),
+        std_v=np.hypot(points.std_v, np.where(after_charge, REST_SHARE * size_v, 0.0)),
+        common_v=np.hypot(points.common_v, REST_SHARE_STD * size_v),
+    )
+
+
+def _of_test(test: RelaxationTest, points: Points) -> Source:
+    temperatures = points.temperature_c[np.isfinite(points.temperature_c)]
+    temperature_c = float(temperatures.mean()) if temperatures.size else float("nan")
+    notes = () if test.start_soc > 0.9995 else (f"starts at SOC {test.start_soc:.3f}",)
+    return Source(test.name, f"{len(test.rests)} rests", points, temperature_c, None, notes)

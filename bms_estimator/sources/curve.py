@@ -1,0 +1,65 @@
+"""A curve of open-circuit voltage that somebody else found, as a CSV file."""
+
+import csv
+import gzip
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.errors import UserError
+
+Floats = NDArray[np.float64]
+
+COLUMNS = ("soc", "ocv_v", "hysteresis_v")
+
+
+class CurveColumns(NamedTuple):
+    """Columns of a curve file, in the order of SOC; shape (n,) each."""
+
+    soc: Floats
+    ocv_v: Floats
+    hysteresis_v: Floats | None
+
+
+def read_curve(path: Path) -> CurveColumns | None:
+    """The curve in a CSV file (.gz) with columns soc (0..1), ocv_v [V] and perhaps hysteresis_v [V].
+
+    Returns:
+        None when the file is no CSV or has no such columns.
+
+    Raises:
+        UserError: It has, but what is in them is no curve.
+    """
+    if not path.is_file() or not path.name.lower().endswith((".csv", ".csv.gz")):
+        return None
+    try:
+        with gzip.open(path, "rt") if path.name.lower().endswith(".gz") else path.open() as text:
+            rows = csv.DictReader(line for line in text if line.strip() and not line.startswith("#"))
+            if not {"soc", "ocv_v"} <= set(rows.fieldnames or ()):
+                return None
+            found = [[_number(path, rows.line_num, name, row.get(name)) for name in COLUMNS] for row in rows]
+    except (OSError, EOFError, UnicodeDecodeError):
+        return None  # whoever reads captures says what is wrong
+    return _checked(path, np.array(found).reshape(-1, 3), "hysteresis_v" in (rows.fieldnames or ()))
+
+
+def _number(path: Path, line: int, name: str, cell: str | None) -> float:
+    if cell is None:
+        return float("nan")
+    try:
+        return float(cell)
+    except ValueError:
+        raise UserError(f"{path}: line {line}: {name} = {cell!r}: must be a number") from None
+
+
+def _checked(path: Path, values: Floats, has_hysteresis: bool) -> CurveColumns:
+    values = values[np.argsort(values[:, 0], kind="stable")]
+    soc, ocv_v, hysteresis_v = values.T
+    wanted = values if has_hysteresis else values[:, :2]
+    if soc.size == 0 or not np.isfinite(wanted).all():
+        raise UserError(f"{path}: {'no rows' if soc.size == 0 else 'a value is missing'}: give numbers in every column")
+    if soc[0] < 0.0 or soc[-1] > 1.0:
+        raise UserError(f"{path}: soc runs from {soc[0]:g} to {soc[-1]:g}: must lie within 0..1, not percent")
+    return CurveColumns(soc, ocv_v, hysteresis_v if has_hysteresis else None)
