@@ -176,8 +176,8 @@ def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells:
     warmths = sum(one.size for one in stds)
     for source in range(int(points.source.max()) + 1):
         own = (points.source == source)[:, None]
-        common_v = common * float(points.common_v[own[:, 0]].mean())
-        columns += [own * _hats(points.soc, DEVIATION_NODES) * common_v, own * _shifts(points.soc, slope_v)]
+        off_v = common * points.common_v[:, None] * _hats(points.soc, DEVIATION_NODES)
+        columns += [own * off_v, own * _shifts(points.soc, slope_v)]
         stds += [np.ones(DEVIATION_NODES.size), np.array([SOC_STD, CAPACITY_STD])]
     weights = 1.0 / np.concatenate(stds)
     prior = np.zeros((bends.shape[0] + weights.size, spline.shape[1] + weights.size))

@@ -5,14 +5,15 @@ the ohmic part, is its hysteresis. A discharge without its charge gives the curv
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
 
 from bms_estimator.calibration.ocv_points import COLD_V, Points, coldness
-from bms_estimator.calibration.relaxation import mean_temperature_c, resting_samples, runs
+from bms_estimator.calibration.relaxation import SOC_SLACK, mean_temperature_c, resting_samples, runs
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 Floats = NDArray[np.float64]
@@ -41,6 +42,10 @@ POINT_V, POINT_SOC = 1e-3, 0.002
 """Standard deviations of one point of a slow curve: of its voltage, per cell in series [V], and of its SOC."""
 PAIR_V, PAIR_PART = 1.5e-3, 0.1
 """What the mean of a pair is off as a whole: so much per cell in series [V], and this part of the half difference."""
+ALONE_PART = 0.5
+"""The same where one of the two is missing: the difference is then that of the middle."""
+TURN = 0.03
+"""SOC within which a charge that ends early, at its highest voltage, is not the mean's other half."""
 LONE_V = 0.01
 """What a lone branch is off, with the ohmic part taken out, per cell in series [V]."""
 COLD_PART = 0.25
@@ -101,7 +106,11 @@ class SlowCurve:
 
 
 def slow_branches(good: SampleBlock, name: str) -> list[Branch]:
-    """The slow discharges and charges of a capture without glitches; none: it is of another kind."""
+    """The slow discharges and charges of a capture without glitches; none: it is of another kind.
+
+    Raises:
+        UserError: The voltage goes the other way than the current.
+    """
     moved_ah = np.r_[0.0, np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"]))] / 3600.0
     if good.size < 2 or np.ptp(moved_ah) == 0.0:
         return []
@@ -129,6 +138,12 @@ def _branch(
     charge = bool(np.median(part["current_a"]) < 0.0)
     ah = np.abs(moved_ah[first:last] - moved_ah[first])
     voltage_v = part["voltage_v"].astype(np.float64)
+    if charge != (voltage_v[-1] > voltage_v[0]):
+        raise UserError(
+            f"{name}: current has the wrong sign: {'charge' if charge else 'discharge'} from {part['time_s'][0]:.0f} s on "
+            f"while the voltage went from {voltage_v[0]:.3f} to {voltage_v[-1]:.3f} V; discharge must be positive "
+            "(--current-sign)"
+        )
     jump_v = float("nan")
     if charge and last < good.size and resting[last]:
         jump_v = voltage_v[-1] - float(good["voltage_v"][last])
@@ -167,11 +182,19 @@ def slow_curves(
         capacity_ah: Capacity that SOC is counted against [Ah].
         initial_soc: SOC at the first sample of each capture, 0..1.
         series_count: Cells in series, for what is known per cell.
+
+    Raises:
+        UserError: A discharge takes more than there is.
     """
     charges = [branch for branch in branches if branch.charge]
     found = []
     for discharge in (branch for branch in branches if not branch.charge):
         soc = initial_soc - (discharge.before_ah + discharge.ah) / capacity_ah
+        if soc[-1] < -SOC_SLACK:
+            raise UserError(
+                f"{discharge.name}: SOC runs from {soc[0]:.3f} to {soc[-1]:.3f}, outside 0..1: {discharge.ah[-1]:.3f} Ah were "
+                f"drawn, more than a capacity of {capacity_ah:g} Ah holds; give the right capacity or initial SOC"
+            )
         charge = next((one for one in charges if _are_pair(discharge, one)), None)
         if charge is None:
             found.append(_lone(discharge, soc, series_count, ()))
@@ -201,24 +224,27 @@ def _are_pair(discharge: Branch, charge: Branch) -> bool:
 
 
 def _pair(down: Branch, soc: Floats, up: Branch, up_soc: Floats, series_count: int) -> SlowCurve:
-    """The mean of the two; where one is missing the other, off by half of what they differ by nearest to there."""
+    """The mean of the two; where one is missing the other, off by half of what they differ by in the middle."""
     low, high = max(soc[-1], up_soc[0]), min(soc[0], up_soc[-1])
+    high = high if high > ENDS[1] else high - TURN  # a charge that ends early rises before it ends
     both = GRID[(low <= GRID) & (high >= GRID)]
-    half_v = np.interp(GRID, both, 0.5 * (_at(both, up_soc, up.voltage_v) - _at(both, soc, down.voltage_v)))
+    differ_v = 0.5 * (_at(both, up_soc, up.voltage_v) - _at(both, soc, down.voltage_v))
+    middle_v = float(np.median(differ_v))
+    half_v = np.where((low <= GRID) & (high >= GRID), np.interp(GRID, both, differ_v), middle_v)
     grid = GRID[(min(soc[-1], up_soc[0]) <= GRID) & (max(soc[0], up_soc[-1]) >= GRID)]
     half = np.interp(grid, GRID, half_v)
     known = (grid >= soc[-1]) & (grid <= soc[0])
     ocv_v = np.where(known, _at(grid, soc, down.voltage_v) + half, _at(grid, up_soc, up.voltage_v) - half)
     steps = [branch.step_v for branch in (down, up) if np.isfinite(branch.step_v)]
     ohmic_v = float(np.mean(steps)) if steps else float("nan")
-    notes = () if steps else ("hysteresis with its ohmic part",)
-    common_v = PAIR_V * series_count + PAIR_PART * float(np.median(np.abs(half)))
+    points = _points(grid, ocv_v, PAIR_V * series_count, COLD_PART, down.temperature_c, series_count)
+    alone = (grid < low) | (grid > high)
     return SlowCurve(
         branches=(down, up),
-        points=_points(grid, ocv_v, common_v, COLD_PART, down.temperature_c, series_count),
+        points=replace(points, common_v=points.common_v + np.where(alone, ALONE_PART, PAIR_PART) * np.abs(half)),
         hysteresis_v=_smooth(half_v - (ohmic_v if steps else 0.0)),
         ohmic_v=ohmic_v,
-        notes=notes,
+        notes=() if steps else ("hysteresis with its ohmic part",),
     )
 
 

@@ -111,12 +111,14 @@ def ocv(
     """
     check_out(out, captures, force=force)
     recordings, curves = [], []
+    names = [path.name for path in captures]
     for path in captures:
+        name = path.name if names.count(path.name) == 1 else str(path)
         columns = read_curve(path)
         if columns is None:
-            recordings.append(Recording(path.name, load_capture(path, current_sign=current_sign).rows))
+            recordings.append(Recording(name, load_capture(path, current_sign=current_sign).rows))
         else:
-            curves.append(GivenCurve(path.name, *columns))
+            curves.append(GivenCurve(name, *columns))
     good = [without_glitches(one.samples, one.name)["voltage_v"] for one in recordings]
     middle_v = float(np.median(np.concatenate([*good, *(curve.ocv_v for curve in curves)])))
     count = series or max(round(middle_v / CELL_VOLTAGE_V), 1)
@@ -124,7 +126,7 @@ def ocv(
     points = found.points
     fit = fit_table(points) if form is Form.TABLE else fit_chen_mora(points)
     result = _result(form, count, points, fit, found)
-    write_cell(out, _cell(name_of(out), count, fit, found, recordings), _remarks(captures, result))
+    write_cell(out, _cell(name_of(out), count, fit, found, recordings), _remarks(result))
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
@@ -213,11 +215,10 @@ def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
     return min(tests, key=lambda test: abs(test.temperature_c - REFERENCE_C), default=None)
 
 
-def _remarks(captures: list[Path], result: OcvResult) -> list[str]:
-    names = ", ".join(path.name for path in captures)
+def _remarks(result: OcvResult) -> list[str]:
     rests = "one value each from the rests of one capture" if result.captures else "typical of cells of this capacity"
     return [
-        f"OCV: {', '.join(source.kind for source in result.sources)} of {names};",
+        f"OCV: {', '.join(f'{source.kind} of {source.name}' for source in result.sources)};",
         f"the {result.form} form lies {result.rms_mv:.2f} mV RMS off the points, {result.max_mv:.2f} mV at most.",
         f"Elements: {rests}, a start for identify.",
     ]

@@ -71,7 +71,7 @@ def test_several_captures_are_fitted_jointly(captures, tmp_path, capsys):
     assert {name: one["rests"] for name, one in found["captures"].items()} == {"run0.csv": 20, "run1.csv": 20}
     cell = load_cell(out)
     assert cell.cell.series_count == 1
-    assert "OCV: 40 rests of run0.csv, run1.csv" in out.read_text()
+    assert "OCV: 20 rests of run0.csv, 20 rests of run1.csv" in out.read_text()
     # elements: a first idea from the rests, 0.0861 ohm and some 20 mohm in the middle of the true cell
     assert cell.r_s.offset_ohm == pytest.approx(0.0861, rel=0.15)
     assert 0.01 < cell.r_tl.offset_ohm < 0.05
@@ -164,3 +164,45 @@ def test_the_sign_of_a_tables_current_can_be_given(tmp_path, capsys):
     assert "discharge must be positive (--current-sign)" in err
     assert run(capsys, *arguments, "--current-sign", "charge_positive")[0] == 0
     assert "20 rests of charge.csv" in (tmp_path / "c.toml").read_text()
+
+
+def test_what_each_capture_is_is_found_out(tmp_path, capsys, data):
+    """A slow discharge, a given curve with hysteresis and rests of a pouch cell of another make: each by itself."""
+    out = tmp_path / "m50.toml"
+    folder = data / "lgm50"
+    arguments = ("ocv", folder / "rate_0p1c_25c.csv.gz", folder / "ocv_25c.csv", "--out", out)
+    code, text, _ = run(capsys, *arguments, "--json")
+    assert code == 0
+    found = json.loads(text)
+    assert [source["kind"] for source in found["sources"]] == ["C/10 discharge, 4.945 Ah", "given curve, 101 points"]
+    assert found["capacity_ah"] == found["capacity_measured_ah"] == pytest.approx(4.945, abs=1e-3)
+    ocv = load_cell(out).ocv
+    assert ocv.hysteresis_v is not None
+    assert ocv.per_kelvin_v is None
+    given = np.loadtxt(folder / "ocv_25c.csv", delimiter=",", skiprows=1)
+    inside = (given[:, 0] > 0.1) & (given[:, 0] < 0.95)
+    assert PchipInterpolator(ocv.soc, ocv.ocv_v)(given[inside, 0]) == pytest.approx(given[inside, 1], abs=8e-3)
+    _, text, _ = run(capsys, *arguments, "--force")
+    for words in ("C/10 discharge, 4.945 Ah", "given curve, 101 points", "found to be", "typical"):
+        assert words in text + out.read_text()
+
+
+def test_rests_of_a_pouch_cell(tmp_path, capsys, data):
+    out = tmp_path / "leaf.toml"
+    code, text, _ = run(
+        capsys, "ocv", data / "leaf" / "hppc_25c_from_full.csv.gz", "--capacity-ah", "30.5", "--out", out, "--json"
+    )
+    assert code == 0
+    found = json.loads(text)
+    assert found["sources"][0]["kind"] == "10 rests"
+    assert found["error_mv"][0] > 3.0 * np.median(found["error_mv"])
+
+
+def test_two_captures_of_one_name_are_two(captures, tmp_path, capsys):
+    other = tmp_path / captures[0].name
+    other.write_bytes(captures[1].read_bytes())
+    code, text, _ = run(
+        capsys, "ocv", captures[0], other, "--capacity-ah", "3", "--out", tmp_path / "two.toml", "--json"
+    )
+    assert code == 0
+    assert set(json.loads(text)["captures"]) == {str(captures[0]), str(other)}

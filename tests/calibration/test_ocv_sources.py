@@ -1,0 +1,143 @@
+"""What captures are found to be, and what they say together."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.ocv_sources import GivenCurve, Recording, find_sources
+from bms_estimator.calibration.ocv_table import NODES, fit_table
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.replay import load_capture
+from tests.calibration.simulated_load import TRUTH, capture
+from tests.calibration.simulated_relaxation import relaxation, schedule
+from tests.calibration.simulated_slow import CAPACITY_AH, hysteresis_v, slow, true_v
+
+INSIDE = (NODES > 0.1) & (NODES < 0.95)
+
+
+def of(*samples, curves=(), capacity_ah=None, **options):
+    recordings = [Recording(f"run{i}", one) for i, one in enumerate(samples)]
+    return find_sources(recordings, curves, capacity_ah=capacity_ah, **options)
+
+
+def off_v(found):
+    return (fit_table(found.points).ocv_v - true_v(NODES))[INSIDE]
+
+
+@pytest.mark.parametrize("files", [1, 2])
+def test_a_pair_gives_mean_hysteresis_and_capacity(files):
+    """In one file or two."""
+    found = of(slow((1.0, -1.0))) if files == 1 else of(slow((1.0,)), slow((-1.0,)))
+    (source,) = found.sources
+    assert source.kind.startswith("C/20 discharge and charge, 2.99")
+    assert found.capacity_ah == found.measured_ah == pytest.approx(CAPACITY_AH, rel=2e-3)
+    assert np.abs(off_v(found)).max() < 2e-3
+    assert found.hysteresis_v[INSIDE] == pytest.approx(hysteresis_v(NODES[INSIDE]), abs=2e-3)  # 6 mV of it ohmic
+
+
+def test_a_lone_discharge_is_off_by_its_hysteresis_and_knows_it():
+    found = of(slow((1.0,)))
+    fit = fit_table(found.points)
+    assert found.sources[0].kind.startswith("C/20 discharge, 2.99")
+    assert found.hysteresis_v is None
+    assert np.median(off_v(found)) < -5e-3
+    assert (np.abs(off_v(found)) < 2.5 * fit.error_v[INSIDE]).all()
+
+
+def test_a_charge_that_lacks_much_of_what_came_out_is_left_out_and_said():
+    found = of(slow((1.0,)), slow((-1.0,), part=0.85))
+    assert found.hysteresis_v is None
+    assert len(found.sources) == 1
+    assert "charge run1 left out: 2.5" in found.sources[0].notes[0]
+
+
+def test_a_slow_curve_of_an_older_cell_is_counted_against_its_own_capacity():
+    found = of(slow((1.0, -1.0), capacity_ah=2.7), capacity_ah=CAPACITY_AH)
+    assert found.capacity_ah == CAPACITY_AH
+    assert found.measured_ah == pytest.approx(2.7, rel=2e-3)
+    assert "counted against its own 2.69" in found.sources[0].notes[0]
+    assert np.abs(off_v(found)).max() < 2e-3
+
+
+def test_a_given_curve_and_its_hysteresis():
+    soc = np.linspace(0.0, 1.0, 101)
+    found = of(curves=[GivenCurve("book", soc, true_v(soc), hysteresis_v(soc))], capacity_ah=5.0)
+    assert [source.kind for source in found.sources] == ["given curve, 101 points"]
+    assert np.abs(off_v(found)).max() < 2e-3
+    assert found.hysteresis_v == pytest.approx(hysteresis_v(NODES), abs=1e-3)
+
+
+def test_rests_are_moved_to_the_middle_of_a_known_hysteresis():
+    soc = np.linspace(0.0, 1.0, 101)
+    flat = GivenCurve("book", soc, true_v(soc), np.full(soc.size, 0.02))
+    rests = relaxation()
+    plain = of(rests, capacity_ah=TRUTH.cell.capacity_ah).points
+    moved = of(rests, curves=[flat], capacity_ah=TRUTH.cell.capacity_ah).points
+    assert moved.ocv_v[moved.source == 1] == pytest.approx(plain.ocv_v + 0.01)
+
+
+def test_a_capture_that_starts_lower_is_aligned_by_its_first_rest():
+    full, lower = relaxation(), capture(schedule(rounds=12), soc=0.93)
+    found = of(full, lower, capacity_ah=TRUTH.cell.capacity_ah)
+    assert [test.start_soc for test in found.tests] == [1.0, pytest.approx(0.93, abs=5e-3)]
+    assert found.sources[1].notes == (f"starts at SOC {found.tests[1].start_soc:.3f}",)
+    alone = of(lower, capacity_ah=TRUTH.cell.capacity_ah, initial_soc=0.93)
+    assert alone.tests[0].start_soc == 0.93
+
+
+def test_charge_within_a_test_is_counted_and_its_rests_are_less_certain():
+    """Regeneration: some rounds of the test put charge back."""
+    current_a = schedule(rounds=17)
+    is_load = current_a > 0.0
+    current_a[is_load & (np.cumsum(np.diff(is_load, prepend=False) & is_load) % 5 == 4)] *= -0.5
+    test = of(capture(current_a, soc=1.0), capacity_ah=TRUTH.cell.capacity_ah)
+    points, rests = test.points, test.tests[0].rests
+    charged = np.array([rest.after_charge for rest in rests])
+    assert 2 <= charged.sum() < 5
+    grid = np.linspace(points.soc[0], 0.95, 50)
+    plain = fit_table(of(relaxation(), capacity_ah=TRUTH.cell.capacity_ah).points)
+    assert fit_table(points)(grid) == pytest.approx(plain(grid), abs=4e-3)
+    by_soc = charged[np.argsort(test.tests[0].soc, kind="stable")]
+    assert points.std_v[by_soc].min() > np.median(points.std_v[~by_soc])
+
+
+def test_entropy_from_pairs_at_several_temperatures():
+    per_kelvin_v = 3e-4
+    runs = [slow((1.0, -1.0), temperature_c=t, off_v=per_kelvin_v * (t - 25.0)) for t in (10.0, 25.0, 45.0)]
+    fit = fit_table(of(*runs).points)
+    assert fit.per_kelvin_v is not None
+    assert np.median(fit.per_kelvin_v) == pytest.approx(per_kelvin_v, rel=0.3)
+    assert np.abs((fit.ocv_v - true_v(NODES))[INSIDE]).max() < 3e-3
+
+
+@pytest.mark.parametrize(
+    ("samples", "capacity_ah", "message"),
+    [
+        (relaxation, None, "--capacity-ah: not given, and no capture is a slow discharge"),
+        (lambda: slow((1.0,), part=0.7), None, "--capacity-ah: not given"),
+        (lambda: slow((1.0,), part=0.7), 1.8, "SOC runs from 1.000 to -0.16"),
+        (lambda: capture(np.full(7200, 1.5), soc=1.0), 3.0, "no rests in 1.94 h"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_numbers(samples, capacity_ah, message):
+    with pytest.raises(UserError, match=message):
+        of(samples(), capacity_ah=capacity_ah)
+
+
+def test_a_slow_discharge_of_the_wrong_sign_is_refused():
+    samples = slow((1.0,))
+    samples["current_a"] *= -1.0
+    with pytest.raises(UserError, match=r"wrong sign: charge from 3600 s on .*--current-sign"):
+        of(samples)
+
+
+def test_lfp_pairs_at_three_temperatures(shared_data):
+    folder = shared_data / "a123"
+    names = [f"c30_{way}_{at}.csv.gz" for at in ("p25", "p05", "n15") for way in ("dis", "chg")]
+    found = find_sources([Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=None)
+    assert found.capacity_ah == pytest.approx(2.06, abs=0.005)
+    assert [round(source.temperature_c) for source in found.sources] == [25, 5, -15]
+    assert 0.008 < found.hysteresis_v[INSIDE].min() < found.hysteresis_v[INSIDE].max() < 0.03
+    fit = fit_table(found.points)
+    warm = found.sources[0].points
+    plateau = (warm.soc > 0.15) & (warm.soc < 0.95)
+    assert np.abs(fit(warm.soc) - warm.ocv_v)[plateau].max() < 3e-3
