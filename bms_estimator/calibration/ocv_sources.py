@@ -31,8 +31,9 @@ STARTS_ALIKE_V = 0.02
 """Captures whose first rests differ by less start at the same SOC: a full charge ends no more alike, per cell [V]."""
 GIVEN_V, GIVEN_COMMON_V = 1e-3, 2e-3
 """Standard deviation of each point of a given curve, and of what it is off as a whole, per cell [V]."""
-REST_SHARE, REST_SHARE_STD = 0.5, 0.3
-"""Part of the hysteresis of slow curves that a rest after a discharge keeps, and its standard deviation: 0.3 to 1 seen."""
+REST_SHARE, REST_SHARE_STD = 0.7, 0.3
+"""Part of the hysteresis of slow curves that a rest after a discharge keeps, and its standard deviation: 0.4 and 0.5 seen of
+an NCA cell, 1.0 of an LFP cell."""
 OTHER_CAPACITY = 0.05
 """A capacity that differs by more from what a slow discharge measured is remarked on, relative."""
 
@@ -142,10 +143,10 @@ def find_sources(
 
 def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
     first, *others = curve.branches
-    kind = f"{first.label}, {first.ah[-1]:.3f} Ah"
+    kind = f"{first.label(slow_ah)}, {first.ah[-1]:.3f} Ah"
     name = first.name
     if others:
-        kind = f"{first.label} and charge, {first.ah[-1]:.3f} and {others[0].ah[-1]:.3f} Ah"
+        kind = f"{first.label(slow_ah)} and charge, {first.ah[-1]:.3f} and {others[0].ah[-1]:.3f} Ah"
         name = first.name if others[0].name == first.name else f"{first.name}, {others[0].name}"
     notes = curve.notes
     if abs(slow_ah / capacity_ah - 1.0) > OTHER_CAPACITY:

@@ -21,9 +21,11 @@ Floats = NDArray[np.float64]
 LEAST_S = 7.0 * 3600.0
 """A slow curve takes at least so long [s]: a whole one at C/7. At C/10 half of the difference is some 20 mV."""
 SAME_CURRENT = 0.05
-"""A current is constant within this part of it, and four standard deviations of its noise."""
-BLIP_SAMPLES = 5
-"""A current that is another for half as many samples is a fault."""
+"""A current is constant within this part of it, and a standard deviation of its noise."""
+SMOOTH_SAMPLES = 31
+"""Its median over so many samples counts: faults are not seen, noise is a fifth."""
+NOISE_OF_STEP = 1.05
+"""Standard deviation of white noise over the median step between its samples."""
 WHOLE_FALL = 0.01
 """A discharge is whole when its voltage falls by this part in the last hundredth of its charge: it ends at empty."""
 PAIR_K, PAIR_CURRENT = 5.0, 0.3
@@ -80,10 +82,9 @@ class Branch:
     step_v: float
     whole: bool
 
-    @property
-    def label(self) -> str:
+    def label(self, capacity_ah: float) -> str:
         """Such as C/20 discharge."""
-        return f"C/{self.ah[-1] / self.current_a:.0f} {'charge' if self.charge else 'discharge'}"
+        return f"C/{capacity_ah / self.current_a:.0f} {'charge' if self.charge else 'discharge'}"
 
 
 @dataclass(frozen=True)
@@ -114,21 +115,18 @@ def slow_branches(good: SampleBlock, name: str) -> list[Branch]:
     moved_ah = np.r_[0.0, np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"]))] / 3600.0
     if good.size < 2 or np.ptp(moved_ah) == 0.0:
         return []
-    resting = resting_samples(good, float(np.ptp(moved_ah)))
+    smooth = good.copy()
+    smooth["current_a"] = median_filter(good["current_a"], SMOOTH_SAMPLES, mode="nearest")
+    noise_a = NOISE_OF_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
+    resting = resting_samples(smooth, float(np.ptp(moved_ah)))
     found = []
     for first, last in runs(~resting):
-        for a, b in _constant(good["current_a"][first:last]):
+        current_a = smooth["current_a"][first:last]
+        middle_a = float(np.median(current_a))
+        for a, b in runs(np.abs(current_a - middle_a) <= SAME_CURRENT * abs(middle_a) + noise_a):
             if good["time_s"][first + b - 1] - good["time_s"][first + a] >= LEAST_S:
                 found.append(_branch(good, moved_ah, resting, first + a, first + b, name))
     return found
-
-
-def _constant(current_a: Floats) -> list[tuple[int, int]]:
-    """Where the current is its median."""
-    smooth_a = median_filter(current_a, BLIP_SAMPLES, mode="nearest")
-    middle_a = float(np.median(smooth_a))
-    noise_a = 1.05 * float(np.median(np.abs(np.diff(smooth_a)))) if smooth_a.size > 1 else 0.0
-    return runs(np.abs(smooth_a - middle_a) <= SAME_CURRENT * abs(middle_a) + 4.0 * noise_a)
 
 
 def _branch(
@@ -166,7 +164,7 @@ def _branch(
 
 def measured_capacity_ah(branches: Sequence[Branch]) -> float:
     """Charge of the whole slow discharge nearest to 25 C [Ah]; NaN when there is none."""
-    whole = [branch for branch in branches if branch.whole and abs(branch.before_ah) < 0.01 * branch.ah[-1]]
+    whole = [branch for branch in branches if branch.whole and branch.before_ah < 0.01 * branch.ah[-1]]
     if not whole:
         return float("nan")
     return float(min(whole, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0)).ah[-1])
@@ -189,7 +187,8 @@ def slow_curves(
     charges = [branch for branch in branches if branch.charge]
     found = []
     for discharge in (branch for branch in branches if not branch.charge):
-        soc = initial_soc - (discharge.before_ah + discharge.ah) / capacity_ah
+        start = min(initial_soc - discharge.before_ah / capacity_ah, 1.0)  # a charge before it may have filled it
+        soc = start - discharge.ah / capacity_ah
         if soc[-1] < -SOC_SLACK:
             raise UserError(
                 f"{discharge.name}: SOC runs from {soc[0]:.3f} to {soc[-1]:.3f}, outside 0..1: {discharge.ah[-1]:.3f} Ah were "

@@ -35,7 +35,9 @@ COMMANDS = {
     "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
     "board": Entry("bms_estimator.cli.board:board", "Show a board, set its bandgap, gains and serial number."),
     "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
-    "ocv": Entry("bms_estimator.cli.ocv:ocv", "Open-circuit voltage from relaxation tests, into a cell file."),
+    "ocv": Entry(
+        "bms_estimator.cli.ocv:ocv", "Open-circuit voltage from rests, slow curves or given curves, into a cell file."
+    ),
     "identify": Entry(
         "bms_estimator.cli.identify:identify_command", "A cell's elements from captures, into a cell file."
     ),

@@ -34,6 +34,8 @@ CURRENT_MAX_C = 5.0
 """Limit of a good sample when the capture itself has no larger current [1/h]."""
 
 
+STEEP = 0.05
+"""SOC from the ends within which curves are steep."""
 TENTHS = np.linspace(0.0, 1.0, 11)
 
 
@@ -71,6 +73,7 @@ class OcvResult:
     std_v: list[float]
     rms_mv: float  # points less curve
     max_mv: float
+    rms_inside_mv: float  # at SOC 0.05 to 0.95, away from the steep ends
     error_mv: list[float]  # standard deviation of the table at SOC 0, 0.1 ... 1; none for (2.10)
     parameters: dict[str, dict[str, float | None]]  # a16..a21: value, std (None at a bound); none for a table
     sources: list[SourceResult]
@@ -152,6 +155,7 @@ def _result(form: Form, series_count: int, points: Points, fit: ChenMoraFit | Ta
         std_v=points.std_v.tolist(),
         rms_mv=1e3 * rms_v(fit.residual_v),
         max_mv=1e3 * max_v(fit.residual_v),
+        rms_inside_mv=1e3 * rms_v(fit.residual_v[(points.soc > STEEP) & (points.soc < 1.0 - STEEP)]),
         error_mv=(1e3 * fit.error_at(TENTHS)).tolist() if isinstance(fit, TableFit) else [],
         parameters=parameters,
         sources=_source_results(fit, found),
@@ -238,6 +242,7 @@ def _table(out: Path, result: OcvResult, found: Sources) -> Table:
         "cells in series": f"{result.series_count}",
         "std of a point": f"{np.median(std_mv):.2f} mV, at most {std_mv.max():.2f} mV",
         "points less curve": f"{result.rms_mv:.2f} mV RMS, at most {result.max_mv:.2f} mV",
+        f"the same at SOC {STEEP:g} to {1.0 - STEEP:g}": f"{result.rms_inside_mv:.2f} mV RMS",
     }
     if result.captures:
         left_mv = 1e3 * np.abs(result.remaining_v)

@@ -34,6 +34,17 @@ def test_a_pair_gives_mean_hysteresis_and_capacity(files):
     assert found.hysteresis_v[INSIDE] == pytest.approx(hysteresis_v(NODES[INSIDE]), abs=2e-3)  # 6 mV of it ohmic
 
 
+@pytest.mark.parametrize("noise_a", [0.01, 0.04])
+def test_a_noisy_current_sensor_and_a_charge_before_the_discharge(noise_a):
+    samples = slow((-1.0, 1.0))
+    samples["current_a"] += noise_a * np.random.default_rng(1).standard_normal(samples.size)
+    samples["current_a"][[700, 4000]] = 0.5
+    found = of(samples)
+    assert found.sources[0].kind.startswith("C/20 discharge and charge")
+    assert found.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-2)
+    assert np.abs(off_v(found)).max() < 3e-3
+
+
 def test_a_lone_discharge_is_off_by_its_hysteresis_and_knows_it():
     found = of(slow((1.0,)))
     fit = fit_table(found.points)
@@ -72,7 +83,7 @@ def test_rests_are_moved_to_the_middle_of_a_known_hysteresis():
     rests = relaxation()
     plain = of(rests, capacity_ah=TRUTH.cell.capacity_ah).points
     moved = of(rests, curves=[flat], capacity_ah=TRUTH.cell.capacity_ah).points
-    assert moved.ocv_v[moved.source == 1] == pytest.approx(plain.ocv_v + 0.01)
+    assert moved.ocv_v[moved.source == 1] == pytest.approx(plain.ocv_v + 0.014)
 
 
 def test_a_capture_that_starts_lower_is_aligned_by_its_first_rest():
