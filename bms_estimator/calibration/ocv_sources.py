@@ -32,8 +32,10 @@ STARTS_ALIKE_V = 0.02
 GIVEN_V, GIVEN_COMMON_V = 1e-3, 2e-3
 """Standard deviation of each point of a given curve, and of what it is off as a whole, per cell [V]."""
 REST_SHARE, REST_SHARE_STD = 0.7, 0.3
-"""Part of the hysteresis of slow curves that a rest after a discharge keeps, and its standard deviation: 0.4 and 0.5 seen of
-an NCA cell, 1.0 of an LFP cell."""
+"""Part of the half difference of slow curves that a rest after a discharge keeps, the other is polarisation; and its
+standard deviation: 0.4 and 0.5 seen of an NCA cell, 1.0 of an LFP cell."""
+LEAST_SHARE, SHARE_POINTS, SHARE_K, SHARE_SOC = 0.1, 6, 10.0, (0.1, 0.95)
+"""Rests at SOC between these tell it themselves, if there are so many within this of the slow curves' temperature [K]."""
 OTHER_CAPACITY = 0.05
 """A capacity that differs by more from what a slow discharge measured is remarked on, relative."""
 
@@ -86,7 +88,8 @@ class Sources:
         measured_ah: By a whole slow discharge [Ah]; NaN when there is none.
         sources: Slow curves, given curves, rests.
         tests: Those captures that are relaxation tests, as ``sources`` has them.
-        hysteresis_v: At ``NODES`` [V], of the source nearest to 25 C that tells; None when none does.
+        hysteresis_v: At ``NODES`` [V], of the source nearest to 25 C that tells, as far as rests keep it; None when none
+            does.
     """
 
     capacity_ah: float
@@ -135,10 +138,21 @@ def find_sources(
     slow = slow_curves(every, slow_ah, initial_soc=initial_soc, series_count=series_count)
     sources = [_of_slow(curve, slow_ah, known_ah) for curve in slow] + [_of_given(one, series_count) for one in curves]
     rests = [one for one in recordings if not branches[one.name]]
-    hysteresis_v = _hysteresis(sources)
-    tests, of_rests = _rests(rests, sources, every, known_ah, initial_soc, series_count, hysteresis_v)
-    at_nodes = None if hysteresis_v is None else np.interp(NODES, GRID, hysteresis_v)
-    return Sources(known_ah, measured_ah, (*sources, *of_rests), tuple(tests), at_nodes)
+    found = _rests(rests, sources, every, known_ah, initial_soc, series_count)
+    telling = _telling(sources)
+    hysteresis_v = None
+    if telling is not None and telling.hysteresis_v is not None:
+        share = _share(telling, found)
+        hysteresis_v = np.interp(NODES, GRID, telling.hysteresis_v * (1.0 if share is None else share))
+        kept_v = telling.hysteresis_v * (REST_SHARE if share is None else share)
+        found = [(test, _amid_hysteresis(points, test, kept_v)) for test, points in found]
+        if share is not None:
+            sources = [
+                replace(one, notes=(*one.notes, f"rests keep {share:.2f} of its hysteresis")) if one is telling else one
+                for one in sources
+            ]
+    of_rests = [_of_test(test, points) for test, points in found]
+    return Sources(known_ah, measured_ah, (*sources, *of_rests), tuple(test for test, _ in found), hysteresis_v)
 
 
 def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
@@ -163,14 +177,31 @@ def _of_given(curve: GivenCurve, series_count: int) -> Source:
     return Source(curve.name, f"given curve, {curve.soc.size} points", points, float("nan"), hysteresis_v, ())
 
 
-def _hysteresis(sources: Sequence[Source]) -> Floats | None:
-    """Of the source nearest to 25 C that tells, at ``GRID`` [V]."""
+def _telling(sources: Sequence[Source]) -> Source | None:
+    """The source nearest to 25 C that tells of hysteresis."""
     telling = [source for source in sources if source.hysteresis_v is not None]
-    if not telling:
-        return None
-    return min(
-        telling, key=lambda one: abs(np.nan_to_num(one.temperature_c, nan=REFERENCE_C) - REFERENCE_C)
-    ).hysteresis_v
+    return min(telling, key=lambda one: _from_reference(one.temperature_c), default=None)
+
+
+def _from_reference(temperature_c: float) -> float:
+    return abs(float(np.nan_to_num(temperature_c, nan=REFERENCE_C)) - REFERENCE_C)
+
+
+def _share(telling: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> float | None:
+    """Part of the hysteresis that rests after discharge keep: the median over them; None when there are too few."""
+    low, high = SHARE_SOC
+    shares: list[float] = []
+    for test, points in found:
+        if _from_reference(test.temperature_c) > SHARE_K + _from_reference(telling.temperature_c):
+            continue
+        after_charge = _after_charge(test)
+        size_v = np.interp(
+            points.soc, GRID, np.zeros(GRID.size) if telling.hysteresis_v is None else telling.hysteresis_v
+        )
+        below_v = np.interp(points.soc, telling.points.soc, telling.points.ocv_v) - points.ocv_v
+        tells = (points.soc > low) & (points.soc < high) & ~after_charge & (size_v > 0.0)
+        shares += (below_v[tells] / size_v[tells]).tolist()
+    return float(np.clip(np.median(shares), LEAST_SHARE, 1.0)) if len(shares) >= SHARE_POINTS else None
 
 
 def _rests(
@@ -180,8 +211,7 @@ def _rests(
     capacity_ah: float,
     initial_soc: float,
     series_count: int,
-    hysteresis_v: Floats | None,
-) -> tuple[list[RelaxationTest], list[Source]]:
+) -> list[tuple[RelaxationTest, Points]]:
     """Relaxation tests and their points; a capture that starts lower than the others gets its SOC from their curve."""
     starts = [initial_rest_v(one.samples, one.name, capacity_ah) for one in recordings]
     highest_v = np.nanmax([*starts, *(branch.start_v for branch in branches if not branch.charge), -np.inf])
@@ -189,7 +219,7 @@ def _rests(
 
     def test(one: Recording, soc: float) -> tuple[RelaxationTest, Points]:
         found = relaxation_test(one.samples, capacity_ah, initial_soc=soc, series_count=series_count, name=one.name)
-        return found, _amid_hysteresis(points_of(found, series_count), found, hysteresis_v)
+        return found, points_of(found, series_count)
 
     found = {one.name: test(one, initial_soc) for one, lower in zip(recordings, low, strict=True) if not lower}
     if any(low):
@@ -197,8 +227,7 @@ def _rests(
         for one, start_v, lower in zip(recordings, starts, low, strict=True):
             if lower:
                 found[one.name] = test(one, _soc_at(curve, start_v))
-    tests = [found[one.name][0] for one in recordings]
-    return tests, [_of_test(test, points) for test, points in found.values()]
+    return [found[one.name] for one in recordings]
 
 
 def _soc_at(curve: TableFit, voltage_v: float) -> float:
@@ -206,16 +235,18 @@ def _soc_at(curve: TableFit, voltage_v: float) -> float:
     return float(np.interp(voltage_v, curve(grid), grid))
 
 
-def _amid_hysteresis(points: Points, test: RelaxationTest, hysteresis_v: Floats | None) -> Points:
-    """Rests moved to halfway between discharge and charge."""
-    if hysteresis_v is None:
-        return points
-    size_v = np.interp(points.soc, GRID, hysteresis_v)
-    after_charge = np.array([rest.after_charge for rest in test.rests])[np.argsort(test.soc, kind="stable")]
+def _after_charge(test: RelaxationTest) -> NDArray[np.bool_]:
+    """Of the test's points, in the order of SOC."""
+    return np.array([rest.after_charge for rest in test.rests])[np.argsort(test.soc, kind="stable")]
+
+
+def _amid_hysteresis(points: Points, test: RelaxationTest, kept_v: Floats) -> Points:
+    """Rests moved to halfway between discharge and charge, ``kept_v`` above those after discharge."""
+    size_v, after_charge = np.interp(points.soc, GRID, kept_v), _after_charge(test)
     return replace(
         points,
-        ocv_v=points.ocv_v + np.where(after_charge, 0.0, REST_SHARE * size_v),
-        std_v=np.hypot(points.std_v, np.where(after_charge, REST_SHARE * size_v, 0.0)),
+        ocv_v=points.ocv_v + np.where(after_charge, 0.0, size_v),
+        std_v=np.hypot(points.std_v, np.where(after_charge, size_v, 0.0)),
         common_v=np.hypot(points.common_v, REST_SHARE_STD * size_v),
     )
 

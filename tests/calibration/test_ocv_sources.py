@@ -77,13 +77,16 @@ def test_a_given_curve_and_its_hysteresis():
     assert found.hysteresis_v == pytest.approx(hysteresis_v(NODES), abs=1e-3)
 
 
-def test_rests_are_moved_to_the_middle_of_a_known_hysteresis():
-    soc = np.linspace(0.0, 1.0, 101)
-    flat = GivenCurve("book", soc, true_v(soc), np.full(soc.size, 0.02))
-    rests = relaxation()
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_rests_tell_how_much_of_the_hysteresis_they_keep_and_are_moved_by_it(share):
+    soc, rests = np.linspace(0.0, 1.0, 101), relaxation()
     plain = of(rests, capacity_ah=TRUTH.cell.capacity_ah).points
-    moved = of(rests, curves=[flat], capacity_ah=TRUTH.cell.capacity_ah).points
-    assert moved.ocv_v[moved.source == 1] == pytest.approx(plain.ocv_v + 0.014)
+    book = GivenCurve("book", soc, fit_table(plain)(soc) + share * 0.02, np.full(soc.size, 0.02))
+    found = of(rests, curves=[book], capacity_ah=TRUTH.cell.capacity_ah)
+    moved = found.points.ocv_v[found.points.source == 1]
+    assert moved == pytest.approx(plain.ocv_v + share * 0.02, abs=1e-3)
+    assert found.hysteresis_v == pytest.approx(np.full(NODES.size, share * 0.02), abs=1e-3)
+    assert f"rests keep {found.hysteresis_v[0] / 0.02:.2f} of its hysteresis" in found.sources[0].notes
 
 
 def test_a_capture_that_starts_lower_is_aligned_by_its_first_rest():
