@@ -26,12 +26,6 @@ def rests_too_short():
     return relaxation(rest_s=20)
 
 
-def charging_inside():
-    current_a = schedule(rounds=12)
-    current_a[8000:8400] = -LOAD_A
-    return capture(current_a, soc=1.0)
-
-
 def glitched(share, seed=5):
     """Samples at 0 V, as a loose wire gives them."""
     samples = relaxation()
