@@ -1,0 +1,166 @@
+"""One extended Kalman filter: predict with F and Q, update with H, R, S and K.
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS, ``q`` one of its hypotheses. No allocation, no clock.
+"""
+
+import math
+
+from numba import njit
+
+from bms_estimator.kernels.cell import ocv
+from bms_estimator.kernels.ekf_noise import add_process_noise, bias_variance
+from bms_estimator.kernels.ekf_state import (
+    B_FAST,
+    B_SLOW,
+    CURVE,
+    HYST,
+    LN_Q,
+    LN_R,
+    LN_R0,
+    OFFSET,
+    SOC,
+    STATES,
+    X,
+)
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius, on_grid, resistances
+from bms_estimator.kernels.state import Record
+
+NARROWEST, WIDEST = 0.006, 0.3
+"""The OCV's slope is that of the secant over one std of SOC, between these."""
+LEAST_SLOPE_V = 0.1
+"""Of one cell [V]; a plateau would let the filter go anywhere."""
+HUBER = 2.0
+"""An innovation of more than so many of its std counts as one of so many."""
+MINUTE_S, TEN_MINUTES_S = 60.0, 600.0
+"""Over which a mean innovation shows an error that stays."""
+INFLATION_OVER = 5.0, 3.0
+"""It is averaged over so many times as long."""
+LOWEST, HIGHEST = -0.05, 1.05
+"""Where the SOC of a filter may be."""
+MOST_STDS = 3.0
+"""Resistances are within so many of their first std."""
+
+
+@njit(cache=True)
+def predict(s: Record, p: Record, q: int) -> None:
+    """Mean and covariance over the window: x = f(x), P = F P F' + Q.
+
+    F is diagonal but for what offset and capacity do to the SOC, and the offset to the branches.
+    """
+    x, cov, f, w = s.mean[q], s.covariance[q], s.f, s.window
+    dt_s = w.time_s
+    bias_v2 = bias_variance(s, p, x[SOC])
+    capacity_as = p.capacity_as * math.exp(x[LN_Q])
+    moved, through = (w.charge_as - x[OFFSET] * dt_s) / capacity_as, w.throughput_as / capacity_as
+    for j in range(STATES):
+        f[j] = 1.0
+    for k in range(BRANCHES):
+        f[X + k] = math.exp(-dt_s / TAUS[k])
+    f[B_SLOW], f[B_FAST] = math.exp(-dt_s / p.slow_s), math.exp(-dt_s / p.fast_s)
+    f[HYST], f[CURVE] = math.exp(-through / p.hysteresis_soc), math.exp(-through / p.curve_length)
+    for j in range(STATES):
+        x[j] *= f[j]
+    x[SOC] -= moved  # (2.1)
+    x[HYST] -= math.copysign(1.0 - f[HYST], w.charge_as)
+    for k in range(X, X + BRANCHES):
+        x[k] -= (1.0 - f[k]) * x[OFFSET]
+    for j in range(STATES):
+        for k in range(STATES):
+            cov[j, k] *= f[j] * f[k]
+    for k in range(STATES):
+        cov[SOC, k] += dt_s / capacity_as * cov[OFFSET, k] + moved * cov[LN_Q, k]
+        for j in range(X, X + BRANCHES):
+            cov[j, k] -= (1.0 - f[j]) * cov[OFFSET, k]
+    for k in range(STATES):
+        cov[k, SOC] += dt_s / capacity_as * cov[k, OFFSET] + moved * cov[k, LN_Q]
+        for j in range(X, X + BRANCHES):
+            cov[k, j] -= (1.0 - f[j]) * cov[k, OFFSET]
+    add_process_noise(s, p, q, dt_s, through, bias_v2)
+
+
+@njit(cache=True)
+def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, float]:
+    """Take the mean voltage of the window in.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        q: Hypothesis.
+        variance_v2: R [V^2].
+
+    Returns:
+        The innovation [V] and its variance S [V^2].
+    """
+    x, cov, h, ph = s.mean[q], s.covariance[q], s.h, s.ph
+    predicted_v, curved_v = linearise(s, p, q)
+    innovation_v = s.window.sum_v / s.window.samples - predicted_v
+    total_v2 = variance_v2 + curved_v * curved_v
+    for j in range(STATES):
+        along = 0.0
+        for k in range(STATES):
+            along += cov[j, k] * h[k]
+        ph[j] = along
+        total_v2 += h[j] * along
+    total_v2 = max(total_v2, (innovation_v / HUBER) ** 2)
+    for j in range(STATES):
+        gain = ph[j] / total_v2
+        x[j] += gain * innovation_v
+        for k in range(j, STATES):
+            cov[j, k] -= gain * ph[k]
+            cov[k, j] = cov[j, k]
+    x[SOC] = min(max(x[SOC], LOWEST), HIGHEST)
+    for j in (LN_R0, LN_R):
+        x[j] = min(max(x[j], -MOST_STDS * p.r_std), MOST_STDS * p.r_std)
+    return innovation_v, total_v2
+
+
+@njit(cache=True)
+def linearise(s: Record, p: Record, q: int) -> tuple[float, float]:
+    """Predicted mean voltage of the window [V], H into ``s.h``, and what the secant of the OCV leaves out [V].
+
+    v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. How the resistances
+    change with SOC is no part of H: it would take an error of the resistance for one of the SOC.
+    """
+    x, h, ohm, w, t = s.mean[q], s.h, s.ohm, s.window, s.temperature_c
+    soc = x[SOC] + (w.charge_as - w.sum_as / w.samples) / p.capacity_as  # in the middle of the samples
+    resistances(soc, p.weak_ohm, p.strong_ohm, arrhenius(WEAK_J, t), arrhenius(STRONG_J, t), ohm)
+    variance = s.covariance[q, SOC, SOC]
+    reach = min(max(math.sqrt(variance), NARROWEST), WIDEST)
+    e_o, above, below = (
+        ocv(soc, p.ocv_v, p.ocv_slope_v),
+        ocv(soc + reach, p.ocv_v, p.ocv_slope_v),
+        ocv(soc - reach, p.ocv_v, p.ocv_slope_v),
+    )
+    for j in range(STATES):
+        h[j] = 0.0
+    h[SOC] = max(0.5 * (above - below) / reach, LEAST_SLOPE_V * p.series)
+    first, others = math.exp(x[LN_R0]), math.exp(x[LN_R])
+    h[LN_R0] = -first * ohm[0] * (w.sum_a / w.samples - x[OFFSET])
+    for k in range(BRANCHES):
+        h[X + k] = -others * ohm[1 + k]
+        h[LN_R] += h[X + k] * (w.sum_x_a[k] / w.samples + x[X + k])
+    h[OFFSET] = first * ohm[0]
+    h[B_SLOW] = h[B_FAST] = 1.0
+    h[HYST], h[CURVE] = on_grid(soc, p.hysteresis_v), on_grid(soc, p.curve_error_v)
+    voltage_v = e_o + h[HYST] * x[HYST] + h[CURVE] * x[CURVE] + h[LN_R0] + h[LN_R] + x[B_SLOW] + x[B_FAST]
+    voltage_v += (t - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
+    return voltage_v, 0.5 * (above + below - 2.0 * e_o) * min(variance / (reach * reach), 1.0)
+
+
+@njit(cache=True)
+def inflate(s: Record, q: int, dt_s: float, u: float) -> None:
+    """Let the variance of the biases follow what innovations have in common over a minute and over ten.
+
+    The mean over a time T of a white, normalised innovation has the variance dt / 2T; each follows its own ratio to that.
+
+    Args:
+        s: Record of EKF_STATE.
+        q: Hypothesis.
+        dt_s: Step [s].
+        u: Innovation over its std.
+    """
+    s.minute_u[q] += min(1.0, dt_s / MINUTE_S) * (u - s.minute_u[q])
+    s.ten_minutes_u[q] += min(1.0, dt_s / TEN_MINUTES_S) * (u - s.ten_minutes_u[q])
+    fast, slow = 2.0 * MINUTE_S * s.minute_u[q] ** 2, 2.0 * TEN_MINUTES_S * s.ten_minutes_u[q] ** 2
+    s.fast_inflation[q] += min(1.0, dt_s / (INFLATION_OVER[0] * MINUTE_S)) * (max(fast, 1.0) - s.fast_inflation[q])
+    s.slow_inflation[q] += min(1.0, dt_s / (INFLATION_OVER[1] * TEN_MINUTES_S)) * (max(slow, 1.0) - s.slow_inflation[q])

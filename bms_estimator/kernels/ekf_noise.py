@@ -1,0 +1,107 @@
+"""Where the noise of the filter comes from: each term of R, Q and P(0).
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
+"""
+
+from numba import njit
+
+from bms_estimator.kernels.cell import Floats, ocv_and_slope
+from bms_estimator.kernels.ekf_state import (
+    B_FAST,
+    B_SLOW,
+    CURVE,
+    HYST,
+    SOC,
+    X,
+)
+from bms_estimator.kernels.ladder import BRANCHES, RESISTANCES, STRONG_J, TAUS, WEAK_J, arrhenius, resistances
+from bms_estimator.kernels.state import Record
+
+FLOOR_C = 0.1
+"""The load counts as at least so large [C]: an idle cell is not a perfect model [1/h]."""
+STEEPEST_V = 3.0
+"""Near empty the OCV is steeper, but known no better along SOC [V]."""
+INDEPENDENT_S = 30.0
+"""A sample after a longer pause tells no more [s]."""
+OUTSIDE_K = 10.0
+"""So far outside the temperatures of the cell file, errors are twice as large [K]."""
+
+
+@njit(cache=True)
+def outside(p: Record, temperature_c: float) -> float:
+    """Factor on errors of the model beyond the temperatures that the cell file was made for."""
+    return 1.0 + max(p.low_c - temperature_c, temperature_c - p.high_c, 0.0) / OUTSIDE_K
+
+
+@njit(cache=True)
+def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> float:
+    """R [V^2] of the mean voltage of a window: what the ladder leaves, far more than the sensor's noise."""
+    model_v = p.model_v * arrhenius(p.model_j, s.temperature_c) * outside(p, s.temperature_c)
+    return model_v * model_v / min(max(dt_s, 1.0), INDEPENDENT_S) + p.sensor_v2 / samples
+
+
+@njit(cache=True)
+def bias_variance(s: Record, p: Record, soc: float) -> float:
+    """Variance of B_SLOW + B_FAST [V^2] at a steady state: resistances and OCV are wrong in proportion."""
+    t = s.temperature_c
+    resistances(soc, p.weak_ohm, p.strong_ohm, arrhenius(WEAK_J, t), arrhenius(STRONG_J, t), s.ohm)
+    total_ohm = 0.0
+    for k in range(RESISTANCES):
+        total_ohm += s.ohm[k]
+    floor_a = FLOOR_C * p.capacity_as / 3600.0
+    _, slope = ocv_and_slope(soc, p.ocv_v, p.ocv_slope_v)
+    along_v = p.bias_soc * min(slope, STEEPEST_V * p.series)
+    return outside(p, t) ** 2 * (
+        (p.bias_relative * total_ohm) ** 2 * max(s.rms_a2, floor_a * floor_a) + along_v * along_v
+    )
+
+
+@njit(cache=True)
+def add_process_noise(s: Record, p: Record, q: int, dt_s: float, moved: float, bias_v2: float) -> None:
+    """Q of one step into the covariance of hypothesis ``q``; the diagonal of F is in ``s.f``.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        q: Hypothesis.
+        dt_s: Step [s].
+        moved: Magnitude of the charge moved, per unit of SOC.
+        bias_v2: ``bias_variance`` [V^2].
+    """
+    cov, f, w = s.covariance[q], s.f, s.window
+    unknown = w.unknown_as / p.capacity_as
+    cov[SOC, SOC] += p.charge_error**2 * moved + unknown * unknown
+    a2 = (p.x_relative * w.charge_as / dt_s) ** 2 + (w.unknown_as / dt_s) ** 2
+    for k in range(X, X + BRANCHES):
+        cov[k, k] += a2 * (1.0 - f[k] * f[k])
+    cov[B_SLOW, B_SLOW] += 0.5 * bias_v2 * s.slow_inflation[q] * (1.0 - f[B_SLOW] ** 2)
+    cov[B_FAST, B_FAST] += 0.5 * bias_v2 * s.fast_inflation[q] * (1.0 - f[B_FAST] ** 2)
+    cov[HYST, HYST] += 0.1 * (1.0 - f[HYST] ** 2)
+    cov[CURVE, CURVE] += 1.0 - f[CURVE] ** 2
+
+
+@njit(cache=True)
+def switch_on(p: Record, current_a: float, mean: Floats, covariance: Floats) -> None:
+    """x_k of a load that nobody saw: mean and covariance, given the current at switch-on.
+
+    The load was a level, normal with mean ``load_mean_c`` and std ``load_level_c``, and on it a Gauss-Markov process of
+    time constant t = ``load_s`` and std ``load_c``. Of that, the stationary covariance of branches k and l is
+    [t/(t+tau_l)/tau_k + t/(t+tau_k)/tau_l] / (1/tau_k + 1/tau_l), that of branch k and the current t/(t+tau_k).
+
+    Args:
+        p: Record of EKF_SETTINGS.
+        current_a: At the first sample [A].
+        mean: Shape (STATES,), its x_k are written.
+        covariance: Shape (STATES, STATES), its x_k are written.
+    """
+    one_c = p.capacity_as / 3600.0
+    level_a2, load_a2, t = (p.load_level_c * one_c) ** 2, (p.load_c * one_c) ** 2, p.load_s
+    for k in range(BRANCHES):
+        with_k = level_a2 + load_a2 * t / (t + TAUS[k])
+        mean[X + k] = p.load_mean_c * one_c
+        mean[X + k] += with_k / (level_a2 + load_a2) * (current_a - p.load_mean_c * one_c)
+        for m in range(BRANCHES):
+            with_m = level_a2 + load_a2 * t / (t + TAUS[m])
+            rate = t / (t + TAUS[m]) / TAUS[k] + t / (t + TAUS[k]) / TAUS[m]
+            both = level_a2 + load_a2 * rate / (1.0 / TAUS[k] + 1.0 / TAUS[m])
+            covariance[X + k, X + m] = both - with_k * with_m / (level_a2 + load_a2)

@@ -1,0 +1,292 @@
+"""Several filters side by side, from SOCs apart, until they agree: switched on anywhere.
+
+At switch-on neither the SOC nor the polarisation is known, and far from the truth the OCV's slope is another. So filters
+start at ``HYPOTHESES`` SOCs around the one that is told. Each is weighted by its likelihood to a power below 1, since
+successive errors of the model are not independent (tempering); those that agree become one, unlikely ones go. What
+goes out is mean and standard deviation of the mixture.
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. At more than 1 Hz the filters see the mean of a second's samples.
+"""
+
+import math
+
+from numba import njit
+
+from bms_estimator.kernels.charge import LONGEST_FLOW_S, UNMEASURED_S, held_current
+from bms_estimator.kernels.ekf import HIGHEST, LOWEST, inflate, predict, update
+from bms_estimator.kernels.ekf_noise import bias_variance, measurement_variance, switch_on
+from bms_estimator.kernels.ekf_state import (
+    B_FAST,
+    B_SLOW,
+    CURVE,
+    HYPOTHESES,
+    HYST,
+    LN_Q,
+    LN_R,
+    LN_R0,
+    OFFSET,
+    SOC,
+    STATES,
+    X,
+)
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, TAUS
+from bms_estimator.kernels.state import Record
+
+WINDOW_S = 0.99
+"""Samples of about a second make one update [s]."""
+SAME_STEP = 0.005
+"""A step as long as that before within this, relative, has its decays."""
+ONE_STD = 0.06
+"""An SOC known better than this needs one filter only."""
+REACH_STDS = 2.25
+"""Hypotheses reach so far to both sides."""
+OVERLAP = 0.62
+"""Std of a hypothesis over the distance to the next."""
+BEYOND_STD = 0.03
+"""How far outside 0..1 a told SOC may mean, std."""
+UNLIKELY = -9.0
+"""ln of a relative weight below which a hypothesis goes."""
+ALIKE_STDS = 0.7
+"""Two hypotheses closer than this many std of SOC are one."""
+LOAD_S = 600.0
+"""The load is judged over so long [s]."""
+TEMPERATURE_S = 10.0
+"""A temperature sensor's noise is averaged over so long [s]."""
+IDLE_C = 0.1
+"""Std of a current that nobody measured [C]."""
+HYST_STD = 0.7
+"""Std of the first hysteresis."""
+UNKNOWN_R_STD = 0.25
+"""Resistances without a temperature sensor: std of their logarithm."""
+
+
+@njit(cache=True)
+def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: float) -> None:
+    """First sample: nothing is known but the told ``soc``, to ``p.soc_std``."""
+    s.started = 1
+    s.current_a = current_a
+    s.sensed = 1 if math.isfinite(temperature_c) else 0
+    s.temperature_c = temperature_c if s.sensed else REFERENCE_C
+    s.rms_a2 = max(current_a * current_a, (p.load_mean_c * p.capacity_as / 3600.0) ** 2)
+    for k in range(BRANCHES):
+        s.x_a[k] = 0.0
+    x, cov = s.mean[0], s.covariance[0]
+    for j in range(STATES):
+        x[j] = 0.0
+        for k in range(STATES):
+            cov[j, k] = 0.0
+    cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = p.r_std**2
+    cov[OFFSET, OFFSET] = (p.offset_c * p.capacity_as / 3600.0) ** 2
+    cov[LN_Q, LN_Q] = p.capacity_std**2
+    seed(s, p, soc, p.soc_std)
+    clear(s)
+
+
+@njit(cache=True)
+def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
+    """Begin again at ``soc`` with all that the likeliest hypothesis knows of sensor and cell.
+
+    SOC, polarisation, hysteresis and errors of the model are unknown.
+    """
+    known = s.mean[s.best], s.covariance[s.best]
+    for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
+        forget(known[0], known[1], j)
+    for k in range(BRANCHES):
+        forget(known[0], known[1], X + k)
+        s.x_a[k] = 0.0
+    switch_on(p, s.current_a, known[0], known[1])
+    known[1][HYST, HYST], known[1][CURVE, CURVE] = HYST_STD**2, 1.0
+    s.count = HYPOTHESES if soc_std > ONE_STD else 1
+    apart = 2.0 * REACH_STDS * soc_std / (HYPOTHESES - 1)
+    if s.best != 0:
+        copy(s, s.best, 0)
+    for q in range(s.count - 1, -1, -1):
+        if q > 0:
+            copy(s, 0, q)
+        away = (q - (s.count - 1) // 2) * apart
+        std = OVERLAP * apart if s.count > 1 else soc_std
+        s.mean[q, SOC] = min(max(soc + away, LOWEST), HIGHEST)
+        s.covariance[q, SOC, SOC] = std * std
+        s.ln_weight[q] = -0.5 * (away / soc_std) ** 2 - 0.5 * ((soc + away - s.mean[q, SOC]) / BEYOND_STD) ** 2
+        half_v2 = 0.5 * bias_variance(s, p, s.mean[q, SOC])
+        s.covariance[q, B_SLOW, B_SLOW] = s.covariance[q, B_FAST, B_FAST] = half_v2
+        s.minute_u[q] = s.ten_minutes_u[q] = 0.0
+        s.fast_inflation[q] = s.slow_inflation[q] = 1.0
+    s.best = (s.count - 1) // 2
+    combine(s)
+
+
+@njit(cache=True)
+def forget(mean: Record, covariance: Record, j: int) -> None:
+    """State ``j`` is 0 and belongs to none."""
+    mean[j] = 0.0
+    for k in range(STATES):
+        covariance[j, k] = covariance[k, j] = 0.0
+
+
+@njit(cache=True)
+def copy(s: Record, source: int, to: int) -> None:
+    """Hypothesis ``to`` becomes as ``source``."""
+    for j in range(STATES):
+        s.mean[to, j] = s.mean[source, j]
+        for k in range(STATES):
+            s.covariance[to, j, k] = s.covariance[source, j, k]
+    s.ln_weight[to] = s.ln_weight[source]
+    s.minute_u[to], s.ten_minutes_u[to] = s.minute_u[source], s.ten_minutes_u[source]
+    s.fast_inflation[to], s.slow_inflation[to] = s.fast_inflation[source], s.slow_inflation[source]
+
+
+@njit(cache=True)
+def clear(s: Record) -> None:
+    """Begin a new window."""
+    w = s.window
+    w.samples = 0
+    w.time_s = w.charge_as = w.throughput_as = w.unknown_as = 0.0
+    w.sum_v = w.sum_a = w.sum_as = 0.0
+    for k in range(BRANCHES):
+        w.sum_x_a[k] = 0.0
+
+
+@njit(cache=True)
+def count_on(s: Record, p: Record, dt_s: float, current_a: float, temperature_c: float) -> None:
+    """Charge and branches from the sample before to this one."""
+    if math.isfinite(temperature_c):
+        share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
+        s.temperature_c += share * (temperature_c - s.temperature_c)
+        s.sensed = 1
+    w = s.window
+    held_a, flow_s = held_current(dt_s, s.current_a, current_a), min(dt_s, LONGEST_FLOW_S)
+    if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
+        s.decay_s = dt_s
+        for k in range(BRANCHES):
+            s.decay[k] = math.exp(-dt_s / TAUS[k])
+    for k in range(BRANCHES):
+        s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
+    w.time_s += dt_s
+    w.charge_as += held_a * flow_s
+    w.throughput_as += abs(held_a) * flow_s
+    if dt_s > UNMEASURED_S:
+        w.unknown_as += (0.5 * max(abs(current_a), abs(s.current_a)) + IDLE_C * p.capacity_as / 3600.0) * dt_s
+    s.soc = min(max(s.soc - held_a * flow_s / p.capacity_as, 0.0), 1.0)
+    s.current_a = current_a
+
+
+@njit(cache=True)
+def gather(s: Record, current_a: float, voltage_v: float) -> None:
+    """Add a sample to the window."""
+    w = s.window
+    w.samples += 1
+    w.sum_v += voltage_v
+    w.sum_a += current_a
+    w.sum_as += w.charge_as
+    for k in range(BRANCHES):
+        w.sum_x_a[k] += s.x_a[k]
+
+
+@njit(cache=True)
+def update_all(s: Record, p: Record) -> None:
+    """Take the window in, with every hypothesis."""
+    w = s.window
+    dt_s = w.time_s
+    if dt_s > 0.0:
+        s.rms_a2 += min(1.0, dt_s / LOAD_S) * ((w.charge_as / dt_s) ** 2 - s.rms_a2)
+    variance_v2 = measurement_variance(s, p, dt_s, w.samples)
+    best = 0
+    for q in range(s.count):
+        if dt_s > 0.0:
+            predict(s, p, q)
+        innovation_v, total_v2 = update(s, p, q, variance_v2)
+        u = innovation_v / math.sqrt(total_v2)
+        s.ln_weight[q] -= p.temper * (u * u + math.log(total_v2))
+        if dt_s > 0.0:
+            inflate(s, q, dt_s, u)
+        if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
+            best = q
+            s.innovation_v, s.innovation_variance = innovation_v, total_v2
+    s.voltage_v = w.sum_v / w.samples - s.innovation_v
+    s.best = best
+    merge(s)
+    combine(s)
+    clear(s)
+
+
+@njit(cache=True)
+def merge(s: Record) -> None:
+    """Drop what is unlikely, and make one of neighbours that agree."""
+    top, q = s.ln_weight[s.best], 0
+    while q < s.count:
+        s.ln_weight[q] -= top
+        if s.ln_weight[q] < UNLIKELY:
+            remove(s, q)
+        else:
+            q += 1
+    q = 1
+    while q < s.count:
+        apart = abs(s.mean[q, SOC] - s.mean[q - 1, SOC])
+        if apart * apart < ALIKE_STDS**2 * min(s.covariance[q, SOC, SOC], s.covariance[q - 1, SOC, SOC]):
+            unite(s, q - 1, q)
+            remove(s, q)
+        else:
+            q += 1
+
+
+@njit(cache=True)
+def unite(s: Record, a: int, b: int) -> None:
+    """Hypothesis ``a`` becomes the normal distribution with mean and covariance of both."""
+    most = max(s.ln_weight[a], s.ln_weight[b])
+    weight_a, weight_b = math.exp(s.ln_weight[a] - most), math.exp(s.ln_weight[b] - most)
+    share = weight_b / (weight_a + weight_b)
+    apart = s.ph
+    for j in range(STATES):
+        apart[j] = s.mean[b, j] - s.mean[a, j]
+        s.mean[a, j] += share * apart[j]
+    for j in range(STATES):
+        for k in range(STATES):
+            s.covariance[a, j, k] += share * (s.covariance[b, j, k] - s.covariance[a, j, k])
+            s.covariance[a, j, k] += share * (1.0 - share) * apart[j] * apart[k]
+    s.ln_weight[a] = most + math.log(weight_a + weight_b)
+    if s.best == b:
+        s.best = a
+
+
+@njit(cache=True)
+def remove(s: Record, q: int) -> None:
+    """Close the row."""
+    for j in range(q, s.count - 1):
+        copy(s, j + 1, j)
+    s.count -= 1
+    if s.best > q:
+        s.best -= 1
+
+
+@njit(cache=True)
+def combine(s: Record) -> None:
+    """Mean and std of SOC of the mixture."""
+    total = mean = variance = 0.0
+    for q in range(s.count):
+        weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
+        total += weight
+        mean += weight * s.mean[q, SOC]
+    mean /= total
+    for q in range(s.count):
+        weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best]) / total
+        variance += weight * (s.covariance[q, SOC, SOC] + (s.mean[q, SOC] - mean) ** 2)
+    s.soc, s.soc_std = min(max(mean, 0.0), 1.0), math.sqrt(variance)
+
+
+@njit(cache=True)
+def ekf_step(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float, temperature_c: float) -> None:
+    """Take one sample after the first.
+
+    Args:
+        s: Record of EKF_STATE; updated in place.
+        p: Record of EKF_SETTINGS.
+        dt_s: Since the sample before [s], above 0.
+        current_a: Current [A], positive on discharge.
+        voltage_v: Terminal voltage [V].
+        temperature_c: Of the cell [C]; NaN without a sensor.
+    """
+    count_on(s, p, dt_s, current_a, temperature_c)
+    gather(s, current_a, voltage_v)
+    if s.window.time_s >= WINDOW_S:
+        update_all(s, p)

@@ -1,0 +1,63 @@
+"""The overpotential as a ladder: a series resistance and six RC branches of fixed, log-spaced time constants.
+
+A branch is the current filtered with its time constant, x_k [A], times its resistance R_k(SOC, T). Diffusion has no time
+constant of its own; a ladder follows it from a second to an hour, and is linear in what is to be found, the R_k.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from bms_estimator.kernels.cell import Floats
+
+TAU_S = (1.0, 6.0, 30.0, 120.0, 500.0, 2000.0)
+"""Time constants of the branches [s]."""
+BRANCHES = len(TAU_S)
+RESISTANCES = 1 + BRANCHES
+"""The series resistance, then each branch's."""
+WEAK_J, STRONG_J = 12e3, 45e3
+"""Activation energies of the two parts of each resistance [J/mol]: of the electrolyte, and of reaction and diffusion."""
+GAS_J = 8.314462618
+"""[J/(mol K)]"""
+REFERENCE_C = 25.0
+"""Resistances and the OCV are given at this temperature [C]."""
+GRID = 41
+"""Nodes of resistances, entropy and hysteresis, evenly spaced over SOC 0..1."""
+
+TAUS = np.array(TAU_S)
+
+
+@njit(cache=True)
+def arrhenius(energy_j: float, temperature_c: float) -> float:
+    """Factor on a resistance of activation energy ``energy_j`` [J/mol]; 1 at 25 C."""
+    return math.exp(energy_j / GAS_J * (1.0 / (temperature_c + 273.15) - 1.0 / (REFERENCE_C + 273.15)))
+
+
+@njit(cache=True)
+def on_grid(soc: float, values: Floats) -> float:
+    """Value at ``soc`` of one that is given at ``GRID`` nodes; beyond the ends that of the end."""
+    position = min(max(soc, 0.0), 1.0) * (GRID - 1)
+    i = min(int(position), GRID - 2)
+    return values[i] + (position - i) * (values[i + 1] - values[i])
+
+
+@njit(cache=True)
+def resistances(soc: float, weak_ohm: Floats, strong_ohm: Floats, weak: float, strong: float, ohm: Floats) -> None:
+    """R_0..R_6 at ``soc`` [ohm] into ``ohm``.
+
+    Args:
+        soc: State of charge.
+        weak_ohm: Shape (GRID, RESISTANCES), the part of activation energy ``WEAK_J`` at 25 C [ohm].
+        strong_ohm: The same of ``STRONG_J``.
+        weak: ``arrhenius(WEAK_J, T)``.
+        strong: ``arrhenius(STRONG_J, T)``.
+        ohm: Shape (RESISTANCES,), written.
+    """
+    position = min(max(soc, 0.0), 1.0) * (GRID - 1)
+    i = min(int(position), GRID - 2)
+    t = position - i
+    for k in range(RESISTANCES):
+        a = weak * weak_ohm[i, k] + strong * strong_ohm[i, k]
+        b = weak * weak_ohm[i + 1, k] + strong * strong_ohm[i + 1, k]
+        ohm[k] = a + t * (b - a)
