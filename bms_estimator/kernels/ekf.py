@@ -7,8 +7,8 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.cell import ocv
-from bms_estimator.kernels.ekf_noise import add_process_noise, bias_variance
+from bms_estimator.kernels.cell import Floats, ocv
+from bms_estimator.kernels.ekf_noise import add_process_noise, bias_variance, resistance_std
 from bms_estimator.kernels.ekf_state import (
     B_FAST,
     B_SLOW,
@@ -22,12 +22,12 @@ from bms_estimator.kernels.ekf_state import (
     STATES,
     X,
 )
-from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius, on_grid, resistances
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, TAUS, on_grid, resistances
 from bms_estimator.kernels.state import Record
 
 NARROWEST, WIDEST = 0.006, 0.3
 """The OCV's slope is that of the secant over one std of SOC, between these."""
-LEAST_SLOPE_V = 0.1
+LEAST_SLOPE_V = 0.02
 """Of one cell [V]; a plateau would let the filter go anywhere."""
 HUBER = 2.0
 """An innovation of more than so many of its std counts as one of so many."""
@@ -42,40 +42,52 @@ MOST_STDS = 3.0
 
 
 @njit(cache=True)
-def predict(s: Record, p: Record, q: int) -> None:
-    """Mean and covariance over the window: x = f(x), P = F P F' + Q.
-
-    F is diagonal but for what offset and capacity do to the SOC, and the offset to the branches.
-    """
-    x, cov, f, w = s.mean[q], s.covariance[q], s.f, s.window
-    dt_s = w.time_s
-    bias_v2 = bias_variance(s, p, x[SOC])
-    capacity_as = p.capacity_as * math.exp(x[LN_Q])
-    moved, through = (w.charge_as - x[OFFSET] * dt_s) / capacity_as, w.throughput_as / capacity_as
+def decay(s: Record, p: Record) -> None:
+    """The diagonal of F over the window into ``s.f``; the same for all hypotheses."""
+    f, dt_s, through = s.f, s.window.time_s, s.window.throughput_as / p.capacity_as
     for j in range(STATES):
         f[j] = 1.0
     for k in range(BRANCHES):
         f[X + k] = math.exp(-dt_s / TAUS[k])
     f[B_SLOW], f[B_FAST] = math.exp(-dt_s / p.slow_s), math.exp(-dt_s / p.fast_s)
     f[HYST], f[CURVE] = math.exp(-through / p.hysteresis_soc), math.exp(-through / p.curve_length)
+    if not s.sensed:
+        f[LN_R0] = f[LN_R] = math.exp(-dt_s / p.unsensed_s)
+
+
+@njit(cache=True)
+def predict(s: Record, p: Record, q: int) -> None:
+    """Mean and covariance over the window: x = f(x), P = F P F' + Q.
+
+    F is diagonal but for what offset and capacity do to the SOC, and the offset to the branches.
+    """
+    x, cov, f, w = s.mean[q], s.covariance[q], s.f, s.window
+    bias_v2 = bias_variance(s, p, x[SOC])
+    capacity_as = p.capacity_as * math.exp(x[LN_Q])
+    moved = (w.charge_as - x[OFFSET] * w.time_s) / capacity_as
     for j in range(STATES):
         x[j] *= f[j]
+        for k in range(j, STATES):
+            cov[j, k] = cov[k, j] = cov[j, k] * f[j] * f[k]
     x[SOC] -= moved  # (2.1)
     x[HYST] -= math.copysign(1.0 - f[HYST], w.charge_as)
     for k in range(X, X + BRANCHES):
         x[k] -= (1.0 - f[k]) * x[OFFSET]
-    for j in range(STATES):
-        for k in range(STATES):
-            cov[j, k] *= f[j] * f[k]
+    couple(cov, f, w.time_s / capacity_as, moved)
+    add_process_noise(s, p, q, w.throughput_as / capacity_as, bias_v2)
+
+
+@njit(cache=True)
+def couple(cov: Floats, f: Floats, by_offset: float, moved: float) -> None:
+    """What is off the diagonal of F: SOC by the offset [1/A] and ln Q, branches by the offset."""
     for k in range(STATES):
-        cov[SOC, k] += dt_s / capacity_as * cov[OFFSET, k] + moved * cov[LN_Q, k]
+        cov[SOC, k] += by_offset * cov[OFFSET, k] + moved * cov[LN_Q, k]
         for j in range(X, X + BRANCHES):
             cov[j, k] -= (1.0 - f[j]) * cov[OFFSET, k]
     for k in range(STATES):
-        cov[k, SOC] += dt_s / capacity_as * cov[k, OFFSET] + moved * cov[k, LN_Q]
+        cov[k, SOC] += by_offset * cov[k, OFFSET] + moved * cov[k, LN_Q]
         for j in range(X, X + BRANCHES):
             cov[k, j] -= (1.0 - f[j]) * cov[k, OFFSET]
-    add_process_noise(s, p, q, dt_s, through, bias_v2)
 
 
 @njit(cache=True)
@@ -109,8 +121,9 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
             cov[j, k] -= gain * ph[k]
             cov[k, j] = cov[j, k]
     x[SOC] = min(max(x[SOC], LOWEST), HIGHEST)
+    most = MOST_STDS * resistance_std(s, p)
     for j in (LN_R0, LN_R):
-        x[j] = min(max(x[j], -MOST_STDS * p.r_std), MOST_STDS * p.r_std)
+        x[j] = min(max(x[j], -most), most)
     return innovation_v, total_v2
 
 
@@ -121,9 +134,9 @@ def linearise(s: Record, p: Record, q: int) -> tuple[float, float]:
     v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. How the resistances
     change with SOC is no part of H: it would take an error of the resistance for one of the SOC.
     """
-    x, h, ohm, w, t = s.mean[q], s.h, s.ohm, s.window, s.temperature_c
+    x, h, ohm, w = s.mean[q], s.h, s.ohm, s.window
     soc = x[SOC] + (w.charge_as - w.sum_as / w.samples) / p.capacity_as  # in the middle of the samples
-    resistances(soc, p.weak_ohm, p.strong_ohm, arrhenius(WEAK_J, t), arrhenius(STRONG_J, t), ohm)
+    resistances(soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, ohm)
     variance = s.covariance[q, SOC, SOC]
     reach = min(max(math.sqrt(variance), NARROWEST), WIDEST)
     e_o, above, below = (
@@ -143,7 +156,7 @@ def linearise(s: Record, p: Record, q: int) -> tuple[float, float]:
     h[B_SLOW] = h[B_FAST] = 1.0
     h[HYST], h[CURVE] = on_grid(soc, p.hysteresis_v), on_grid(soc, p.curve_error_v)
     voltage_v = e_o + h[HYST] * x[HYST] + h[CURVE] * x[CURVE] + h[LN_R0] + h[LN_R] + x[B_SLOW] + x[B_FAST]
-    voltage_v += (t - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
+    voltage_v += (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
     return voltage_v, 0.5 * (above + below - 2.0 * e_o) * min(variance / (reach * reach), 1.0)
 
 

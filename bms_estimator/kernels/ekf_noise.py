@@ -5,24 +5,26 @@
 
 from numba import njit
 
-from bms_estimator.kernels.cell import Floats, ocv_and_slope
+from bms_estimator.kernels.cell import Floats
 from bms_estimator.kernels.ekf_state import (
     B_FAST,
     B_SLOW,
     CURVE,
     HYST,
+    LN_R,
+    LN_R0,
     SOC,
     X,
 )
-from bms_estimator.kernels.ladder import BRANCHES, RESISTANCES, STRONG_J, TAUS, WEAK_J, arrhenius, resistances
+from bms_estimator.kernels.ladder import BRANCHES, RESISTANCES, TAUS, arrhenius, resistances
 from bms_estimator.kernels.state import Record
 
 FLOOR_C = 0.1
 """The load counts as at least so large [C]: an idle cell is not a perfect model [1/h]."""
-STEEPEST_V = 3.0
-"""Near empty the OCV is steeper, but known no better along SOC [V]."""
 INDEPENDENT_S = 30.0
 """A sample after a longer pause tells no more [s]."""
+UNSENSED_R_STD = 0.25
+"""Std of ln of the resistances where nobody measures the temperature: 10 K either way."""
 OUTSIDE_K = 10.0
 """So far outside the temperatures of the cell file, errors are twice as large [K]."""
 
@@ -31,6 +33,12 @@ OUTSIDE_K = 10.0
 def outside(p: Record, temperature_c: float) -> float:
     """Factor on errors of the model beyond the temperatures that the cell file was made for."""
     return 1.0 + max(p.low_c - temperature_c, temperature_c - p.high_c, 0.0) / OUTSIDE_K
+
+
+@njit(cache=True)
+def resistance_std(s: Record, p: Record) -> float:
+    """Std of ln of the true over the file's resistances: without a temperature they may be anything near."""
+    return p.r_std if s.sensed else max(p.r_std, UNSENSED_R_STD)
 
 
 @njit(cache=True)
@@ -43,32 +51,36 @@ def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> flo
 @njit(cache=True)
 def bias_variance(s: Record, p: Record, soc: float) -> float:
     """Variance of B_SLOW + B_FAST [V^2] at a steady state: resistances and OCV are wrong in proportion."""
-    t = s.temperature_c
-    resistances(soc, p.weak_ohm, p.strong_ohm, arrhenius(WEAK_J, t), arrhenius(STRONG_J, t), s.ohm)
-    total_ohm = 0.0
-    for k in range(RESISTANCES):
-        total_ohm += s.ohm[k]
+    ohm = total_resistance(s, p, soc)
+    steep = total_resistance(s, p, soc - p.bias_soc) - total_resistance(s, p, soc + p.bias_soc)
     floor_a = FLOOR_C * p.capacity_as / 3600.0
-    _, slope = ocv_and_slope(soc, p.ocv_v, p.ocv_slope_v)
-    along_v = p.bias_soc * min(slope, STEEPEST_V * p.series)
-    return outside(p, t) ** 2 * (
-        (p.bias_relative * total_ohm) ** 2 * max(s.rms_a2, floor_a * floor_a) + along_v * along_v
-    )
+    wrong_ohm2 = (p.bias_relative * ohm) ** 2 + (0.5 * steep) ** 2
+    return outside(p, s.temperature_c) ** 2 * wrong_ohm2 * max(s.rms_a2, floor_a * floor_a)
 
 
 @njit(cache=True)
-def add_process_noise(s: Record, p: Record, q: int, dt_s: float, moved: float, bias_v2: float) -> None:
+def total_resistance(s: Record, p: Record, soc: float) -> float:
+    """Sum of the resistances at ``soc`` [ohm]."""
+    resistances(soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
+    total = 0.0
+    for k in range(RESISTANCES):
+        total += s.ohm[k]
+    return total
+
+
+@njit(cache=True)
+def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float) -> None:
     """Q of one step into the covariance of hypothesis ``q``; the diagonal of F is in ``s.f``.
 
     Args:
         s: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
         q: Hypothesis.
-        dt_s: Step [s].
         moved: Magnitude of the charge moved, per unit of SOC.
         bias_v2: ``bias_variance`` [V^2].
     """
     cov, f, w = s.covariance[q], s.f, s.window
+    dt_s = w.time_s
     unknown = w.unknown_as / p.capacity_as
     cov[SOC, SOC] += p.charge_error**2 * moved + unknown * unknown
     a2 = (p.x_relative * w.charge_as / dt_s) ** 2 + (w.unknown_as / dt_s) ** 2
@@ -76,6 +88,8 @@ def add_process_noise(s: Record, p: Record, q: int, dt_s: float, moved: float, b
         cov[k, k] += a2 * (1.0 - f[k] * f[k])
     cov[B_SLOW, B_SLOW] += 0.5 * bias_v2 * s.slow_inflation[q] * (1.0 - f[B_SLOW] ** 2)
     cov[B_FAST, B_FAST] += 0.5 * bias_v2 * s.fast_inflation[q] * (1.0 - f[B_FAST] ** 2)
+    for j in (LN_R0, LN_R):
+        cov[j, j] += resistance_std(s, p) ** 2 * (1.0 - f[j] * f[j])
     cov[HYST, HYST] += 0.1 * (1.0 - f[HYST] ** 2)
     cov[CURVE, CURVE] += 1.0 - f[CURVE] ** 2
 

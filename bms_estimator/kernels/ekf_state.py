@@ -39,11 +39,11 @@ class Noise:
     """R: error of the ladder in the mean of one second, std at 25 C [V]."""
     model_j: float = 27e3
     """It grows in the cold with this activation energy [J/mol]."""
-    bias_relative: float = 0.05
+    bias_relative: float = 0.04
     """B: error of the model that stays, relative to the sum of the resistances times the RMS current of 10 min."""
-    bias_soc: float = 0.01
-    """B: the same along SOC: times dE_o/dSOC."""
-    slow_s: float = 4.0 * 3600.0
+    bias_soc: float = 0.015
+    """B: the same from a shift of the resistances along SOC."""
+    slow_s: float = 2.0 * 3600.0
     fast_s: float = 90.0
     """B: half of its variance each changes within so long [s]."""
     x_relative: float = 0.05
@@ -52,9 +52,11 @@ class Noise:
     """Q: std of SOC gained over the whole range: linearity of the current sensor."""
     r_std: float = 0.1
     """Resistances: std of their logarithm, where the cell file says nothing."""
-    offset_c: float = 0.005
+    unsensed_s: float = 3600.0
+    """Where no temperature is told, resistances follow an unknown one with this time constant [s]."""
+    offset_c: float = 0.007
     """Offset of the current sensor, std [C]."""
-    capacity_std: float = 0.03
+    capacity_std: float = 0.08
     """Capacity, relative std."""
     soc_std: float = 0.2
     """SOC at switch-on, std."""
@@ -66,7 +68,7 @@ class Noise:
     """... the std of that, constant for hours, ..."""
     load_s: float = 20.0
     """... and for how long it stays the same [s]."""
-    temper: float = 0.1
+    temper: float = 0.2
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
     curve_length: float = 0.3
     """Charge over which the error of the OCV curve changes [SOC]."""
@@ -121,6 +123,7 @@ EKF_STATE = np.dtype(
         ("count", "i8"),  # hypotheses in use
         ("best", "i8"),  # the likeliest
         ("started", "i8"),
+        ("reopened", "i8"),  # times the SOC became unknown: the model would have to be wrong by too much
         ("window", WINDOW),
         ("current_a", "f8"),  # of the last sample
         ("x_a", "f8", BRANCHES),  # current filtered by the branches since switch-on [A]
@@ -128,6 +131,8 @@ EKF_STATE = np.dtype(
         ("decay_s", "f8"),
         ("rms_a2", "f8"),  # mean square of the current over 10 min [A^2]
         ("temperature_c", "f8"),
+        ("weak", "f8"),  # Arrhenius factors at it
+        ("strong", "f8"),
         ("sensed", "i8"),  # 1: a temperature was told
         ("soc", "f8"),  # mean of the hypotheses
         ("soc_std", "f8"),
@@ -137,7 +142,7 @@ EKF_STATE = np.dtype(
         ("ohm", "f8", RESISTANCES),  # scratch: resistances,
         ("h", "f8", STATES),  # H,
         ("ph", "f8", STATES),  # P H',
-        ("f", "f8", STATES),  # diagonal of F
+        ("f", "f8", STATES),  # diagonal of F over the window
     ],
     align=True,
 )

@@ -13,8 +13,8 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.charge import LONGEST_FLOW_S, UNMEASURED_S, held_current
-from bms_estimator.kernels.ekf import HIGHEST, LOWEST, inflate, predict, update
-from bms_estimator.kernels.ekf_noise import bias_variance, measurement_variance, switch_on
+from bms_estimator.kernels.ekf import HIGHEST, LOWEST, decay, inflate, predict, update
+from bms_estimator.kernels.ekf_noise import bias_variance, measurement_variance, resistance_std, switch_on
 from bms_estimator.kernels.ekf_state import (
     B_FAST,
     B_SLOW,
@@ -29,7 +29,7 @@ from bms_estimator.kernels.ekf_state import (
     STATES,
     X,
 )
-from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, TAUS
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius
 from bms_estimator.kernels.state import Record
 
 WINDOW_S = 0.99
@@ -56,8 +56,10 @@ IDLE_C = 0.1
 """Std of a current that nobody measured [C]."""
 HYST_STD = 0.7
 """Std of the first hysteresis."""
-UNKNOWN_R_STD = 0.25
-"""Resistances without a temperature sensor: std of their logarithm."""
+REOPEN_STDS = 4.0
+"""A model that would have to be wrong by so many std is not: the SOC is ..."""
+REOPEN_STD = 0.2
+"""... by as much as at switch-on."""
 
 
 @njit(cache=True)
@@ -67,6 +69,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     s.current_a = current_a
     s.sensed = 1 if math.isfinite(temperature_c) else 0
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
+    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     s.rms_a2 = max(current_a * current_a, (p.load_mean_c * p.capacity_as / 3600.0) ** 2)
     for k in range(BRANCHES):
         s.x_a[k] = 0.0
@@ -75,7 +78,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
         x[j] = 0.0
         for k in range(STATES):
             cov[j, k] = 0.0
-    cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = p.r_std**2
+    cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = (p.offset_c * p.capacity_as / 3600.0) ** 2
     cov[LN_Q, LN_Q] = p.capacity_std**2
     seed(s, p, soc, p.soc_std)
@@ -190,6 +193,8 @@ def update_all(s: Record, p: Record) -> None:
     dt_s = w.time_s
     if dt_s > 0.0:
         s.rms_a2 += min(1.0, dt_s / LOAD_S) * ((w.charge_as / dt_s) ** 2 - s.rms_a2)
+        decay(s, p)
+    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
     best = 0
     for q in range(s.count):
@@ -207,7 +212,19 @@ def update_all(s: Record, p: Record) -> None:
     s.best = best
     merge(s)
     combine(s)
+    reopen(s, p)
     clear(s)
+
+
+@njit(cache=True)
+def reopen(s: Record, p: Record) -> None:
+    """Begin again where the model would have to be wrong by far more than it is: then the SOC is, by any amount."""
+    if s.count > 1:
+        return
+    bias_v = s.mean[0, B_SLOW] + s.mean[0, B_FAST]
+    if bias_v * bias_v > REOPEN_STDS**2 * bias_variance(s, p, s.mean[0, SOC]):
+        seed(s, p, s.mean[0, SOC], REOPEN_STD)
+        s.reopened += 1
 
 
 @njit(cache=True)
