@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import sample_step as kernel
+from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.identifier import identifier_init
-from bms_estimator.kernels.identifier_guard import keep
-from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, LN_CAPACITY, SOC, V_SLOW, V_TL, V_TS
+from bms_estimator.kernels.hypotheses import forget, seed
+from bms_estimator.kernels.input_checks import keep
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
@@ -76,7 +76,9 @@ class Estimator:
         self.state: NDArray[np.void] = self.record["observer"]
         self._trace: TraceBlock = np.zeros(0, dtype=TRACE)
 
-    def step(self, time_s: float, current_a: float, voltage_v: float, status: int = 0) -> Verdict:
+    def step(
+        self, time_s: float, current_a: float, voltage_v: float, status: int = 0, temperature_c: float = math.nan
+    ) -> Verdict:
         """Take one sample.
 
         Args:
@@ -84,11 +86,14 @@ class Estimator:
             current_a: Current [A], positive on discharge.
             voltage_v: Terminal voltage [V].
             status: Bits of ``SampleStatus``.
+            temperature_c: Of the cell [C]; NaN without a sensor.
 
         Returns:
             Whether it was accepted, else why not; the state counts each kind.
         """
-        return VERDICTS[kernel.step(self.record, self.settings_record, time_s, current_a, voltage_v, status)]
+        return VERDICTS[
+            kernel.step(self.record, self.settings_record, time_s, current_a, voltage_v, status, temperature_c)
+        ]
 
     def run(self, block: SampleBlock) -> TraceBlock:
         """Take a block of samples, dtype ``SAMPLE``.
@@ -115,37 +120,31 @@ class Estimator:
         if not 0.0 <= soc <= 1.0:
             raise ValueError(f"SOC {soc} is outside 0..1")
         self.state["soc"] = self.state["soc_coulomb"] = soc
-        x = self.record[0]["identifier"]
-        x["mean"][SOC] = soc
-        x["covariance"][SOC, :] = x["covariance"][:, SOC] = 0.0
-        x["covariance"][SOC, SOC] = SET_SOC_STD**2
-        x["offset_sense"][SOC] = x["capacity_sense"][SOC] = x["outliers"] = x["breaks"] = 0.0
-        keep(x)
+        if self.identifying:
+            f, c = self.record[0]["filter"], self.record[0]["checks"]
+            seed(f, self.settings_record[0]["filter"], soc, SET_SOC_STD)
+            c["outliers"] = 0.0
+            keep(c, f)
 
     def resume(self, unseen_s: float) -> None:
         """Prepare for samples of another clock, after a time in which nobody measured.
 
-        Time begins with the next sample, which is taken as a clock set back. The SOC may have moved, and the branch
-        voltages are what they may be at a first sample. After a long time the elements may belong to another SOC: they
-        are those of the cell file again. The map is kept, and what was learned of capacity and current offset.
+        Time begins with the next sample, which is taken as a clock set back. The SOC may have moved, and the load before
+        it is not known, as at a first sample. After a long time the cell may be at another temperature or SOC: its
+        resistances are those of the cell file again. The map is kept, and what was learned of capacity and current offset.
 
         Args:
             unseen_s: How long nobody measured [s]; infinite when nobody knows.
         """
         self.state["time_s"] = np.inf
-        x, p = self.record[0]["identifier"], self.settings_record[0]["identifier"]
-        soc_variance = x["covariance"][SOC, SOC] + min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST) ** 2
+        f, p = self.record[0]["filter"], self.settings_record[0]["filter"]
+        moved = min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST)
+        f["soc"], f["soc_std"] = self.state["soc"][0], math.hypot(f["soc_std"], moved)
         if unseen_s > SAME_ELEMENTS_S:
-            sensor_and_cell = [(j, x["mean"][j], x["covariance"][j, j]) for j in (CURRENT_OFFSET, LN_CAPACITY)]
-            branch = x["branch"]
-            identifier_init(x, p)
-            x["mean"][SOC], x["branch"] = self.state["soc"][0], branch
-            for j, mean, variance in sensor_and_cell:
-                x["mean"][j], x["covariance"][j, j] = mean, variance
-        x["covariance"][SOC, SOC] = soc_variance
-        for branch in (V_TS, V_TL, V_SLOW):
-            x["covariance"][branch, branch] += p["variance"][branch]
-        keep(x)
+            best = f["best"]
+            for j in (LN_R0, LN_R):
+                forget(f["mean"][best], f["covariance"][best], j)
+                f["covariance"][best, j, j] = p["r_std"] ** 2
         if math.isfinite(unseen_s):
             self.record["unlearned_s"] += unseen_s
 

@@ -1,14 +1,14 @@
-"""What the identifier has learned, read from the estimator's records."""
+"""What the filter has learned, read from the estimator's records."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
+from bms_estimator.kernels.ekf_state import LN_Q, OFFSET
 from bms_estimator.kernels.element_map import ELEMENT_NAMES
+from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS
 from bms_estimator.kernels.identification import LEAST_BINS
-from bms_estimator.kernels.identifier import element_ln_stds, element_values
-from bms_estimator.kernels.identifier_state import LN_CAPACITY
 
 
 class Learned(NamedTuple):
@@ -28,16 +28,13 @@ def present_elements(record: np.void) -> dict[str, Learned]:
     """The elements at the present SOC by name: ``ELEMENT_NAMES``, in ohm and farad.
 
     Args:
-        record: Of dtype ESTIMATOR_STATE, with an identifier that has taken a sample.
+        record: Of dtype ESTIMATOR_STATE, after a sample, identifying.
     """
-    r_s, r_ts, _, c_ts, r_tl, _, c_tl = element_values(record["identifier"])
-    s_r_s, s_r_ts, _, s_c_ts, s_r_tl, _, s_c_tl = element_ln_stds(record["identifier"])
-    values = (r_ts, s_r_ts), (r_tl, s_r_tl), (c_ts, s_c_ts), (c_tl, s_c_tl), (r_s, s_r_s)
-    ages = record["unlearned_s"]
-    return {
-        name: Learned(value, value * ln_std, float(age_s))
-        for name, (value, ln_std), age_s in zip(ELEMENT_NAMES, values, ages, strict=True)
-    }
+    elements, ages = record["elements"], record["unlearned_s"]
+    order = R_TS, R_TL, C_TS, C_TL, R_S
+    values = elements["value"][list(order)]
+    stds = values * np.sqrt(elements["ln_variance"][list(order)])
+    return {name: Learned(*map(float, one)) for name, *one in zip(ELEMENT_NAMES, values, stds, ages, strict=True)}
 
 
 def fitted_parameter(record: np.void, index: int) -> Learned | None:
@@ -56,6 +53,17 @@ def fitted_parameter(record: np.void, index: int) -> Learned | None:
 
 def relative_capacity(record: np.void) -> Learned:
     """True over declared capacity."""
-    x = record["identifier"]
-    ratio = math.exp(x["mean"][LN_CAPACITY])
-    return Learned(ratio, ratio * math.sqrt(x["covariance"][LN_CAPACITY, LN_CAPACITY]), 0.0)
+    ln_q, std = _bias(record, LN_Q)
+    return Learned(math.exp(ln_q), math.exp(ln_q) * std, 0.0)
+
+
+def current_offset(record: np.void) -> Learned:
+    """Measured less true current [A]."""
+    return Learned(*_bias(record, OFFSET), 0.0)
+
+
+def _bias(record: np.void, j: int) -> tuple[float, float]:
+    """Mean and standard deviation of state ``j`` of the likeliest hypothesis."""
+    f = record["filter"]
+    best = f["best"]
+    return float(f["mean"][best, j]), math.sqrt(f["covariance"][best, j, j])

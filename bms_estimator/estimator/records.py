@@ -1,14 +1,11 @@
 """From typed settings to the kernels' records."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.kernels.cell import OCV_POINTS, emf
 from bms_estimator.kernels.estimator_state import ESTIMATOR_SETTINGS
-from bms_estimator.kernels.identifier_state import Tuning, identifier_settings
 from bms_estimator.kernels.mittag_leffler import decay_table, series_coefficients
 from bms_estimator.kernels.nussbaum import Nussbaum
 from bms_estimator.kernels.state import OBSERVER_SETTINGS, PARAMETERS
@@ -21,10 +18,6 @@ LOCK_FRACTION = 0.02
 """An error of this fraction of the nominal voltage is no tracking."""
 GAP_S = 5.0
 """A step longer than this counts as a gap [s]."""
-HYSTERESIS_ERROR = 0.2
-"""A hysteresis that is told is right within this, relative."""
-ELEMENTS_AT_SOC = 0.5
-"""The identifier starts from the configured elements at this SOC, where they are flat."""
 IMPROVED = range(1, 13)
 """Parameters that the improved method adapts (Algorithm 1); a13..a15 come from (4.2)."""
 
@@ -73,32 +66,9 @@ def estimator_settings(
     p["configured"][1:] = cell.a[1:PARAMETERS]
     for i in range(1, PARAMETERS):
         p["lower"][i], p["upper"][i] = cell.bounds(i).lower, cell.bounds(i).upper
-    p["identifier"] = identifier_settings(
-        cell.cell.capacity_ah,
-        p["observer"]["ocv_v"],
-        p["observer"]["ocv_slope_v"],
-        0.5 if initial_soc is None else initial_soc,
-        _elements(cell),
-        noise_v=0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v,
-        resolution_v=voltage_resolution_v,
-        tuning=_tuning(identifier).pack(cell.cell.series_count),
-    )[0]
+    grid = p["observer"]["ocv_v"], p["observer"]["ocv_slope_v"]
+    p["filter"] = filter_settings(cell, grid, identifier, voltage_resolution_v, voltage_noise_v)[0]
     return record
-
-
-def _tuning(identifier: IdentifierSettings) -> Tuning:
-    tuning = Tuning(current_offset_std_a=identifier.current_offset_std_a, capacity_std=identifier.capacity_std)
-    if identifier.hysteresis_v == 0.0:
-        return tuning
-    known_v = HYSTERESIS_ERROR * identifier.hysteresis_v
-    return replace(tuning, hysteresis_charge_v=identifier.hysteresis_v, hysteresis_error_v=known_v)
-
-
-def _elements(cell: CellModel) -> tuple[float, float, float, float, float]:
-    """R_s [ohm], R_ts [ohm], R_ts C_ts [s], R_tl [ohm], R_tl C_tl [s] of the cell file where they are flat."""
-    soc, a = ELEMENTS_AT_SOC, cell.a
-    ohm_ts, ohm_tl = chen_mora.r_ts(soc, a), chen_mora.r_tl(soc, a)
-    return chen_mora.r_s(soc, a), ohm_ts, ohm_ts * chen_mora.c_ts(soc, a), ohm_tl, ohm_tl * chen_mora.c_tl(soc, a)
 
 
 def observer_settings(

@@ -1,15 +1,17 @@
-"""The records of the whole estimator: observer, identifier, map of the elements and the fit to it, in one each."""
+"""The records of the whole estimator, in one each: observer, filter and its checks, map of the elements, fit to it."""
 
 import numpy as np
 
+from bms_estimator.kernels.ekf_state import EKF_SETTINGS, EKF_STATE
 from bms_estimator.kernels.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS
-from bms_estimator.kernels.identifier_state import IDENTIFIER_SETTINGS, IDENTIFIER_STATE
+from bms_estimator.kernels.equivalent import EQUIVALENT
+from bms_estimator.kernels.input_checks import CHECKS, COUNTERS
 from bms_estimator.kernels.state import OBSERVER_SETTINGS, OBSERVER_STATE, PARAMETERS
 
 ESTIMATOR_SETTINGS = np.dtype(
     [
         ("observer", OBSERVER_SETTINGS),
-        ("identifier", IDENTIFIER_SETTINGS),
+        ("filter", EKF_SETTINGS),
         ("identify", "i8"),  # 0: SOC by coulomb counting, parameters as configured
         ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
         ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
@@ -23,12 +25,15 @@ ESTIMATOR_SETTINGS = np.dtype(
 ESTIMATOR_STATE = np.dtype(
     [
         ("observer", OBSERVER_STATE),
-        ("identifier", IDENTIFIER_STATE),
+        ("filter", EKF_STATE),
+        ("elements", EQUIVALENT),  # what the filter's ladder amounts to now
+        ("checks", CHECKS),
+        ("counters", COUNTERS),
         ("map", ELEMENT_MAP),
         ("fit", ELEMENT_FIT),
         ("fit_age_s", "f8"),  # since an element was fitted
         ("next_element", "i8"),  # to be fitted
-        ("unlearned_s", "f8", ELEMENTS),  # since the map learned of each element
+        ("unlearned_s", "f8", ELEMENTS),  # since the map learned of each element; infinite: never did
     ],
     align=True,
 )

@@ -1,4 +1,4 @@
-"""The identifier at work beside the observer: its SOC, its elements gathered in the map, the fit handed to (3.18).
+"""The filter at work beside the observer: its SOC, its elements gathered in the map, the fit handed to (3.18).
 
 ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 """
@@ -8,61 +8,128 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.charge import UNMEASURED_S
+from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
-from bms_estimator.kernels.identifier import identifier_init, identifier_step, soc
-from bms_estimator.kernels.identifier_state import LN_R_S, LN_R_TL, LN_R_TS, LN_TAU_TL, LN_TAU_TS, SOC
+from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, equivalent, told
+from bms_estimator.kernels.hypotheses import WINDOW_S, clear, count_on, gather, seed, start, update_all
+from bms_estimator.kernels.input_checks import (
+    SIGN_OF_CURRENT,
+    believed,
+    doubt_sign,
+    guard,
+    judge,
+    keep,
+    watch_sign,
+)
 from bms_estimator.kernels.margins import delta
 from bms_estimator.kernels.state import Record
 
-FIT_EVERY_S = 10.0
+FIT_EVERY_S = 120.0
 """One element is fitted this often, each in its turn [s of samples]."""
 LEAST_BINS = 3
 """Three parameters of an element need so many bins of SOC."""
+EXCITING_C = 0.05
+"""A load of so much, RMS over 10 min, tells of the resistances [C]."""
 
 
 @njit(cache=True)
-def start_identifier(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
+def start_identifier(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """Begin at the SOC of the observer's first sample."""
-    identifier_init(s.identifier, p.identifier)
-    s.identifier.mean[SOC] = s.identifier.good_mean[SOC] = s.observer.soc
-    identifier_step(s.identifier, p.identifier, 0.0, current_a, voltage_v)
+    start(s.filter, p.filter, s.observer.soc, current_a, temperature_c)
+    for e in range(ELEMENTS):
+        s.unlearned_s[e] = math.inf
+    take_first(s, p, current_a, voltage_v)
 
 
 @njit(cache=True)
-def identify(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
+def restart_identifier(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
+    """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, the load before is not known."""
+    f = s.filter
+    f.current_a = current_a
+    seed(f, p.filter, f.soc, f.soc_std)
+    clear(f)
+    s.checks.slow_v = 0.0
+    s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
+    take_first(s, p, current_a, voltage_v)
+
+
+@njit(cache=True)
+def take_first(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
+    """The first sample is an update by itself."""
+    f = s.filter
+    keep(s.checks, f)
+    gather(f, current_a, voltage_v)
+    s.checks.mean_a = current_a
+    update_all(f, p.filter)
+    equivalent(f, p.filter, s.elements)
+    s.observer.soc = f.soc
+
+
+@njit(cache=True)
+def identify(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """Take one sample: SOC for the observer, elements for the map, every now and then a fit for (3.18)."""
-    identifier_step(s.identifier, p.identifier, dt_s, current_a, voltage_v)
-    s.observer.soc = soc(s.identifier)
-    if dt_s <= UNMEASURED_S:
-        learn_elements(s, dt_s)
+    f, c = s.filter, s.checks
+    change_a = current_a - f.current_a
+    count_on(f, p.filter, dt_s, current_a, temperature_c)
+    watch_sign(c, f, p.filter, dt_s, current_a, voltage_v)
+    if c.suspects & SIGN_OF_CURRENT:
+        doubt_sign(f, p.filter, dt_s, current_a)
+    if believed(c, s.counters, f, s.elements, dt_s, change_a, current_a, voltage_v):
+        gather(f, current_a, voltage_v)
+    if f.window.time_s >= WINDOW_S and f.window.samples > 0:
+        take_window(s, p)
+    s.observer.soc = f.soc
     s.fit_age_s += dt_s
     if s.fit_age_s >= FIT_EVERY_S:
-        e = s.next_element
-        for row in range(ELEMENTS):
-            age(s.map, row, math.exp(-s.fit_age_s / p.map_memory_s))
-        fit_element(s.map, e, p.configured, s.fit)
-        hand_over(s, p, e)
-        s.next_element = (e + 1) % ELEMENTS
-        s.fit_age_s = 0.0
+        fit_next(s, p)
 
 
 @njit(cache=True)
-def learn_elements(s: Record, dt_s: float) -> None:
-    """Add the present elements to the map, in its order R_ts, R_tl, C_ts, C_tl, R_s."""
-    x, cov, now = s.identifier.mean, s.identifier.covariance, s.observer.soc
-    learn_one(s, 0, now, x[LN_R_TS], cov[LN_R_TS, LN_R_TS], dt_s)
-    learn_one(s, 1, now, x[LN_R_TL], cov[LN_R_TL, LN_R_TL], dt_s)
-    variance = cov[LN_TAU_TS, LN_TAU_TS] + cov[LN_R_TS, LN_R_TS] - 2.0 * cov[LN_TAU_TS, LN_R_TS]
-    learn_one(s, 2, now, x[LN_TAU_TS] - x[LN_R_TS], variance, dt_s)
-    variance = cov[LN_TAU_TL, LN_TAU_TL] + cov[LN_R_TL, LN_R_TL] - 2.0 * cov[LN_TAU_TL, LN_R_TL]
-    learn_one(s, 3, now, x[LN_TAU_TL] - x[LN_R_TL], variance, dt_s)
-    learn_one(s, 4, now, x[LN_R_S], cov[LN_R_S, LN_R_S], dt_s)
+def take_window(s: Record, p: Record) -> None:
+    """One update of the filter, and what follows from it."""
+    f, c = s.filter, s.checks
+    dt_s = f.window.time_s
+    c.mean_a = f.window.sum_a / f.window.samples
+    update_all(f, p.filter)
+    guard(c, s.counters, f, p.filter, dt_s)
+    judge(c, f, p.filter, dt_s)
+    equivalent(f, p.filter, s.elements)
+    if dt_s <= UNMEASURED_S and not c.suspects & SIGN_OF_CURRENT:
+        learn_elements(s, p, dt_s)
 
 
 @njit(cache=True)
-def learn_one(s: Record, e: int, now: float, ln_value: float, variance: float, dt_s: float) -> None:
-    """Add one element, and note when that was."""
-    learned = learn(s.map, e, now, ln_value, variance, dt_s)
+def fit_next(s: Record, p: Record) -> None:
+    """Fit one element to the map, each in its turn."""
+    e = s.next_element
+    for row in range(ELEMENTS):
+        age(s.map, row, math.exp(-s.fit_age_s / p.map_memory_s))
+    fit_element(s.map, e, p.configured, s.fit)
+    hand_over(s, p, e)
+    s.next_element = (e + 1) % ELEMENTS
+    s.fit_age_s = 0.0
+
+
+@njit(cache=True)
+def learn_elements(s: Record, p: Record, dt_s: float) -> None:
+    """Add the present elements to the map, in its order R_ts, R_tl, C_ts, C_tl, R_s, where the load told of them."""
+    f = s.filter
+    exciting_a = EXCITING_C * p.filter.capacity_as / 3600.0
+    loaded = f.rms_a2 > exciting_a * exciting_a
+    branches = loaded and told(f, p.filter, LN_R)
+    learn_one(s, 0, R_TS, branches, dt_s)
+    learn_one(s, 1, R_TL, branches, dt_s)
+    learn_one(s, 2, C_TS, branches, dt_s)
+    learn_one(s, 3, C_TL, branches, dt_s)
+    learn_one(s, 4, R_S, loaded and told(f, p.filter, LN_R0), dt_s)
+
+
+@njit(cache=True)
+def learn_one(s: Record, e: int, j: int, is_told: bool, dt_s: float) -> None:
+    """Add one element, ``j`` of the equivalent ones, and note when that was."""
+    learned = is_told and learn(
+        s.map, e, s.filter.soc, math.log(s.elements.value[j]), s.elements.ln_variance[j], dt_s
+    )
     s.unlearned_s[e] = 0.0 if learned else s.unlearned_s[e] + dt_s
 
 

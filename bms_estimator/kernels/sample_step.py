@@ -8,9 +8,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import soc_from_ocv
-from bms_estimator.kernels.identification import identify, start_identifier
-from bms_estimator.kernels.identifier import element_ln_stds, element_values, soc_std
-from bms_estimator.kernels.identifier_state import V_SLOW, V_TL, V_TS
+from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
+from bms_estimator.kernels.identification import identify, restart_identifier, start_identifier
 from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
 
@@ -59,7 +58,15 @@ def judge(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
 
 
 @njit(cache=True)
-def step(state: Records, settings: Records, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
+def step(
+    state: Records,
+    settings: Records,
+    time_s: float,
+    current_a: float,
+    voltage_v: float,
+    status: int,
+    temperature_c: float,
+) -> int:
     """Take one sample.
 
     Args:
@@ -69,6 +76,7 @@ def step(state: Records, settings: Records, time_s: float, current_a: float, vol
         current_a: Current [A], positive on discharge.
         voltage_v: Terminal voltage [V].
         status: Bits of ``SampleStatus``.
+        temperature_c: Of the cell [C]; NaN without a sensor.
 
     Returns:
         A ``Verdict``.
@@ -81,20 +89,23 @@ def step(state: Records, settings: Records, time_s: float, current_a: float, vol
     if not s.started:
         start(s, p, time_s, current_a, voltage_v)
         if settings[0].identify:
-            start_identifier(state[0], settings[0], current_a, voltage_v)
+            start_identifier(state[0], settings[0], current_a, voltage_v, temperature_c)
         return verdict
     dt_s = time_s - s.time_s
     s.time_s = time_s
     if dt_s < 0.0:  # the clock was set back: go on from here
-        s.time_steps_back += 1 if math.isfinite(dt_s) else 0  # infinite: a new clock after a restart
-        s.current_a = state[0].identifier.current_a = current_a
+        s.current_a = state[0].filter.current_a = current_a
+        if math.isfinite(dt_s):
+            s.time_steps_back += 1
+        elif settings[0].identify:  # a new clock after a restart
+            restart_identifier(state[0], settings[0], current_a, voltage_v)
         return verdict
     if dt_s > max(p.gap_s, GAP_RATIO * s.step_s):
         s.gaps += 1
     s.step_s = dt_s
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
-        identify(state[0], settings[0], dt_s, current_a, voltage_v)
+        identify(state[0], settings[0], dt_s, current_a, voltage_v, temperature_c)
     else:
         s.soc = s.soc_coulomb
     observer_step(s, p, dt_s, voltage_v)
@@ -117,7 +128,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
     rows = 0
     for j in range(samples.shape[0]):
         x = samples[j]
-        if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status) == _ACCEPTED:
+        if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
             write_observer(trace[rows], state[0].observer, settings[0].observer, x)
             write_identifier(trace[rows], state[0], settings[0])
             rows += 1
@@ -146,7 +157,7 @@ def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
 
 @njit(cache=True)
 def write_identifier(row: Record, s: Record, p: Record) -> None:
-    """What the identifier says; records as in ``step``. Without it: the observer's e, and NaN.
+    """What the filter says; records as in ``step``. Without it: the observer's e, and NaN.
 
     The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.
     """
@@ -156,15 +167,19 @@ def write_identifier(row: Record, s: Record, p: Record) -> None:
         row.r_s_ohm = row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
         row.r_s_std_ohm = row.r_ts_std_ohm = row.tau_ts_std_s = row.r_tl_std_ohm = row.tau_tl_std_s = math.nan
         return
-    x = s.identifier
-    ohm_s, ohm_ts, tau_ts, _, ohm_tl, tau_tl, _ = element_values(x)
-    std_s, std_ts, std_tau_ts, _, std_tl, std_tau_tl, _ = element_ln_stds(x)
-    row.innovation_v = x.innovation_v
-    e_o = row.voltage_v + x.mean[V_TS] + x.mean[V_TL] + x.mean[V_SLOW] + row.current_a * ohm_s  # (2.4) solved for E_o
-    row.soc_ocv = soc_from_ocv(e_o, p.observer.ocv_v, p.observer.ocv_slope_v)
-    row.soc_std = soc_std(x)
-    row.r_s_ohm, row.r_s_std_ohm = ohm_s, ohm_s * std_s
-    row.r_ts_ohm, row.r_ts_std_ohm = ohm_ts, ohm_ts * std_ts
-    row.tau_ts_s, row.tau_ts_std_s = tau_ts, tau_ts * std_tau_ts
-    row.r_tl_ohm, row.r_tl_std_ohm = ohm_tl, ohm_tl * std_tl
-    row.tau_tl_s, row.tau_tl_std_s = tau_tl, tau_tl * std_tau_tl
+    f, e = s.filter, s.elements
+    row.innovation_v = f.innovation_v
+    e_o = open_circuit(f, p.filter, e, row.current_a, row.voltage_v)
+    row.soc_ocv = soc_from_ocv(e_o, p.filter.ocv_v, p.filter.ocv_slope_v)
+    row.soc_std = f.soc_std
+    row.r_s_ohm, row.r_s_std_ohm = value_and_std(e, R_S)
+    row.r_ts_ohm, row.r_ts_std_ohm = value_and_std(e, R_TS)
+    row.tau_ts_s, row.tau_ts_std_s = value_and_std(e, TAU_TS)
+    row.r_tl_ohm, row.r_tl_std_ohm = value_and_std(e, R_TL)
+    row.tau_tl_s, row.tau_tl_std_s = value_and_std(e, TAU_TL)
+
+
+@njit(cache=True)
+def value_and_std(e: Record, j: int) -> tuple[float, float]:
+    """An element of a record of EQUIVALENT, and its standard deviation, in its unit."""
+    return e.value[j], e.value[j] * math.sqrt(e.ln_variance[j])

@@ -106,14 +106,20 @@ class IdentifierSettings(Strict):
     map_memory_h: Annotated[float, Field(ge=1)] = Field(
         default=336.0, description="time constant with which learned elements are forgotten"
     )
-    current_offset_std_a: NotNegative = Field(
-        default=0.0, description="how wrong the current sensor's zero may be; 0: it is taken as right"
+    current_offset_std_a: NotNegative | None = Field(
+        default=None,
+        description="how wrong the current sensor's zero may be; 0.5 % of the current that empties the pack in an hour "
+        "when left out; 0: it is taken as right",
     )
     capacity_std: Annotated[float, Field(ge=0, le=0.3)] = Field(
-        default=0.0, description="how wrong the declared capacity may be, relative; 0: it is taken as right"
+        default=0.03, description="how wrong the declared capacity may be, relative; 0: it is taken as right"
     )
-    hysteresis_v: NotNegative = Field(
-        default=0.0, description="OCV after charge less that after discharge, of one cell; for LFP some 0.02"
+    soc_std: Annotated[float, Field(ge=0.005, le=0.5)] = Field(
+        default=0.2, description="how wrong the SOC at start may be"
+    )
+    hysteresis_v: NotNegative | None = Field(
+        default=None,
+        description="OCV after charge less that after discharge, of one cell; that of the cell file when left out",
     )
 
 

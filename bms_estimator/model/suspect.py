@@ -4,13 +4,14 @@ from enum import IntFlag
 
 
 class Suspect(IntFlag):
-    """Bits of ``kernels.identifier.suspects``; several may be set."""
+    """Bits of ``suspects`` of ``kernels.input_checks.CHECKS``; several may be set."""
 
     SIGN_OF_CURRENT = 1
     OFFSET = 2
     CAPACITY = 4
     OCV = 8
     OUTLIERS = 16
+    TEMPERATURE = 32
 
     @property
     def text(self) -> str:
@@ -29,4 +30,5 @@ _TEXT = {
     "and the number of cells in series",
     Suspect.OUTLIERS: "single samples far from those around them: check wiring and supply of the sensors, "
     "and that voltage and current are taken at the same time",
+    Suspect.TEMPERATURE: "the cell file was not made for this temperature: make it with captures taken there",
 }

@@ -8,23 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.identifier_state import (
-    CURRENT_OFFSET,
-    IDENTIFIER_COUNTERS,
-    IDENTIFIER_STATE,
-    LN_CAPACITY,
-    SOC,
-)
+from bms_estimator.kernels.hypotheses import forget
+from bms_estimator.kernels.input_checks import COUNTERS
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.service.checkpoint import fields
 
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
-COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
+OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
-_SEEN = tuple(name for name in IDENTIFIER_STATE.names or () if name.startswith("seen_"))
 SAME_SOC = 0.03
-"""The identifier's SOC may leave 0..1 by as much; where it is further from the observer's, it was switched off."""
+"""Where the SOC of the filter is further from the observer's, it was switched off."""
 
 
 def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
@@ -43,21 +38,19 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     """
     new = estimator.record.copy()
     estimator.step(0.0, 0.0, estimator.cell.cell.nominal_voltage_v)
-    was_on = bool(np.any(saved.get("identifier.covariance", 0.0)))
-    _fill(estimator.record, {name: v for name, v in saved.items() if was_on or not name.startswith("identifier.")})
+    was_on = bool(saved.get("filter.started", np.zeros(1))[0])
+    _fill(estimator.record, {name: v for name, v in saved.items() if was_on or name.startswith("observer.")})
     wrong = _insane(estimator)
     if wrong:
         estimator.record[...] = new
         return wrong
-    x = estimator.record[0]["identifier"]
-    if not was_on or abs(x["mean"][SOC] - estimator.state["soc"][0]) > SAME_SOC:
+    if not was_on or abs(estimator.record["filter"]["soc"][0] - estimator.state["soc"][0]) > SAME_SOC:
         unseen_s = math.inf
     _open_new_states(estimator)
     estimator.resume(unseen_s)
-    for name in COUNTERS:
+    for name in OBSERVER_COUNTERS:
         estimator.state[name] = 0
-    for name in (*IDENTIFIER_COUNTERS, *_SEEN):
-        x[name] = 0
+    estimator.record["counters"] = np.zeros(1, COUNTERS)
     return ""
 
 
@@ -69,19 +62,20 @@ def _fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _open_new_states(estimator: Estimator) -> None:
-    """Offset and capacity begin as configured where they were no states of the identifier before, or are none now."""
-    x, p = estimator.record[0]["identifier"], estimator.settings_record[0]["identifier"]
-    for j in (CURRENT_OFFSET, LN_CAPACITY):
-        if (x["covariance"][j, j] > 0.0) != (p["variance"][j] > 0.0):
-            x["mean"][j] = p["mean"][j]
-            x["covariance"][j, :] = x["covariance"][:, j] = 0.0
-            x["covariance"][j, j] = p["variance"][j]
+    """Offset and capacity begin as configured where they were no states of the filter before, or are none now."""
+    f, p = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
+    best = f["best"]
+    stds = {OFFSET: p["offset_c"] * p["capacity_as"] / 3600.0, LN_Q: p["capacity_std"]}
+    for j, std in stds.items():
+        if (f["covariance"][best, j, j] > 0.0) != (std > 0.0):
+            forget(f["mean"][best], f["covariance"][best], j)
+            f["covariance"][best, j, j] = std**2
 
 
 def _insane(estimator: Estimator) -> str:
     """Why a state cannot be used; empty when it can."""
     record, cell = estimator.record, estimator.cell.cell
-    for part in ("observer", "identifier", "map"):
+    for part in ("observer", "filter", "checks", "map"):
         for name in ESTIMATOR_STATE[part].names or ():
             if not np.isfinite(record[part][name]).all():
                 return f"{name} of the {part} is not finite"
@@ -97,7 +91,11 @@ def _insane(estimator: Estimator) -> str:
     for name, (low, high) in ranges.items():
         if not low <= s[name] <= high:
             return f"{name} = {s[name]} is outside {low}..{high}"
-    variances = np.diagonal(record[0]["identifier"]["covariance"])
+    f = record[0]["filter"]
+    count, best = int(f["count"]), int(f["best"])
+    if not 0 <= best < count <= HYPOTHESES:
+        return f"{count} hypotheses, the best of them {best}"
+    variances = np.diagonal(f["covariance"][:count], axis1=1, axis2=2)
     for name, good in (("a parameter a1..a15", s["a"][1:16] > 0.0), ("a variance", variances >= 0.0)):
         if not good.all():
             return f"{name} is not positive"

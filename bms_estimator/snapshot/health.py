@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.kernels.identifier_state import IDENTIFIER_COUNTERS
+from bms_estimator.kernels.input_checks import COUNTERS
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Health
 from bms_estimator.model.suspect import Suspect
@@ -38,12 +38,12 @@ def dropped_text(dropped: Mapping[str, int]) -> str:
 
 def identifier_counters(record: np.void) -> dict[str, int]:
     """How often the identifier did not believe its input or itself, of a record of ESTIMATOR_STATE."""
-    return {name: int(record["identifier"][name]) for name in IDENTIFIER_COUNTERS}
+    return {name: int(record["counters"][name]) for name in COUNTERS.names or ()}
 
 
 def suspicions(record: np.void) -> list[str]:
     """What the identifier suspects of its input, of a record of ESTIMATOR_STATE: one sentence each."""
-    suspects = Suspect(int(record["identifier"]["suspects"]))
+    suspects = Suspect(int(record["checks"]["suspects"]))
     return [suspect.text for suspect in Suspect if suspect in suspects]
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import Learned, fitted_parameter, present_elements, relative_capacity
 from bms_estimator.kernels import cell as chen_mora
-from bms_estimator.kernels.identifier_state import LN_CAPACITY
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Parameter, ParameterReport
 from bms_estimator.snapshot.topics import finite
@@ -80,7 +79,7 @@ def _state_of_health(estimator: Estimator, r_s: Learned, now_s: float) -> dict[s
     """Capacity and R_s over those of the cell file."""
     new = chen_mora.r_s(float(estimator.state[0]["soc"]), estimator.cell.a)
     ratio = Learned(r_s.value / new, r_s.std / new, r_s.unlearned_s)
-    if estimator.settings_record["identifier"]["variance"][0][LN_CAPACITY] > 0.0:
+    if estimator.settings_record["filter"]["capacity_std"][0] > 0.0:
         capacity = _identified(relative_capacity(estimator.record[0]), _configured(1.0, ""), VALID_CAPACITY_STD, now_s)
     else:
         capacity = _configured(1.0, "").model_copy(update={"reason": "identifier.capacity_std is 0: taken as declared"})

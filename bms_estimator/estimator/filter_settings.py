@@ -1,0 +1,119 @@
+"""From cell file and settings to the filter's record."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.ekf_state import EKF_SETTINGS, Noise
+from bms_estimator.kernels.ladder import BRANCHES, GRID, REFERENCE_C, RESISTANCES, TAU_S
+from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.settings import IdentifierSettings
+
+CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
+"""Where the cell file does not say how wrong its OCV is: std of one cell [V], and std along SOC."""
+BEYOND_BRANCHES = 0.2
+"""Two branches leave out diffusion that is slower: its resistance, as a part of theirs."""
+BRANCHES_STD = 0.35
+"""Relative std of resistances that come from two branches."""
+LEAST_CAPACITANCE = 0.05
+"""C_ts, C_tl, negative below delta1, delta2, are at least this part of a9, a12."""
+
+SOC_GRID = np.linspace(0.0, 1.0, GRID)
+"""Of resistances, and of what is known of the OCV. Shape (GRID,)."""
+
+
+def filter_settings(
+    cell: CellModel,
+    grid: tuple[NDArray[np.float64], NDArray[np.float64]],
+    identifier: IdentifierSettings,
+    voltage_resolution_v: float,
+    voltage_noise_v: float | None,
+) -> NDArray[np.void]:
+    """The filter's settings record.
+
+    Args:
+        cell: The pack as one object.
+        grid: Its open-circuit voltage and the slope of that, as ``records.ocv_grid`` makes them [V].
+        identifier: Its ``[identifier]`` section.
+        voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
+        voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
+
+    Returns:
+        Shape (1,), dtype ``EKF_SETTINGS``.
+    """
+    record = np.zeros(1, dtype=EKF_SETTINGS)
+    p, series = record[0], cell.cell.series_count
+    p["capacity_as"], p["series"] = 3600.0 * cell.cell.capacity_ah, series
+    p["ocv_v"], p["ocv_slope_v"] = grid
+    _open_circuit(p, cell, identifier.hysteresis_v)
+    weak_ohm, strong_ohm, r_std, (p["low_c"], p["high_c"]) = _ladder(cell)
+    p["weak_ohm"], p["strong_ohm"] = weak_ohm, strong_ohm
+    noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
+    p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
+    offset_a = identifier.current_offset_std_a
+    noise = Noise(r_std=r_std, capacity_std=identifier.capacity_std, soc_std=identifier.soc_std)
+    if offset_a is not None:
+        noise = replace(noise, offset_c=offset_a / cell.cell.capacity_ah)
+    for field in fields(noise):
+        p[field.name] = getattr(noise, field.name)
+    p["model_v"] *= series
+    return record
+
+
+def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> None:
+    """The error of E_o at 25 C, and what hysteresis and temperature do to it.
+
+    Args:
+        p: Of dtype EKF_SETTINGS, with E_o; written.
+        cell: The pack as one object.
+        hysteresis_v: OCV after charge less that after discharge, of one cell [V]; None: the cell file's.
+    """
+    series, ocv = p["series"], cell.ocv
+    slope_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_slope_v"].size), p["ocv_slope_v"])
+    p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * slope_v)
+    midway = False
+    if isinstance(ocv, TableOcv):
+        midway = ocv.hysteresis_v is not None
+        for name in ("error_v", "hysteresis_v", "per_kelvin_v"):
+            column = getattr(ocv, name)
+            if column is not None:
+                p["curve_error_v" if name == "error_v" else name] = np.interp(SOC_GRID, ocv.soc, column)
+    if hysteresis_v is not None:
+        p["hysteresis_v"] = 0.5 * hysteresis_v * series
+        if not midway:  # the curve is that after discharge
+            p["ocv_v"] += 0.5 * hysteresis_v * series
+
+
+def _ladder(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:
+    """Weak and strong part of the resistances, each (GRID, RESISTANCES) [ohm], their relative std, temperatures [C]."""
+    ladder = cell.ladder
+    if ladder is None:
+        half_ohm = 0.5 * ladder_of_branches(cell)
+        return half_ohm, half_ohm, BRANCHES_STD, (REFERENCE_C, REFERENCE_C)
+    weak_ohm, strong_ohm = (
+        np.column_stack([np.interp(SOC_GRID, ladder.soc, row) for row in rows])
+        for rows in (ladder.weak_ohm, ladder.strong_ohm)
+    )
+    return weak_ohm, strong_ohm, ladder.std, ladder.temperature_c
+
+
+def ladder_of_branches(cell: CellModel) -> NDArray[np.float64]:
+    """The ladder's resistances [ohm] that stand for (2.5)-(2.9). Shape (GRID, RESISTANCES).
+
+    Each branch is shared between the two time constants of the ladder around its own, by the logarithm.
+    """
+    ohm, a = np.zeros((GRID, RESISTANCES)), cell.a
+    ln_taus = np.log(TAU_S)
+    for i, soc in enumerate(SOC_GRID):
+        ohm[i, 0] = chen_mora.r_s(soc, a)
+        c_ts = max(chen_mora.c_ts(soc, a), LEAST_CAPACITANCE * a[9])
+        c_tl = max(chen_mora.c_tl(soc, a), LEAST_CAPACITANCE * a[12])
+        for r, c in ((chen_mora.r_ts(soc, a), c_ts), (chen_mora.r_tl(soc, a), c_tl)):
+            position = float(np.interp(np.log(r * c), ln_taus, np.arange(BRANCHES)))
+            k = min(int(position), BRANCHES - 2)
+            ohm[i, 1 + k] += r * (k + 1 - position)
+            ohm[i, 2 + k] += r * (position - k)
+            ohm[i, BRANCHES] += BEYOND_BRANCHES * r
+    return ohm

@@ -1,0 +1,223 @@
+"""What keeps the filter sane for years: samples that are not believed, a watch on its input, the last good state.
+
+``c`` is a record of CHECKS, ``n`` of COUNTERS, ``f`` of EKF_STATE, ``p`` of EKF_SETTINGS.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from bms_estimator.kernels.charge import UNMEASURED_S
+from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET, SOC, STATES
+from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS
+from bms_estimator.kernels.hypotheses import clear, seed, start
+from bms_estimator.kernels.state import Record
+from bms_estimator.model.suspect import Suspect
+
+GATE_STDS = 6.0
+"""A sample further from its prediction than so many std of the innovation is a glitch, ..."""
+GATE_SAMPLES, GATE_S = 5, 5.0
+"""... unless so many in a row, for so long [s], say the same: then the cell has changed."""
+SNAPSHOT_S = 60.0
+"""The state is kept as the last good one so often [s]."""
+LOST_STD = 0.05
+"""How far the SOC may have gone from the last good one, std."""
+FAST_S = 10.0
+"""Changes of voltage and current within this time belong together [s]."""
+SIGN_S = 300.0
+"""Memory of how the voltage goes with the current, counted while it changes [s]."""
+LEAST_EVIDENCE = 0.1
+"""Share of that memory which must be filled."""
+VISIBLE_V = 0.003
+"""A change of the overpotential of one cell that shows fully [V]."""
+CLIP = 5.0
+"""A change of voltage counts up to so many times what the resistances explain: not a glitch to zero."""
+OUTLIERS_S = 3600.0
+"""Memory of single samples that were not believed [s]."""
+MANY_OUTLIERS, FEW_OUTLIERS = 5.0, 1.0
+FIRST_STDS, PRESENT_STDS = 2.0, 3.0
+"""Offset and capacity are suspicious beyond so many of their first and of their present std."""
+TAKEN_BACK = 0.7
+"""A suspicion stands until its measure is below this part of its limit."""
+INFLATED = 10.0
+"""The variance of the error that stays, over what the settings say."""
+UNKNOWN_K = 5.0
+"""So far outside the temperatures of the cell file nothing is known of it [K]."""
+
+SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE = (int(bit) for bit in Suspect)
+
+CHECKS = np.dtype(
+    [
+        ("mean_a", "f8"),  # current at the last update of the filter [A]
+        ("gated_in_row", "i8"),
+        ("gated_s", "f8"),  # how long samples have been gated [s]
+        ("outliers", "f8"),  # single samples not believed of late
+        ("slow_v", "f8"),  # voltage and ...
+        ("slow_a", "f8"),  # ... current without their fast changes
+        ("sign_evidence", "f8"),  # 0..1: how much was seen of
+        ("change_v_a", "f8"),  # running mean of the fast change of voltage times that of current [V A]
+        ("change_a2", "f8"),  # the same of the current's squared [A^2]
+        ("suspects", "i8"),  # bits of model.suspect.Suspect
+        ("good_mean", "f8", STATES),  # of the likeliest filter when it was last kept
+        ("good_covariance", "f8", (STATES, STATES)),
+        ("good_soc", "f8"),
+        ("good_soc_std", "f8"),
+        ("good_age_s", "f8"),
+    ],
+    align=True,
+)
+
+COUNTERS = np.dtype(
+    [
+        ("gated", "i8"),  # samples not believed
+        ("reopened", "i8"),  # so many in a row that they were
+        ("reset", "i8"),  # not finite: back to the last good state
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def believed(
+    c: Record, n: Record, f: Record, e: Record, dt_s: float, change_a: float, current_a: float, voltage_v: float
+) -> bool:
+    """Whether the filter may see a sample: its voltage is near what was predicted, or stays where it is.
+
+    Args:
+        c: Record of CHECKS.
+        n: Record of COUNTERS.
+        f: Record of EKF_STATE.
+        e: Record of EQUIVALENT.
+        dt_s: Since the sample before [s].
+        change_a: Of the current since then [A].
+        current_a: Current [A].
+        voltage_v: Voltage [V].
+    """
+    away_a = current_a - c.mean_a
+    predicted_v = f.voltage_v - e.value[R_S] * away_a
+    jump_v = (e.value[R_S] + e.value[R_TS] + e.value[R_TL]) * max(abs(away_a), abs(change_a))
+    limit_v = GATE_STDS * math.sqrt(f.innovation_variance) + jump_v
+    if abs(voltage_v - predicted_v) <= limit_v or dt_s > UNMEASURED_S:
+        if c.gated_in_row > 0 and not enough(c):
+            c.outliers += c.gated_in_row
+        c.gated_in_row, c.gated_s = 0, 0.0
+        return True
+    if enough(c):
+        return True
+    c.gated_in_row += 1
+    c.gated_s += dt_s
+    if enough(c):
+        n.reopened += 1
+        return True
+    n.gated += 1
+    return False
+
+
+@njit(cache=True)
+def enough(c: Record) -> bool:
+    """So many samples in a row are no glitch."""
+    return c.gated_in_row >= GATE_SAMPLES and c.gated_s >= GATE_S
+
+
+@njit(cache=True)
+def keep(c: Record, f: Record) -> None:
+    """Keep what the likeliest filter knows as the last good state."""
+    for j in range(STATES):
+        c.good_mean[j] = f.mean[f.best, j]
+        for k in range(STATES):
+            c.good_covariance[j, k] = f.covariance[f.best, j, k]
+    c.good_soc, c.good_soc_std, c.good_age_s = f.soc, f.soc_std, 0.0
+
+
+@njit(cache=True)
+def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
+    """Back to the last good state when anything of the filter is not finite; else keep it now and then."""
+    total = f.soc + f.soc_std + f.innovation_v + f.innovation_variance + f.rms_a2
+    for q in range(f.count):
+        total += f.ln_weight[q] + f.fast_inflation[q] + f.slow_inflation[q]
+        for j in range(STATES):
+            total += f.mean[q, j] + f.covariance[q, j, j]
+    if math.isfinite(total) and 1 <= f.count <= HYPOTHESES:
+        c.good_age_s += dt_s
+        if c.good_age_s >= SNAPSHOT_S:
+            keep(c, f)
+        return
+    f.best = 0
+    for j in range(STATES):
+        f.mean[0, j] = c.good_mean[j]
+        for k in range(STATES):
+            f.covariance[0, j, k] = c.good_covariance[j, k]
+    f.rms_a2 = max(f.current_a**2, (p.load_mean_c * p.capacity_as / 3600.0) ** 2)
+    seed(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + LOST_STD**2))
+    clear(f)
+    n.reset += 1
+
+
+@njit(cache=True)
+def watch_sign(c: Record, f: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
+    """How fast changes of the voltage go with those of the current: by -R_s when the sign is right."""
+    if dt_s > UNMEASURED_S or c.slow_v == 0.0:  # a gap, or the first sample
+        c.slow_v, c.slow_a = voltage_v, current_a
+        return
+    middle = p.weak_ohm.shape[0] // 2
+    ohm = 0.0
+    for k in range(p.weak_ohm.shape[1]):
+        ohm += p.weak_ohm[middle, k] + p.strong_ohm[middle, k]
+    change_a = current_a - c.slow_a
+    limit_v = CLIP * ohm * abs(change_a)
+    change_v = min(max(voltage_v - c.slow_v, -limit_v), limit_v)
+    share = min(1.0, dt_s / FAST_S)
+    c.slow_v += share * (voltage_v - c.slow_v)
+    c.slow_a += share * change_a
+    visible = min(1.0, (ohm * change_a / (VISIBLE_V * p.series)) ** 2)
+    weight = visible * min(1.0, dt_s / SIGN_S)
+    c.sign_evidence += weight * (1.0 - c.sign_evidence)
+    c.change_v_a += weight * (change_v * change_a - c.change_v_a)
+    c.change_a2 += weight * (change_a * change_a - c.change_a2)
+
+
+@njit(cache=True)
+def doubt_sign(f: Record, p: Record, dt_s: float, current_a: float) -> None:
+    """Charge counted with the wrong sign: the SOC errs by twice as much, always the same way."""
+    wrong = 2.0 * abs(current_a) * min(dt_s, UNMEASURED_S) / p.capacity_as
+    for q in range(f.count):
+        std = math.sqrt(f.covariance[q, SOC, SOC])
+        f.covariance[q, SOC, SOC] = (std + wrong) ** 2
+
+
+@njit(cache=True)
+def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
+    """Set and take back the bits of ``c.suspects`` after an update; start the filter again when the sign is right again."""
+    before = c.suspects
+    c.outliers -= c.outliers * min(1.0, dt_s / OUTLIERS_S)
+    middle = p.weak_ohm.shape[0] // 2
+    steep = 0.25 * (p.weak_ohm[middle, 0] + p.strong_ohm[middle, 0]) * c.change_a2
+    if c.change_v_a > (0.0 if before & SIGN_OF_CURRENT else steep) and c.sign_evidence > LEAST_EVIDENCE:
+        c.suspects = SIGN_OF_CURRENT
+        return
+    if before & SIGN_OF_CURRENT:  # what was learned under the wrong one is worth nothing
+        start(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
+    bits = 0
+    if c.outliers > (FEW_OUTLIERS if before & OUTLIERS else MANY_OUTLIERS):
+        bits |= OUTLIERS
+    x, cov = f.mean[f.best], f.covariance[f.best]
+    offset_std = p.offset_c * p.capacity_as / 3600.0
+    if beyond(x[OFFSET], cov[OFFSET, OFFSET], offset_std, before & OFFSET_BIT):
+        bits |= OFFSET_BIT
+    if beyond(x[LN_Q], cov[LN_Q, LN_Q], p.capacity_std, before & CAPACITY):
+        bits |= CAPACITY
+    if f.slow_inflation[f.best] > INFLATED * (TAKEN_BACK if before & OCV else 1.0):
+        bits |= OCV
+    outside_k = max(p.low_c - f.temperature_c, f.temperature_c - p.high_c)
+    if f.sensed and outside_k > UNKNOWN_K * (TAKEN_BACK if before & TEMPERATURE else 1.0):
+        bits |= TEMPERATURE
+    c.suspects = bits
+
+
+@njit(cache=True)
+def beyond(value: float, variance: float, first_std: float, before: int) -> bool:
+    """Whether a bias is more than it was expected to be, and known to be so."""
+    part = TAKEN_BACK if before else 1.0
+    limit = part * max(FIRST_STDS * first_std, PRESENT_STDS * math.sqrt(variance))
+    return first_std > 0.0 and abs(value) > limit
