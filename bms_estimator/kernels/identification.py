@@ -71,7 +71,7 @@ def identify(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: flo
     f, c = s.filter, s.checks
     change_a = current_a - f.current_a
     count_on(f, p.filter, dt_s, current_a, temperature_c)
-    watch_sign(c, f, p.filter, dt_s, current_a, voltage_v)
+    watch_sign(c, p.filter, dt_s, current_a, voltage_v)
     if c.suspects & SIGN_OF_CURRENT:
         doubt_sign(f, p.filter, dt_s, current_a)
     if believed(c, s.counters, f, s.elements, dt_s, change_a, current_a, voltage_v):
@@ -127,9 +127,7 @@ def learn_elements(s: Record, p: Record, dt_s: float) -> None:
 @njit(cache=True)
 def learn_one(s: Record, e: int, j: int, is_told: bool, dt_s: float) -> None:
     """Add one element, ``j`` of the equivalent ones, and note when that was."""
-    learned = is_told and learn(
-        s.map, e, s.filter.soc, math.log(s.elements.value[j]), s.elements.ln_variance[j], dt_s
-    )
+    learned = is_told and learn(s.map, e, s.filter.soc, math.log(s.elements.value[j]), s.elements.ln_variance[j], dt_s)
     s.unlearned_s[e] = 0.0 if learned else s.unlearned_s[e] + dt_s
 
 

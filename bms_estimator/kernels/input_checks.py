@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from bms_estimator.kernels.charge import UNMEASURED_S
-from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET, SOC, STATES
+from bms_estimator.kernels.ekf_state import B_SLOW, HYPOTHESES, LN_Q, OFFSET, SOC, STATES
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS
 from bms_estimator.kernels.hypotheses import clear, seed, start
 from bms_estimator.kernels.state import Record
@@ -36,12 +36,12 @@ CLIP = 5.0
 OUTLIERS_S = 3600.0
 """Memory of single samples that were not believed [s]."""
 MANY_OUTLIERS, FEW_OUTLIERS = 5.0, 1.0
-FIRST_STDS, PRESENT_STDS = 2.0, 3.0
+FIRST_STDS, PRESENT_STDS = 3.0, 3.0
 """Offset and capacity are suspicious beyond so many of their first and of their present std."""
 TAKEN_BACK = 0.7
 """A suspicion stands until its measure is below this part of its limit."""
-INFLATED = 10.0
-"""The variance of the error that stays, over what the settings say."""
+WRONG_V, WRONG_S = 0.12, 1800.0
+"""No curve of the cell's own chemistry is so far off, of one cell [V], over so long [s]."""
 UNKNOWN_K = 5.0
 """So far outside the temperatures of the cell file nothing is known of it [K]."""
 
@@ -58,6 +58,7 @@ CHECKS = np.dtype(
         ("sign_evidence", "f8"),  # 0..1: how much was seen of
         ("change_v_a", "f8"),  # running mean of the fast change of voltage times that of current [V A]
         ("change_a2", "f8"),  # the same of the current's squared [A^2]
+        ("wrong_v", "f8"),  # running mean of the error that stays [V]
         ("suspects", "i8"),  # bits of model.suspect.Suspect
         ("good_mean", "f8", STATES),  # of the likeliest filter when it was last kept
         ("good_covariance", "f8", (STATES, STATES)),
@@ -155,7 +156,7 @@ def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
 
 
 @njit(cache=True)
-def watch_sign(c: Record, f: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
+def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
     """How fast changes of the voltage go with those of the current: by -R_s when the sign is right."""
     if dt_s > UNMEASURED_S or c.slow_v == 0.0:  # a gap, or the first sample
         c.slow_v, c.slow_a = voltage_v, current_a
@@ -207,8 +208,9 @@ def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
         bits |= OFFSET_BIT
     if beyond(x[LN_Q], cov[LN_Q, LN_Q], p.capacity_std, before & CAPACITY):
         bits |= CAPACITY
-    if f.slow_inflation[f.best] > INFLATED * (TAKEN_BACK if before & OCV else 1.0):
-        bits |= OCV
+    c.wrong_v += min(1.0, dt_s / WRONG_S) * (x[B_SLOW] - c.wrong_v)
+    if abs(c.wrong_v) > WRONG_V * p.series * (TAKEN_BACK if before & OCV else 1.0):
+        bits = OCV | bits & OUTLIERS  # offset and capacity try to explain it
     outside_k = max(p.low_c - f.temperature_c, f.temperature_c - p.high_c)
     if f.sensed and outside_k > UNKNOWN_K * (TAKEN_BACK if before & TEMPERATURE else 1.0):
         bits |= TEMPERATURE

@@ -7,9 +7,9 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter, present_elements
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.ekf_state import LN_Q, LN_R0, OFFSET, SOC
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS
 from bms_estimator.kernels.identification import hand_over
-from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, LN_CAPACITY, LN_R_S
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
@@ -137,15 +137,16 @@ def test_time_that_nobody_measured_teaches_the_map_nothing(load) -> None:
 
 
 def test_a_long_pause_leaves_what_was_learned_of_sensor_and_capacity(load) -> None:
-    on = IdentifierSettings(current_offset_std_a=0.05, capacity_std=0.05)
-    estimator = Estimator(TRUTH, identifier=on, initial_soc=1.0)
+    estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     estimator.run(load[0])
-    x = estimator.record["identifier"]
-    learned = x["mean"][0, [CURRENT_OFFSET, LN_CAPACITY]].copy()
+    f = estimator.record[0]["filter"]
+    learned = f["mean"][f["best"], [OFFSET, LN_Q]].copy()
     estimator.resume(86400.0)
-    assert np.array_equal(x["mean"][0, [CURRENT_OFFSET, LN_CAPACITY]], learned)
-    assert x["covariance"][0, LN_CAPACITY, LN_CAPACITY] < 0.05**2
-    assert x["mean"][0, LN_R_S] == estimator.settings_record["identifier"]["mean"][0, LN_R_S]
+    mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]]
+    assert learned.all()
+    assert np.array_equal(mean[[OFFSET, LN_Q]], learned)
+    assert covariance[LN_Q, LN_Q] < ON.capacity_std**2
+    assert (mean[LN_R0], covariance[LN_R0, LN_R0]) == (0.0, estimator.settings_record[0]["filter"]["r_std"] ** 2)
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2"])
@@ -220,8 +221,7 @@ def test_a_reset_after_a_pause_goes_back_to_the_soc_of_the_pause(load) -> None:
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     estimator.run(load[0][:5000])
     estimator.set_soc(0.7)
-    estimator.resume(1e4)
-    identifier = estimator.record["identifier"]
-    assert identifier["good_mean"][0, 0] == identifier["mean"][0, 0] == 0.7
+    estimator.record["filter"]["mean"][0, :, SOC] = np.nan
     estimator.run(load[0][5000:5002])
-    assert estimator.state["time_steps_back"][0] == 0
+    assert estimator.record["counters"]["reset"][0] == 1
+    assert estimator.state["soc"][0] == pytest.approx(0.7, abs=0.05)
