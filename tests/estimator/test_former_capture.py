@@ -1,4 +1,4 @@
-"""What was recorded by the first version gives the estimates that it gave."""
+"""What was recorded by the first version is read as it was then."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ ROUNDING = 1e-9
 """Relative: another processor may round the last bits otherwise."""
 
 
-def test_a_capture_of_the_first_version_gives_the_estimates_it_gave(data: Path) -> None:
+def test_a_capture_of_the_first_version_is_read_as_it_was_then(data: Path) -> None:
     recorded = data / "simulated" / "board_0_1_0.bms"
     then = json.loads(recorded.with_suffix(".json").read_text())
     now = estimate(load_capture(recorded), load_cell("chen_mora"))

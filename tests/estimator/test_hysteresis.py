@@ -35,6 +35,7 @@ def cycled(seed: int) -> tuple[SampleBlock, np.ndarray]:
     rng = np.random.default_rng(seed)
     current_a = load_a(rng, 4)
     block = np.zeros(current_a.size, dtype=SAMPLE)
+    block["temperature_c"] = 25.0
     block["time_s"], block["current_a"] = np.arange(current_a.size), current_a
     grid, x, branch, soc = ocv_grid(CELL), (1.0, 0.0, 0.0), 0.0, np.empty(current_a.size)
     for n, i in enumerate(current_a):
@@ -46,14 +47,17 @@ def cycled(seed: int) -> tuple[SampleBlock, np.ndarray]:
     return block, soc
 
 
-def soc_rms(block: SampleBlock, soc: np.ndarray, hysteresis_v: float) -> float:
+def errors(block: SampleBlock, soc: np.ndarray, hysteresis_v: float) -> tuple[float, float]:
+    """RMS error of the SOC after two hours, and the share of time inside two standard deviations."""
     estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=hysteresis_v), initial_soc=1.0)
-    error = estimator.run(block)["soc"] - soc
-    return float(np.sqrt(np.mean(error[7200:] ** 2)))
+    trace = estimator.run(block)[7200:]
+    error = trace["soc"] - soc[7200:]
+    return float(np.sqrt(np.mean(error**2))), float(np.mean(np.abs(error) < 2.0 * trace["soc_std"]))
 
 
-def test_a_hysteresis_that_is_told_makes_the_soc_better() -> None:
-    loads = [cycled(seed) for seed in range(1, 6)]
-    told, untold = (np.mean([soc_rms(*load, v) for load in loads]) for v in (HYSTERESIS_V, 0.0))
-    assert told < 0.002
-    assert told < 0.8 * untold
+def test_a_hysteresis_that_is_told_makes_the_soc_better_and_its_band_true() -> None:
+    loads = [cycled(seed) for seed in range(1, 4)]
+    told, untold = (np.mean([errors(*load, v) for load in loads], axis=0) for v in (HYSTERESIS_V, 0.0))
+    assert told[0] < 0.012
+    assert told[0] < 0.8 * untold[0]
+    assert told[1] > 0.95

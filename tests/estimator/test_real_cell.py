@@ -16,8 +16,8 @@ def test_soc_wrong_by_a_fifth_is_right_within_an_hour(data, first):
     found = estimate(Columns(whole.rows[first:]), cell, initial_soc=soc[0] - 0.2)
     judged = (found["time_s"] > found["time_s"][0] + 3600.0) & (soc > 0.05)
     error = found["soc"][judged] - soc[judged]
-    assert np.abs(error).max() < 0.01
-    assert (np.abs(error) < 2.0 * found["soc_std"][judged]).mean() > 0.9
+    assert np.abs(error).max() < 0.02
+    assert (np.abs(error) < 2.0 * found["soc_std"][judged]).mean() > 0.95
 
 
 def test_blocks_of_a_real_capture_leave_what_its_samples_leave_to_the_last_bit(data):

@@ -31,6 +31,7 @@ def at(soc: float) -> Estimator:
 def pulses(current_a: float, hours: float) -> np.ndarray:
     """The cell's voltage under pulses of a minute at 10 Hz."""
     block = np.zeros(int(36_000 * hours), dtype=SAMPLE)
+    block["temperature_c"] = 25.0
     block["time_s"] = 0.1 * np.arange(block.size)
     block["current_a"] = np.where(np.arange(block.size) // 600 % 2 == 0, current_a, 0.0)
     block["voltage_v"], _ = chen_mora.simulate_cell(
