@@ -111,7 +111,7 @@ async def _replay(settings: Settings, cell: CellModel, source: Replay, table: Ta
         wall_s = time.perf_counter() - started_s
         if publisher:
             publisher.publish_last()
-    return summary.result(estimator.record[0], source.samples, wall_s)
+    return summary.result(estimator.record[0], estimator.settings_record[0], source.samples, wall_s)
 
 
 async def _publisher(

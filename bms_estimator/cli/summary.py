@@ -62,11 +62,12 @@ class Summary:
         difference = trace["soc"] - trace["soc_coulomb"]
         self._soc_difference += float(difference @ difference)
 
-    def result(self, record: np.void, read: int, wall_s: float) -> Result:
+    def result(self, record: np.void, settings: np.void, read: int, wall_s: float) -> Result:
         """The outcome.
 
         Args:
             record: Of dtype ESTIMATOR_STATE, after the last sample.
+            settings: Of dtype ESTIMATOR_SETTINGS.
             read: How many samples the capture had.
             wall_s: How long it took [s].
         """
@@ -84,7 +85,7 @@ class Summary:
             lock_lost=bool(state["lock_losses"]),
             lock_losses=int(state["lock_losses"]),
             k_final=finite(state["k"]),
-            suspects=suspicions(record),
+            suspects=suspicions(record, settings),
             gain_rearms=int(state["gain_rearms"]),
             dropped={
                 name.removeprefix("dropped_"): count for name, count in counters.items() if name.startswith("dropped_")

@@ -71,7 +71,8 @@ class ParameterReport(Report):
     a: dict[str, Parameter] = Field(description="a1..a21 of (2.5)-(2.10)")
     elements: dict[str, Parameter] = Field(description="r_s_ohm, r_ts_ohm, c_ts_farad, r_tl_ohm, c_tl_farad, e_o_v")
     state_of_health: dict[str, Parameter] = Field(
-        description="capacity and r_s over those of the cell file: 1 is as new; r_s at the present SOC"
+        description="capacity and r_s over those of the cell file: 1 is as new; r_s at the present SOC; "
+        "current_offset_a: what the current sensor shows at no current [A]"
     )
 
 
@@ -115,6 +116,9 @@ class Info(Report):
     series_count: int
     nominal_voltage_v: float
     observer: str = Field(description="adaptation law and gain")
+    temperature_sensor: bool = Field(
+        description="a cell temperature came; without any 25 C is taken, and the resistances are less sure"
+    )
     publish_rate_hz: float
     board: dict[str, str] = Field(description="what the board said of itself; empty until it did")
 

@@ -30,5 +30,6 @@ _TEXT = {
     "and the number of cells in series",
     Suspect.OUTLIERS: "single samples far from those around them: check wiring and supply of the sensors, "
     "and that voltage and current are taken at the same time",
-    Suspect.TEMPERATURE: "the cell file was not made for this temperature: make it with captures taken there",
+    Suspect.TEMPERATURE: "errors are larger there: check the temperature sensor, or make the cell file with captures "
+    "at this temperature",
 }

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET
-from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
 from bms_estimator.kernels.hypotheses import forget
 from bms_estimator.kernels.input_checks import COUNTERS
 from bms_estimator.kernels.state import OBSERVER_STATE
@@ -75,10 +74,10 @@ def _open_new_states(estimator: Estimator) -> None:
 def _insane(estimator: Estimator) -> str:
     """Why a state cannot be used; empty when it can."""
     record, cell = estimator.record, estimator.cell.cell
-    for part in ("observer", "filter", "checks", "map"):
-        for name in ESTIMATOR_STATE[part].names or ():
-            if not np.isfinite(record[part][name]).all():
-                return f"{name} of the {part} is not finite"
+    for name, field in fields(record):
+        part, _, what = name.partition(".")
+        if part in ("observer", "filter", "checks", "map") and not np.isfinite(field).all():
+            return f"{what} of the {part} is not finite"
     s = record[0]["observer"]
     if not s["started"]:
         return "no sample was taken"

@@ -37,18 +37,30 @@ def dropped_text(dropped: Mapping[str, int]) -> str:
 
 
 def identifier_counters(record: np.void) -> dict[str, int]:
-    """How often the identifier did not believe its input or itself, of a record of ESTIMATOR_STATE."""
+    """How often the filter did not believe its input or itself, of a record of ESTIMATOR_STATE."""
     return {name: int(record["counters"][name]) for name in COUNTERS.names or ()}
 
 
-def suspicions(record: np.void) -> list[str]:
-    """What the identifier suspects of its input, of a record of ESTIMATOR_STATE: one sentence each."""
+def suspicions(record: np.void, settings: np.void) -> list[str]:
+    """What the filter suspects of its input: one sentence each.
+
+    Args:
+        record: Of dtype ESTIMATOR_STATE.
+        settings: Of dtype ESTIMATOR_SETTINGS.
+    """
     suspects = Suspect(int(record["checks"]["suspects"]))
-    return [suspect.text for suspect in Suspect if suspect in suspects]
+    texts = {suspect: suspect.text for suspect in Suspect if suspect in suspects}
+    if Suspect.TEMPERATURE in texts:
+        low_c, high_c = float(settings["filter"]["low_c"]), float(settings["filter"]["high_c"])
+        known = f"{low_c:.0f} C" if low_c == high_c else f"{low_c:.0f} to {high_c:.0f} C"
+        numbers = f"no data at {float(record['filter']['temperature_c']):.0f} C, the cell file knows {known}"
+        texts[Suspect.TEMPERATURE] = f"{numbers}: {Suspect.TEMPERATURE.text}"
+    return list(texts.values())
 
 
 def health_report(
     record: np.void,
+    settings: np.void,
     line: Mapping[str, int],
     *,
     now_s: float,
@@ -64,6 +76,7 @@ def health_report(
 
     Args:
         record: Of dtype ESTIMATOR_STATE.
+        settings: Of dtype ESTIMATOR_SETTINGS.
         line: The source's counters.
         now_s: Wall clock [s since 1970].
         uptime_s: Since the service started [s].
@@ -88,7 +101,7 @@ def health_report(
         line={name: int(count) for name, count in line.items() if name != "reconnects"},
         samples=sample_counters(state),
         identifier=identifier_counters(record),
-        suspects=suspicions(record),
+        suspects=suspicions(record, settings),
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),
         publish_drops=delivery.drops,

@@ -5,7 +5,13 @@ import math
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.learned import Learned, fitted_parameter, present_elements, relative_capacity
+from bms_estimator.estimator.learned import (
+    Learned,
+    current_offset,
+    fitted_parameter,
+    present_elements,
+    relative_capacity,
+)
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Parameter, ParameterReport
@@ -16,7 +22,9 @@ VALID_STD = 0.3
 """An element known better than this, relative, is identified."""
 VALID_FIT_STD = 0.5
 """The same for a1..a15: amplitudes and exponents show only where the SOC was swept."""
-VALID_CAPACITY_STD = 0.03
+VALID_CAPACITY_STD = 0.02
+VALID_OFFSET = 0.5
+"""An offset is identified when its standard deviation is below this part of the first one."""
 _FUNCTIONS = {
     "r_s_ohm": chen_mora.r_s,  # (2.9)
     "r_ts_ohm": chen_mora.r_ts,  # (2.5)
@@ -79,11 +87,25 @@ def _state_of_health(estimator: Estimator, r_s: Learned, now_s: float) -> dict[s
     """Capacity and R_s over those of the cell file."""
     new = chen_mora.r_s(float(estimator.state[0]["soc"]), estimator.cell.a)
     ratio = Learned(r_s.value / new, r_s.std / new, r_s.unlearned_s)
-    if estimator.settings_record["filter"]["capacity_std"][0] > 0.0:
-        capacity = _identified(relative_capacity(estimator.record[0]), _configured(1.0, ""), VALID_CAPACITY_STD, now_s)
-    else:
-        capacity = _configured(1.0, "").model_copy(update={"reason": "identifier.capacity_std is 0: taken as declared"})
-    return {"capacity": capacity, "r_s": _identified(ratio, _configured(1.0, ""), VALID_STD, now_s)}
+    record, p = estimator.record[0], estimator.settings_record[0]["filter"]
+    capacity, offset_a = relative_capacity(record), current_offset(record)
+    first_std_a = float(p["offset_c"] * p["capacity_as"]) / 3600.0
+    return {
+        "capacity": _bias(capacity, VALID_CAPACITY_STD, "identifier.capacity_std", now_s),
+        "r_s": _identified(ratio, _configured(1.0, ""), VALID_STD, now_s),
+        "current_offset_a": _bias(offset_a, VALID_OFFSET * first_std_a, "identifier.current_offset_std_a", now_s),
+    }
+
+
+def _bias(learned: Learned, limit: float, setting: str, now_s: float) -> Parameter:
+    """What is known of sensor or capacity, valid below ``limit`` [its unit]."""
+    value, std = finite(learned.value), finite(learned.std)
+    if std == 0.0:
+        declared = f"{setting} is 0: taken as declared"
+        return Parameter(value=value, std=None, valid=False, source="configured", reason=declared)
+    valid = learned.std < limit
+    reason = None if valid else f"known to {learned.std:.2g} so far, valid below {limit:.2g}"
+    return Parameter(value=value, std=std, valid=valid, source="identified", updated=iso_utc(now_s), reason=reason)
 
 
 def _of_source(held: Parameter, led: np.bool_) -> Parameter:
@@ -100,6 +122,8 @@ def _parameter(held: Parameter, fit: Learned | None, now_s: float) -> Parameter:
 
 def _identified(learned: Learned, held: Parameter, limit: float, now_s: float) -> Parameter:
     """What was learned where that is known well enough, else what the observer holds and how far learning has come."""
+    if math.isinf(learned.unlearned_s):
+        return held
     if learned.relative_std < limit:
         updated = iso_utc(max(now_s - learned.unlearned_s, 0.0))
         return Parameter(

@@ -152,6 +152,7 @@ class Publisher:
         lag_s, self._lag_s = self._lag_s, 0.0
         return health_report(
             self._estimator.record[0],
+            self._estimator.settings_record[0],
             self._source.counters,
             now_s=self._clock.wall(),
             uptime_s=now_s - self._started_s,
@@ -165,7 +166,8 @@ class Publisher:
 
     def _info(self) -> Info:
         self._board = self._source.board or self._board  # one that was lost is most likely to come back
-        return info_report(self._settings, self._cell, self._board, self._started_wall_s)
+        sensed = bool(self._estimator.record["filter"]["sensed"][0])
+        return info_report(self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed)
 
     def _sensor_message(self, now_s: float) -> str | None:
         """Why values are not fresh, None when they are."""

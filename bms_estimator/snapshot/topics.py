@@ -70,7 +70,9 @@ def estimate_report(
     )
 
 
-def info_report(settings: Settings, cell: CellModel, board: Mapping[str, str], started_s: float) -> Info:
+def info_report(
+    settings: Settings, cell: CellModel, board: Mapping[str, str], started_s: float, *, temperature_sensor: bool
+) -> Info:
     """Topic ``info``.
 
     Args:
@@ -78,6 +80,7 @@ def info_report(settings: Settings, cell: CellModel, board: Mapping[str, str], s
         cell: The pack as one object.
         board: What the board said of itself.
         started_s: Wall clock at start [s since 1970].
+        temperature_sensor: Whether the cell's temperature is measured.
     """
     return Info(
         device=settings.pack.name,
@@ -88,6 +91,7 @@ def info_report(settings: Settings, cell: CellModel, board: Mapping[str, str], s
         series_count=cell.cell.series_count,
         nominal_voltage_v=cell.cell.nominal_voltage_v,
         observer=f"{settings.observer.law}, {settings.observer.nussbaum}",
+        temperature_sensor=temperature_sensor,
         publish_rate_hz=settings.publish.rate_hz,
         board=dict(board),
     )

@@ -1,7 +1,6 @@
 """What outlives a restart: taken up when it is of the same pack, whatever else was edited or has come with a version."""
 
 import asyncio
-import math
 import os
 import stat
 import threading
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.identifier_state import CURRENT_OFFSET, ELEMENTS, LN_R_S
+from bms_estimator.kernels.ekf_state import OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Health
@@ -39,17 +38,12 @@ def edited(section: str, **values: Any) -> Settings:
     return Settings.model_validate(tables | {section: tables[section] | values})
 
 
-def old_state() -> np.ndarray:
-    with np.load(OLD_FILE) as file:
-        return file["state"]
-
-
-def an_old_pack() -> Estimator:
+def a_used_pack() -> Estimator:
     """An estimator that has learned."""
     estimator = new_estimator(SETTINGS, CELL)
-    assert resume(estimator, dict(fields(old_state())), 0.0) == ""
-    estimator.step(0.0, 0.0, 3.8)  # of the new clock
-    assert estimator.record["map"]["weight"].any()
+    for i in range(600):
+        estimator.step(float(i), 0.3 * (i // 60 % 2), 3.8)
+    estimator.record["map"]["weight"] = estimator.record["map"]["moment"] = 1.0
     return estimator
 
 
@@ -99,17 +93,19 @@ async def test_a_restart_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
     ids=lambda settings: str(settings.model_dump(exclude_defaults=True)),
 )
 async def test_an_edited_setting_costs_nothing_that_was_learned(tmp_path: Path, settings: Settings) -> None:
-    learned = an_old_pack()
+    learned = a_used_pack()
     CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, restarts=0)
     run = await ran(tmp_path, settings, samples=1)
-    assert run.health.checkpoint == "restored: SOC 0.5762"
+    assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
     assert run.estimator.record["map"].tobytes() == learned.record["map"].tobytes()
 
 
 async def test_an_edited_description_costs_nothing_that_was_learned(tmp_path: Path) -> None:
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(an_old_pack().record, restarts=0)
+    learned = a_used_pack()
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, restarts=0)
     described = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"name": "mine", "description": "new"})})
-    assert (await ran(tmp_path, cell=described, samples=2)).health.checkpoint == "restored: SOC 0.5762"
+    run = await ran(tmp_path, cell=described, samples=2)
+    assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
 
 def test_only_what_gives_the_state_its_meaning_is_the_identity() -> None:
@@ -122,28 +118,24 @@ def test_only_what_gives_the_state_its_meaning_is_the_identity() -> None:
 
 
 def test_a_version_with_other_fields_reads_what_it_knows() -> None:
-    saved, fresh, estimator = an_old_pack(), new_estimator(SETTINGS, CELL), new_estimator(SETTINGS, CELL)
+    saved, fresh, estimator = a_used_pack(), new_estimator(SETTINGS, CELL), new_estimator(SETTINGS, CELL)
     fresh.step(0.0, 0.0, CELL.cell.nominal_voltage_v)
-    later = {name: field for name, field in fields(saved.record) if name not in ("identifier.misfit", "map.dwell_s")}
-    later |= {"identifier.mean": np.zeros((1, 99)), "map.of_a_later_version": np.ones(3)}
+    later = {name: field for name, field in fields(saved.record) if name not in ("checks.good_soc", "map.dwell_s")}
+    later |= {"filter.ohm": np.zeros((1, 99)), "map.of_a_later_version": np.ones(3)}
     assert resume(estimator, later, 0.0) == ""
     assert estimator.state["soc"][0] == saved.state["soc"][0]
     assert (estimator.record["map"]["weight"] == saved.record["map"]["weight"]).all()
-    assert estimator.record["identifier"]["misfit"] == fresh.record["identifier"]["misfit"] == 1.0
+    assert estimator.record["checks"]["good_soc"] == fresh.record["checks"]["good_soc"]
     assert not estimator.record["map"]["dwell_s"].any()
-    elements = slice(LN_R_S, LN_R_S + ELEMENTS)
-    assert (
-        estimator.record["identifier"]["mean"][0, elements] == fresh.record["identifier"]["mean"][0, elements]
-    ).any()
+    assert estimator.record["filter"]["ohm"].shape == fresh.record["filter"]["ohm"].shape
 
 
 async def test_a_checkpoint_of_the_format_before_is_taken_over(tmp_path: Path) -> None:
     (tmp_path / "pack.npz").write_bytes(OLD_FILE.read_bytes())
-    old = old_state()
     run = await ran(tmp_path, edited("identifier", map_memory_h=100.0), samples=1)
     assert run.health.checkpoint == "restored: SOC 0.5762"
     assert run.health.restarts == 4
-    assert (run.estimator.record["map"]["weight"] == old["map"]["weight"]).all()
+    assert not run.estimator.record["map"]["weight"].any()  # its elements were of another model
     assert not (tmp_path / "pack.npz").exists()
     assert (await ran(tmp_path, samples=1)).health.restarts == 5
 
@@ -225,15 +217,20 @@ def test_what_is_written_is_private_and_goes_through_no_planted_link(tmp_path: P
     assert stat.S_IMODE(file.path.lstat().st_mode) == 0o600
 
 
+def offset_covariance(estimator: Estimator) -> np.ndarray:
+    f = estimator.record[0]["filter"]
+    return np.asarray(f["covariance"][f["best"], OFFSET])
+
+
 def test_an_offset_that_may_be_learned_from_now_on_begins_as_configured() -> None:
-    before = new_estimator(SETTINGS, CELL)
+    before = new_estimator(edited("identifier", current_offset_std_a=0.0), CELL)
     before.step(0.0, 0.1, 3.8)
     after = new_estimator(edited("identifier", current_offset_std_a=0.1), CELL)
     assert resume(after, dict(fields(before.record)), 1.0) == ""
-    assert after.record["identifier"]["covariance"][0, CURRENT_OFFSET, CURRENT_OFFSET] == pytest.approx(0.01)
+    assert offset_covariance(after)[OFFSET] == pytest.approx(0.01)
     after.step(0.0, 0.1, 3.8)
     assert resume(before, dict(fields(after.record)), 1.0) == ""
-    assert not before.record["identifier"]["covariance"][0, CURRENT_OFFSET].any()
+    assert not offset_covariance(before).any()
 
 
 def test_an_identifier_that_is_switched_on_begins_at_the_soc_that_was_counted() -> None:
@@ -244,7 +241,7 @@ def test_an_identifier_that_is_switched_on_begins_at_the_soc_that_was_counted() 
     for i in range(3):
         identifying.step(float(i), 0.0, 3.8)
     assert identifying.state["soc"][0] == pytest.approx(0.5, abs=0.15)
-    assert 0.01 < math.sqrt(identifying.record["identifier"]["covariance"][0, 0, 0]) < 0.35
+    assert 0.01 < identifying.record["filter"]["soc_std"][0] < 0.35
 
 
 def test_a_pack_is_served_once_at_a_time(tmp_path: Path) -> None:

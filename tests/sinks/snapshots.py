@@ -31,6 +31,7 @@ def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None
         parameter_report(estimator, NOW),
         health_report(
             estimator.record[0],
+            estimator.settings_record[0],
             {"frames_received": 2},
             now_s=NOW,
             uptime_s=1.0,
@@ -41,7 +42,7 @@ def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None
             clock_ppm=None,
             delivery=delivery or Delivery(),
         ),
-        info_report(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW),
+        info_report(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW, temperature_sensor=False),
     )
 
 

@@ -75,7 +75,7 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     before = estimator.run(pulses(0.2, 0.01)).copy()
     assert before["soc_std"][-1] > 0.0
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
-    estimator.run(pulses(0.2, 1.0))
+    estimator.run(pulses(0.2, 2.5))
     report = parameter_report(estimator, NOW_S)
     r_s = report.elements["r_s_ohm"]
     assert (r_s.source, r_s.valid, r_s.reason) == ("identified", True, None)
@@ -86,8 +86,11 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert abs(r_s.value - truth) < max(3.0 * r_s.std, 0.02 * truth)
     health = report.state_of_health
     assert health["r_s"].value == pytest.approx(1.0, abs=0.03)
-    assert (health["capacity"].valid, health["capacity"].value) == (False, 1.0)
-    assert "taken as declared" in (health["capacity"].reason or "")
+    capacity, offset_a = health["capacity"], health["current_offset_a"]
+    assert capacity.value == pytest.approx(1.0, abs=0.03)
+    assert (capacity.std, capacity.source) == (pytest.approx(0.03, rel=0.2), "identified")
+    assert "valid below 0.02" in (capacity.reason or "")
+    assert abs(offset_a.value) < 2.0 * offset_a.std <= 2.0 * 0.005 * Q_AH
     assert report.a["a15"].std is not None
     assert report.elements["e_o_v"].source == "configured"
     a1, target = report.a["a1"], float(estimator.state["target"][0, 1])
@@ -101,12 +104,41 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
 def test_what_the_identifier_did_not_believe_is_counted_since_the_start() -> None:
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     block = pulses(0.2, 0.1)
-    block["voltage_v"][3000:3003] = 2.9
+    block["voltage_v"][3000:3003] = 2.6
     estimator.run(block)
     assert identifier_counters(estimator.record[0])["gated"] == 3
     resume(estimator, dict(fields(estimator.record.copy())), 1.0)
     assert set(identifier_counters(estimator.record[0]).values()) == {0}
-    assert suspicions(estimator.record[0]) == []
+    assert suspicions(estimator.record[0], estimator.settings_record[0]) == []
+
+
+def test_nothing_is_identified_before_a_load_has_told_of_it() -> None:
+    estimator = Estimator(CELL, initial_soc=0.5)
+    block = pulses(0.0, 0.1)
+    estimator.run(block)
+    report = parameter_report(estimator, NOW_S)
+    assert {p.source for p in report.elements.values()} == {"configured"}
+    assert {p.valid for p in report.state_of_health.values()} == {False}
+
+
+def test_what_is_not_to_be_learned_is_taken_as_declared() -> None:
+    off = IdentifierSettings(capacity_std=0.0, current_offset_std_a=0.0)
+    estimator = Estimator(CELL, identifier=off, initial_soc=1.0)
+    estimator.run(pulses(0.2, 0.1))
+    health = parameter_report(estimator, NOW_S).state_of_health
+    assert (health["capacity"].value, health["current_offset_a"].value) == (1.0, 0.0)
+    assert "identifier.capacity_std is 0: taken as declared" in (health["capacity"].reason or "")
+
+
+@pytest.mark.parametrize(("temperature_c", "said"), [(25.0, ""), (-8.0, "no data at -8 C, the cell file knows 25 C")])
+def test_a_temperature_that_the_cell_file_does_not_know_is_named(temperature_c: float, said: str) -> None:
+    estimator = Estimator(CELL, initial_soc=1.0)
+    block = pulses(0.2, 0.1)
+    block["temperature_c"] = temperature_c
+    estimator.run(block)
+    texts = suspicions(estimator.record[0], estimator.settings_record[0])
+    assert (" ".join(texts) if texts else "").startswith(said)
+    assert bool(texts) == bool(said)
 
 
 def test_a_current_of_the_wrong_sign_is_named() -> None:
@@ -114,7 +146,7 @@ def test_a_current_of_the_wrong_sign_is_named() -> None:
     block = pulses(0.2, 1.0)
     block["current_a"] *= -1.0
     estimator.run(block)
-    assert any("check the sign of the current" in text for text in suspicions(estimator.record[0]))
+    assert any("check the sign of the current" in text for text in suspicions(estimator.record[0], estimator.settings_record[0]))
     good = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     good.run(pulses(0.2, 1.0))
-    assert suspicions(good.record[0]) == []
+    assert suspicions(good.record[0], good.settings_record[0]) == []
