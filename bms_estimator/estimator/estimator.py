@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import sample_step as kernel
+from bms_estimator.kernels.ekf_noise import resistance_std
 from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
 from bms_estimator.kernels.hypotheses import forget, seed
@@ -144,7 +145,7 @@ class Estimator:
             best = f["best"]
             for j in (LN_R0, LN_R):
                 forget(f["mean"][best], f["covariance"][best], j)
-                f["covariance"][best, j, j] = p["r_std"] ** 2
+                f["covariance"][best, j, j] = resistance_std(f, p) ** 2
         if math.isfinite(unseen_s):
             self.record["unlearned_s"] += unseen_s
 

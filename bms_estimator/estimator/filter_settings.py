@@ -52,10 +52,13 @@ def filter_settings(
     p["weak_ohm"], p["strong_ohm"] = weak_ohm, strong_ohm
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
-    offset_a = identifier.current_offset_std_a
-    noise = Noise(r_std=r_std, capacity_std=identifier.capacity_std, soc_std=identifier.soc_std)
-    if offset_a is not None:
-        noise = replace(noise, offset_c=offset_a / cell.cell.capacity_ah)
+    noise = Noise(r_std=r_std)
+    if identifier.current_offset_std_a is not None:
+        noise = replace(noise, offset_c=identifier.current_offset_std_a / cell.cell.capacity_ah)
+    for name in ("capacity_std", "soc_std"):
+        told = getattr(identifier, name)
+        if told is not None:
+            noise = replace(noise, **{name: told})
     for field in fields(noise):
         p[field.name] = getattr(noise, field.name)
     p["model_v"] *= series

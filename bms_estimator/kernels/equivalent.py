@@ -11,18 +11,9 @@ import math
 import numpy as np
 from numba import njit
 
+from bms_estimator.kernels.ekf_noise import resistance_std
 from bms_estimator.kernels.ekf_state import HYST, LN_R, LN_R0, OFFSET, SOC, X
-from bms_estimator.kernels.ladder import (
-    BRANCHES,
-    REFERENCE_C,
-    RESISTANCES,
-    STRONG_J,
-    TAU_S,
-    WEAK_J,
-    arrhenius,
-    on_grid,
-    resistances,
-)
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, RESISTANCES, TAU_S, on_grid, resistances
 from bms_estimator.kernels.state import Record
 
 R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
@@ -49,8 +40,8 @@ EQUIVALENT = np.dtype(
 @njit(cache=True)
 def equivalent(f: Record, p: Record, e: Record) -> None:
     """Resistances and two branches at SOC and temperature of the likeliest filter into ``e``."""
-    x, cov, t = f.mean[f.best], f.covariance[f.best], f.temperature_c
-    resistances(x[SOC], p.weak_ohm, p.strong_ohm, arrhenius(WEAK_J, t), arrhenius(STRONG_J, t), e.ohm)
+    x, cov = f.mean[f.best], f.covariance[f.best]
+    resistances(x[SOC], p.weak_ohm, p.strong_ohm, f.weak, f.strong, e.ohm)
     e.ohm[0] *= math.exp(x[LN_R0])
     for k in range(1, RESISTANCES):
         e.ohm[k] *= math.exp(x[LN_R])
@@ -85,7 +76,7 @@ def one_branch(e: Record, first: int, end: int, at: int, scale_variance: float, 
 @njit(cache=True)
 def told(f: Record, p: Record, j: int) -> bool:
     """Whether data have told of the scale LN_R0 or LN_R, ``j``."""
-    return f.covariance[f.best, j, j] < KNOWN * p.r_std**2
+    return f.covariance[f.best, j, j] < KNOWN * resistance_std(f, p) ** 2
 
 
 @njit(cache=True)

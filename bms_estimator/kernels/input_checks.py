@@ -36,12 +36,17 @@ CLIP = 5.0
 OUTLIERS_S = 3600.0
 """Memory of single samples that were not believed [s]."""
 MANY_OUTLIERS, FEW_OUTLIERS = 5.0, 1.0
-FIRST_STDS, PRESENT_STDS = 3.0, 3.0
-"""Offset and capacity are suspicious beyond so many of their first and of their present std."""
+OFFSET_STDS, CAPACITY_STDS = 4.0, 2.0
+"""Offset and capacity are suspicious beyond so many of their first std, ..."""
+PRESENT_STDS = 3.0
+"""... and of their present one."""
 TAKEN_BACK = 0.7
 """A suspicion stands until its measure is below this part of its limit."""
 WRONG_V, WRONG_S = 0.12, 1800.0
 """No curve of the cell's own chemistry is so far off, of one cell [V], over so long [s]."""
+SEARCHES_S = 5.0 * 3600.0
+"""Memory of searches for the SOC: time after time only a wrong OCV explains them [s]."""
+MANY_SEARCHES = 4.0
 UNKNOWN_K = 5.0
 """So far outside the temperatures of the cell file nothing is known of it [K]."""
 
@@ -59,6 +64,8 @@ CHECKS = np.dtype(
         ("change_v_a", "f8"),  # running mean of the fast change of voltage times that of current [V A]
         ("change_a2", "f8"),  # the same of the current's squared [A^2]
         ("wrong_v", "f8"),  # running mean of the error that stays [V]
+        ("searches", "f8"),  # times the filter began again of late
+        ("seen_reopened", "i8"),
         ("suspects", "i8"),  # bits of model.suspect.Suspect
         ("good_mean", "f8", STATES),  # of the likeliest filter when it was last kept
         ("good_covariance", "f8", (STATES, STATES)),
@@ -203,13 +210,16 @@ def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
     if c.outliers > (FEW_OUTLIERS if before & OUTLIERS else MANY_OUTLIERS):
         bits |= OUTLIERS
     x, cov = f.mean[f.best], f.covariance[f.best]
-    offset_std = p.offset_c * p.capacity_as / 3600.0
-    if beyond(x[OFFSET], cov[OFFSET, OFFSET], offset_std, before & OFFSET_BIT):
+    offset_a = OFFSET_STDS * p.offset_c * p.capacity_as / 3600.0
+    if beyond(x[OFFSET], cov[OFFSET, OFFSET], offset_a, before & OFFSET_BIT):
         bits |= OFFSET_BIT
-    if beyond(x[LN_Q], cov[LN_Q, LN_Q], p.capacity_std, before & CAPACITY):
+    if beyond(x[LN_Q], cov[LN_Q, LN_Q], CAPACITY_STDS * p.capacity_std, before & CAPACITY):
         bits |= CAPACITY
     c.wrong_v += min(1.0, dt_s / WRONG_S) * (x[B_SLOW] - c.wrong_v)
-    if abs(c.wrong_v) > WRONG_V * p.series * (TAKEN_BACK if before & OCV else 1.0):
+    c.searches += f.reopened - c.seen_reopened - min(1.0, dt_s / SEARCHES_S) * c.searches
+    c.seen_reopened = f.reopened
+    part = TAKEN_BACK if before & OCV else 1.0
+    if abs(c.wrong_v) > part * WRONG_V * p.series or c.searches > part * MANY_SEARCHES:
         bits = OCV | bits & OUTLIERS  # offset and capacity try to explain it
     outside_k = max(p.low_c - f.temperature_c, f.temperature_c - p.high_c)
     if f.sensed and outside_k > UNKNOWN_K * (TAKEN_BACK if before & TEMPERATURE else 1.0):
@@ -218,8 +228,7 @@ def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
 
 
 @njit(cache=True)
-def beyond(value: float, variance: float, first_std: float, before: int) -> bool:
+def beyond(value: float, variance: float, expected: float, before: int) -> bool:
     """Whether a bias is more than it was expected to be, and known to be so."""
     part = TAKEN_BACK if before else 1.0
-    limit = part * max(FIRST_STDS * first_std, PRESENT_STDS * math.sqrt(variance))
-    return first_std > 0.0 and abs(value) > limit
+    return expected > 0.0 and abs(value) > part * max(expected, PRESENT_STDS * math.sqrt(variance))

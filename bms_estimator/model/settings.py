@@ -108,14 +108,15 @@ class IdentifierSettings(Strict):
     )
     current_offset_std_a: NotNegative | None = Field(
         default=None,
-        description="how wrong the current sensor's zero may be; 0.5 % of the current that empties the pack in an hour "
-        "when left out; 0: it is taken as right",
+        description="how wrong the current sensor's zero may be; from the capacity when left out; 0: it is taken as right",
     )
-    capacity_std: Annotated[float, Field(ge=0, le=0.3)] = Field(
-        default=0.03, description="how wrong the declared capacity may be, relative; 0: it is taken as right"
+    capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
+        default=None,
+        description="how wrong the declared capacity may be, relative; as for most packs when left out; "
+        "0: it is taken as right",
     )
-    soc_std: Annotated[float, Field(ge=0.005, le=0.5)] = Field(
-        default=0.2, description="how wrong the SOC at start may be"
+    soc_std: Annotated[float, Field(ge=0.005, le=0.5)] | None = Field(
+        default=None, description="how wrong the SOC at start may be; a fifth when left out"
     )
     hysteresis_v: NotNegative | None = Field(
         default=None,

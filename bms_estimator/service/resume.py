@@ -50,6 +50,7 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     for name in OBSERVER_COUNTERS:
         estimator.state[name] = 0
     estimator.record["counters"] = np.zeros(1, COUNTERS)
+    estimator.record["filter"]["reopened"] = estimator.record["checks"]["seen_reopened"] = 0
     return ""
 
 

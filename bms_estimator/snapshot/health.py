@@ -38,7 +38,8 @@ def dropped_text(dropped: Mapping[str, int]) -> str:
 
 def identifier_counters(record: np.void) -> dict[str, int]:
     """How often the filter did not believe its input or itself, of a record of ESTIMATOR_STATE."""
-    return {name: int(record["counters"][name]) for name in COUNTERS.names or ()}
+    counts = {name: int(record["counters"][name]) for name in COUNTERS.names or ()}
+    return counts | {"searched": int(record["filter"]["reopened"])}
 
 
 def suspicions(record: np.void, settings: np.void) -> list[str]:

@@ -324,7 +324,7 @@ async def test_a_parameter_says_where_it_comes_from_and_a_negative_capacitance_w
     known = {"pack": PackSettings(initial_soc=0.001), "identifier": IdentifierSettings(soc_std=0.005)}
     nearly_empty = SETTINGS.model_copy(update=known)
     async with running(nearly_empty) as run:
-        run.source.give((0.0, 0.0, 3.0))
+        run.source.give((0.0, 0.0, 2.5))
         run.source.finish()
         await run.task
         parameters = run.sink.snapshots[-1].parameters
