@@ -15,10 +15,10 @@ from bms_estimator.kernels.hypotheses import WINDOW_S, clear, count_on, gather, 
 from bms_estimator.kernels.input_checks import (
     SIGN_OF_CURRENT,
     believed,
-    doubt_sign,
     guard,
     judge,
     keep,
+    wait_for_sign,
     watch_sign,
 )
 from bms_estimator.kernels.margins import delta
@@ -73,8 +73,8 @@ def identify(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: flo
     count_on(f, p.filter, dt_s, current_a, temperature_c)
     watch_sign(c, p.filter, dt_s, current_a, voltage_v)
     if c.suspects & SIGN_OF_CURRENT:
-        doubt_sign(f, p.filter, dt_s, current_a)
-    if believed(c, s.counters, f, s.elements, dt_s, change_a, current_a, voltage_v):
+        wait_for_sign(c, f, p.filter, dt_s, current_a)
+    elif believed(c, s.counters, f, s.elements, dt_s, change_a, current_a, voltage_v):
         gather(f, current_a, voltage_v)
     if f.window.time_s >= WINDOW_S and f.window.samples > 0:
         take_window(s, p)
@@ -94,7 +94,7 @@ def take_window(s: Record, p: Record) -> None:
     guard(c, s.counters, f, p.filter, dt_s)
     judge(c, f, p.filter, dt_s)
     equivalent(f, p.filter, s.elements)
-    if dt_s <= UNMEASURED_S and not c.suspects & SIGN_OF_CURRENT:
+    if dt_s <= UNMEASURED_S:
         learn_elements(s, p, dt_s)
 
 

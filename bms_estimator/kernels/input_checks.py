@@ -23,6 +23,8 @@ SNAPSHOT_S = 60.0
 """The state is kept as the last good one so often [s]."""
 LOST_STD = 0.05
 """How far the SOC may have gone from the last good one, std."""
+LOST_AT_MOST = 0.4
+"""No SOC is less certain than this, std."""
 FAST_S = 10.0
 """Changes of voltage and current within this time belong together [s]."""
 SIGN_S = 300.0
@@ -165,7 +167,7 @@ def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
 @njit(cache=True)
 def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
     """How fast changes of the voltage go with those of the current: by -R_s when the sign is right."""
-    if dt_s > UNMEASURED_S or c.slow_v == 0.0:  # a gap, or the first sample
+    if dt_s > FAST_S or c.slow_v == 0.0:  # too long to tell, or the first sample
         c.slow_v, c.slow_a = voltage_v, current_a
         return
     middle = p.weak_ohm.shape[0] // 2
@@ -186,26 +188,38 @@ def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: f
 
 
 @njit(cache=True)
-def doubt_sign(f: Record, p: Record, dt_s: float, current_a: float) -> None:
-    """Charge counted with the wrong sign: the SOC errs by twice as much, always the same way."""
+def sign_is_wrong(c: Record, p: Record) -> bool:
+    """Whether the voltage rises with what is said to be discharge; what is suspected already is so until it falls."""
+    middle = p.weak_ohm.shape[0] // 2
+    steep = 0.25 * (p.weak_ohm[middle, 0] + p.strong_ohm[middle, 0]) * c.change_a2
+    return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > LEAST_EVIDENCE
+
+
+@njit(cache=True)
+def wait_for_sign(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
+    """A sample while the current has the wrong sign: no voltage can be explained, and the charge counts the wrong way.
+
+    The SOC errs by twice the charge, always the same way. What was learned meanwhile is worth nothing: once the sign is right
+    again the filter starts anew.
+    """
     wrong = 2.0 * abs(current_a) * min(dt_s, UNMEASURED_S) / p.capacity_as
-    for q in range(f.count):
-        std = math.sqrt(f.covariance[q, SOC, SOC])
-        f.covariance[q, SOC, SOC] = (std + wrong) ** 2
+    f.soc_std = min(f.soc_std + wrong, LOST_AT_MOST)
+    if sign_is_wrong(c, p):
+        return
+    soc_std = max(f.soc_std, p.soc_std)
+    start(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
+    seed(f, p, f.soc, soc_std)
+    c.suspects = 0
 
 
 @njit(cache=True)
 def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
-    """Set and take back the bits of ``c.suspects`` after an update; start the filter again when the sign is right again."""
+    """Set and take back the bits of ``c.suspects`` after an update of the filter over ``dt_s``."""
     before = c.suspects
     c.outliers -= c.outliers * min(1.0, dt_s / OUTLIERS_S)
-    middle = p.weak_ohm.shape[0] // 2
-    steep = 0.25 * (p.weak_ohm[middle, 0] + p.strong_ohm[middle, 0]) * c.change_a2
-    if c.change_v_a > (0.0 if before & SIGN_OF_CURRENT else steep) and c.sign_evidence > LEAST_EVIDENCE:
+    if sign_is_wrong(c, p):
         c.suspects = SIGN_OF_CURRENT
         return
-    if before & SIGN_OF_CURRENT:  # what was learned under the wrong one is worth nothing
-        start(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
     bits = 0
     if c.outliers > (FEW_OUTLIERS if before & OUTLIERS else MANY_OUTLIERS):
         bits |= OUTLIERS

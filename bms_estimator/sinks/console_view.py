@@ -227,7 +227,11 @@ def _health(health: Health, parameters: ParameterReport) -> Flow:
     if wrong:
         return Flow(*wrong)
     worn = parameters.state_of_health.items()
-    known = [f"{WORN[name]} {p.value:.2f} ± {p.std:.2f} of new" for name, p in worn if name in WORN and p.valid and p.value and p.std]
+    known = [
+        f"{WORN[name]} {p.value:.2f} ± {p.std:.2f} of new"
+        for name, p in worn
+        if name in WORN and p.valid and p.value and p.std
+    ]
     return Flow(Text.assemble(("health ", "dim"), ("good", "bold green")), *map(Text, known))
 
 

@@ -146,7 +146,10 @@ def test_a_current_of_the_wrong_sign_is_named() -> None:
     block = pulses(0.2, 1.0)
     block["current_a"] *= -1.0
     estimator.run(block)
-    assert any("check the sign of the current" in text for text in suspicions(estimator.record[0], estimator.settings_record[0]))
+    assert any(
+        "check the sign of the current" in text
+        for text in suspicions(estimator.record[0], estimator.settings_record[0])
+    )
     good = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     good.run(pulses(0.2, 1.0))
     assert suspicions(good.record[0], good.settings_record[0]) == []
