@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from bms_estimator.kernels.charge import UNMEASURED_S
-from bms_estimator.kernels.ekf_state import B_SLOW, HYPOTHESES, LN_Q, OFFSET, SOC, STATES
+from bms_estimator.kernels.ekf_state import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS
 from bms_estimator.kernels.hypotheses import clear, seed, start
 from bms_estimator.kernels.state import Record

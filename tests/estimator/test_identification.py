@@ -5,48 +5,15 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter, present_elements
-from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.kernels.ekf_state import LN_Q, LN_R0, OFFSET, SOC
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS
 from bms_estimator.kernels.identification import hand_over
-from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 
 ON = IdentifierSettings()
-TRUTH = load_cell("ncr18650")
-NOISE_V = 3e-4
-
-
-def wrong_cell(factor: float) -> CellModel:
-    """The true cell with every resistance ``factor`` times as large."""
-    parts = {}
-    for name in ("r_s", "r_ts", "r_tl"):
-        part = getattr(TRUTH, name)
-        parts[name] = part.model_copy(
-            update={"amplitude_ohm": part.amplitude_ohm * factor, "offset_ohm": part.offset_ohm * factor}
-        )
-    return TRUTH.model_copy(update=parts)
-
-
-def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleBlock, np.ndarray]:
-    """Random pulses and rests at 1 Hz that empty the true cell, and its true SOC."""
-    rng = np.random.default_rng(seed)
-    block = np.zeros(int(3600 * hours), dtype=SAMPLE)
-    block["temperature_c"] = 25.0
-    block["time_s"] = np.arange(block.size)
-    steps = np.repeat(rng.choice([0.0, 0.0, 0.75, 1.5, 3.0, -0.5], block.size // 60), 60)
-    block["current_a"] = steps
-    ocv_v, slope_v = ocv_grid(TRUTH)
-    a, capacity_as = TRUTH.a, TRUTH.cell.capacity_ah * 3600.0
-    x, true_soc = (soc, 0.0, 0.0), np.empty(block.size)
-    for n, i in enumerate(steps):
-        block["voltage_v"][n] = chen_mora.ocv(x[0], ocv_v, slope_v) - x[1] - x[2] - i * chen_mora.r_s(x[0], a)
-        true_soc[n] = x[0]
-        x = chen_mora.cell_step(x, i, 1.0, capacity_as, a)
-    block["voltage_v"] = np.round((block["voltage_v"] + rng.normal(0, NOISE_V, block.size)) / 1e-3) * 1e-3
-    return block, true_soc
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +38,7 @@ def test_a_wrong_soc_and_wrong_resistances_are_found(load) -> None:
     trace = estimator.run(block)
     late = slice(1800, None)
     error = trace["soc"] - true_soc
-    assert np.abs(error[late]).max() < 0.025
+    assert np.abs(error[late]).max() < 0.04
     assert np.mean(np.abs(error[late]) < 2.0 * trace["soc_std"][late]) > 0.95
     assert trace["soc_coulomb"][5000] == pytest.approx(true_soc[5000] - 0.2, abs=1e-3)
     elements, soc, a = present_elements(estimator.record[0]), true_soc[-1], TRUTH.a
@@ -147,7 +114,7 @@ def test_a_long_pause_leaves_what_was_learned_of_sensor_and_capacity(load) -> No
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]]
     assert learned.all()
     assert np.array_equal(mean[[OFFSET, LN_Q]], learned)
-    assert covariance[LN_Q, LN_Q] < ON.capacity_std**2
+    assert covariance[LN_Q, LN_Q] < estimator.settings_record[0]["filter"]["capacity_std"] ** 2
     assert (mean[LN_R0], covariance[LN_R0, LN_R0]) == (0.0, estimator.settings_record[0]["filter"]["r_std"] ** 2)
 
 

@@ -1,0 +1,41 @@
+"""A cell of two branches under random pulses, and copies of its file that are wrong."""
+
+import numpy as np
+
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+
+TRUTH = load_cell("ncr18650")
+NOISE_V = 3e-4
+
+
+def wrong_cell(factor: float) -> CellModel:
+    """The true cell with every resistance ``factor`` times as large."""
+    parts = {}
+    for name in ("r_s", "r_ts", "r_tl"):
+        part = getattr(TRUTH, name)
+        parts[name] = part.model_copy(
+            update={"amplitude_ohm": part.amplitude_ohm * factor, "offset_ohm": part.offset_ohm * factor}
+        )
+    return TRUTH.model_copy(update=parts)
+
+
+def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleBlock, np.ndarray]:
+    """Random pulses and rests at 1 Hz that empty the true cell, and its true SOC."""
+    rng = np.random.default_rng(seed)
+    block = np.zeros(int(3600 * hours), dtype=SAMPLE)
+    block["temperature_c"] = 25.0
+    block["time_s"] = np.arange(block.size)
+    steps = np.repeat(rng.choice([0.0, 0.0, 0.75, 1.5, 3.0, -0.5], block.size // 60), 60)
+    block["current_a"] = steps
+    ocv_v, slope_v = ocv_grid(TRUTH)
+    a, capacity_as = TRUTH.a, TRUTH.cell.capacity_ah * 3600.0
+    x, true_soc = (soc, 0.0, 0.0), np.empty(block.size)
+    for n, i in enumerate(steps):
+        block["voltage_v"][n] = chen_mora.ocv(x[0], ocv_v, slope_v) - x[1] - x[2] - i * chen_mora.r_s(x[0], a)
+        true_soc[n] = x[0]
+        x = chen_mora.cell_step(x, i, 1.0, capacity_as, a)
+    block["voltage_v"] = np.round((block["voltage_v"] + rng.normal(0, NOISE_V, block.size)) / 1e-3) * 1e-3
+    return block, true_soc

@@ -1,0 +1,242 @@
+"""Bad input: the estimate stays finite, says what it suspects, and comes back when the input is good again."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator import Estimator, load_capture, load_cell
+from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.suspect import Suspect
+from tests.estimator.simulated_cell import TRUTH, pulses
+
+FAULT_S = 3600.0, 7200.0
+"""The hour in which the input is bad, from the first sample."""
+CAPACITY_AH = 3.0
+FIRST_SOC = {"cell1_random_steps": 0.98, "cell5_hppc": 0.98}
+"""Where the first rest is not that of a full cell."""
+CHANGING = ["cell5_random_steps", "cell1_dst", "cell1_hppc"]
+PIECE = 20
+"""Samples after which the suspicions are looked at."""
+Fault = Callable[[SampleBlock, np.ndarray], None]
+
+
+def good(block: SampleBlock, during: np.ndarray) -> None:
+    """None."""
+
+
+def flipped(block: SampleBlock, during: np.ndarray) -> None:
+    block["current_a"][during] *= -1.0
+
+
+def offset(block: SampleBlock, during: np.ndarray) -> None:
+    """1 % of a range of 5 A."""
+    block["current_a"][during] += 0.05
+
+
+def now_and_then(during: np.ndarray) -> np.ndarray:
+    return during & (np.random.default_rng(1).random(during.size) < 0.01)
+
+
+def glitches(block: SampleBlock, during: np.ndarray) -> None:
+    """Within the range of the cell."""
+    block["voltage_v"][now_and_then(during)] = 2.6
+
+
+def spikes(block: SampleBlock, during: np.ndarray) -> None:
+    block["current_a"][now_and_then(during)] = 4.6
+
+
+def repeated(block: SampleBlock, during: np.ndarray) -> None:
+    """Every second stamp is that of the sample before."""
+    twice = np.flatnonzero(during)[1::2]
+    block["time_s"][twice] = block["time_s"][twice - 1]
+
+
+class Run:
+    """A capture with a fault, started 0.2 too low: time since the start [s], error of the SOC, its std, suspects."""
+
+    def __init__(self, path: Path, cell: CellModel, fault: Fault = good, wrong: float = -0.2) -> None:
+        block = load_capture(path).rows.copy()
+        block = block[(block["voltage_v"] > 2.0) & (block["voltage_v"] < 4.4)]
+        when_s = block["time_s"] - block["time_s"][0]
+        moved_ah = np.r_[0.0, np.cumsum(block["current_a"][:-1] * np.clip(np.diff(when_s), 0.0, None))] / 3600.0
+        self.soc = FIRST_SOC.get(path.name.partition(".")[0], 1.0 if block["voltage_v"][0] > 4.0 else 0.0)
+        self.soc = self.soc - moved_ah / CAPACITY_AH
+        fault(block, (when_s >= FAULT_S[0]) & (when_s < FAULT_S[1]))
+        self.estimator = Estimator(cell, initial_soc=min(max(self.soc[0] + wrong, 0.0), 1.0))
+        traces, suspects = [], []
+        for first in range(0, block.size, PIECE):
+            traces.append(self.estimator.run(block[first : first + PIECE]).copy())
+            suspects += [int(self.estimator.record["checks"]["suspects"][0])] * traces[-1].size
+        trace = np.concatenate(traces)
+        self.time_s, self.suspects = trace["time_s"] - block["time_s"][0], np.array(suspects)
+        self.soc = np.interp(trace["time_s"], block["time_s"], self.soc)
+        self.error, self.std = trace["soc"] - self.soc, trace["soc_std"]
+
+    def after(self, time_s: float) -> np.ndarray:
+        return (self.time_s > time_s) & (self.soc > 0.05)
+
+    def covered(self, after_s: float = 900.0) -> float:
+        """Share of the samples whose error is within two std."""
+        judged = self.after(after_s)
+        return float(np.mean(np.abs(self.error[judged]) < 2.0 * self.std[judged]))
+
+
+@pytest.fixture
+def captures(shared_data: Path) -> Path:
+    return shared_data / "ncr18650"
+
+
+def capture(captures: Path, name: str) -> Path:
+    return captures / f"{name}.csv.gz"
+
+
+@pytest.mark.parametrize("name", CHANGING)
+@pytest.mark.parametrize("fault", [flipped, offset, glitches, spikes, repeated])
+def test_an_hour_of_bad_input(captures: Path, name: str, fault: Fault) -> None:
+    """Within an hour of good input the SOC is right again, and stays so."""
+    run = Run(capture(captures, name), TRUTH, fault)
+    assert np.isfinite(run.error).all()
+    assert np.abs(run.error[run.after(FAULT_S[1] + 3600.0)]).max() < 0.025
+    assert run.covered() > (0.9 if fault is flipped else 0.95)
+
+
+@pytest.mark.parametrize("name", CHANGING)
+@pytest.mark.parametrize(("fault", "suspect"), [(flipped, Suspect.SIGN_OF_CURRENT), (glitches, Suspect.OUTLIERS)])
+def test_a_passing_fault_is_named_and_then_forgotten(captures: Path, name: str, fault: Fault, suspect: Suspect) -> None:
+    run = Run(capture(captures, name), TRUTH, fault)
+    named = run.suspects & suspect != 0
+    assert named[(run.time_s > FAULT_S[0]) & (run.time_s < FAULT_S[1])].any()
+    assert not named[run.time_s < FAULT_S[0]].any()
+    assert run.suspects[-1] == 0
+
+
+@pytest.mark.parametrize("name", CHANGING)
+@pytest.mark.parametrize("offset_a", [0.05, -0.05])
+def test_an_offset_of_the_current_is_learned(captures: Path, name: str, offset_a: float) -> None:
+    """1 % of a range of 5 A: 1.7 % of the capacity in an hour."""
+
+    def off(block: SampleBlock, _: np.ndarray) -> None:
+        block["current_a"] += offset_a
+
+    run = Run(capture(captures, name), TRUTH, off)
+    assert np.abs(run.error[run.after(900.0)]).max() < 0.025
+    assert run.covered() > 0.95
+
+
+@pytest.mark.parametrize("name", CHANGING)
+def test_an_offset_that_no_sensor_may_have_is_suspected(captures: Path, name: str) -> None:
+    def off(block: SampleBlock, _: np.ndarray) -> None:
+        block["current_a"] += 0.15
+
+    run = Run(capture(captures, name), TRUTH, off)
+    assert run.suspects[-1] & (Suspect.OFFSET | Suspect.CAPACITY)
+    assert np.abs(run.error[run.after(3600.0)]).max() < 0.03
+
+
+@pytest.mark.parametrize("name", ["cell5_random_steps", "cell1_dst"])
+def test_a_capacity_that_is_a_fifth_too_small_is_suspected(captures: Path, name: str) -> None:
+    smaller = TRUTH.cell.model_copy(update={"capacity_ah": 0.8 * TRUTH.cell.capacity_ah})
+    run = Run(capture(captures, name), TRUTH.model_copy(update={"cell": smaller}))
+    assert run.suspects[-1] & Suspect.CAPACITY
+    assert np.abs(run.error[run.after(3600.0)]).max() < 0.03
+    assert run.covered() > 0.95
+
+
+@pytest.mark.parametrize("name", CHANGING)
+def test_the_ocv_of_another_chemistry_is_suspected(captures: Path, name: str) -> None:
+    """An iron-phosphate curve: a plateau at 3.3 V."""
+    soc = np.linspace(0.0, 1.0, 51)
+    plateau_v = 3.275 + 0.05 * soc + 0.1 * np.tanh((soc - 0.98) * 40.0) - 0.5 * np.exp(-25.0 * soc)
+    table = TableOcv(form="table", soc=tuple(soc), ocv_v=tuple(plateau_v))
+    run = Run(capture(captures, name), TRUTH.model_copy(update={"ocv": table}))
+    assert run.suspects[-1] == Suspect.OCV
+
+
+@pytest.mark.parametrize("wrong", [-0.2, 0.2])
+def test_nothing_is_suspected_of_good_captures(captures: Path, wrong: float) -> None:
+    for path in sorted(captures.glob("*.csv.gz")):
+        run = Run(path, TRUTH, wrong=wrong)
+        assert not run.suspects.any(), path.name
+
+
+def test_nothing_is_suspected_of_a_leaf(data: Path) -> None:
+    for name in ("hppc_25c_from_full", "cc_1c"):
+        assert not Run(data / "leaf" / f"{name}.csv.gz", load_cell("leaf")).suspects.any()
+
+
+def test_a_gap_of_an_hour(captures: Path) -> None:
+    """What the current did meanwhile is not known, and the std says so."""
+    block = load_capture(capture(captures, "cell5_random_steps")).rows
+    when_s = block["time_s"] - block["time_s"][0]
+    before, after = when_s < FAULT_S[0], when_s >= FAULT_S[1]
+    soc = 1.0 - np.r_[0.0, np.cumsum(block["current_a"][:-1] * np.diff(when_s))] / 3600.0 / CAPACITY_AH
+    estimator = Estimator(TRUTH, initial_soc=0.8)
+    known = estimator.run(block[before])["soc_std"][-1]
+    trace = estimator.run(block[after])
+    error = trace["soc"] - soc[after]
+    assert trace["soc_std"][0] > known
+    assert np.mean(np.abs(error) < 2.0 * trace["soc_std"]) > 0.95
+    assert np.abs(error[3600:][soc[after][3600:] > 0.05]).max() < 0.025
+
+
+@pytest.fixture(scope="module")
+def load() -> tuple[SampleBlock, np.ndarray]:
+    return pulses()
+
+
+def test_garbage_for_hours(load) -> None:
+    """Any numbers at all: nothing overflows, and the cell is found again afterwards."""
+    rng, garbage = np.random.default_rng(0), load[0].copy()
+    garbage["current_a"] = rng.normal(0.0, 1.0, garbage.size) ** 9
+    garbage["voltage_v"] = rng.normal(3.0, 2.0, garbage.size) ** 5
+    garbage["temperature_c"] = rng.normal(0.0, 100.0, garbage.size) ** 3
+    estimator = Estimator(TRUTH, initial_soc=0.5)
+    assert np.isfinite(estimator.run(garbage)["soc"]).all()
+    back = load[0].copy()
+    back["time_s"] += garbage["time_s"][-1] + 1.0
+    trace = estimator.run(back)
+    assert np.isfinite(trace["soc_std"]).all()
+    assert np.abs(trace["soc"] - load[1])[5400:].max() < 0.05
+
+
+def test_not_finite_goes_back_to_the_last_good_state(load) -> None:
+    block, true_soc = load
+    estimator = Estimator(TRUTH, initial_soc=0.9)
+    estimator.run(block[:3000])
+    before = float(estimator.state["soc"][0])
+    for field in ("mean", "covariance", "rms_a2"):
+        estimator.record["filter"][field][0] = np.nan
+    estimator.run(block[3000:3002])
+    assert estimator.record["counters"]["reset"][0] == 1
+    assert estimator.state["soc"][0] == pytest.approx(before, abs=0.05)
+    trace = estimator.run(block[3002:])
+    assert estimator.record["counters"]["reset"][0] == 1
+    assert abs(trace["soc"][-1] - true_soc[-1]) < 0.015
+
+
+def test_single_samples_far_off_are_passed_over_but_a_new_level_is_taken(load) -> None:
+    block = load[0][:1000].copy()
+    block["voltage_v"][500:502] = 2.6
+    clean, glitched = Estimator(TRUTH, initial_soc=0.95), Estimator(TRUTH, initial_soc=0.95)
+    clean.run(load[0][:1000])
+    glitched.run(block)
+    assert glitched.record["counters"][0].tolist() == (2, 0, 0)
+    assert glitched.state["soc"][0] == pytest.approx(clean.state["soc"][0], abs=1e-3)
+    block["voltage_v"][500:] = 2.9
+    moved = Estimator(TRUTH, initial_soc=0.95)
+    moved.run(block)
+    assert moved.record["counters"]["gated"][0] == 4
+    assert moved.record["counters"]["reopened"][0] == 1
+
+
+def test_every_suspect_says_what_to_do() -> None:
+    for suspect in Suspect:
+        assert "check" in suspect.text
+    both = Suspect.OFFSET | Suspect.CAPACITY
+    assert Suspect.OFFSET.text in both.text
+    assert Suspect.CAPACITY.text in both.text
+    assert not Suspect(0).text
