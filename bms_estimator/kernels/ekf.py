@@ -25,7 +25,7 @@ from bms_estimator.kernels.ekf_state import (
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, TAUS, on_grid, resistances
 from bms_estimator.kernels.state import Record
 
-NARROWEST, WIDEST = 0.006, 0.3
+NARROWEST, WIDEST = 0.02, 0.3
 """The OCV's slope is that of the secant over one std of SOC, between these."""
 LEAST_SLOPE_V = 0.02
 """Of one cell [V]; a plateau would let the filter go anywhere."""

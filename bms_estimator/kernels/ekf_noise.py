@@ -53,8 +53,9 @@ def bias_variance(s: Record, p: Record, soc: float) -> float:
     """Variance of B_SLOW + B_FAST [V^2] at a steady state: resistances and OCV are wrong in proportion."""
     ohm = total_resistance(s, p, soc)
     steep = total_resistance(s, p, soc - p.bias_soc) - total_resistance(s, p, soc + p.bias_soc)
+    grown = max(ohm - p.middle_ohm, 0.0)
     floor_a = FLOOR_C * p.capacity_as / 3600.0
-    wrong_ohm2 = (p.bias_relative * ohm) ** 2 + (0.5 * steep) ** 2
+    wrong_ohm2 = (p.bias_relative * ohm) ** 2 + (p.bias_grown * grown) ** 2 + (0.5 * steep) ** 2
     return outside(p, s.temperature_c) ** 2 * wrong_ohm2 * max(s.rms_a2, floor_a * floor_a)
 
 

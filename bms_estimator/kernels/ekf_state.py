@@ -41,6 +41,8 @@ class Noise:
     """It grows in the cold with this activation energy [J/mol]."""
     bias_relative: float = 0.04
     """B: error of the model that stays, relative to the sum of the resistances times the RMS current of 10 min."""
+    bias_grown: float = 0.1
+    """B: the same by which resistances have grown, in the cold and near empty, beyond those at 25 C and SOC 0.5."""
     bias_soc: float = 0.015
     """B: the same from a shift of the resistances along SOC."""
     slow_s: float = 2.0 * 3600.0
@@ -58,6 +60,8 @@ class Noise:
     """Offset of the current sensor, std [C]."""
     capacity_std: float = 0.08
     """Capacity, relative std."""
+    cell_spread: float = 0.03
+    """Cells in series: by how much of the charge drawn the emptiest lies below their mean, std of SOC."""
     soc_std: float = 0.2
     """SOC at switch-on, std."""
     load_c: float = 1.2
@@ -87,6 +91,7 @@ EKF_SETTINGS = np.dtype(
         ("hysteresis_v", "f8", GRID),  # half of what E_o is higher after charge than after discharge [V]
         ("weak_ohm", "f8", (GRID, RESISTANCES)),  # at 25 C, activation energy WEAK_J [ohm]
         ("strong_ohm", "f8", (GRID, RESISTANCES)),  # the same with STRONG_J
+        ("middle_ohm", "f8"),  # sum of all at SOC 0.5 and 25 C [ohm]
         ("low_c", "f8"),  # temperatures that the resistances are known for [C]
         ("high_c", "f8"),
         ("sensor_v2", "f8"),  # variance of one voltage sample: noise and rounding [V^2]
