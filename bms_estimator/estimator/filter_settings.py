@@ -17,6 +17,8 @@ BEYOND_BRANCHES = 0.2
 """Two branches leave out diffusion that is slower: its resistance, as a part of theirs."""
 BRANCHES_STD = 0.35
 """Relative std of resistances that come from two branches."""
+BIAS_OF_STD = 0.2
+"""Resistances that are hardly known are wrong in their ratios, too: so much of their relative std is ``bias_relative``."""
 LEAST_CAPACITANCE = 0.05
 """C_ts, C_tl, negative below delta1, delta2, are at least this part of a9, a12."""
 
@@ -50,6 +52,8 @@ def filter_settings(
     _open_circuit(p, cell, identifier.hysteresis_v)
     weak_ohm, strong_ohm, r_std, (p["low_c"], p["high_c"]) = _ladder(cell)
     p["weak_ohm"], p["strong_ohm"] = weak_ohm, strong_ohm
+    middle = GRID // 2
+    p["middle_ohm"] = weak_ohm[middle].sum() + strong_ohm[middle].sum()
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
     noise = Noise(r_std=r_std)
@@ -59,6 +63,7 @@ def filter_settings(
         told = getattr(identifier, name)
         if told is not None:
             noise = replace(noise, **{name: told})
+    noise = replace(noise, bias_relative=max(noise.bias_relative, BIAS_OF_STD * r_std))
     for field in fields(noise):
         p[field.name] = getattr(noise, field.name)
     p["model_v"] *= series
