@@ -30,6 +30,8 @@ CELL_VOLTAGE_V = 3.7
 """Of one Li-ion cell in the middle of its discharge: tells how many are in series [V]."""
 LOWEST, HIGHEST = 0.55, 1.06
 """Limits of a good sample: of the median voltage, of the full one."""
+MEASURED_CAPACITY_STD = 0.015
+"""Of a capacity measured by a slow discharge, relative: gain of the current sensor, and the cell's next years."""
 CURRENT_MAX_C = 5.0
 """Limit of a good sample when the capture itself has no larger current [1/h]."""
 
@@ -198,6 +200,7 @@ def _cell(
     cell = Cell(
         name=name,
         capacity_ah=round(found.capacity_ah, 4),
+        capacity_std=MEASURED_CAPACITY_STD if found.capacity_ah == found.measured_ah else None,
         series_count=series_count,
         nominal_voltage_v=round(middle_v, 2),
         voltage_min_v=round(min(LOWEST * middle_v, lowest_v), 2),

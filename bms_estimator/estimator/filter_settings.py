@@ -59,8 +59,8 @@ def filter_settings(
     noise = Noise(r_std=r_std)
     if identifier.current_offset_std_a is not None:
         noise = replace(noise, offset_c=identifier.current_offset_std_a / cell.cell.capacity_ah)
-    for name in ("capacity_std", "soc_std"):
-        told = getattr(identifier, name)
+    capacity_std = cell.cell.capacity_std if identifier.capacity_std is None else identifier.capacity_std
+    for name, told in (("capacity_std", capacity_std), ("soc_std", identifier.soc_std)):
         if told is not None:
             noise = replace(noise, **{name: told})
     noise = replace(noise, bias_relative=max(noise.bias_relative, BIAS_OF_STD * r_std))

@@ -172,6 +172,9 @@ class Cell(Strict):
     name: str
     description: str = ""
     capacity_ah: Positive = Field(description="rated capacity in ampere-hours")
+    capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
+        default=None, description="how wrong capacity_ah may be, relative; as for most cells when left out"
+    )
     series_count: Annotated[int, Field(ge=1)] = Field(default=1, description="cells in series that the values describe")
     nominal_voltage_v: Positive
     voltage_min_v: Positive = Field(description="a sample below is a glitch")
@@ -302,7 +305,9 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
     cell = _packaged(f"cells/{text}.toml") if text in shipped_cells() else _from_file(text)
     if capacity_ah is None:
         return cell
-    return cell.model_copy(update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah})})
+    return cell.model_copy(
+        update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": None})}
+    )
 
 
 def _packaged(name: str) -> CellModel:

@@ -112,7 +112,7 @@ class IdentifierSettings(Strict):
     )
     capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
         default=None,
-        description="how wrong the declared capacity may be, relative; as for most packs when left out; "
+        description="how wrong the declared capacity may be, relative; the cell file's when left out; "
         "0: it is taken as right",
     )
     soc_std: Annotated[float, Field(ge=0.005, le=0.5)] | None = Field(
