@@ -33,7 +33,7 @@ EXCITING_C = 0.05
 
 
 @njit(cache=True)
-def start_identifier(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
+def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """Begin at the SOC of the observer's first sample."""
     start(s.filter, p.filter, s.observer.soc, current_a, temperature_c)
     for e in range(ELEMENTS):
@@ -42,7 +42,7 @@ def start_identifier(s: Record, p: Record, current_a: float, voltage_v: float, t
 
 
 @njit(cache=True)
-def restart_identifier(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
+def restart_filter(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
     """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, the load before is not known."""
     f = s.filter
     f.current_a = current_a

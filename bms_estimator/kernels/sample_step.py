@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import soc_from_ocv
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
-from bms_estimator.kernels.identification import identify, restart_identifier, start_identifier
+from bms_estimator.kernels.identification import identify, restart_filter, start_filter
 from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
 
@@ -89,7 +89,7 @@ def step(
     if not s.started:
         start(s, p, time_s, current_a, voltage_v)
         if settings[0].identify:
-            start_identifier(state[0], settings[0], current_a, voltage_v, temperature_c)
+            start_filter(state[0], settings[0], current_a, voltage_v, temperature_c)
         return verdict
     dt_s = time_s - s.time_s
     s.time_s = time_s
@@ -98,7 +98,7 @@ def step(
         if math.isfinite(dt_s):
             s.time_steps_back += 1
         elif settings[0].identify:  # a new clock after a restart
-            restart_identifier(state[0], settings[0], current_a, voltage_v)
+            restart_filter(state[0], settings[0], current_a, voltage_v)
         return verdict
     if dt_s > max(p.gap_s, GAP_RATIO * s.step_s):
         s.gaps += 1
@@ -130,7 +130,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
         x = samples[j]
         if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
             write_observer(trace[rows], state[0].observer, settings[0].observer, x)
-            write_identifier(trace[rows], state[0], settings[0])
+            write_filter(trace[rows], state[0], settings[0])
             rows += 1
     return rows
 
@@ -156,7 +156,7 @@ def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
 
 
 @njit(cache=True)
-def write_identifier(row: Record, s: Record, p: Record) -> None:
+def write_filter(row: Record, s: Record, p: Record) -> None:
     """What the filter says; records as in ``step``. Without it: the observer's e, and NaN.
 
     The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import ocv_and_slope
+from bms_estimator.kernels.cell import ocv_and_slope, rc_step
 
 Floats = NDArray[np.float64]
 
@@ -83,11 +83,9 @@ def _branch_step(d: Floats, v: float, x: Floats, b: int, middle: float, wanted: 
     least = LEAST_CAPACITANCE * x[c0 + 2]
     held = c < least
     c = max(c, least)
-    tau = r * c
-    decay = math.exp(-dt / tau)
+    after, decay, by_r, by_tau = rc_step(v, i, r, r * c, dt)
     if wanted > 0.0:
-        by_tau = (v - i * r) * decay * dt / (tau * tau)
-        by_r = i * (1.0 - decay) + by_tau * c
+        by_r += by_tau * c
         by_c = by_tau * r
         d_c = 0.0 if held else by_c
         by_soc = -by_r * x[r0] * x[r0 + 1] * er + d_c * x[c0] * x[c0 + 1] * ec
@@ -98,7 +96,7 @@ def _branch_step(d: Floats, v: float, x: Floats, b: int, middle: float, wanted: 
         d[4] = decay * d[4] + d_c * x[c0] * soc * ec
         d[5] = decay * d[5] + (by_c * LEAST_CAPACITANCE if held else d_c)
         d[6] = decay * d[6] + (by_soc if middle > 0.0 else 0.0)
-    return v * decay + i * r * (1.0 - decay)  # (2.2), (2.3)
+    return after  # (2.2), (2.3)
 
 
 @njit(cache=True)

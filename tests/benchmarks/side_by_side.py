@@ -90,9 +90,8 @@ class Trial:
 
     def run_held_back(self, estimator: Estimator) -> float:
         """SOC RMSE [%] of an estimator that learned before and is told a wrong SOC."""
-        estimator.resume(np.inf)
         estimator.set_soc(self.start_soc)
-        estimator.record["identifier"]["covariance"][0, 0, 0] = WRONG_SOC**2
+        estimator.resume(np.inf)
         return self.soc_rmse_percent(estimator.run(self.blind)["soc"])
 
 
