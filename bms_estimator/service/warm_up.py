@@ -22,5 +22,7 @@ def load_kernels() -> None:
     sample = np.zeros(1, dtype=SAMPLE)
     sample["voltage_v"] = cell.cell.nominal_voltage_v
     estimator.run(sample)
+    estimator.set_soc(0.5)
+    estimator.resume(0.0)
     parameter_report(estimator, 0.0)
     remaining_charge(estimator, 0.0)
