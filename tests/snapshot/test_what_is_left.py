@@ -88,9 +88,10 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert health["r_s"].value == pytest.approx(1.0, abs=0.03)
     capacity, offset_a = health["capacity"], health["current_offset_a"]
     assert capacity.value == pytest.approx(1.0, abs=0.03)
-    assert (capacity.source, capacity.valid, capacity.reason) == ("identified", True, None)
-    assert 0.005 < capacity.std < 0.02
-    assert abs(offset_a.value) < 2.0 * offset_a.std <= 2.0 * 0.005 * Q_AH
+    assert (capacity.source, capacity.valid) == ("identified", False)
+    assert 0.005 < capacity.std < estimator.settings_record["filter"]["capacity_std"][0]
+    assert "valid below 0.02" in (capacity.reason or "")
+    assert abs(offset_a.value) < 2.0 * offset_a.std <= 2.0 * 0.007 * Q_AH
     assert report.a["a15"].std is not None
     assert report.elements["e_o_v"].source == "configured"
     a1, target = report.a["a1"], float(estimator.state["target"][0, 1])
