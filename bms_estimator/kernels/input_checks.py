@@ -170,10 +170,7 @@ def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: f
     if dt_s > FAST_S or c.slow_v == 0.0:  # too long to tell, or the first sample
         c.slow_v, c.slow_a = voltage_v, current_a
         return
-    middle = p.weak_ohm.shape[0] // 2
-    ohm = 0.0
-    for k in range(p.weak_ohm.shape[1]):
-        ohm += p.weak_ohm[middle, k] + p.strong_ohm[middle, k]
+    ohm = p.middle_ohm
     change_a = current_a - c.slow_a
     limit_v = CLIP * ohm * abs(change_a)
     change_v = min(max(voltage_v - c.slow_v, -limit_v), limit_v)

@@ -42,7 +42,7 @@ def test_a_wrong_soc_and_wrong_resistances_are_found(load) -> None:
     assert np.mean(np.abs(error[late]) < 2.0 * trace["soc_std"][late]) > 0.95
     assert trace["soc_coulomb"][5000] == pytest.approx(true_soc[5000] - 0.2, abs=1e-3)
     elements, soc, a = present_elements(estimator.record[0]), true_soc[-1], TRUTH.a
-    assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=0.02)
+    assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=0.05)
     for name, truth in (("r_ts_ohm", chen_mora.r_ts(soc, a)), ("r_tl_ohm", chen_mora.r_tl(soc, a))):
         assert abs(elements[name].value - truth) < 3.0 * elements[name].std
         assert elements[name].relative_std < 0.4
