@@ -22,7 +22,10 @@ def load() -> tuple[SampleBlock, np.ndarray]:
 
 
 def test_step_and_run_leave_the_same_record_to_the_last_bit(load) -> None:
-    block = load[0][:3000]
+    block = load[0][:3000].copy()
+    block["temperature_c"] = np.where(
+        block["time_s"] % 7.0 == 0.0, np.nan, 25.0 + 10.0 * np.sin(block["time_s"] / 300.0)
+    )
     whole, stepped, pieces = (Estimator(TRUTH, identifier=ON, initial_soc=0.8) for _ in range(3))
     whole.run(block)
     for row in block:

@@ -1,0 +1,76 @@
+"""What the filter makes of a cell file and ``[identifier]``."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bms_estimator import Estimator
+from bms_estimator.estimator.filter_settings import BEYOND_BRANCHES, BRANCHES_STD, SOC_GRID, ladder_of_branches
+from bms_estimator.estimator.learned import present_elements
+from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.ladder import GRID, RESISTANCES
+from bms_estimator.model.cell import Ladder, TableOcv, load_cell
+from bms_estimator.model.settings import IdentifierSettings
+
+CELL = load_cell("ncr18650")
+
+
+def test_a_file_without_a_ladder_has_its_two_branches_in_it() -> None:
+    """The present elements, read from the ladder again, are those of the file."""
+    estimator = Estimator(CELL, identifier=IdentifierSettings(soc_std=0.005), initial_soc=0.5)
+    estimator.step(0.0, 0.0, float(chen_mora.ocv(0.5, *(estimator.settings[0][n] for n in ("ocv_v", "ocv_slope_v")))))
+    soc, a, elements = float(estimator.state["soc"][0]), CELL.a, present_elements(estimator.record[0])
+    r_ts, r_tl = chen_mora.r_ts(soc, a), chen_mora.r_tl(soc, a)
+    assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=1e-3)
+    both = elements["r_ts_ohm"].value + elements["r_tl_ohm"].value
+    assert both == pytest.approx((1.0 + BEYOND_BRANCHES) * (r_ts + r_tl), rel=1e-3)
+    assert elements["r_ts_ohm"].value == pytest.approx(r_ts, rel=0.15)
+    assert elements["c_ts_farad"].value == pytest.approx(chen_mora.c_ts(soc, a), rel=0.15)
+    assert estimator.settings_record["filter"]["r_std"][0] == BRANCHES_STD
+    assert all(math.isinf(element.unlearned_s) for element in elements.values())
+
+
+def test_the_resistances_of_two_branches_are_kept_over_soc() -> None:
+    ohm, a = ladder_of_branches(CELL), CELL.a
+    assert ohm.shape == (GRID, RESISTANCES)
+    for soc, row in zip(SOC_GRID, ohm, strict=True):
+        branches = chen_mora.r_ts(soc, a) + chen_mora.r_tl(soc, a)
+        assert row[0] == pytest.approx(chen_mora.r_s(soc, a))
+        assert row[1:].sum() == pytest.approx((1.0 + BEYOND_BRANCHES) * branches)
+
+
+def test_a_ladder_of_a_pack_is_interpolated() -> None:
+    rows = tuple((0.001 * (k + 1), 0.002 * (k + 1)) for k in range(RESISTANCES))
+    ladder = Ladder(
+        soc=(0.0, 1.0), weak_ohm=rows, strong_ohm=rows, std=0.12, error_v=0.004, temperature_c=(-10.0, 25.0)
+    )
+    p = Estimator(CELL.model_copy(update={"ladder": ladder}).pack(3, 1)).settings_record[0]["filter"]
+    assert p["weak_ohm"][GRID // 2] == pytest.approx(3.0 * 0.0015 * np.arange(1, RESISTANCES + 1))
+    assert (p["r_std"], p["low_c"], p["high_c"], p["series"]) == (0.12, -10.0, 25.0, 3.0)
+
+
+def test_a_hysteresis_that_is_told_lifts_a_curve_that_is_that_after_discharge() -> None:
+    soc, ocv_v = (0.0, 0.3, 0.7, 1.0), (3.0, 3.25, 3.3, 3.5)
+    after = CELL.model_copy(update={"ocv": TableOcv(form="table", soc=soc, ocv_v=ocv_v)})
+    midway = CELL.model_copy(
+        update={"ocv": TableOcv(form="table", soc=soc, ocv_v=ocv_v, hysteresis_v=(0.005, 0.01, 0.01, 0.005))}
+    )
+    told = IdentifierSettings(hysteresis_v=0.03)
+    for cell, lifted_v in ((after, 0.015), (midway, 0.0)):
+        without = Estimator(cell).settings_record[0]["filter"]
+        p = Estimator(cell, identifier=told).settings_record[0]["filter"]
+        assert p["ocv_v"] - without["ocv_v"] == pytest.approx(lifted_v)
+        assert p["hysteresis_v"] == pytest.approx(0.015)
+    assert without["hysteresis_v"].max() == pytest.approx(0.01)
+
+
+def test_states_are_switched_off_by_0_and_told_in_amperes() -> None:
+    off = IdentifierSettings(current_offset_std_a=0.0, capacity_std=0.0)
+    p = Estimator(CELL, identifier=off).settings_record[0]["filter"]
+    assert (p["offset_c"], p["capacity_std"]) == (0.0, 0.0)
+    told = IdentifierSettings(current_offset_std_a=0.1, soc_std=0.05)
+    p = Estimator(CELL, identifier=told).settings_record[0]["filter"]
+    assert p["offset_c"] * p["capacity_as"] / 3600.0 == pytest.approx(0.1)
+    assert p["soc_std"] == 0.05
+    assert p["capacity_std"] > 0.0
