@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.held_current import Load
+from bms_estimator.calibration.load import Load
 from bms_estimator.calibration.relaxation import REST_CURRENT_C, SOC_SLACK, runs
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv, r_s, soc_from_ocv
@@ -11,8 +11,8 @@ from bms_estimator.model.cell import CellModel
 
 Floats = NDArray[np.float64]
 
-LEAST_CURRENT_C = 0.02
-"""A capture whose current never exceeds this C-rate says nothing of the elements [1/h]."""
+LEAST_CURRENT_C = 0.1
+"""A capture whose current never exceeds this C-rate says nothing of the resistances: it is for `ocv` [1/h]."""
 STEP_SHARE = 0.1
 """Change of current between two samples that counts as a step, of the capture's largest current."""
 STEP_S = 3.0
@@ -36,6 +36,11 @@ def contradictions(load: Load, cell: CellModel) -> list[str]:
         if found:
             return [f"{load.name}: {found}"]
     return []
+
+
+def without_excitation(load: Load, cell: CellModel) -> bool:
+    """Whether the current is too small to tell anything of the resistances."""
+    return _no_excitation(load, cell) is not None
 
 
 def step_resistance(load: Load) -> float | None:

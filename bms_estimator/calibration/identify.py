@@ -1,42 +1,65 @@
-"""Identification of a1..a15 from captures: a prediction-error fit with analytic sensitivities.
+"""Identification of a cell from captures: the ladder of the filter, a1..a15 of its two branches, a better OCV.
 
-What the model leaves of a voltage wanders for minutes under the noise of the samples. Taken as white it would claim
-seven to twenty-five times the information there is (NCR18650), and let the slow part of the error decide. So errors pass the Kalman predictor of
-white noise plus a Gauss-Markov drift, and the squares of its one-step prediction errors are made least (large ones
-by their magnitudes: Huber).
-
-With a1..a15 go: the SOC at the start of each capture, held by the voltage of its first rest; where several captures
-are fitted, a contact resistance of each; and a smooth correction of the open-circuit voltage, a cubic B-spline held to
-zero and to smoothness. Captures not used for the fit are predicted better with the correction, by a sixth to a quarter
-of the error (NCR18650): relaxation goes on for hours, and what is left after a rest of minutes depends on the test.
+The fit is that of ``ladder_fit``. Whether it is any good is asked of the estimator itself: replays cut in mid-load, before
+and after. A capture beside which others of about its temperature were given is held back from the fit that it judges.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration import elements
-from bms_estimator.calibration.capture_checks import contradictions, step_resistance
-from bms_estimator.calibration.held_current import Load, thinned, whole_load
-from bms_estimator.calibration.identifiability import Parameter, parameters
-from bms_estimator.calibration.prediction_error import Problem, Solution
+from bms_estimator.calibration import branches
+from bms_estimator.calibration.capture_checks import contradictions, without_excitation
+from bms_estimator.calibration.ladder_fit import (
+    EVEN,
+    HELD_PER_KELVIN_V,
+    HELD_V,
+    KELVIN_NODES,
+    PER_KELVIN_V,
+    SOC_NODES,
+    TYPICAL_V,
+    WEAK_SHARE,
+    LadderFit,
+    Prior,
+    correction_at,
+    fit_ladder,
+    moments,
+)
+from bms_estimator.calibration.ladder_voltage import arrhenius, hats, overpotential, temperature_of
+from bms_estimator.calibration.load import Load, whole_load
+from bms_estimator.calibration.replays import interval_score
+from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import r_s, soc_from_ocv
-from bms_estimator.kernels.sensitivity import spline_weights
-from bms_estimator.model.cell import ELEMENTS, CellModel, TableOcv
+from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J
+from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 
 Floats = NDArray[np.float64]
 
+SHOWN_SOC = (0.2, 0.5, 0.8)
+"""SOCs at which the resistances are reported."""
 OCV_STEP = 0.01
-"""Nodes of the corrected table: at each such step of SOC, and where the cell file has one."""
+"""Nodes of the corrected table: at each such step of SOC."""
 LEAST_SLOPE_V = 1e-3
 """The corrected table rises at least so steeply, per cell and 1 of SOC [V]."""
-SHOWN_SOC = (0.2, 0.5, 0.8)
-"""SOCs at which the elements are reported."""
+SPAN_K = 10.0
+"""Temperatures that differ by less tell nothing of activation energies and dE/dT [K]."""
+FULL_V, COLD_K = 0.03, 5.0
+"""A rest in the cold, so far from 25 C, tells the SOC no better than this, per cell [V, K]: so near to full it is full."""
+LOWEST_C, HIGHEST_C = -45.0, 85.0
+"""Temperatures of cells [C]."""
+PERCENTILES = (2.0, 98.0)
+"""The temperatures of the captures are known between these."""
+LADDER_STD = 0.1
+"""Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
+JUDGED_SOC = 0.1
+"""RMS errors are given above it."""
+NO_WORSE = 0.1
+"""Scores that differ by less are the same [%]."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +70,23 @@ class CaptureFit:
         name: What it is called.
         samples: How many it had.
         glitches: How many were left out as glitches.
-        steps: How many steps of held current were fitted.
-        initial_soc: At the first sample, identified, 0..1.
-        initial_soc_std: Its standard error.
-        contact_ohm: Series resistance beside R_s; 0 where only one capture is fitted [ohm].
-        voltage_rms_v: Of the fitted error, each second weighing the same, SOC above 0.1 [V].
+        initial_soc: At the first sample, 0..1.
+        temperature_c: Lowest and highest [C]; None without a sensor.
+        voltage_rms_v: What the ladder leaves, each second weighing the same, SOC above 0.1 [V].
+        score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
+        score_after: The same with the identified one.
+        held_back: The capture had no part in the cell of ``score_after``.
     """
 
     name: str
     samples: int
     glitches: int
-    steps: int
     initial_soc: float
-    initial_soc_std: float
-    contact_ohm: float
+    temperature_c: tuple[float, float] | None
     voltage_rms_v: float
+    score_before: float
+    score_after: float
+    held_back: bool
 
 
 @dataclass(frozen=True)
@@ -69,45 +94,75 @@ class Identification:
     """An identified cell.
 
     Attributes:
-        cell: The cell with its new elements and open-circuit voltage.
-        parameters: a1..a15 in order.
-        correlation: Of their estimates, shape (15, 15).
-        elements: SOC -> element -> value, standard error [ohm, F].
+        cell: The cell with its ladder, the elements of its two branches, and perhaps a new open-circuit voltage.
+        elements: SOC -> ``r_s``, ``r_ts``, ``r_tl`` at 25 C -> value, standard error [ohm].
         captures: In the order given.
-        ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V].
-        iterations: Of Levenberg-Marquardt, all passes.
+        left_out: Names of captures without excitation.
+        ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0: it is the given one.
+        score_before: Mean interval score of the replays with the given cell [%]; NaN when none could judge.
+        score_after: The same with the identified one.
     """
 
     cell: CellModel
-    parameters: tuple[Parameter, ...]
-    correlation: Floats
     elements: dict[float, dict[str, tuple[float, float]]]
     captures: tuple[CaptureFit, ...]
+    left_out: tuple[str, ...]
     ocv_correction_v: float
-    iterations: int
+    score_before: float
+    score_after: float
 
 
-def identify(captures: Sequence[Columns], cell: CellModel, *, refine_ocv: bool = True) -> Identification:
-    """Fit a1..a15 to captures jointly.
+@dataclass(frozen=True)
+class Run:
+    """One capture with what is known of it beside its samples."""
+
+    load: Load
+    soc: Floats
+    temperature_c: Floats
+
+    @property
+    def mean_c(self) -> float:
+        """Mean temperature [C]."""
+        return float(self.temperature_c.mean())
+
+
+def identify(
+    captures: Sequence[Columns],
+    cell: CellModel,
+    *,
+    refine_ocv: bool = True,
+    initial_soc: float | None = None,
+    temperature_c: float | None = None,
+) -> Identification:
+    """Fit the ladder to captures jointly.
 
     Args:
         captures: Raw samples, rows of dtype ``SAMPLE``; each should start from rest.
-        cell: Capacity, limits and OCV; its elements are where the search starts, a factor of 2 off does no harm.
-        refine_ocv: Correct the open-circuit voltage as well.
+        cell: Capacity, limits and OCV; its ladder, if it has one, says what captures of one temperature do not.
+        refine_ocv: Correct the open-circuit voltage as well where that makes the replays better.
+        initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
+        temperature_c: Of captures without a sensor; None: 25 C.
 
     Raises:
-        UserError: A capture without excitation, or one that contradicts the cell: sign of the current, capacity, OCV.
+        UserError: No capture with excitation; one that contradicts the cell: sign of the current, capacity, OCV; a
+            temperature that no cell has; or replays that get worse.
     """
     whole = [whole_load(capture.name, capture.rows, cell) for capture in captures]
-    found = [line for load in whole for line in contradictions(load, cell)]
+    loads = [load for load in whole if not without_excitation(load, cell)]
+    found = [line for load in loads or whole for line in contradictions(load, cell)]
+    found += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
     if found:
         raise UserError("\n".join(found))
-    loads = [thinned(load, cell.cell.capacity_ah) for load in whole]
-    known_ohm = [ohm for ohm in map(step_resistance, whole) if ohm is not None]
-    scale_ohm = float(np.median(known_ohm)) if known_ohm else r_s(0.5, cell.a)
-    problem = Problem(cell, loads, [initial_soc(load, cell) for load in loads], scale_ohm, refine_ocv=refine_ocv)
-    solution = problem.solve()
-    return _outcome(cell, problem, solution, refine_ocv)
+    runs = [_run(load, cell, initial_soc, temperature_c) for load in loads]
+    left_out = tuple(load.name for load in whole if without_excitation(load, cell))
+    candidates = [_Candidate(runs, cell, refine_ocv=refine) for refine in ((True, False) if refine_ocv else (False,))]
+    before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
+    after = [candidate.scores() for candidate in candidates]
+    best = int(np.argmin([_mean(scores) for scores in after])) if np.isfinite(before).any() else 0
+    outcome = candidates[best].outcome(before, after[best], left_out)
+    if outcome.score_after > outcome.score_before + NO_WORSE:
+        raise UserError(_worse(outcome))
+    return outcome
 
 
 def initial_soc(load: Load, cell: CellModel) -> float:
@@ -116,89 +171,191 @@ def initial_soc(load: Load, cell: CellModel) -> float:
     return soc_from_ocv(load.start_v + current_a * r_s(0.5, cell.a), *ocv_grid(cell))
 
 
-def _outcome(cell: CellModel, problem: Problem, solution: Solution, refine_ocv: bool) -> Identification:
-    layout, z = problem.layout, solution.z
-    theta = z[layout.theta]
-    a = elements.to_a(theta)
-    jacobian = elements.by_theta(theta)
-    covariance = jacobian @ solution.covariance[layout.theta, layout.theta] @ jacobian.T
-    std = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(std, std)
-    soc_std = np.sqrt(np.diag(solution.covariance))[layout.soc]
-    fits = tuple(
-        CaptureFit(
-            name=load.name,
-            samples=load.samples,
-            glitches=load.glitches,
-            steps=load.time_s.size,
-            initial_soc=float(z[layout.soc][k]),
-            initial_soc_std=float(soc_std[k]),
-            contact_ohm=float(z[layout.contact][k]),
-            voltage_rms_v=problem.voltage_rms_v(z, k),
+class _Candidate:
+    """One way to fit the captures: with the OCV refined or kept."""
+
+    def __init__(self, runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> None:
+        self._runs, self._cell, self._refine = runs, cell, refine_ocv
+        self._scale_ohm = TYPICAL_V * cell.cell.series_count / cell.cell.capacity_ah
+        grid = np.linspace(0.0, 1.0, ocv_grid(cell)[0].size)
+        self._moments = []
+        for run in runs:
+            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + _by_temperature(cell, run)
+            self._moments.append(
+                moments(run.load, run.soc, given_v, run.temperature_c, self._scale_ohm, cell.cell.series_count)
+            )
+        self.fit, self.cell = self._fitted(range(len(runs)))
+
+    def scores(self) -> Floats:
+        """Of each capture's replays, with a cell that did not see it where there are others like it [%]."""
+        return np.array([interval_score(self._cell_for(j), run.load, run.soc) for j, run in enumerate(self._runs)])
+
+    def held_back(self, j: int) -> bool:
+        """Whether another capture at about the temperature of ``j`` was given."""
+        mean_c = [run.mean_c for run in self._runs]
+        return any(k != j and abs(mean_c[k] - mean_c[j]) < SPAN_K for k in range(len(mean_c)))
+
+    def outcome(self, before: Floats, after: Floats, left_out: tuple[str, ...]) -> Identification:
+        """All there is to say."""
+        fits = tuple(
+            CaptureFit(
+                name=run.load.name,
+                samples=run.load.samples,
+                glitches=run.load.glitches,
+                initial_soc=float(run.soc[0]),
+                temperature_c=_temperature_range([run]) if np.isfinite(run.load.temperature_c).any() else None,
+                voltage_rms_v=_rms(self.cell, run),
+                score_before=float(before[j]),
+                score_after=float(after[j]),
+                held_back=self.held_back(j),
+            )
+            for j, run in enumerate(self._runs)
         )
-        for k, load in enumerate(problem.loads)
-    )
-    new = _with_elements(cell, a)
-    change_v = 0.0
-    if refine_ocv:
-        new = new.model_copy(update={"ocv": corrected_ocv(cell, z[layout.ocv])})
-        soc = np.linspace(0.1, 1.0, 181)
-        change_v = float(np.sqrt(np.mean(spline(z[layout.ocv], soc) ** 2)))
-    return Identification(
-        cell=new,
-        parameters=parameters(a, std, correlation, solution.at_limit),
-        correlation=correlation,
-        elements={soc: _elements_at(soc, a, covariance) for soc in SHOWN_SOC},
-        captures=fits,
-        ocv_correction_v=change_v,
-        iterations=solution.iterations,
-    )
+        change_v = correction_at(np.linspace(0.1, 1.0, 181)) @ self.fit.correction
+        return Identification(
+            cell=self.cell,
+            elements={
+                soc: {name: self.fit.branches(soc, *which) for name, which in branches.SECTIONS.items()}
+                for soc in SHOWN_SOC
+            },
+            captures=fits,
+            left_out=left_out,
+            ocv_correction_v=float(np.sqrt(np.mean(change_v**2))) if self._refine else 0.0,
+            score_before=_mean(before),
+            score_after=_mean(after),
+        )
+
+    def _cell_for(self, j: int) -> CellModel:
+        if not self.held_back(j):
+            return self.cell
+        return self._fitted([k for k in range(len(self._runs)) if k != j])[1]
+
+    def _fitted(self, which: Sequence[int]) -> tuple[LadderFit, CellModel]:
+        runs = [self._runs[k] for k in which]
+        low_c, high_c = _temperature_range(runs)
+        known = self._cell.ladder
+        tells = high_c - low_c >= SPAN_K
+        series = self._cell.cell.series_count
+        prior = Prior(
+            ocv_error_v=_ocv_error(self._cell) if self._refine else np.full(EVEN.size, HELD_V),
+            per_kelvin_v=(PER_KELVIN_V if tells and self._refine else HELD_PER_KELVIN_V) * series,
+            scale_ohm=self._scale_ohm,
+            series=series,
+            weak_share=None if tells else WEAK_SHARE if known is None else _share(known),
+        )
+        fit = fit_ladder([self._moments[k] for k in which], prior)
+        if not tells and known is not None:
+            low_c, high_c = min(low_c, known.temperature_c[0]), max(high_c, known.temperature_c[1])
+        ladder = Ladder(
+            soc=_tuple(SOC_NODES),
+            weak_ohm=tuple(map(_tuple, fit.weak_ohm)),
+            strong_ohm=tuple(map(_tuple, fit.strong_ohm)),
+            std=LADDER_STD,
+            error_v=1.0,
+            temperature_c=(low_c, high_c),
+        )
+        update: dict[str, object] = {"ladder": ladder, "adaptation": {}, **branches.sections(ladder)}
+        if self._refine:
+            update["ocv"] = _corrected_ocv(self._cell, fit, entropy=tells)
+        new = self._cell.model_copy(update=update)
+        error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), 1e-5)
+        return fit, new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
 
 
-def _with_elements(cell: CellModel, a: Floats) -> CellModel:
-    """The cell with a1..a15; bounds of the adaptation law stay where they still hold the value."""
-    table = cell.model_dump()
-    for name, (first, amplitude, offset) in ELEMENTS.items():
-        table[name] = {amplitude: float(a[first]), "exponent": float(a[first + 1]), offset: float(a[first + 2])}
-    table["adaptation"] = {
-        name: bounds
-        for name, bounds in table["adaptation"].items()
-        if bounds["lower"] <= a[int(name[1:])] <= bounds["upper"]
-    }
-    return CellModel.model_validate(table)
+def _run(load: Load, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
+    temperature = temperature_of(load, REFERENCE_C if temperature_c is None else temperature_c)
+    start = initial_soc(load, cell) if soc is None else soc
+    full_v = ocv_grid(cell)[0][-1]
+    cold = abs(float(temperature[0]) - REFERENCE_C) > COLD_K
+    if soc is None and cold and abs(full_v - load.start_v) < FULL_V * cell.cell.series_count:
+        start = 1.0
+    return Run(load, start - load.discharged_ah / cell.cell.capacity_ah, temperature)
 
 
-def spline(coefficients_v: Floats, soc: Floats) -> Floats:
-    """The correction of the open-circuit voltage at ``soc`` [V]."""
-    w = np.zeros(8)
-    values = np.empty(soc.size)
-    for j, x in enumerate(soc):
-        first = spline_weights(x, coefficients_v.size, w)
-        values[j] = w[:4] @ coefficients_v[first : first + 4]
-    return values
+def _by_temperature(cell: CellModel, run: Run) -> Floats:
+    """What dE/dT of the given cell adds to its OCV [V]."""
+    if not isinstance(cell.ocv, TableOcv) or cell.ocv.per_kelvin_v is None:
+        return np.zeros(run.soc.size)
+    return np.interp(run.soc, cell.ocv.soc, cell.ocv.per_kelvin_v) * (run.temperature_c - REFERENCE_C)
 
 
-def corrected_ocv(cell: CellModel, coefficients_v: Floats) -> TableOcv:
-    """The cell's open-circuit voltage with the correction, as an increasing table."""
-    grid_v, _ = ocv_grid(cell)
-    nodes = np.linspace(0.0, 1.0, grid_v.size)
+def _wrong_temperature(load: Load, temperature_c: float | None) -> list[str]:
+    temperature = temperature_of(load, REFERENCE_C if temperature_c is None else temperature_c)
+    if temperature.min() >= LOWEST_C and temperature.max() <= HIGHEST_C:
+        return []
+    runs = f"temperature_c runs from {temperature.min():.1f} to {temperature.max():.1f}"
+    return [f"{load.name}: {runs}, but cells are between {LOWEST_C:g} and {HIGHEST_C:g} C"]
+
+
+def _temperature_range(runs: list[Run]) -> tuple[float, float]:
+    low_c, high_c = np.percentile(np.concatenate([run.temperature_c for run in runs]), PERCENTILES)
+    return round(float(low_c), 1), round(float(high_c), 1)
+
+
+def _share(ladder: Ladder) -> Floats:
+    """Weak part of each resistance, mean over SOC."""
+    weak, strong = np.array(ladder.weak_ohm).mean(axis=1), np.array(ladder.strong_ohm).mean(axis=1)
+    return np.where(weak + strong > 0.0, weak / np.maximum(weak + strong, 1e-12), WEAK_SHARE)
+
+
+def _ocv_error(cell: CellModel) -> Floats:
+    """Std of the given OCV at ``EVEN`` [V]."""
+    if isinstance(cell.ocv, TableOcv) and cell.ocv.error_v is not None:
+        return np.interp(EVEN, cell.ocv.soc, cell.ocv.error_v)
+    slope_v = np.interp(EVEN, np.linspace(0.0, 1.0, ocv_grid(cell)[1].size), ocv_grid(cell)[1])
+    return np.hypot(CURVE_ERROR_V * cell.cell.series_count, CURVE_ERROR_SOC * slope_v)
+
+
+def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOcv:
+    """The cell's OCV with the correction, as an increasing table; its hysteresis stays, its error too."""
+    given = cell.ocv if isinstance(cell.ocv, TableOcv) else None
     soc = np.linspace(0.0, 1.0, round(1.0 / OCV_STEP) + 1)
-    if isinstance(cell.ocv, TableOcv):
-        own = np.array(cell.ocv.soc)
-        far = np.abs(own[:, None] - soc).min(axis=1) > 0.2 * OCV_STEP
-        soc = np.sort(np.r_[soc, own[far]])
+    grid_v = ocv_grid(cell)[0]
     slope = LEAST_SLOPE_V * cell.cell.series_count * soc
-    ocv_v = np.maximum.accumulate(np.interp(soc, nodes, grid_v) + spline(coefficients_v, soc) - slope) + slope
-    return TableOcv(form="table", soc=tuple(soc.tolist()), ocv_v=tuple(ocv_v.tolist()))
+    corrected_v = np.interp(soc, np.linspace(0.0, 1.0, grid_v.size), grid_v) + correction_at(soc) @ fit.correction
+    per_kelvin_v = hats(soc, KELVIN_NODES) @ fit.per_kelvin_v if entropy else None
+    if given is not None and given.per_kelvin_v is not None:
+        known_v = np.interp(soc, given.soc, given.per_kelvin_v)
+        per_kelvin_v = known_v if per_kelvin_v is None else per_kelvin_v + known_v
+    hysteresis_v = None if given is None or given.hysteresis_v is None else given.hysteresis_v
+    return TableOcv(
+        form="table",
+        soc=_tuple(soc),
+        ocv_v=_tuple(np.maximum.accumulate(corrected_v - slope) + slope),
+        error_v=_tuple(np.interp(soc, EVEN, _ocv_error(cell))),
+        hysteresis_v=None if hysteresis_v is None or given is None else _tuple(np.interp(soc, given.soc, hysteresis_v)),
+        per_kelvin_v=None if per_kelvin_v is None else _tuple(per_kelvin_v),
+    )
 
 
-def _elements_at(soc: float, a: Floats, covariance: Floats) -> dict[str, tuple[float, float]]:
-    """Elements (2.5)-(2.9) at ``soc`` with standard errors from the covariance of a1..a15."""
-    found = {}
-    for name, (first, _, _) in ELEMENTS.items():
-        sign = -1.0 if name.startswith("c_") else 1.0
-        decay = np.exp(-a[first + 1] * soc)
-        slope = np.array([sign * decay, -sign * a[first] * soc * decay, 1.0])
-        part = covariance[first - 1 : first + 2, first - 1 : first + 2]
-        found[name] = (float(sign * a[first] * decay + a[first + 2]), float(np.sqrt(slope @ part @ slope)))
-    return found
+def _rms(cell: CellModel, run: Run) -> float:
+    """What the cell leaves of a capture's voltage, as at 25 C, each second weighing the same [V]."""
+    grid_v = ocv_grid(cell)[0]
+    e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
+    load = replace(run.load, temperature_c=run.temperature_c)
+    error_v = run.load.voltage_v - e_o + overpotential(cell, load, run.soc)
+    weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, 60.0)
+    weight *= (run.soc > JUDGED_SOC) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
+    return float(np.sqrt((weight * error_v**2).sum() / max(weight.sum(), 1e-12)))
+
+
+def _mean(scores: Floats) -> float:
+    known = scores[np.isfinite(scores)]
+    return float(known.mean()) if known.size else float("nan")
+
+
+def _worse(outcome: Identification) -> str:
+    lines = [
+        f"{c.name}: {c.score_before:.2f} before, {c.score_after:.2f} after"
+        for c in outcome.captures
+        if np.isfinite(c.score_after)
+    ]
+    return (
+        "nothing is written: replays cut in mid-load get worse, their interval score (smaller is better) goes from "
+        f"{outcome.score_before:.2f} to {outcome.score_after:.2f} % of SOC; keep the cell file, or give captures with "
+        f"more of its loads\n" + "\n".join(lines)
+    )
+
+
+def _tuple(values: Floats) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)

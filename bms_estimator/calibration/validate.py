@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.capture_checks import contradictions, soc_outside
-from bms_estimator.calibration.held_current import whole_load
 from bms_estimator.calibration.identify import initial_soc as soc_of_first_rest
+from bms_estimator.calibration.ladder_voltage import overpotential
+from bms_estimator.calibration.load import whole_load
 from bms_estimator.calibration.relaxation import REST_CURRENT_C
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.sensitivity import sensitivities
+from bms_estimator.kernels.cell import ocv
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -80,7 +81,8 @@ class Validation:
 def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = None) -> Validation:
     """Simulate a capture's voltage from its current alone and compare.
 
-    Where C_ts, C_tl turn negative (below delta1, delta2) they are held just above 0, so that the simulation goes on.
+    The ladder of the cell file counts, at the capture's temperature; without one (2.2)-(2.9). Where C_ts, C_tl turn
+    negative (below delta1, delta2) they are held just above 0, so that the simulation goes on.
 
     Args:
         capture: Raw samples, rows of dtype ``SAMPLE``; it should start from rest.
@@ -96,22 +98,9 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     outside = soc_outside(load, cell.cell.capacity_ah, start)
     if outside:
         raise UserError("\n".join(dict.fromkeys([*warnings, f"{capture.name}: {outside}"])))
-    simulated_v = np.empty(load.time_s.size)
-    sensitivities(
-        load.time_s,
-        load.current_a,
-        load.held_a,
-        start,
-        0.0,
-        cell.cell.capacity_ah * 3600.0,
-        cell.a[:16],
-        *ocv_grid(cell),
-        np.zeros(4),
-        simulated_v,
-        np.empty((0, 0)),
-    )
-    error_v = load.voltage_v - simulated_v
     soc = start - load.discharged_ah / cell.cell.capacity_ah
+    grid = ocv_grid(cell)
+    error_v = load.voltage_v - np.array([ocv(x, *grid) for x in soc]) + overpotential(cell, load, soc)
     above = soc > LOW_SOC
     resting = np.abs(load.current_a) < REST_CURRENT_C * cell.cell.capacity_ah
     current_a = load.current_a[above]

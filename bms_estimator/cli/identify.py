@@ -1,6 +1,7 @@
-"""``bms-estimator identify``: a cell's elements from captures, into a cell file."""
+"""``bms-estimator identify``: a cell's resistances from captures, into a cell file."""
 
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -11,8 +12,7 @@ from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 
-from bms_estimator.calibration.identifiability import Verdict
-from bms_estimator.calibration.identify import Identification, identify
+from bms_estimator.calibration.identify import CaptureFit, Identification, identify
 from bms_estimator.cli.captures import (
     CELL_HELP,
     AsJson,
@@ -27,32 +27,36 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.sources.replay import load_capture
 
-UNITS = {"r": "ohm", "c": "F"}
-COLOURS = {Verdict.IDENTIFIED: "green", Verdict.WEAK: "yellow", Verdict.NOT_TOLD: "red"}
-
 
 def identify_command(
     captures: Annotated[
         list[Path], typer.Argument(help="recorded captures, CSV (.gz) or Parquet, each from rest", show_default=False)
     ],
-    cell: Annotated[str, typer.Option(help=f"{CELL_HELP}; its capacity, OCV, start", show_default=False)],
+    cell: Annotated[str, typer.Option(help=f"{CELL_HELP}; its capacity and OCV", show_default=False)],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
+    soc: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=1.0, help="at the first sample of each capture; else from the first rest's voltage"),
+    ] = None,
+    temperature_c: Annotated[
+        float | None, typer.Option(help="of captures without the column temperature_c; else 25", show_default=False)
+    ] = None,
     keep_ocv: Annotated[bool, typer.Option(help="leave the open-circuit voltage as it is")] = False,
     current_sign: SignOfCurrent = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Identify a cell's elements from captures and write a cell file.
+    """Identify a cell's resistances from captures and write a cell file.
 
-    Several captures are fitted jointly. Loads with steps and rests over the whole range of SOC tell most; what a load
-    does not tell keeps about the value of --cell, and is named.
+    Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole range of SOC tell most;
+    the OCV is better found by `ocv` before. Written is only what makes replays cut in mid-load no worse.
     """
     check_out(out, captures, force=force)
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     started_s = time.perf_counter()
-    found = identify(loaded, model, refine_ocv=not keep_ocv)
+    found = identify(loaded, model, refine_ocv=not keep_ocv, initial_soc=soc, temperature_c=temperature_c)
     seconds = time.perf_counter() - started_s
     renamed = found.cell.model_copy(update={"cell": found.cell.cell.model_copy(update={"name": name_of(out)})})
     start = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
@@ -66,83 +70,100 @@ def identify_command(
 def _json(out: Path, found: Identification, seconds: float) -> dict[str, Any]:
     return {
         "out": str(out),
-        "parameters": {
-            p.name: {
-                "value": p.value,
-                "std": p.std,
-                "relative_std": p.relative_std,
-                "verdict": p.verdict.value,
-                "at_limit": p.at_limit,
-                "leans_on": p.leans_on,
-                "correlation": p.correlation,
-            }
-            for p in found.parameters
-        },
-        "not_told": [p.name for p in found.parameters if p.verdict is Verdict.NOT_TOLD],
-        "correlation": found.correlation.tolist(),
         "elements": [
             {"soc": soc}
-            | {f"{name}_{_unit(name)}": value for name, (value, _) in row.items()}
-            | {f"{name}_{_unit(name)}_std": std for name, (_, std) in row.items()}
+            | {f"{name}_ohm": value for name, (value, _) in row.items()}
+            | {f"{name}_ohm_std": std for name, (_, std) in row.items()}
             for soc, row in found.elements.items()
         ],
+        "temperature_c": _temperatures(found),
+        "error_mv": 1e3 * _error_v(found),
         "captures": [
             {
                 "name": c.name,
                 "samples": c.samples,
                 "glitches": c.glitches,
-                "steps": c.steps,
                 "initial_soc": c.initial_soc,
-                "initial_soc_std": c.initial_soc_std,
-                "contact_ohm": c.contact_ohm,
+                "temperature_c": c.temperature_c,
                 "voltage_rms_mv_soc_above_0_1": 1e3 * c.voltage_rms_v,
+                "score_before_percent": _number(c.score_before),
+                "score_after_percent": _number(c.score_after),
+                "held_back": c.held_back,
             }
             for c in found.captures
         ],
+        "left_out": list(found.left_out),
         "ocv_correction_rms_mv": 1e3 * found.ocv_correction_v,
-        "iterations": found.iterations,
+        "score_before_percent": _number(found.score_before),
+        "score_after_percent": _number(found.score_after),
         "seconds": seconds,
     }
 
 
+def _temperatures(found: Identification) -> tuple[float, float]:
+    ladder = found.cell.ladder
+    return (math.nan, math.nan) if ladder is None else ladder.temperature_c
+
+
+def _error_v(found: Identification) -> float:
+    return math.nan if found.cell.ladder is None else found.cell.ladder.error_v
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def _remarks(cell: str, found: Identification) -> list[str]:
     fitted = ", ".join(f"{c.name} ({1e3 * c.voltage_rms_v:.1f} mV RMS)" for c in found.captures)
-    doubtful = ", ".join(p.name for p in found.parameters if p.verdict is Verdict.NOT_TOLD)
+    low_c, high_c = _temperatures(found)
     lines = [
-        f"Identified from {fitted}, SOC above 0.1;",
-        f"capacity and the start of the search from {Path(cell).name}.",
+        f"Resistances identified from {fitted}, SOC above 0.1;",
+        f"capacity and open-circuit voltage from {Path(cell).name}. Cell temperatures {low_c:g} to {high_c:g} C.",
     ]
     if found.ocv_correction_v:
         lines.append(f"OCV: that of {Path(cell).name}, corrected by {1e3 * found.ocv_correction_v:.1f} mV RMS.")
-    return [*lines, f"Not told by this load: {doubtful}."] if doubtful else lines
+    return [*lines, f"{_scores(found)}."]
+
+
+def _scores(found: Identification) -> str:
+    if not math.isfinite(found.score_after):
+        return "No capture is long enough for replays cut in mid-load"
+    return (
+        f"Replays cut in mid-load, started 0.2 wrong: interval score {found.score_before:.2f} % before, "
+        f"{found.score_after:.2f} % after"
+    )
 
 
 def _tables(out: Path, found: Identification, seconds: float) -> Group:
     """The outcome for people."""
-    numbers = Table(title=f"{out}: written", title_justify="left", box=box.SIMPLE_HEAD)
-    for column in ("", "value", "std", "", "leans on"):
-        numbers.add_column(column, justify="left" if not column or column == "leans on" else "right")
-    for p in found.parameters:
-        verdict = f"[{COLOURS[p.verdict]}]{p.verdict.value}[/]" + (", at its limit" if p.at_limit else "")
-        numbers.add_row(p.name, f"{p.value:.5g}", f"{p.std:.2g}", verdict, f"{p.leans_on} ({p.correlation:+.2f})")
-    shown = Table("SOC", *(f"{soc:g}" for soc in found.elements), box=box.SIMPLE_HEAD)
+    shown = Table("SOC", *(f"{soc:g}" for soc in found.elements), title=f"{out}: written", box=box.SIMPLE_HEAD)
+    shown.title_justify = "left"
     for name in next(iter(found.elements.values())):
         cells = (found.elements[soc][name] for soc in found.elements)
-        shown.add_row(f"{name} \\[{_unit(name)}]", *(f"{value:.4g} ± {std:.2g}" for value, std in cells))
+        shown.add_row(f"{name} \\[mohm], 25 °C", *(f"{1e3 * value:.4g} ± {1e3 * std:.2g}" for value, std in cells))
     fits = Table(box=box.SIMPLE_HEAD)
-    for column in ("capture", "RMS, SOC > 0.1", "initial SOC", "contacts", "glitches"):
-        fits.add_column(column, justify="left" if column == "capture" else "right")
+    for column in ("capture", "°C", "initial SOC", "RMS, SOC > 0.1", "score before", "after", "", "glitches"):
+        fits.add_column(column, justify="left" if column in ("capture", "") else "right")
     for c in found.captures:
-        fits.add_row(
-            c.name.split(".")[0],
-            f"{1e3 * c.voltage_rms_v:.2f} mV",
-            f"{c.initial_soc:.4f} ± {c.initial_soc_std:.4f}",
-            f"{1e3 * c.contact_ohm:+.2f} mohm",
-            f"{c.glitches}",
-        )
-    ocv = f"OCV corrected by {1e3 * found.ocv_correction_v:.1f} mV RMS; " if found.ocv_correction_v else ""
-    return Group(numbers, shown, fits, f"{ocv}{found.iterations} iterations in {seconds:.2f} s")
+        fits.add_row(*_row(c))
+    low_c, high_c = _temperatures(found)
+    lines = [f"cell temperatures {low_c:g} to {high_c:g} °C; outside, the band widens", _scores(found)]
+    if found.ocv_correction_v:
+        lines.append(f"OCV corrected by {1e3 * found.ocv_correction_v:.1f} mV RMS")
+    if found.left_out:
+        lines.append(f"left out, too small a current to tell of resistances: {', '.join(found.left_out)}")
+    return Group(shown, fits, *lines, f"{seconds:.1f} s")
 
 
-def _unit(element: str) -> str:
-    return UNITS[element[0]]
+def _row(c: CaptureFit) -> tuple[str, ...]:
+    temperature = "no sensor" if c.temperature_c is None else f"{c.temperature_c[0]:.0f} to {c.temperature_c[1]:.0f}"
+    scores = (f"{x:.2f} %" if math.isfinite(x) else "-" for x in (c.score_before, c.score_after))
+    return (
+        c.name.split(".")[0],
+        temperature,
+        f"{c.initial_soc:.4f}",
+        f"{1e3 * c.voltage_rms_v:.1f} mV",
+        *scores,
+        "held back" if c.held_back else "",
+        f"{c.glitches}",
+    )

@@ -127,17 +127,10 @@ def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
 
 
 @njit(cache=True)
-def rc_step(
-    v_rc: float, current_a: float, r_ohm: float, tau_s: float, dt_s: float
-) -> tuple[float, float, float, float]:
-    """RC branch after ``dt_s`` under constant current, (2.2)-(2.3) solved exactly.
-
-    Returns:
-        Its voltage [V], and the derivatives of that by the voltage before, by R at this tau [A], by tau [V/s].
-    """
+def rc_step(v_rc: float, current_a: float, r_ohm: float, tau_s: float, dt_s: float) -> float:
+    """Voltage of an RC branch after ``dt_s`` under constant current, (2.2)-(2.3) solved exactly [V]."""
     decay = math.exp(-dt_s / tau_s)
-    by_tau = (v_rc - current_a * r_ohm) * decay * dt_s / (tau_s * tau_s)
-    return v_rc * decay + current_a * r_ohm * (1.0 - decay), decay, current_a * (1.0 - decay), by_tau
+    return v_rc * decay + current_a * r_ohm * (1.0 - decay)
 
 
 @njit(cache=True)
@@ -160,8 +153,8 @@ def cell_step(x: State, current_a: float, dt_s: float, capacity_as: float, a: Fl
     ohm_tl = r_tl(middle, a)
     return (
         soc - drop,  # (2.1)
-        rc_step(v_ts, current_a, ohm_ts, ohm_ts * c_ts(middle, a), dt_s)[0],  # (2.2)
-        rc_step(v_tl, current_a, ohm_tl, ohm_tl * c_tl(middle, a), dt_s)[0],  # (2.3)
+        rc_step(v_ts, current_a, ohm_ts, ohm_ts * c_ts(middle, a), dt_s),  # (2.2)
+        rc_step(v_tl, current_a, ohm_tl, ohm_tl * c_tl(middle, a), dt_s),  # (2.3)
     )
 
 

@@ -1,8 +1,4 @@
-"""A capture as the fit wants it: without glitches, and with stretches of steady current as single long steps.
-
-The model's step is exact for a current that holds, so nothing is lost by thinning a rest or a constant load; charge
-is kept exactly, as the mean current between the samples that are kept.
-"""
+"""A capture as calibration wants it: what the cell did, without glitches."""
 
 from dataclasses import dataclass
 
@@ -16,16 +12,6 @@ from bms_estimator.model.sample import SampleBlock
 
 Floats = NDArray[np.float64]
 
-STEADY_C = 0.01
-"""A current that stays within this C-rate of its value at the last kept sample counts as held [1/h]."""
-DENSE_SAMPLES = 5
-"""Samples kept one by one after each change of current."""
-GROWTH = 0.1
-"""Then a step may be this fraction of the time since the change: relaxation is smooth in log time."""
-LONGEST_STEP_S = 60.0
-"""No step is longer [s]."""
-LARGEST_DROP = 1e-3
-"""Nor moves SOC by more than this, so that the elements held at mid-step are right."""
 NEIGHBOURS = 2
 """Samples on either side that a glitch is told by."""
 LEAST_SAMPLES = 2 * NEIGHBOURS + 1
@@ -46,8 +32,8 @@ class Load:
         name: What to call it.
         time_s: Shape (n,), increasing, from 0 [s].
         current_a: Shape (n,), at the sample, discharge positive [A].
-        held_a: Shape (n,), mean from the sample to the next kept one [A].
         voltage_v: Shape (n,), measured [V].
+        temperature_c: Shape (n,), of the cell [C]; NaN where it was not measured.
         discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
         resting_samples: How many of the first samples are at rest.
         samples: How many samples the capture had.
@@ -57,8 +43,8 @@ class Load:
     name: str
     time_s: Floats
     current_a: Floats
-    held_a: Floats
     voltage_v: Floats
+    temperature_c: Floats
     discharged_ah: Floats
     resting_samples: int
     samples: int
@@ -84,52 +70,13 @@ def whole_load(name: str, samples: SampleBlock, cell: CellModel) -> Load:
         name=name,
         time_s=time_s,
         current_a=current_a,
-        held_a=current_a,
         voltage_v=np.ascontiguousarray(good["voltage_v"]),
+        temperature_c=np.ascontiguousarray(good["temperature_c"]),
         discharged_ah=np.r_[0.0, np.cumsum(current_a[:-1] * np.diff(time_s))] / 3600.0,
         resting_samples=int(np.argmin(resting)) if not resting.all() else resting.size,
         samples=samples.size,
         glitches=samples.size - good.size,
     )
-
-
-def thinned(load: Load, capacity_ah: float) -> Load:
-    """The same with stretches of steady current as long steps."""
-    kept = np.flatnonzero(_kept(load, capacity_ah))
-    step_s = np.diff(load.time_s[kept])
-    held_a = np.r_[np.diff(load.discharged_ah[kept]) * 3600.0 / step_s, load.current_a[kept[-1]]]
-    return Load(
-        name=load.name,
-        time_s=load.time_s[kept],
-        current_a=load.current_a[kept],
-        held_a=held_a,
-        voltage_v=load.voltage_v[kept],
-        discharged_ah=load.discharged_ah[kept],
-        resting_samples=int(np.searchsorted(kept, load.resting_samples)),
-        samples=load.samples,
-        glitches=load.glitches,
-    )
-
-
-def _kept(load: Load, capacity_ah: float) -> NDArray[np.bool_]:
-    """Which samples stay."""
-    kept = np.zeros(load.time_s.size, dtype=np.bool_)
-    kept[[0, -1]] = True
-    steady_a = STEADY_C * capacity_ah
-    times, currents, charges = load.time_s.tolist(), load.current_a.tolist(), load.discharged_ah.tolist()
-    changed = last = 0
-    for j in range(1, len(times)):
-        if abs(currents[j] - currents[last]) > steady_a:
-            kept[j - 1] = kept[j] = True
-            changed = last = j
-            continue
-        longest_s = min(GROWTH * (times[j] - times[changed]), LONGEST_STEP_S)
-        ahead_s = times[min(j + 1, len(times) - 1)] - times[last]
-        drop = abs(charges[j] - charges[last]) / capacity_ah
-        if j - changed < DENSE_SAMPLES or ahead_s > longest_s or drop > LARGEST_DROP:
-            kept[j] = True
-            last = j
-    return kept
 
 
 def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBlock:
