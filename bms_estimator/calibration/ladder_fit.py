@@ -60,6 +60,13 @@ ERROR_V, ERROR_J = 4e-3, 22e3
 """Std of a row at 25 C, per cell [V], and how it grows in the cold [J/mol]."""
 RELATIVE = 0.1
 """Std relative to the drop that ``TYPICAL_V`` makes of the largest current of the last half minute."""
+STEPS_WORTH, STEP_V = 30.0, 1e-3
+"""The jumps of a capture's voltage at clean steps of its current count as so many rows, of this std per cell [V]: they tell
+R_0, and do not wander."""
+STEADY, STEADY_S, STEP_S = 0.01, 5.0, 1.5
+"""A step is clean when before it and behind it the current moves by no more than this part of the largest for so long [s],
+and when it is sampled so closely [s]: of a current that goes on changing, samples that are taken a little before those of
+the voltage would tell another R_0."""
 STEP_SHARE = 0.1
 """A change of current by this part of the capture's largest begins a new stretch."""
 SHORTEST_S, LONGEST_S = 10.0, 30.0
@@ -151,15 +158,33 @@ def moments(load: Load, soc: Floats, given_v: Floats, temperature_c: Floats, sca
         series: Cells in series.
     """
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
+    weight, last = _weights(load)
+    inside = (soc > LOWEST) & (soc < HIGHEST)
+    kept = (_apart(load.time_s) | last) & inside
     load_a = np.abs(currents[:, :4]).max(axis=1)
     std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE * scale_ohm * load_a)
-    weight, last = _weights(load)
-    kept = (_apart(load.time_s) | last) & (soc > LOWEST) & (soc < HIGHEST)
     weight = np.where(kept, weight, 0.0)
     root = (np.sqrt(WORTH * weight / weight.sum()) / std_v)[kept, None]
-    soc, temperature_c, currents = soc[kept], temperature_c[kept], currents[kept]
+    left_v = load.voltage_v - given_v
+    rows = _rows(soc[kept], temperature_c[kept], currents[kept]) * root
+    target = left_v[kept] * root[:, 0]
+    after = _clean_steps(load) & inside
+    before = np.r_[after[1:], False]
+    if after.any():
+        change_a = np.abs(load.current_a[after] - load.current_a[before])
+        std_v = np.hypot(STEP_V * series, RELATIVE * scale_ohm * change_a) * arrhenius(ERROR_J, temperature_c[after])
+        root = (np.sqrt(STEPS_WORTH / after.sum()) / std_v)[:, None]
+        jump = _rows(soc[after], temperature_c[after], currents[after])
+        jump -= _rows(soc[before], temperature_c[before], currents[before])
+        rows = np.vstack([rows, jump * root])
+        target = np.r_[target, (left_v[after] - left_v[before]) * root[:, 0]]
+    return Moments(rows.T @ rows, rows.T @ target)
+
+
+def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:
+    """The model's rows, not weighted. Shape (n, FREE + 2 PART)."""
     places = (currents[:, :, None] * hats(soc, SOC_NODES)[:, None, :]).reshape(soc.size, -1)
-    rows = np.hstack(
+    return np.hstack(
         [
             correction_at(soc),
             hats(soc, KELVIN_NODES) * (temperature_c - REFERENCE_C)[:, None],
@@ -167,8 +192,6 @@ def moments(load: Load, soc: Floats, given_v: Floats, temperature_c: Floats, sca
             -places * arrhenius(STRONG_J, temperature_c)[:, None],
         ]
     )
-    rows *= root
-    return Moments(rows.T @ rows, rows.T @ ((load.voltage_v - given_v)[kept] * root[:, 0]))
 
 
 def fit_ladder(captures: list[Moments], prior: Prior) -> LadderFit:
@@ -234,3 +257,16 @@ def _weights(load: Load) -> tuple[Floats, NDArray[np.bool_]]:
     last = np.zeros(weight.size, dtype=np.bool_)
     last[ends] = True
     return weight, last
+
+
+def _clean_steps(load: Load) -> NDArray[np.bool_]:
+    """Samples right behind a step of current that is held before and behind it."""
+    largest_a = float(np.abs(load.current_a).max())
+    change_a = np.abs(np.diff(load.current_a, prepend=load.current_a[0]))
+    step_s = np.diff(load.time_s, prepend=load.time_s[0])
+    changes = np.flatnonzero(change_a > STEADY * largest_a)
+    bounds_s = np.r_[load.time_s[0], load.time_s[changes], load.time_s[-1]]
+    steady = (bounds_s[1:-1] - bounds_s[:-2] >= STEADY_S) & (bounds_s[2:] - bounds_s[1:-1] >= STEADY_S)
+    clean = np.zeros(change_a.size, dtype=np.bool_)
+    clean[changes[steady]] = True
+    return np.asarray(clean & (change_a > STEP_SHARE * largest_a) & (step_s <= STEP_S))
