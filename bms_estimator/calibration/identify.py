@@ -58,8 +58,8 @@ LADDER_STD = 0.1
 """Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
 JUDGED_SOC = 0.1
 """RMS errors are given above it."""
-NO_WORSE = 0.1
-"""Scores that differ by less are the same [%]."""
+NO_WORSE = 1.05
+"""Scores that differ by less than this factor are the same: four replays do not tell more."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def identify(
     after = [candidate.scores() for candidate in candidates]
     best = int(np.argmin([_mean(scores) for scores in after])) if np.isfinite(before).any() else 0
     outcome = candidates[best].outcome(before, after[best], left_out)
-    if outcome.score_after > outcome.score_before + NO_WORSE:
+    if outcome.score_after > NO_WORSE * outcome.score_before:
         raise UserError(_worse(outcome))
     return outcome
 
@@ -263,7 +263,9 @@ class _Candidate:
 
 
 def _run(load: Load, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
-    temperature = temperature_of(load, REFERENCE_C if temperature_c is None else temperature_c)
+    if temperature_c is not None:
+        load = replace(load, temperature_c=temperature_of(load, temperature_c))
+    temperature = temperature_of(load)
     start = initial_soc(load, cell) if soc is None else soc
     full_v = ocv_grid(cell)[0][-1]
     cold = abs(float(temperature[0]) - REFERENCE_C) > COLD_K

@@ -1,14 +1,15 @@
 """Captures of a simulated cell, for the tests of identification."""
 
 import numpy as np
+from scipy.signal import lfilter
 
-from bms_estimator.calibration.elements import SIZE
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv, simulate_cell
-from bms_estimator.model.cell import ELEMENTS, CellModel, load_cell
+from bms_estimator.model.cell import ELEMENTS, CellModel, Ladder, load_cell
 from bms_estimator.model.sample import SAMPLE
 
-TRUTH = load_cell("ncr18650")
+TRUTH = load_cell("ncr18650").model_copy(update={"ladder": None})
+"""Two branches: what (2.2)-(2.9) make of it is the truth."""
 
 
 def steps(seed=0, duration_s=18_000):
@@ -29,7 +30,7 @@ def capture(current_a, *, cell=TRUTH, soc=0.98, noise_v=0.5e-3, seed=0):
     """What a sensor sees of ``cell`` under ``current_a`` at 1 Hz, to SOC 0.03."""
     time_s = np.arange(current_a.size, dtype=float)
     elements = np.zeros(22)
-    elements[1 : SIZE + 1] = cell.a[1 : SIZE + 1]
+    elements[1:16] = cell.a[1:16]
     drop_v, counted = simulate_cell((soc, 0.0, 0.0), time_s, current_a, 3600.0 * cell.cell.capacity_ah, elements)
     grid = ocv_grid(cell)
     samples = np.zeros(time_s.size, dtype=SAMPLE)
@@ -49,3 +50,37 @@ def wrong_start(factor_ohm=1.7, factor_farad=0.6):
         table[name][offset] *= factor
         table[name]["exponent"] *= 1.3
     return CellModel.model_validate(table)
+
+
+LADDER = Ladder(
+    soc=(0.0, 0.2, 1.0),
+    weak_ohm=((0.05, 0.02, 0.02), *((0.01, 0.004, 0.004),) * 6),
+    strong_ohm=((0.02, 0.008, 0.008), *((0.008, 0.004, 0.004),) * 6),
+    std=0.1,
+    error_v=0.005,
+    temperature_c=(-20.0, 45.0),
+)
+"""What ``ladder_capture`` is made of."""
+
+
+def ladder_capture(current_a, temperature_c, *, soc=0.98, noise_v=0.5e-3, seed=0, told_c=None):
+    """As ``capture``, of ``TRUTH`` with ``LADDER`` for its elements, at one temperature."""
+    time_s = np.arange(current_a.size, dtype=float)
+    drawn_as = np.r_[0.0, np.cumsum(current_a[:-1])]
+    counted = soc - drawn_as / (3600.0 * TRUTH.cell.capacity_ah)
+    kelvin = 1.0 / (temperature_c + 273.15) - 1.0 / 298.15
+    factors = (np.exp(12e3 / 8.314462618 * kelvin), np.exp(45e3 / 8.314462618 * kelvin))
+    held_a = 0.5 * (current_a[1:] + current_a[:-1])
+    drop_v = np.zeros(time_s.size)
+    for k, tau_s in enumerate((0.0, 1.0, 6.0, 30.0, 120.0, 500.0, 2000.0)):
+        decay = np.exp(-1.0 / tau_s) if k else 0.0
+        filtered_a = np.r_[0.0, lfilter([1.0 - decay], [1.0, -decay], held_a)] if k else current_a
+        for factor, rows in zip(factors, (LADDER.weak_ohm, LADDER.strong_ohm), strict=True):
+            drop_v += factor * np.interp(counted, LADDER.soc, rows[k]) * filtered_a
+    grid = ocv_grid(TRUTH)
+    samples = np.zeros(time_s.size, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"] = time_s, current_a
+    samples["voltage_v"] = np.array([ocv(x, *grid) for x in counted]) - drop_v
+    samples["voltage_v"] += noise_v * np.random.default_rng(seed + 100).standard_normal(time_s.size)
+    samples["temperature_c"] = temperature_c if told_c is None else told_c
+    return samples[np.minimum.accumulate(counted) > 0.03]

@@ -1,104 +1,158 @@
 import numpy as np
 import pytest
 
+from bms_estimator.calibration import branches
+from bms_estimator.calibration import identify as module
 from bms_estimator.calibration.capture_checks import contradictions
-from bms_estimator.calibration.elements import by_theta, from_a, start, to_a
-from bms_estimator.calibration.held_current import thinned, whole_load
-from bms_estimator.calibration.identifiability import Verdict
-from bms_estimator.calibration.identify import corrected_ocv, identify, spline
-from bms_estimator.calibration.prediction_error import COEFFICIENTS
+from bms_estimator.calibration.identify import identify
+from bms_estimator.calibration.ladder_voltage import hats
+from bms_estimator.calibration.load import whole_load
+from bms_estimator.calibration.replays import interval_score
 from bms_estimator.calibration.validate import validate
-from bms_estimator.cli.main import main
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import c_tl, c_ts, r_s, r_tl, r_ts
-from bms_estimator.kernels.sensitivity import sensitivities
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture
-from tests.calibration.simulated_load import TRUTH, capture, constant, steps, wrong_start
+from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps, wrong_start
+
+WARM_C, COLD_C = 25.0, -5.0
+OHM = {"r_s": 28e-3, "r_ts": 24e-3, "r_tl": 24e-3}
+"""Of ``LADDER`` at SOC 0.5 and 25 C."""
 
 
 @pytest.fixture(scope="module")
-def identified():
-    return identify([Columns(capture(steps()), "steps")], wrong_start())
+def warm():
+    return Columns(ladder_capture(steps(), WARM_C), "warm")
 
 
 @pytest.fixture(scope="module")
-def from_constant_current():
-    return identify([Columns(capture(constant()), "constant")], wrong_start())
+def cold():
+    return Columns(ladder_capture(steps(3), COLD_C), "cold")
 
 
-def deviations(found):
-    """Each of a1..a15 less its true value, in standard errors."""
-    return np.array([(p.value - TRUTH.a[int(p.name[1:])]) / p.std for p in found.parameters])
+@pytest.fixture(scope="module")
+def identified(warm, cold):
+    return identify([warm, cold], wrong_start())
 
 
-def verdicts(found):
-    return {p.name: p.verdict for p in found.parameters}
+def errors_mv(cell, samples):
+    return 1e3 * validate(Columns(samples, "other"), cell).above.voltage_rms_v
 
 
-def test_parameters_are_recovered_within_their_standard_errors(identified):
-    assert np.abs(deviations(identified)).max() < 3.0
-    assert np.sqrt(np.mean(deviations(identified) ** 2)) < 1.3
+def test_resistances_are_found_at_25_c(identified):
+    for name, ohm in OHM.items():
+        value, std = identified.elements[0.5][name]
+        assert value == pytest.approx(ohm, rel=0.05 if name == "r_s" else 0.15)
+        assert abs(value - ohm) < 2.0 * std < 0.5 * ohm
 
 
-def test_standard_errors_are_small_where_the_load_tells(identified):
-    told = [p for p in identified.parameters if p.verdict is Verdict.IDENTIFIED]
-    assert {"a3", "a9", "a12", "a13", "a14", "a15"} <= {p.name for p in told}
-    assert all(p.relative_std <= 0.15 for p in told)
+def test_captures_at_two_temperatures_tell_of_those_between(identified, warm):
+    between = ladder_capture(steps(7), 10.0)
+    assert identified.cell.ladder.temperature_c == (COLD_C, WARM_C)
+    assert errors_mv(identified.cell, between) < 6.0
+    from_warm = identify([warm], wrong_start()).cell
+    assert from_warm.ladder.temperature_c == (WARM_C, WARM_C)
+    assert errors_mv(from_warm, between) > 1.5 * errors_mv(identified.cell, between)
 
 
-@pytest.mark.parametrize("soc", [0.2, 0.5, 0.8])
-def test_series_resistance_within_one_percent_and_rc_products_within_five(identified, soc):
-    row = {name: value for name, (value, _) in identified.elements[soc].items()}
-    a = TRUTH.a
-    assert row["r_s"] == pytest.approx(r_s(soc, a), rel=0.01)
-    assert row["r_ts"] * row["c_ts"] == pytest.approx(r_ts(soc, a) * c_ts(soc, a), rel=0.05)
-    assert row["r_tl"] * row["c_tl"] == pytest.approx(r_tl(soc, a) * c_tl(soc, a), rel=0.05)
+def test_at_one_temperature_the_parts_are_shared_as_in_the_file_given(identified, warm):
+    found = identify([warm], identified.cell).cell.ladder
+    share, known = (
+        [np.sum(x.weak_ohm[k]) / np.sum([x.weak_ohm[k], x.strong_ohm[k]]) for k in range(7)]
+        for x in (found, identified.cell.ladder)
+    )
+    assert share == pytest.approx(known, abs=1e-6)
+    assert found.temperature_c == (COLD_C, WARM_C)
 
 
-def test_identified_cell_predicts_another_load(identified):
-    held_back = capture(steps(7), soc=0.9, seed=7)
-    assert validate(Columns(held_back, "other"), identified.cell).above.voltage_rms_v < 1e-3
-    assert validate(Columns(held_back, "other"), wrong_start()).above.voltage_rms_v > 10e-3
+def test_the_two_branches_of_the_file_are_those_of_the_ladder(identified):
+    ladder, a = identified.cell.ladder, identified.cell.a
+    for soc in (0.35, 0.5, 0.9):
+        rows = np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)
+        ohm = rows @ hats(np.array([soc]), np.array(ladder.soc))[0]
+        assert r_s(soc, a) == pytest.approx(ohm[0], rel=0.1)
+        assert r_ts(soc, a) == pytest.approx(ohm[1:4].sum(), rel=0.1)
+        assert r_tl(soc, a) == pytest.approx(ohm[4:].sum(), rel=0.1)
+        assert 1.0 < r_ts(soc, a) * c_ts(soc, a) < 30.0
+        assert 120.0 < r_tl(soc, a) * c_tl(soc, a) < 2000.0
 
 
-def test_constant_current_is_said_not_to_tell_what_it_cannot(from_constant_current):
-    found = verdicts(from_constant_current)
-    not_told = {name for name, verdict in found.items() if verdict is Verdict.NOT_TOLD}
-    assert {"a1", "a4", "a5", "a6", "a7", "a8", "a10", "a11", "a12"} <= not_told
-    assert found["a15"] is not Verdict.IDENTIFIED
-    assert np.abs(deviations(from_constant_current)).max() < 3.0
+def test_capacitances_of_a_flat_ladder_are_positive_down_to_empty():
+    flat = LADDER.model_copy(update={"weak_ohm": ((0.02,) * 3,) * 7, "strong_ohm": ((0.0,) * 3,) * 7})
+    made = branches.sections(flat)
+    assert made["r_s"].offset_ohm == pytest.approx(0.02, rel=1e-3)
+    for name in ("c_ts", "c_tl"):
+        assert 0.0 < made[name].amplitude_farad < made[name].offset_farad
 
 
-def test_what_a_load_does_not_tell_keeps_about_the_value_of_the_cell_file(from_constant_current):
-    for name in ("a5", "a11"):
-        ratio = from_constant_current.parameters[int(name[1:]) - 1].value / wrong_start().a[int(name[1:])]
-        assert 0.5 < ratio < 2.0
+def test_captures_of_about_one_temperature_judge_cells_that_did_not_see_them(warm, cold):
+    other = Columns(ladder_capture(steps(5), WARM_C + 3.0), "other")
+    found = identify([warm, cold, other], wrong_start())
+    assert [c.held_back for c in found.captures] == [True, False, True]
+    assert found.score_after < found.score_before
+    assert found.score_before == pytest.approx(np.mean([c.score_before for c in found.captures]))
 
 
-def test_captures_are_fitted_jointly_with_their_own_soc_and_contacts():
-    first = capture(steps(1), soc=0.97, seed=1)
-    second = capture(steps(2), soc=0.70, seed=2)
-    second["voltage_v"] -= 0.006 * second["current_a"]
-    found = identify([Columns(first, "first"), Columns(second, "second")], wrong_start())
-    assert [c.initial_soc for c in found.captures] == pytest.approx([0.97, 0.70], abs=0.006)
-    assert found.captures[1].contact_ohm - found.captures[0].contact_ohm == pytest.approx(0.006, abs=5e-4)
+def test_what_makes_replays_worse_is_refused_with_their_scores(warm, monkeypatch):
+    given = wrong_start()
+    monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell is given else 5.25)
+    with pytest.raises(UserError, match=r"^nothing is written: .* from 1\.50 to 5\.25 % of SOC") as caught:
+        identify([warm], given)
+    assert "warm: 1.50 before, 5.25 after" in str(caught.value)
+
+
+def test_the_ocv_is_kept_where_that_makes_replays_better(warm, monkeypatch):
+    given = wrong_start()
+    monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell.ocv is given.ocv else 5.25)
+    found = identify([warm], given)
+    assert found.cell.ocv == given.ocv
+    assert found.ocv_correction_v == 0.0
+
+
+def test_captures_too_short_for_a_replay_are_identified_all_the_same():
+    found = identify([Columns(ladder_capture(steps()[:1200], WARM_C), "short")], wrong_start())
+    assert np.isnan(found.score_before)
+    assert np.isnan(found.captures[0].score_after)
+
+
+def test_the_score_is_worse_for_a_band_that_is_wrong():
+    load = whole_load("steps", capture(steps()), TRUTH)
+    soc = 0.98 - load.discharged_ah / TRUTH.cell.capacity_ah
+    good = interval_score(TRUTH, load, soc)
+    assert 0.0 < good < 10.0
+    assert interval_score(TRUTH, load, np.clip(soc + 0.2, 0.0, 1.0)) > 3.0 * good
+
+
+def test_a_wrong_ocv_is_corrected(warm):
+    soc = np.linspace(0.0, 1.0, 101)
+    true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
+    wrong_v = true_v + 6e-3 * np.sin(2.0 * np.pi * soc)
+    wrong = TableOcv(form="table", soc=tuple(soc), ocv_v=tuple(wrong_v), error_v=(6e-3,) * soc.size)
+    found = identify([warm], TRUTH.model_copy(update={"ocv": wrong}), initial_soc=0.98).cell.ocv
+    middle = (soc > 0.15) & (soc < 0.95)
+    left_v = np.interp(soc, found.soc, found.ocv_v) - true_v
+    assert np.sqrt(np.mean(left_v[middle] ** 2)) < 0.75 * np.sqrt(np.mean((wrong_v - true_v)[middle] ** 2))
+    assert (np.diff(found.ocv_v) > 0.0).all()
+
+
+def test_ocv_and_its_growth_with_temperature_are_kept_when_asked(warm, cold):
+    found = identify([warm, cold], wrong_start(), refine_ocv=False)
+    assert found.cell.ocv == wrong_start().ocv
+    assert found.ocv_correction_v == 0.0
 
 
 def test_a_pack_is_identified_as_well_as_a_cell():
     pack = TRUTH.pack(6, 2)
     samples = capture(2.0 * steps(), cell=pack, noise_v=3e-3)
     found = identify([Columns(samples, "pack")], wrong_start().pack(6, 2))
-    elements = {name: value for name, (value, _) in found.elements[0.5].items()}
-    assert elements["r_s"] == pytest.approx(3.0 * r_s(0.5, TRUTH.a), rel=0.01)
-    assert elements["r_ts"] * elements["c_ts"] == pytest.approx(r_ts(0.5, TRUTH.a) * c_ts(0.5, TRUTH.a), rel=0.05)
-    assert validate(Columns(samples, "pack"), found.cell).above.voltage_rms_v < 6e-3
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(3.0 * r_s(0.5, TRUTH.a), rel=0.03)
+    assert errors_mv(found.cell, samples) < 36.0
 
 
-def test_glitches_do_no_harm(identified):
-    samples = capture(steps())
+def test_glitches_do_no_harm(warm):
+    samples = warm.rows.copy()
     rng = np.random.default_rng(5)
     places = rng.choice(np.arange(100, samples.size - 100), 60, replace=False)
     samples["voltage_v"][places[:20]] = 0.0
@@ -107,81 +161,43 @@ def test_glitches_do_no_harm(identified):
     resting = places[45:][samples["current_a"][places[45:]] == 0.0]
     samples["current_a"][resting] = 4.6
     samples["time_s"][50:52] = samples["time_s"][49]
-    found = identify([Columns(samples, "glitches")], wrong_start())
+    found, clean = (identify([Columns(rows, "glitches")], wrong_start()) for rows in (samples, warm.rows))
     assert found.captures[0].glitches >= 45
-    assert np.abs(deviations(found)).max() < 3.0
-    clean = np.array([p.value for p in identified.parameters])
-    std = np.array([p.std for p in identified.parameters])
-    assert (np.abs(np.array([p.value for p in found.parameters]) - clean) < std).all()
+    for name in OHM:
+        assert found.elements[0.5][name][0] == pytest.approx(clean.elements[0.5][name][0], rel=0.05)
 
 
 def test_a_gap_at_rest_is_stepped_over():
-    samples = capture(np.r_[steps()[:6000], np.zeros(3600), steps()[6000:]])
+    samples = ladder_capture(np.r_[steps()[:6000], np.zeros(3600), steps()[6000:]], WARM_C)
     found = identify([Columns(np.delete(samples, np.s_[6060:9540]), "gap")], wrong_start())
-    assert np.abs(deviations(found)).max() < 3.0
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(OHM["r_s"], rel=0.05)
 
 
-def test_ocv_is_kept_when_asked():
-    found = identify([Columns(capture(steps()), "steps")], wrong_start(), refine_ocv=False)
-    assert found.cell.ocv == TRUTH.ocv
-    assert found.ocv_correction_v == 0.0
-    assert np.abs(deviations(found)).max() < 3.0
+def test_captures_that_tell_nothing_of_resistances_are_left_out(warm):
+    slow = Columns(capture(constant(0.15, 20_000)), "slow")
+    found = identify([slow, warm], wrong_start())
+    assert found.left_out == ("slow",)
+    assert [c.name for c in found.captures] == ["warm"]
 
 
-def test_a_wrong_ocv_is_corrected():
-    table = wrong_start().model_dump()
-    soc = np.array(table["ocv"]["soc"])
-    table["ocv"]["ocv_v"] = tuple(np.array(table["ocv"]["ocv_v"]) + 0.015 * np.sin(3.0 * soc) * (1.0 - soc))
-    wrong = type(TRUTH).model_validate(table)
-    held_back = capture(steps(7), seed=7)
-    kept = identify([Columns(capture(steps()), "steps")], wrong, refine_ocv=False)
-    refined = identify([Columns(capture(steps()), "steps")], wrong)
-    after = validate(Columns(held_back, "other"), refined.cell).above.voltage_rms_v
-    assert after < 1.5e-3
-    assert after < 0.5 * validate(Columns(held_back, "other"), kept.cell).above.voltage_rms_v
+def test_without_a_sensor_the_temperature_is_as_told(cold):
+    samples = cold.rows.copy()
+    samples["temperature_c"] = np.nan
+    told = identify([Columns(samples, "cold")], wrong_start(), temperature_c=COLD_C)
+    assert told.cell.ladder.temperature_c == (COLD_C, COLD_C)
+    assert told.captures[0].temperature_c == (COLD_C, COLD_C)
+    assert told.elements[0.5]["r_s"][0] < identify([Columns(samples, "cold")], wrong_start()).elements[0.5]["r_s"][0]
+    with pytest.raises(
+        UserError, match=r"^cold: temperature_c runs from 298.0 to 298.0, but cells are between -45 and 85"
+    ):
+        identify([Columns(samples, "cold")], wrong_start(), temperature_c=298.0)
 
 
-def test_corrected_table_increases_whatever_the_correction():
-    table = corrected_ocv(TRUTH, 0.1 * np.random.default_rng(0).standard_normal(COEFFICIENTS))
-    assert (np.diff(table.ocv_v) > 0.0).all()
-    assert (table.soc[0], table.soc[-1]) == (0.0, 1.0)
-
-
-def test_without_correction_the_table_is_the_cells():
-    table = corrected_ocv(TRUTH, np.zeros(COEFFICIENTS))
-    grid_v, _ = ocv_grid(TRUTH)
-    again_v, _ = ocv_grid(TRUTH.model_copy(update={"ocv": table}))
-    assert np.abs(again_v - grid_v).max() < 0.5e-3
-    np.testing.assert_allclose(spline(np.ones(COEFFICIENTS), np.linspace(-0.1, 1.1, 50)), 1.0)
-
-
-def test_thinning_loses_neither_charge_nor_voltage():
-    whole = whole_load("steps", capture(steps(), noise_v=0.0), TRUTH)
-    few = thinned(whole, TRUTH.cell.capacity_ah)
-    assert few.time_s.size < 0.3 * whole.time_s.size
-    charge_ah = np.r_[0.0, np.cumsum(few.held_a[:-1] * np.diff(few.time_s))] / 3600.0
-    np.testing.assert_allclose(charge_ah, few.discharged_ah, atol=1e-12)
-    voltage_v = np.empty(few.time_s.size)
-    arrays = (few.time_s, few.current_a, few.held_a, 0.98, 0.0, 10800.0, TRUTH.a[:16])
-    sensitivities(*arrays, *ocv_grid(TRUTH), np.zeros(4), voltage_v, np.empty((0, 0)))
-    assert np.abs(voltage_v - few.voltage_v).max() < 0.3e-3
-
-
-def test_theta_and_parameters_are_inverse_and_so_are_their_derivatives():
-    a = TRUTH.a[:16]
-    theta = from_a(a)
-    np.testing.assert_allclose(to_a(theta)[1:], a[1:], rtol=1e-12)
-    differences = np.array([(to_a(theta + e) - to_a(theta - e))[1:] / 2e-6 for e in 1e-6 * np.eye(15)]).T
-    np.testing.assert_allclose(by_theta(theta), differences, rtol=1e-6, atol=1e-6 * np.abs(a[1:]).min())
-
-
-def test_search_starts_bent_where_the_file_has_an_element_flat():
-    flat = TRUTH.a[:16]
-    flat[[1, 7]] = 1e-9
-    bent = to_a(start(flat))
-    assert bent[1] > 0.1 * bent[3]
-    assert bent[7] > 0.1 * bent[9]
-    np.testing.assert_allclose(bent[[4, 5, 6, 13, 14, 15]], flat[[4, 5, 6, 13, 14, 15]])
+def test_the_first_soc_can_be_given_and_a_cold_rest_near_full_is_full():
+    samples = ladder_capture(steps(), COLD_C, soc=1.0)
+    samples["voltage_v"] -= 0.015
+    assert identify([Columns(samples, "cold")], wrong_start()).captures[0].initial_soc == 1.0
+    assert identify([Columns(samples, "cold")], wrong_start(), initial_soc=0.99).captures[0].initial_soc == 0.99
 
 
 def with_capacity(capacity_ah):
@@ -224,56 +240,22 @@ def test_a_good_capture_contradicts_nothing():
     assert contradictions(whole_load("good", capture(steps()), TRUTH), TRUTH) == []
 
 
-def errors_on_random_steps(folder, cell, *names):
-    """What a cell identified from some captures of cell 5 leaves of another one."""
-    found = identify([load_capture(folder / f"cell5_{name}.csv.gz") for name in names], cell)
-    return validate(load_capture(folder / "cell5_random_steps.csv.gz"), found.cell).above
-
-
-@pytest.mark.parametrize("names", [("relaxation_c2",), ("relaxation_c2", "hppc")])
-def test_real_cell_predicts_random_steps(shared_data, names):
-    errors = errors_on_random_steps(shared_data / "ncr18650", TRUTH, *names)
-    assert errors.voltage_rms_v <= 6e-3
-    assert errors.mean_abs_percent <= 0.13
-
-
-@pytest.mark.parametrize("form", ["table", "chen-mora"])
-def test_real_cell_from_its_relaxation_test_alone(shared_data, tmp_path, capsys, form):
-    folder, out = shared_data / "ncr18650", tmp_path / "own.toml"
-    test = folder / "cell5_relaxation_c2.csv.gz"
-    with pytest.raises(SystemExit) as ended:
-        main(["ocv", str(test), "--capacity-ah", "3.0", "--form", form, "--out", str(out)])
-    assert not ended.value.code
-    errors = errors_on_random_steps(folder, load_cell(out), "relaxation_c2")
-    assert errors.voltage_rms_v <= 6.1e-3
-    assert errors.mean_abs_percent <= 0.13
-
-
-def scaled(cell, factor):
-    """The cell with every resistance, and so every time constant, wrong by a factor."""
-    table = cell.model_dump()
-    for name in ("r_s", "r_ts", "r_tl"):
-        table[name] |= {key: factor * table[name][key] for key in ("amplitude_ohm", "offset_ohm")}
-    return type(cell).model_validate(table)
+def test_real_cell_from_its_relaxation_test_predicts_random_steps(shared_data):
+    folder = shared_data / "ncr18650"
+    found = identify([load_capture(folder / "cell5_relaxation_c2.csv.gz")], TRUTH)
+    errors = validate(load_capture(folder / "cell5_random_steps.csv.gz"), found.cell).above
+    assert errors.voltage_rms_v <= 12e-3
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(84.4e-3, rel=0.1)  # median of dV/dI at its steps
 
 
 def test_a_real_cell_is_identified_from_a_wrong_start_and_predicts_another_load(data):
     """Nissan Leaf: pulses and rests, then cycles at 1C which the fit never saw."""
-    found = identify([load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")], scaled(load_cell("leaf"), 2.0))
-    assert {"a9", "a15"} <= {p.name for p in found.parameters if p.verdict is Verdict.IDENTIFIED}
-    assert found.elements[0.5]["r_s"][0] == pytest.approx(1.7e-3, rel=0.1)
+    leaf = load_cell("leaf")
+    table = leaf.model_dump() | {"ladder": None}
+    for name in ("r_s", "r_ts", "r_tl"):
+        table[name] |= {key: 2.0 * table[name][key] for key in ("amplitude_ohm", "offset_ohm")}
+    found = identify([load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")], type(leaf).model_validate(table))
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(1.57e-3, rel=0.1)  # median of dV/dI at its steps
     assert found.captures[0].voltage_rms_v < 5e-3
-    assert validate(load_capture(data / "leaf" / "cc_1c.csv.gz"), found.cell).above.voltage_rms_v < 20e-3
-
-
-def test_a_real_constant_load_is_said_not_to_tell_what_it_cannot(data):
-    """LG M50 at C/2 and back: of the fast branch it tells nothing. A tenth of the load is predicted all the same."""
-    points = np.genfromtxt(data / "lgm50" / "ocv_25c.csv", delimiter=",", names=True)
-    table = scaled(TRUTH, 1.0).model_dump()
-    table["ocv"] = {"form": "table", "soc": tuple(points["soc"]), "ocv_v": tuple(points["ocv_v"])}
-    table["cell"] |= {"capacity_ah": 4.95}
-    found = identify([load_capture(data / "lgm50" / "rate_0p5c_25c.csv.gz")], type(TRUTH).model_validate(table))
-    told = {p.name for p in found.parameters if p.verdict is Verdict.IDENTIFIED}
-    assert not told & {"a1", "a2", "a3", "a7", "a8", "a9"}
-    assert found.captures[0].voltage_rms_v < 10e-3
-    assert validate(load_capture(data / "lgm50" / "rate_0p1c_25c.csv.gz"), found.cell).above.voltage_rms_v < 25e-3
+    assert found.score_after < found.score_before
+    assert validate(load_capture(data / "leaf" / "cc_1c.csv.gz"), found.cell).above.voltage_rms_v < 25e-3

@@ -3,6 +3,8 @@ import json
 import numpy as np
 import pytest
 
+from bms_estimator.calibration import identify
+from bms_estimator.kernels.cell import r_s
 from bms_estimator.model.cell import load_cell
 from tests.calibration.simulated_load import TRUTH, capture, steps
 from tests.command_line import run
@@ -33,31 +35,24 @@ def test_identify_writes_a_cell_that_validates_on_another_capture(tables, tmp_pa
     code, text, _ = run(capsys, "identify", tables / "steps0.csv", "--cell", "ncr18650", "--out", out, "--json")
     found = json.loads(text)
     assert code == 0
-    assert list(found["parameters"]) == [f"a{i}" for i in range(1, 16)]
-    assert set(found["parameters"]["a15"]) == {
-        "value",
-        "std",
-        "relative_std",
-        "verdict",
-        "at_limit",
-        "leans_on",
-        "correlation",
-    }
-    assert found["parameters"]["a15"]["verdict"] == "identified"
-    assert np.shape(found["correlation"]) == (15, 15)
     assert found["elements"][1]["soc"] == 0.5
-    assert {"r_s_ohm", "r_s_ohm_std", "c_tl_F"} <= set(found["elements"][1])
+    assert {"r_s_ohm", "r_s_ohm_std", "r_tl_ohm"} <= set(found["elements"][1])
+    assert found["temperature_c"] == [25.0, 25.0]
     assert found["captures"][0]["initial_soc"] == pytest.approx(0.98, abs=0.005)
-    assert {"not_told", "ocv_correction_rms_mv", "iterations", "seconds"} <= set(found)
+    assert found["captures"][0]["temperature_c"] is None
+    assert found["captures"][0]["held_back"] is False
+    assert found["score_after_percent"] <= 1.05 * found["score_before_percent"]
+    assert {"left_out", "ocv_correction_rms_mv", "error_mv", "seconds"} <= set(found)
 
     cell = load_cell(out)
     assert cell.cell.name == "mine"
-    assert cell.a[15] == pytest.approx(found["parameters"]["a15"]["value"], rel=1e-7)
+    assert cell.ladder.temperature_c == (25.0, 25.0)
+    assert r_s(0.5, cell.a) == pytest.approx(found["elements"][1]["r_s_ohm"], rel=0.1)
     code, text, err = run(capsys, "validate", tables / "steps7.csv", "--cell", out, "--json")
     validated = json.loads(text)
     assert (code, err) == (0, "")
     assert set(ERRORS) | {f"{key}_soc_above_0_1" for key in ERRORS} <= set(validated)
-    assert validated["voltage_rms_mv_soc_above_0_1"] < 1.0
+    assert validated["voltage_rms_mv_soc_above_0_1"] < 10.0
     assert validated["initial_soc"] == pytest.approx(0.98, abs=0.005)
     assert validated["initial_soc_from"] == "first rest"
 
@@ -66,10 +61,12 @@ def test_for_people(tables, tmp_path, capsys):
     captures = [tables / "steps0.csv", tables / "steps7.csv"]
     code, text, _ = run(capsys, "identify", *captures, "--cell", "ncr18650", "--out", tmp_path / "c.toml", "--keep-ocv")
     assert code == 0
-    assert "a15" in text
+    assert "r_tl [mohm]" in text
+    assert "held back" in text
+    assert "interval score" in text
     assert "steps7" in text
     assert load_cell(tmp_path / "c.toml").ocv == TRUTH.ocv
-    assert "# Identified from steps0.csv" in (tmp_path / "c.toml").read_text()
+    assert "# Resistances identified from steps0.csv" in (tmp_path / "c.toml").read_text()
     code, text, _ = run(capsys, "validate", tables / "steps0.csv", "--cell", "ncr18650", "--soc", "0.9")
     assert code == 0
     assert "SOC 0.9000 (given)" in text
@@ -105,4 +102,15 @@ def test_the_sign_of_a_tables_current_can_be_given(tables, tmp_path, capsys):
         )
         arguments = (capture, "--cell", "ncr18650", "--out", tmp_path / name, "--current-sign", sign)
         assert run(capsys, "identify", *arguments)[0] == 0
-    assert np.array_equal(load_cell(tmp_path / "first.toml").a, load_cell(tmp_path / "second.toml").a, equal_nan=True)
+    assert load_cell(tmp_path / "first.toml").ladder == load_cell(tmp_path / "second.toml").ladder
+
+
+def test_what_makes_replays_worse_is_not_written(tables, tmp_path, capsys, monkeypatch):
+    scores = iter([1.0, 9.0, 9.0])
+    monkeypatch.setattr(identify, "interval_score", lambda *_: next(scores))
+    out = tmp_path / "worse.toml"
+    code, text, err = run(capsys, "identify", tables / "steps0.csv", "--cell", "ncr18650", "--out", out)
+    assert (code, text) == (2, "")
+    assert "nothing is written: replays cut in mid-load get worse" in err
+    assert "from 1.00 to 9.00 % of SOC" in err
+    assert not out.exists()

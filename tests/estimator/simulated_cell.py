@@ -7,7 +7,7 @@ from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
-TRUTH = load_cell("ncr18650")
+TRUTH = load_cell("ncr18650").model_copy(update={"ladder": None})
 NOISE_V = 3e-4
 
 

@@ -11,7 +11,7 @@ from bms_estimator.model.settings import IdentifierSettings
 
 SOC = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.65, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0)
 OCV_V = (2.6, 2.95, 3.1, 3.19, 3.215, 3.235, 3.262, 3.274, 3.278, 3.282, 3.29, 3.308, 3.312, 3.315, 3.32, 3.335, 3.4)
-CELL = load_cell("ncr18650").model_copy(update={"ocv": TableOcv(form="table", soc=SOC, ocv_v=OCV_V)})
+CELL = load_cell("ncr18650").model_copy(update={"ladder": None, "ocv": TableOcv(form="table", soc=SOC, ocv_v=OCV_V)})
 HYSTERESIS_V = 0.03
 TURN_SOC = 0.05
 """Charge that leads from one branch of the OCV to the other, per unit of SOC."""
