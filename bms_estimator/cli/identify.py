@@ -142,8 +142,8 @@ def _tables(out: Path, found: Identification, seconds: float) -> Group:
         cells = (found.elements[soc][name] for soc in found.elements)
         shown.add_row(f"{name} \\[mohm], 25 °C", *(f"{1e3 * value:.4g} ± {1e3 * std:.2g}" for value, std in cells))
     fits = Table(box=box.SIMPLE_HEAD)
-    for column in ("capture", "°C", "initial SOC", "RMS, SOC > 0.1", "score before", "after", "", "glitches"):
-        fits.add_column(column, justify="left" if column in ("capture", "") else "right")
+    for column in ("capture", "°C", "SOC", "RMS", "before", "after", "held back"):
+        fits.add_column(column, justify="left" if column in ("capture", "held back") else "right")
     for c in found.captures:
         fits.add_row(*_row(c))
     low_c, high_c = _temperatures(found)
@@ -158,12 +158,5 @@ def _tables(out: Path, found: Identification, seconds: float) -> Group:
 def _row(c: CaptureFit) -> tuple[str, ...]:
     temperature = "no sensor" if c.temperature_c is None else f"{c.temperature_c[0]:.0f} to {c.temperature_c[1]:.0f}"
     scores = (f"{x:.2f} %" if math.isfinite(x) else "-" for x in (c.score_before, c.score_after))
-    return (
-        c.name.split(".")[0],
-        temperature,
-        f"{c.initial_soc:.4f}",
-        f"{1e3 * c.voltage_rms_v:.1f} mV",
-        *scores,
-        "held back" if c.held_back else "",
-        f"{c.glitches}",
-    )
+    name, rms = c.name.split(".")[0], f"{1e3 * c.voltage_rms_v:.1f} mV"
+    return name, temperature, f"{c.initial_soc:.3f}", rms, *scores, "yes" if c.held_back else "no"

@@ -96,8 +96,8 @@ class Trial:
 
 
 def wrong(cell: CellModel) -> CellModel:
-    """The cell with resistances twice as large."""
-    parts = {}
+    """The cell with resistances twice as large, and no ladder."""
+    parts: dict[str, object] = {"ladder": None}
     for name in ("r_s", "r_ts", "r_tl"):
         part = getattr(cell, name)
         ohms = {key: WRONG_BY * getattr(part, key) for key in ("amplitude_ohm", "offset_ohm")}
