@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration import branches
-from bms_estimator.calibration.capture_checks import contradictions, without_excitation
+from bms_estimator.calibration.capture_checks import contradictions, step_resistance, without_excitation
 from bms_estimator.calibration.ladder_fit import (
     EVEN,
     HELD_PER_KELVIN_V,
@@ -33,7 +33,9 @@ from bms_estimator.calibration.replays import interval_score
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import r_s, soc_from_ocv
+from bms_estimator.kernels.ekf_state import Noise
 from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J
+from bms_estimator.kernels.open_loop import hysteresis
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -58,6 +60,8 @@ LADDER_STD = 0.1
 """Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
 JUDGED_SOC = 0.1
 """RMS errors are given above it."""
+HYSTERESIS_SHARE = 1.0
+"""Std of how much of the gap between slow charge and discharge a load keeps."""
 NO_WORSE = 1.05
 """Scores that differ by less than this factor are the same: four replays do not tell more."""
 
@@ -176,13 +180,24 @@ class _Candidate:
 
     def __init__(self, runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> None:
         self._runs, self._cell, self._refine = runs, cell, refine_ocv
-        self._scale_ohm = TYPICAL_V * cell.cell.series_count / cell.cell.capacity_ah
+        steps = [ohm for ohm in (step_resistance(run.load) for run in runs) if ohm is not None]
+        self._scale_ohm = (
+            float(np.median(steps)) if steps else TYPICAL_V * cell.cell.series_count / cell.cell.capacity_ah
+        )
         grid = np.linspace(0.0, 1.0, ocv_grid(cell)[0].size)
         self._moments = []
         for run in runs:
-            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + _by_temperature(cell, run)
+            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + _beside_mean(cell, run)
             self._moments.append(
-                moments(run.load, run.soc, given_v, run.temperature_c, self._scale_ohm, cell.cell.series_count)
+                moments(
+                    run.load,
+                    run.soc,
+                    given_v,
+                    np.interp(run.soc, grid, ocv_grid(cell)[1]),
+                    run.temperature_c,
+                    self._scale_ohm,
+                    cell.cell.series_count,
+                )
             )
         self.fit, self.cell = self._fitted(range(len(runs)))
 
@@ -274,11 +289,14 @@ def _run(load: Load, cell: CellModel, soc: float | None, temperature_c: float | 
     return Run(load, start - load.discharged_ah / cell.cell.capacity_ah, temperature)
 
 
-def _by_temperature(cell: CellModel, run: Run) -> Floats:
-    """What dE/dT of the given cell adds to its OCV [V]."""
-    if not isinstance(cell.ocv, TableOcv) or cell.ocv.per_kelvin_v is None:
-        return np.zeros(run.soc.size)
-    return np.interp(run.soc, cell.ocv.soc, cell.ocv.per_kelvin_v) * (run.temperature_c - REFERENCE_C)
+def _beside_mean(cell: CellModel, run: Run) -> Floats:
+    """What temperature and hysteresis add to the given OCV [V]."""
+    ocv, added_v = cell.ocv, np.zeros(run.soc.size)
+    if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
+        added_v += np.interp(run.soc, ocv.soc, ocv.per_kelvin_v) * (run.temperature_c - REFERENCE_C)
+    if isinstance(ocv, TableOcv) and ocv.hysteresis_v is not None:
+        added_v += np.interp(run.soc, ocv.soc, ocv.hysteresis_v) * hysteresis(run.soc, Noise().hysteresis_soc)
+    return added_v
 
 
 def _wrong_temperature(load: Load, temperature_c: float | None) -> list[str]:
@@ -303,7 +321,10 @@ def _share(ladder: Ladder) -> Floats:
 def _ocv_error(cell: CellModel) -> Floats:
     """Std of the given OCV at ``EVEN`` [V]."""
     if isinstance(cell.ocv, TableOcv) and cell.ocv.error_v is not None:
-        return np.interp(EVEN, cell.ocv.soc, cell.ocv.error_v)
+        error_v = np.interp(EVEN, cell.ocv.soc, cell.ocv.error_v)
+        if cell.ocv.hysteresis_v is None:
+            return error_v
+        return np.hypot(error_v, HYSTERESIS_SHARE * np.interp(EVEN, cell.ocv.soc, cell.ocv.hysteresis_v))
     slope_v = np.interp(EVEN, np.linspace(0.0, 1.0, ocv_grid(cell)[1].size), ocv_grid(cell)[1])
     return np.hypot(CURVE_ERROR_V * cell.cell.series_count, CURVE_ERROR_SOC * slope_v)
 

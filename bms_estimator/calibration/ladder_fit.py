@@ -67,6 +67,8 @@ STEADY, STEADY_S, STEP_S = 0.01, 5.0, 1.5
 """A step is clean when before it and behind it the current moves by no more than this part of the largest for so long [s],
 and when it is sampled so closely [s]: of a current that goes on changing, samples that are taken a little before those of
 the voltage would tell another R_0."""
+COUNT_STD = 0.004
+"""Relative std of the charge counted in a capture, and of the capacity at its temperature."""
 STEP_SHARE = 0.1
 """A change of current by this part of the capture's largest begins a new stretch."""
 SHORTEST_S, LONGEST_S = 10.0, 30.0
@@ -146,13 +148,16 @@ def correction_at(soc: Floats) -> Floats:
     return np.asarray(BSpline.design_matrix(np.clip(soc, 0.0, 1.0), knots, 3).toarray())
 
 
-def moments(load: Load, soc: Floats, given_v: Floats, temperature_c: Floats, scale_ohm: float, series: int) -> Moments:
+def moments(
+    load: Load, soc: Floats, given_v: Floats, slope_v: Floats, temperature_c: Floats, scale_ohm: float, series: int
+) -> Moments:
     """What ``load`` says.
 
     Args:
         load: From rest.
         soc: Shape (n,), counted.
         given_v: Shape (n,), the given OCV at SOC and temperature [V].
+        slope_v: Shape (n,), its slope dE_o/dSOC [V].
         temperature_c: Shape (n,) [C].
         scale_ohm: Of the resistances [ohm].
         series: Cells in series.
@@ -165,6 +170,7 @@ def moments(load: Load, soc: Floats, given_v: Floats, temperature_c: Floats, sca
     std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE * scale_ohm * load_a)
     weight = np.where(kept, weight, 0.0)
     root = (np.sqrt(WORTH * weight / weight.sum()) / std_v)[kept, None]
+    first_root = root[:, 0]
     left_v = load.voltage_v - given_v
     rows = _rows(soc[kept], temperature_c[kept], currents[kept]) * root
     target = left_v[kept] * root[:, 0]
@@ -178,7 +184,10 @@ def moments(load: Load, soc: Floats, given_v: Floats, temperature_c: Floats, sca
         jump -= _rows(soc[before], temperature_c[before], currents[before])
         rows = np.vstack([rows, jump * root])
         target = np.r_[target, (left_v[after] - left_v[before]) * root[:, 0]]
-    return Moments(rows.T @ rows, rows.T @ target)
+    counted = np.zeros(target.size)  # what the charge, wrong by its own size, would do
+    counted[: kept.sum()] = slope_v[kept] * (soc[kept] - soc[0]) * first_root
+    both, known = rows.T @ counted, counted @ counted + 1.0 / COUNT_STD**2
+    return Moments(rows.T @ rows - np.outer(both, both) / known, rows.T @ target - both * (counted @ target) / known)
 
 
 def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:

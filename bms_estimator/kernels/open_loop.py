@@ -37,6 +37,25 @@ def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
 
 
 @njit(cache=True)
+def hysteresis(soc: Floats, length: float) -> Floats:
+    """Hysteresis h over counted SOC: 1 after a charge, as at the first sample, towards -1 after discharge.
+
+    Args:
+        soc: Shape (n,), counted.
+        length: Charge that leads from one branch to the other [SOC].
+
+    Returns:
+        Shape (n,).
+    """
+    h = np.ones(soc.size)
+    for j in range(1, soc.size):
+        moved = soc[j] - soc[j - 1]
+        decay = math.exp(-abs(moved) / length)
+        h[j] = decay * h[j - 1] + math.copysign(1.0 - decay, moved)
+    return h
+
+
+@njit(cache=True)
 def two_branches(time_s: Floats, current_a: Floats, soc: Floats, a: Floats) -> Floats:
     """Overpotential of (2.2)-(2.9) with the ohmic drop, the current held from each sample on.
 
