@@ -40,6 +40,8 @@ WEAK_SHARE = np.array([0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57])
 
 TYPICAL_V = 0.09
 """The scale of all resistances: what R_0 and the fast branches take at 1 C, per cell [V]."""
+NOTHING = 1e-6
+"""A resistance below this part of it is at its bound, 0."""
 ROUGH = 0.1
 """Std of the difference of one resistance between two nodes of SOC, and of two branches next to each other, in that scale:
 the resistance of a decade of time is about the same from a second to an hour."""
@@ -219,7 +221,8 @@ def fit_ladder(captures: list[Moments], prior: Prior) -> LadderFit:
     target = np.linalg.solve(root, to_all.T @ right)
     found = to_all @ lsq_linear(root.T, target, bounds=(lowest, np.inf), tol=1e-12, max_iter=500).x
     covariance = to_all @ np.linalg.inv(information) @ to_all.T
-    weak, strong = found[FREE:].reshape(2, RESISTANCES, SOC_NODES.size)
+    ohm = np.where(found[FREE:] > NOTHING * prior.scale_ohm, found[FREE:], 0.0)
+    weak, strong = ohm.reshape(2, RESISTANCES, SOC_NODES.size)
     return LadderFit(found[:SPLINES], found[SPLINES:FREE], weak, strong, covariance[FREE:, FREE:])
 
 

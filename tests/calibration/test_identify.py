@@ -45,7 +45,7 @@ def test_resistances_are_found_at_25_c(identified):
     for name, ohm in OHM.items():
         value, std = identified.elements[0.5][name]
         assert value == pytest.approx(ohm, rel=0.05 if name == "r_s" else 0.15)
-        assert abs(value - ohm) < 2.0 * std < 0.5 * ohm
+        assert abs(value - ohm) < 2.0 * std < 0.6 * ohm
 
 
 def test_captures_at_two_temperatures_tell_of_those_between(identified, warm):
