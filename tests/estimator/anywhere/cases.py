@@ -1,0 +1,233 @@
+"""Captures of each kind that a user may have, short, the same on every machine.
+
+The estimator is switched on in mid-load, at an SOC that is 0.2 too low and 0.2 too high. The cell file comes from the
+impedance of the truth at the temperatures that it is made for, as far as a ladder can follow it, and errs as much as it
+says: an OCV wrong by some millivolts and some SOC, the resistances of another such cell, a capacity off by a percent.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import nnls
+
+from bms_estimator.kernels.ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
+from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from tests.estimator.anywhere.truth import (
+    GRID,
+    Floats,
+    Truth,
+    curve_of,
+    impedance,
+    measured_curve,
+    resistances,
+    simulate,
+    smooth,
+)
+
+OXIDE = Truth(
+    capacity_ah=3.0,
+    ocv_v=measured_curve(),
+    per_kelvin_v=1e-4 * np.sin(6.0 * GRID) - 1e-4,
+    hysteresis_v=0.003 + 0.012 * np.exp(-GRID / 0.15),
+    ohm=resistances((22.0, 4.0, 9.0, 6.0, 7.0, 9.0, 8.0, 5.0)),
+)
+PHOSPHATE = Truth(
+    capacity_ah=2.0,
+    ocv_v=curve_of("lfp") + 0.002 * np.sin(9.0 * GRID),
+    per_kelvin_v=8e-5 * np.cos(4.0 * GRID),
+    hysteresis_v=0.010 + 0.004 * np.sin(5.0 * GRID),
+    ohm=resistances((12.0, 3.0, 5.0, 4.0, 4.0, 5.0, 6.0, 4.0)),
+)
+NODES = np.array([0, 20, 40, 60, 80, 120, 160, 200, 240, 280, 320, 360, 400])
+"""Of ``GRID``: where the cell file has its resistances."""
+OCV_NODES = np.concatenate([np.arange(0, 40, 4), np.arange(40, 401, 10)])
+"""Where it has its OCV."""
+RAD_S = 1.0 / np.geomspace(0.1, 4000.0, 40)
+"""Where the ladder is fitted to the impedance [1/s]."""
+WEAK_SHARE = np.array([0.7, 0.3, 0.3, 0.4, 0.5, 0.5, 0.5])
+"""Of the resistances at 25 C, where the cell file knows no other temperature: another cell's."""
+R_STD, SHAPE_STD = 0.1, 0.05
+"""Resistances of the cell file over the true ones, std of the logarithm: of all together, and of each at each SOC."""
+OCV_STD_V, OCV_STD_SOC, OCV_LENGTH_SOC = {"nmc": 0.004, "lfp": 0.002}, 0.007, 0.15
+"""Error of its OCV: std [V], std along SOC, and how far these stay the same."""
+STEADY_C, PER_HOUR_S = 0.5, 3600
+VOLT_STEP, AMPERE_STEP, KELVIN_STEP = 1e-3, 1e-3, 0.1
+
+
+@dataclass(frozen=True)
+class Case:
+    """One capture, and what the estimator is told of its cell."""
+
+    name: str
+    truth: Truth = OXIDE
+    load: Literal["drive", "constant", "rest"] = "drive"
+    """A drive, a constant load, or a drive with 30 min of rest from 5 min after switch-on."""
+    load_c: float = 0.5
+    """Mean of the load [C]."""
+    temperature_c: float = 25.0
+    rising_k: float = 0.0
+    """How much warmer it gets."""
+    rate_hz: float = 1.0
+    hours: float = 1.3
+    unseen_h: float = 0.5
+    """How long the load ran before the estimator is switched on; 0: from rest."""
+    soc: float = 0.9
+    """Where the load began, from rest; 1: just charged."""
+    file_c: tuple[float, ...] | Literal["generic"] = (25.0, 10.0, 0.0, -10.0)
+    """Temperatures that the cell file is made for; or a generic one."""
+    gain: float = 1.0
+    offset_a: float = 0.0
+    capacity: float = 1.01
+    """Capacity in the cell file over the true one."""
+    weak_cell: float = 1.0
+    """Below 1: six cells in series, one with this part of the capacity of the others."""
+    sensed: bool = True
+    after_s: float = 900.0
+    seed: int = 1
+
+
+KNOWS_25 = {"file_c": (25.0,)}
+LFP = {"truth": PHOSPHATE, "file_c": (25.0, 5.0, -15.0)}
+CASES: tuple[Case, ...] = (
+    Case("oxide 25C", seed=1),
+    Case("oxide 25C again", seed=2),
+    Case("oxide 10C", temperature_c=10.0, seed=3),
+    Case("oxide 10Hz", rate_hz=10.0, hours=0.7, seed=4),
+    Case("constant 0.5C", load="constant"),
+    Case("constant 0.25C", load="constant", load_c=0.25, unseen_h=1.0),
+    Case("oxide 0C", temperature_c=0.0, load_c=0.4, seed=5),
+    Case("oxide -10C", temperature_c=-10.0, load_c=0.35, seed=6),
+    Case("oxide -20C", temperature_c=-20.0, load_c=0.25, seed=7),
+    Case("rest at -10C", load="rest", temperature_c=-10.0, load_c=0.35, after_s=2400.0, seed=8),
+    Case("full at -10C", temperature_c=-10.0, load_c=0.35, soc=1.0, unseen_h=0.0, seed=9),
+    Case("knows 25C at 40C", temperature_c=40.0, **KNOWS_25, seed=10),
+    Case("knows 25C at 10C", temperature_c=10.0, **KNOWS_25, seed=11),
+    Case("knows 25C at 0C", temperature_c=0.0, load_c=0.4, **KNOWS_25, seed=12),
+    Case("knows 25C at -10C", temperature_c=-10.0, load_c=0.35, **KNOWS_25, seed=13),
+    Case("knows 25C at -20C", temperature_c=-20.0, load_c=0.25, **KNOWS_25, seed=14),
+    Case("rising 5..25C", temperature_c=5.0, rising_k=20.0, seed=15),
+    Case("no sensor at 15C", temperature_c=15.0, sensed=False, seed=16),
+    Case("LFP full 25C", **LFP, soc=1.0, unseen_h=0.0, seed=17),
+    Case("LFP full -10C", **LFP, temperature_c=-10.0, load_c=0.4, soc=1.0, unseen_h=0.0, seed=18),
+    Case("LFP cut 25C", **LFP, hours=1.5, seed=19),
+    Case("LFP cut 0C", **LFP, temperature_c=0.0, hours=1.5, seed=20),
+    Case("generic nmc", file_c="generic", seed=21),
+    Case("generic lfp", truth=PHOSPHATE, file_c="generic", soc=1.0, unseen_h=0.0, seed=22),
+    Case("gain +5%", gain=1.05, seed=23),
+    Case("offset +50mA", offset_a=0.05, seed=24),
+    Case("offset -50mA", offset_a=-0.05, seed=25),
+    Case("capacity +5%", capacity=1.05, seed=26),
+    Case("capacity -5%", capacity=0.95, seed=27),
+    Case("capacity +20%", capacity=1.2, seed=28),
+    Case("capacity -20%", capacity=0.8, seed=29),
+    Case("6S one cell -10%", weak_cell=0.9, seed=30),
+)
+WRONG = (-0.2, 0.2)
+"""How far off the SOC is that the estimator is told."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What the estimator sees, and what is true."""
+
+    samples: SampleBlock
+    soc: Floats
+    """At each sample; of the emptiest cell."""
+    cell: CellModel
+
+
+def load_a(case: Case, seconds: int) -> Floats:
+    """Current at 1 Hz [A]: levels of some seconds, stops, some regeneration where it is warm."""
+    rng = np.random.default_rng(case.seed)
+    one_c = case.truth.capacity_ah
+    if case.load == "constant":
+        return np.full(seconds, case.load_c * one_c)
+    level = rng.normal(case.load_c, 0.9 * case.load_c + 0.1, seconds)
+    level[rng.random(seconds) < 0.15] = 0.0
+    level = np.clip(level, -0.5 if case.temperature_c >= 10.0 else 0.0, 3.0)
+    levels_s = rng.exponential(20.0, seconds).astype(int) + 2
+    current_a = one_c * np.repeat(level, levels_s)[:seconds]
+    if case.load == "rest":
+        begin = round(PER_HOUR_S * case.unseen_h) + 300
+        current_a[begin : begin + 1800] = 0.0
+    return current_a
+
+
+def capture(case: Case) -> Capture:
+    """Simulate one."""
+    rng = np.random.default_rng(1000 + case.seed)
+    current_a = np.repeat(load_a(case, round(PER_HOUR_S * (case.unseen_h + case.hours))), round(case.rate_hz))
+    dt_s = 1.0 / case.rate_hz
+    time_s = dt_s * np.arange(current_a.size)
+    temperature_c = case.temperature_c + case.rising_k * time_s / time_s[-1]
+    cells = 1 if case.weak_cell == 1.0 else 6
+    voltage_v, soc = np.zeros(time_s.size), np.ones(time_s.size)
+    for n in range(cells):
+        t = replace(case.truth, capacity_ah=case.truth.capacity_ah * (case.weak_cell if n == 0 else 1.0))
+        curves = t.ocv_v, t.per_kelvin_v, t.hysteresis_v, t.ohm
+        branch = 1.0 if case.soc == 1.0 else -1.0
+        volt, true = simulate(dt_s, current_a, temperature_c, case.soc, branch, t.capacity_ah, *curves)
+        voltage_v, soc = voltage_v + volt, np.minimum(soc, true)
+    begin = int(np.searchsorted(time_s, PER_HOUR_S * case.unseen_h))
+    empty = (soc < 0.02) | (voltage_v < 2.5 * cells if case.truth is OXIDE else voltage_v < 2.0)
+    end = int(np.argmax(empty)) if empty.any() else time_s.size
+    samples = np.zeros(time_s.size, dtype=SAMPLE)
+    samples["time_s"] = time_s
+    seen_a = case.gain * current_a + case.offset_a + rng.normal(0.0, 2e-3, time_s.size)
+    samples["current_a"] = np.round(seen_a / AMPERE_STEP) * AMPERE_STEP
+    seen_v = voltage_v + rng.normal(0.0, 5e-4 * np.sqrt(cells), time_s.size)
+    samples["voltage_v"] = np.round(seen_v / VOLT_STEP) * VOLT_STEP
+    seen_c = temperature_c + rng.normal(0.0, 0.1, time_s.size)
+    samples["temperature_c"] = np.round(seen_c / KELVIN_STEP) * KELVIN_STEP if case.sensed else np.nan
+    return Capture(samples[begin:end], soc[begin:end], cell_file(case).pack(cells, 1))
+
+
+def cell_file(case: Case) -> CellModel:
+    """What the estimator is told of the cell."""
+    kind = "nmc" if case.truth is OXIDE else "lfp"
+    generic = load_cell(kind, case.capacity * case.truth.capacity_ah)
+    if case.file_c == "generic":
+        return generic
+    rng = np.random.default_rng(2000 + case.seed)
+    slope_v = np.gradient(case.truth.ocv_v, GRID)
+    wrong_v = OCV_STD_V[kind] * smooth(rng, OCV_LENGTH_SOC) + OCV_STD_SOC * slope_v * smooth(rng, OCV_LENGTH_SOC)
+    told_v = (case.truth.ocv_v + wrong_v)[OCV_NODES]
+    table = {
+        "soc": GRID[OCV_NODES],
+        "ocv_v": np.maximum.accumulate(told_v) + 1e-6 * np.arange(OCV_NODES.size),
+        "error_v": np.hypot(OCV_STD_V[kind], OCV_STD_SOC * slope_v)[OCV_NODES],
+        "hysteresis_v": np.full(OCV_NODES.size, case.truth.hysteresis_v[GRID.size // 2]),
+    }
+    ocv = TableOcv(form="table", **{name: tuple(column) for name, column in table.items()})
+    return generic.model_copy(update={"ocv": ocv, "ladder": ladder(case.truth, case.file_c, rng)})
+
+
+def ladder(truth: Truth, temperatures_c: tuple[float, ...], rng: np.random.Generator) -> Ladder:
+    """The ladder nearest to the impedance of the truth at each SOC, in relative squares, no resistance below 0; of another cell."""
+    branches = 1.0 / (1.0 + 1j * RAD_S[:, None] * np.array([0.0, *TAU_S]))
+    another = np.exp(R_STD * rng.standard_normal())
+    weak_ohm, strong_ohm = [], []
+    for node in NODES:
+        rows, aims = [], []
+        for t in temperatures_c:
+            aim = impedance(truth, node, t, RAD_S, STEADY_C * truth.capacity_ah)
+            parts = [arrhenius(energy_j, t) * branches for energy_j in (WEAK_J, STRONG_J)]
+            rows.append((branches if len(temperatures_c) == 1 else np.hstack(parts)) / np.abs(aim)[:, None])
+            aims.append(aim / np.abs(aim))
+        matrix, aim = np.concatenate(rows), np.concatenate(aims)
+        ohm, _ = nnls(np.concatenate([matrix.real, matrix.imag]), np.concatenate([aim.real, aim.imag]))
+        if len(temperatures_c) == 1:
+            ohm = np.concatenate([WEAK_SHARE * ohm, (1.0 - WEAK_SHARE) * ohm])
+        weak, strong = ohm.reshape(2, -1) * another * np.exp(SHAPE_STD * rng.standard_normal(1 + len(TAU_S)))
+        weak_ohm.append(weak)
+        strong_ohm.append(strong)
+    return Ladder(
+        soc=tuple(GRID[NODES]),
+        weak_ohm=tuple(map(tuple, np.transpose(weak_ohm))),
+        strong_ohm=tuple(map(tuple, np.transpose(strong_ohm))),
+        std=R_STD,
+        error_v=0.005,
+        temperature_c=(min(temperatures_c), max(temperatures_c)),
+    )

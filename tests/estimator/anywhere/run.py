@@ -1,0 +1,52 @@
+"""The estimator over a capture, with its innovations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.sample_step import Verdict
+from bms_estimator.model.sample import SampleBlock
+
+Floats = NDArray[np.float64]
+
+BLOCK_S = 600.0
+"""Over which innovations are summed: errors of the model that stay so long are those that the SOC suffers from."""
+WHOLE = 0.5
+"""A block with less than this part of the updates of the fullest is left out."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """At each sample, arrays of shape (n,); the innovation is that of the last update, ``updated`` where it was."""
+
+    time_s: Floats
+    soc: Floats
+    soc_std: Floats
+    innovation_v: Floats
+    variance_v2: Floats
+    updated: NDArray[np.bool_]
+
+    def nis(self, after_s: float) -> float:
+        """Mean over ten minutes each of (sum of the innovations)^2 / (sum of their variances S), from ``after_s`` on."""
+        elapsed_s = self.time_s - self.time_s[0] - after_s
+        judged = self.updated & (elapsed_s >= 0.0)
+        block = (elapsed_s[judged] / BLOCK_S).astype(int)
+        total_v, total_v2 = (np.bincount(block, x[judged]) for x in (self.innovation_v, self.variance_v2))
+        count = np.bincount(block)
+        whole = count >= WHOLE * count.max()
+        return float(np.mean(total_v[whole] ** 2 / total_v2[whole]))
+
+
+def run_of(estimator: Estimator, samples: SampleBlock) -> Run:
+    """Take all samples."""
+    f = estimator.record["filter"]
+    soc, std, innovation_v, variance_v2 = (f[n] for n in ("soc", "soc_std", "innovation_v", "innovation_variance"))
+    gathered = f["window"]["samples"]
+    out = np.zeros((samples.size, 5))
+    for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
+        verdict = estimator.step(time_s, current_a, voltage_v, status, temperature_c)
+        updated = verdict is Verdict.ACCEPTED and gathered[0] == 0
+        out[n] = soc[0], std[0], innovation_v[0], variance_v2[0], updated
+    return Run(samples["time_s"], *out[:, :4].T, updated=out[:, 4] == 1.0)

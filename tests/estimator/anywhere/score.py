@@ -1,0 +1,47 @@
+"""How good an SOC with its error is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+LONGEST_S = 60.0
+"""A pause counts as no longer."""
+LOWEST_SOC = 0.05
+LEAST_ROWS = 10
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of one run, weighted by time. All but ``nees`` in percent of SOC, or of the time."""
+
+    rmse: float
+    bias: float
+    cover: float
+    """Time that the truth is inside soc +- 2 soc_std."""
+    std: float
+    """Mean of soc_std."""
+    score: float
+    """Interval score of that band as of 95 %: its width plus 40 times what lies outside (Gneiting and Raftery 2007,
+    eq. 43). Neither a wider nor a narrower band than is true betters it."""
+    nees: float
+    """Mean of (error / soc_std)^2: 1 where the std is right."""
+
+
+def score(time_s: Floats, soc: Floats, soc_std: Floats, truth: Floats, after_s: float = 900.0) -> Score | None:
+    """From ``after_s`` on, above ``LOWEST_SOC``. Arrays of shape (n,).
+
+    Returns:
+        None where that leaves too little.
+    """
+    judged = (time_s - time_s[0] >= after_s) & (truth >= LOWEST_SOC)
+    weight = np.clip(np.diff(time_s, append=time_s[-1]), 0.0, LONGEST_S)[judged]
+    if judged.sum() < LEAST_ROWS or weight.sum() == 0.0:
+        return None
+    weight /= weight.sum()
+    error, std = (soc - truth)[judged], soc_std[judged]
+    beyond = np.clip(np.abs(error) - 2.0 * std, 0.0, None)
+    means = np.array([error**2, error, beyond == 0.0, std, 4.0 * std + 40.0 * beyond, (error / std) ** 2]) @ weight
+    return Score(100.0 * np.sqrt(means[0]), *(100.0 * means[1:5]), means[5])

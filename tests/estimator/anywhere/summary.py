@@ -1,0 +1,71 @@
+"""How the estimator does on each case: a small table that is checked in, so that a change of it shows as a diff."""
+
+import csv
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.ekf_state import LN_Q
+from tests.estimator.anywhere.cases import CASES, WRONG, Capture, Case, capture
+from tests.estimator.anywhere.run import run_of
+from tests.estimator.anywhere.score import Score, score
+
+PATH = Path(__file__).with_name("summary.csv")
+DIGITS = 2
+
+
+@dataclass(frozen=True)
+class Row:
+    """Of one case, started ``wrong`` by so much."""
+
+    case: str
+    wrong: float
+    score: Score
+    nis: float
+    """``Run.nis``."""
+    capacity: float
+    """Learned over true, less 1 [%]."""
+    reopened: int
+    """Times that the filter forgot the SOC again."""
+
+
+def rows() -> list[Row]:
+    """Of every case and start."""
+    return [row(case, seen, wrong) for case in CASES for seen in [capture(case)] for wrong in WRONG]
+
+
+def row(case: Case, seen: Capture, wrong: float) -> Row:
+    """Of one run."""
+    estimator = Estimator(seen.cell, initial_soc=float(np.clip(seen.soc[0] + wrong, 0.0, 1.0)))
+    run = run_of(estimator, seen.samples)
+    result = score(seen.samples["time_s"], run.soc, run.soc_std, seen.soc, case.after_s)
+    assert result is not None
+    f = estimator.record[0]["filter"]
+    capacity = case.capacity * np.exp(f["mean"][f["best"], LN_Q])
+    return Row(case.name, wrong, result, run.nis(case.after_s), 100.0 * (capacity - 1.0), int(f["reopened"]))
+
+
+HEAD = ("case", "wrong", *(f.name for f in fields(Score)), "nis", "capacity", "reopened")
+
+
+def numbers(r: Row) -> tuple[float, ...]:
+    """In the order of ``HEAD``, from the third on."""
+    return (*astuple(r.score), r.nis, r.capacity, float(r.reopened))
+
+
+def write(table: list[Row]) -> None:
+    """As it is checked in."""
+    with PATH.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(HEAD)
+        for r in table:
+            writer.writerow([r.case, f"{r.wrong:+.1f}", *(f"{v:.{DIGITS}f}" for v in numbers(r))])
+
+
+def read() -> dict[tuple[str, float], tuple[float, ...]]:
+    """``numbers`` as they are checked in, by case and start."""
+    with PATH.open() as file:
+        lines = list(csv.reader(file))[1:]
+    return {(line[0], float(line[1])): tuple(map(float, line[2:])) for line in lines}

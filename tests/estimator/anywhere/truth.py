@@ -1,0 +1,122 @@
+"""Cells that the estimator's model does not contain: what a sensor sees of them, and what is true.
+
+Eight processes with time constants of their own between those of the ladder, which slow down in the cold, each with an
+activation energy of its own; one of them obeys Butler-Volmer kinetics, so its resistance falls with the current; two
+kinds of hysteresis, one fast and one slow; entropy; resistances that rise towards empty and full.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from bms_estimator.model.cell import TableOcv, load_cell
+
+Floats = NDArray[np.float64]
+
+GRID = np.linspace(0.0, 1.0, 401)
+"""SOC of all that is given along it."""
+TAU_S = np.array([0.0, 0.4, 3.0, 17.0, 70.0, 300.0, 1200.0, 4000.0])
+"""At 25 C [s]; the first is the series resistance."""
+ENERGY_J = np.array([10e3, 42e3, 48e3, 38e3, 30e3, 28e3, 26e3, 24e3])
+"""Activation energies of the resistances [J/mol]; time constants go with half of it."""
+KINETIC = 2
+"""The process of 3 s: charge transfer."""
+KINETIC_V = 0.051
+"""2 R T / F: where its resistance begins to fall [V]."""
+GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
+LOOPS_SOC, FAST_LOOP = (0.015, 0.15), 0.6
+"""Charge that leads from one branch of the hysteresis to the other, fast and slow, and the share of the fast one."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A cell. Arrays of shape (401,) are over ``GRID``."""
+
+    capacity_ah: float
+    ocv_v: Floats
+    per_kelvin_v: Floats
+    hysteresis_v: Floats
+    """Half the difference between charge and discharge."""
+    ohm: Floats
+    """At 25 C and small currents, shape (401, 8)."""
+
+
+@njit
+def along(soc, values):
+    """Linear between the points of ``GRID``."""
+    position = min(max(soc, 0.0), 1.0) * (len(values) - 1)
+    i = min(int(position), len(values) - 2)
+    return values[i] + (position - i) * (values[i + 1] - values[i])
+
+
+@njit
+def simulate(dt_s, current_a, temperature_c, soc, branch, capacity_ah, ocv_v, per_kelvin_v, hysteresis_v, ohm):
+    """Terminal voltage [V] and SOC at each sample, from rest; the current holds until the next sample."""
+    voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
+    x, fast, slow = np.zeros(len(TAU_S)), branch, branch
+    for n in range(len(current_a)):
+        i, kelvin = current_a[n], temperature_c[n] + KELVIN
+        cold = (1.0 / kelvin - 1.0 / REFERENCE_K) / GAS_J
+        x[0] = i
+        v = along(soc, ocv_v) + (temperature_c[n] - 25.0) * along(soc, per_kelvin_v)
+        v += along(soc, hysteresis_v) * (FAST_LOOP * fast + (1.0 - FAST_LOOP) * slow)
+        for k in range(len(TAU_S)):
+            drop_v = x[k] * along(soc, ohm[:, k]) * math.exp(ENERGY_J[k] * cold)
+            v -= KINETIC_V * math.asinh(drop_v / KINETIC_V) if k == KINETIC else drop_v
+        voltage_v[n], true_soc[n] = v, soc
+        moved = i * dt_s / 3600.0 / capacity_ah
+        soc -= moved
+        for k in range(1, len(TAU_S)):
+            x[k] = i + (x[k] - i) * math.exp(-dt_s / (TAU_S[k] * math.exp(0.5 * ENERGY_J[k] * cold)))
+        if moved != 0.0:
+            to = -math.copysign(1.0, moved)
+            fast = to + (fast - to) * math.exp(-abs(moved) / LOOPS_SOC[0])
+            slow = to + (slow - to) * math.exp(-abs(moved) / LOOPS_SOC[1])
+    return voltage_v, true_soc
+
+
+def impedance(truth: Truth, node: int, temperature_c: float, rad_s: Floats, current_a: float) -> Floats:
+    """Complex, at ``GRID[node]`` and each of ``rad_s`` [1/s], with the kinetics at ``current_a`` [ohm]."""
+    cold = np.exp(ENERGY_J / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K))
+    ohm = truth.ohm[node] * cold
+    at = ohm[KINETIC] * current_a / KINETIC_V
+    ohm[KINETIC] *= math.asinh(at) / at
+    return (ohm / (1.0 + 1j * rad_s[:, None] * TAU_S * np.sqrt(cold))).sum(axis=1)
+
+
+def rising(low: float, high: float) -> Floats:
+    """A factor over ``GRID`` that rises towards empty and full."""
+    return 1.0 + low * np.exp(-GRID / 0.07) + high * np.exp((GRID - 1.0) / 0.05) + 0.15 * np.cos(5.0 * GRID)
+
+
+def resistances(milliohm: tuple[float, ...]) -> Floats:
+    """Shape (401, 8) [ohm], from those in the middle."""
+    shapes = [rising(0.4, 0.0), rising(1.0, 0.3), rising(2.5, 0.8), rising(2.0, 0.5), *4 * [rising(3.0, 0.2)]]
+    return 1e-3 * np.array(milliohm) * np.column_stack(shapes)
+
+
+def smooth(rng: np.random.Generator, length_soc: float) -> Floats:
+    """A normal process of variance 1 over ``GRID``, that forgets within ``length_soc``."""
+    k = np.pi * np.arange(0.0, 4.0 / length_soc / np.pi)
+    part = np.exp(-0.25 * (k * length_soc) ** 2)
+    cosines, sines = rng.standard_normal((2, k.size)) * part / np.sqrt(np.sum(part**2))
+    angle = np.outer(GRID, k)
+    return np.cos(angle) @ cosines + np.sin(angle) @ sines
+
+
+def curve_of(name: str) -> Floats:
+    """Of a generic cell, at ``GRID`` [V]."""
+    ocv = load_cell(name, 1.0).ocv
+    assert isinstance(ocv, TableOcv)
+    return PchipInterpolator(ocv.soc, ocv.ocv_v)(GRID)
+
+
+def measured_curve() -> Floats:
+    """Of an LG M50, NMC811 with silicon in the graphite, at ``GRID`` [V]."""
+    table = np.genfromtxt(Path(__file__).parents[2] / "data" / "lgm50" / "ocv_25c.csv", delimiter=",", names=True)
+    return PchipInterpolator(table["soc"], table["ocv_v"])(GRID)
