@@ -1,0 +1,311 @@
+"""The filter against what it claims to be: Jacobians, a textbook update, mixtures, and what it does for hours."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_continuous_lyapunov
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.filter_settings import filter_settings
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels import ekf, ekf_noise, hypotheses
+from bms_estimator.kernels.ekf_state import B_SLOW, EKF_STATE, LN_Q, LN_R, OFFSET, SOC, STATES, X
+from bms_estimator.kernels.ladder import BRANCHES, TAUS
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.settings import IdentifierSettings
+from tests.estimator.anywhere.cases import CASES, Case, capture
+
+CELL = load_cell("nmc", 3.0)
+BRANCH = slice(X, X + BRANCHES)
+
+
+def settings(**changes):
+    p = filter_settings(CELL, ocv_grid(CELL), IdentifierSettings(), 1e-3, None)[0]
+    for name, value in changes.items():
+        p[name] = value
+    return p
+
+
+def somewhere(p, seed=1, time_s=1.0):
+    """A state in the middle of a drive: any mean, any covariance, a window of five samples."""
+    rng = np.random.default_rng(seed)
+    s = np.zeros(1, EKF_STATE)[0]
+    hypotheses.start(s, p, 0.55, 1.5, 12.0)
+    s["count"], s["best"] = 1, 0
+    s["mean"][0] = 0.3 * rng.standard_normal(STATES) * np.sqrt(np.diag(s["covariance"][3]))
+    s["mean"][0, SOC] = 0.55
+    mixed = rng.standard_normal((STATES, STATES))
+    std = np.sqrt(np.diag(s["covariance"][3]))
+    s["covariance"][0] = (mixed @ mixed.T / STATES) * std[:, None] * std
+    s["x_a"] = rng.normal(1.0, 0.5, BRANCHES)
+    for current_a, voltage_v in zip(rng.normal(1.5, 0.5, 5), rng.normal(3.6, 0.01, 5), strict=True):
+        hypotheses.count_on(s, p, time_s / 5, current_a, 12.0)
+        hypotheses.gather(s, current_a, voltage_v)
+    return s
+
+
+def predicted(s, p, mean):
+    s["mean"][0] = mean
+    return ekf.linearise(s, p, 0)[0]
+
+
+def test_h_is_the_derivative_of_the_voltage_by_every_state_but_the_soc() -> None:
+    p = settings()
+    s = somewhere(p)
+    mean = s["mean"][0].copy()
+    ekf.linearise(s, p, 0)
+    h = s["h"].copy()
+    for j in range(STATES):
+        if j == SOC:
+            continue
+        step = np.zeros(STATES)
+        step[j] = 1e-5
+        by_difference = (predicted(s, p, mean + step) - predicted(s, p, mean - step)) / 2e-5
+        assert h[j] == pytest.approx(by_difference, rel=1e-6, abs=1e-9), j
+
+
+def test_by_the_soc_it_is_the_secant_of_the_ocv_over_one_std_and_nothing_of_the_resistances() -> None:
+    p = settings(sensor_v2=0.0)
+    s = somewhere(p)
+    s["covariance"][0, SOC, SOC] = 0.1**2
+    ekf.linearise(s, p, 0)
+    w, grid = s["window"], np.linspace(0.0, 1.0, p["ocv_v"].size)
+    middle = s["mean"][0, SOC] + (w["charge_as"] - w["sum_as"] / w["samples"]) / p["capacity_as"]
+    below, above = np.interp([middle - 0.1, middle + 0.1], grid, p["ocv_v"])
+    assert s["h"][SOC] == pytest.approx((above - below) / 0.2, rel=1e-3)
+
+
+def test_p_goes_by_the_derivative_of_the_mean() -> None:
+    """F P F' of the kernel, P with Q less P = 0 with Q, against F by finite differences."""
+    p = settings()
+
+    def after(mean, covariance):
+        s = somewhere(p, time_s=20.0)
+        s["mean"][0], s["covariance"][0] = mean, covariance
+        ekf.decay(s, p)
+        ekf.predict(s, p, 0)
+        return s["mean"][0].copy(), s["covariance"][0].copy()
+
+    s = somewhere(p, time_s=20.0)
+    mean, covariance = s["mean"][0].copy(), s["covariance"][0].copy()
+    nothing = np.zeros((STATES, STATES))
+    f = np.empty((STATES, STATES))
+    for j in range(STATES):
+        step = np.zeros(STATES)
+        step[j] = 1e-4
+        f[:, j] = (after(mean + step, nothing)[0] - after(mean - step, nothing)[0]) / 2e-4
+    assert f[SOC, OFFSET] > 0.0
+    assert f[SOC, LN_Q] > 0.0
+    assert f[X, OFFSET] < -0.9
+    by_kernel = after(mean, covariance)[1] - after(mean, nothing)[1]
+    assert by_kernel == pytest.approx(f @ covariance @ f.T, rel=1e-6, abs=1e-12)
+
+
+def test_the_update_is_that_of_the_textbook() -> None:
+    p = settings()
+    s = somewhere(p)
+    _, curved_v = ekf.linearise(s, p, 0)
+    mean, covariance, h = (np.array(x) for x in (s["mean"][0], s["covariance"][0], s["h"]))
+    r = 0.05**2
+    total = h @ covariance @ h + r + curved_v**2
+    s["window"]["sum_v"] = s["window"]["samples"] * (ekf.linearise(s, p, 0)[0] + 0.3 * np.sqrt(total))
+    innovation_v, variance_v2 = ekf.update(s, p, 0, r)
+    gain = covariance @ h / total
+    assert (innovation_v, variance_v2) == pytest.approx((0.3 * np.sqrt(total), total))
+    assert s["mean"][0] == pytest.approx(mean + gain * innovation_v, rel=1e-9, abs=1e-12)
+    assert s["covariance"][0] == pytest.approx(covariance - np.outer(gain, h @ covariance), rel=1e-9, abs=1e-15)
+
+
+def test_an_innovation_of_many_std_counts_as_one_of_two() -> None:
+    p = settings()
+    moved = []
+    for stds in (2.0, 8.0):
+        s = somewhere(p)
+        _, curved_v = ekf.linearise(s, p, 0)
+        h, covariance, before = (np.array(x) for x in (s["h"], s["covariance"][0], s["mean"][0]))
+        std = np.sqrt(h @ covariance @ h + 0.05**2 + curved_v**2)
+        s["window"]["sum_v"] = s["window"]["samples"] * (ekf.linearise(s, p, 0)[0] + stds * std)
+        ekf.update(s, p, 0, 0.05**2)
+        moved.append(s["mean"][0, B_SLOW] - before[B_SLOW])
+    assert moved[1] == pytest.approx(moved[0] * 2.0 / 8.0)
+
+
+def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
+    """Against the Lyapunov equation of the load and the branches that it drives."""
+    p = settings()
+    s = np.zeros(1, EKF_STATE)[0]
+    mean, covariance = s["mean"][0], s["covariance"][0]
+    ekf_noise.switch_on(p, 2.0, mean, covariance)
+    one_c, size = p["capacity_as"] / 3600.0, BRANCHES + 1
+    a = -np.diag(np.concatenate([[1.0 / p["load_s"]], 1.0 / TAUS]))
+    a[1:, 0] = 1.0 / TAUS
+    noise = np.zeros((size, size))
+    noise[0, 0] = 2.0 * (p["load_c"] * one_c) ** 2 / p["load_s"]
+    joint = solve_continuous_lyapunov(a, -noise) + (p["load_level_c"] * one_c) ** 2
+    known = joint[1:, 0] / joint[0, 0]
+    expected_a = p["load_mean_c"] * one_c + known * (2.0 - p["load_mean_c"] * one_c)
+    assert mean[BRANCH] == pytest.approx(expected_a)
+    assert covariance[BRANCH, BRANCH] == pytest.approx(joint[1:, 1:] - np.outer(known, joint[0, 1:]))
+
+
+def test_outside_the_temperatures_of_the_cell_file_r_grows() -> None:
+    p = settings(low_c=0.0, high_c=30.0, model_j=0.0, sensor_v2=0.0)
+    s = somewhere(p)
+    variances = []
+    for s["temperature_c"] in (10.0, 30.0, 40.0, -20.0):
+        variances.append(ekf_noise.measurement_variance(s, p, 1.0, 5) / p["model_v"] ** 2)
+    assert variances == pytest.approx([1.0, 1.0, 4.0, 9.0])
+
+
+def test_inflation_is_one_for_white_innovations_and_follows_those_that_stay() -> None:
+    s = np.zeros(1, EKF_STATE)[0]
+    s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
+    rng, slow = np.random.default_rng(3), []
+    for u in rng.standard_normal(20_000):
+        ekf.inflate(s, 0, 1.0, u)
+        slow.append(s["slow_inflation"][0])
+    assert np.mean(slow) == pytest.approx(1.3, abs=0.3)  # what is below 1 counts as 1
+    for _ in range(7200):
+        ekf.inflate(s, 0, 1.0, 0.2)
+    assert s["slow_inflation"][0] > 30.0
+    assert s["fast_inflation"][0] > 3.0
+
+
+def mixture(mean, covariance, weight):
+    """Mean and covariance of a mixture of normal distributions, by its definition."""
+    weight = weight / weight.sum()
+    total = weight @ mean
+    away = mean - total
+    return total, np.einsum("q,qjk->jk", weight, covariance) + np.einsum("q,qj,qk->jk", weight, away, away)
+
+
+def several(p, count=3):
+    s = somewhere(p)
+    rng = np.random.default_rng(4)
+    for q in range(count):
+        mixed = rng.standard_normal((STATES, STATES))
+        s["mean"][q], s["covariance"][q] = rng.standard_normal(STATES), mixed @ mixed.T
+        s["mean"][q, SOC] = 0.3 + 0.1 * q
+        s["covariance"][q] /= 400.0
+        s["ln_weight"][q] = -0.4 * q
+    s["count"], s["best"] = count, 0
+    return s, np.exp(s["ln_weight"][:count])
+
+
+@pytest.mark.parametrize("series", [1.0, 6.0])
+def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
+    p = settings(series=series)
+    s, weight = several(p)
+    mean, covariance = mixture(s["mean"][:3], s["covariance"][:3], weight)
+    hypotheses.combine(s, p)
+    assert s["soc"] == pytest.approx(mean[SOC])
+    spread = p["cell_spread"] * (1.0 - mean[SOC]) if series > 1.0 else 0.0
+    assert s["soc_std"] == pytest.approx(np.sqrt(covariance[SOC, SOC] + spread**2))
+
+
+def test_two_that_become_one_keep_mean_and_covariance() -> None:
+    s, weight = several(settings(), 2)
+    mean, covariance = mixture(s["mean"][:2], s["covariance"][:2], weight)
+    hypotheses.unite(s, 0, 1)
+    assert s["mean"][0] == pytest.approx(mean)
+    assert s["covariance"][0] == pytest.approx(covariance)
+    assert np.exp(s["ln_weight"][0]) == pytest.approx(weight.sum())
+
+
+def test_what_is_unlikely_goes_and_what_agrees_becomes_one() -> None:
+    s, _ = several(settings(), 4)
+    s["covariance"][:4, SOC, SOC] = 0.02**2
+    s["mean"][:4, SOC] = 0.3, 0.5, 0.505, 0.7
+    s["ln_weight"][:4] = 0.0, -0.1, -0.1, -20.0
+    hypotheses.merge(s)
+    assert s["count"] == 2
+    assert s["mean"][:2, SOC] == pytest.approx([0.3, 0.5025])
+
+
+DRIVE = next(case for case in CASES if case.name == "oxide 25C")
+FAST = Case("100 Hz", rate_hz=100.0, hours=0.25, unseen_h=0.3, seed=5)
+
+
+def start(seen, wrong=0.2):
+    return Estimator(seen.cell, initial_soc=float(seen.soc[0] + wrong))
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return capture(DRIVE)
+
+
+@pytest.fixture(scope="module")
+def fast():
+    return capture(FAST)
+
+
+@pytest.mark.parametrize("rate_hz", [0.1, 1.0, 100.0, 1000.0])
+def test_the_covariance_stays_one_at_any_rate(drive, fast, rate_hz: float) -> None:
+    """Symmetric to the last bit, no variance below 0 beyond rounding, nothing infinite."""
+    samples = {0.1: drive.samples[::10], 1.0: drive.samples, 100.0: fast.samples, 1000.0: fast.samples.copy()}[rate_hz]
+    if rate_hz == 1000.0:
+        samples["time_s"] = samples["time_s"][0] + np.arange(samples.size) / rate_hz
+    estimator = start(drive if rate_hz <= 1.0 else fast)
+    f = estimator.record[0]["filter"]
+    for part in np.array_split(samples, 40):
+        estimator.run(part)
+        assert 1 <= f["count"] <= len(f["mean"])
+        for covariance in f["covariance"][: f["count"]]:
+            assert np.array_equal(covariance, covariance.T)
+            scale = np.sqrt(np.diag(covariance))
+            assert np.isfinite(scale).all()
+            assert (scale > 0.0).all()
+            assert np.linalg.eigvalsh(covariance / scale[:, None] / scale).min() > -1e-9
+    assert estimator.record[0]["counters"]["reset"] == 0
+
+
+def test_a_hundred_samples_a_second_tell_the_same_as_one(fast) -> None:
+    """The mean of a second's samples is an update, whatever their number."""
+    slow = fast.samples[::100]
+    many, few = (start(fast).run(samples).copy() for samples in (fast.samples, slow))
+    many = many[::100]
+    assert many["time_s"] == pytest.approx(few["time_s"])
+    late = slice(300, None)
+    assert np.abs(many["soc"] - few["soc"])[late].max() < 0.004
+    assert many["soc_std"][late] == pytest.approx(few["soc_std"][late], rel=0.1)
+
+
+def test_from_several_socs_to_one(drive) -> None:
+    estimator = start(drive)
+    f = estimator.record[0]["filter"]
+    estimator.run(drive.samples[:1])
+    assert f["count"] > 3
+    counts = []
+    for part in np.array_split(drive.samples[1:], 20):
+        estimator.run(part)
+        counts.append(f["count"])
+    assert all(after <= before for before, after in pairwise(counts))
+    assert counts[-1] == 1
+
+
+def test_an_soc_that_was_told_with_confidence_and_is_wrong_by_far_is_given_up(drive) -> None:
+    """0.3 too low, known to 0.01: within ten minutes the truth is inside the band, and after twenty nearby."""
+    estimator = start(drive)
+    estimator.run(drive.samples[:600])
+    estimator.set_soc(float(drive.soc[600]) - 0.3)
+    trace = estimator.run(drive.samples[600:2400])
+    error = np.abs(trace["soc"] - drive.soc[600:2400])
+    assert estimator.record[0]["filter"]["reopened"] >= 1
+    assert (error < 2.0 * trace["soc_std"])[600:].all()
+    assert error[1200:].max() < 0.04
+
+
+@pytest.mark.parametrize("field", ["mean", "covariance", "ln_weight"])
+def test_what_is_not_finite_is_forgotten_and_counted(drive, field: str) -> None:
+    estimator = start(drive)
+    estimator.run(drive.samples[:1800])
+    before = estimator.state["soc"][0]
+    estimator.record[0]["filter"][field][0] = np.nan
+    trace = estimator.run(drive.samples[1800:2400])
+    assert estimator.record[0]["counters"]["reset"] == 1
+    assert np.isfinite(trace["soc"][2:]).all()
+    assert np.isfinite(trace["soc_std"][2:]).all()
+    assert trace["soc"][5] == pytest.approx(before, abs=0.05)
+    assert estimator.record[0]["filter"]["mean"][0, LN_R] != 0.0
