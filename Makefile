@@ -11,7 +11,7 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare firmware kernels lock
+.PHONY: help venv apt check test demo benchmark compare anywhere firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -45,6 +45,10 @@ compare: ## methods side by side on real captures, PyBOP among them: minutes
 	@[ -x $(COMPARE)/bin/python ] || $(PYTHON) -m venv $(COMPARE)
 	@$(COMPARE)/bin/pip install --quiet --disable-pip-version-check -e . pybop==26.3
 	@$(COMPARE)/bin/python tests/benchmarks/side_by_side.py
+	@$(COMPARE)/bin/python -m tests.benchmarks.anywhere
+
+anywhere: venv ## the SOC when switched on anywhere, on real captures, e.g. make anywhere ARGS=PF: minutes
+	@$(BIN)/python -m tests.benchmarks.anywhere $(ARGS)
 
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \

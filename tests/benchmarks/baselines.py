@@ -1,4 +1,4 @@
-"""What others would use, on the same capture: a textbook EKF with fixed parameters, and RLS on the ARX form."""
+"""What others would use, on the same capture: textbook EKFs with fixed parameters, and RLS on the ARX form."""
 
 import math
 
@@ -7,13 +7,21 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import Floats, ocv
+from bms_estimator.kernels.ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
 
 EKF_VOLTAGE_SIGMA_V = 0.005
 """Measurement noise of the textbook filter [V]."""
+FIVE_SIGMA_V = 0.1
+"""The same in the mean of a second, of the filter with five time constants [V]: of 5, 20, 50, 100 and 200 mV what suits it best."""
+FIVE_TAU_S = np.array([2.0, 15.0, 80.0, 400.0, 2000.0])
+COLD_C = 0.0
+"""Where one activation energy takes the place of two."""
 
 
 @njit
-def fixed_ekf(time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats) -> Floats:
+def fixed_ekf(
+    time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats
+) -> tuple[Floats, Floats]:
     """Extended Kalman filter over (soc, v1, v2) with constant elements.
 
     Args:
@@ -25,13 +33,13 @@ def fixed_ekf(time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float,
         grid: Shape (2, m): OCV and its slope over SOC 0..1 [V].
 
     Returns:
-        SOC at each sample, shape (n,).
+        SOC at each sample and its std, shape (n,) each.
     """
     capacity_as, r_s, r1, tau1, r2, tau2 = cell
     x = np.array([soc0, 0.0, 0.0])
     p = np.diag(np.array([0.2**2, 0.01**2, 0.01**2]))
     q = np.array([1e-10, 1e-9, 1e-9])
-    soc = np.empty(len(time_s))
+    soc, std = np.empty(len(time_s)), np.empty(len(time_s))
     h = np.array([0.0, -1.0, -1.0])
     for k in range(len(time_s)):
         if k > 0:
@@ -46,8 +54,95 @@ def fixed_ekf(time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float,
         s = h @ ph + EKF_VOLTAGE_SIGMA_V**2
         x = x + ph / s * innovation
         p = p - np.outer(ph, ph) / s
-        soc[k] = x[0]
-    return soc
+        soc[k], std[k] = x[0], math.sqrt(p[0, 0])
+    return soc, std
+
+
+def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]:
+    """A cell file's ladder with ``FIVE_TAU_S`` instead: each branch shared between the two nearest, by the logarithm.
+
+    Args:
+        weak_ohm: Shape (GRID, RESISTANCES), as in the filter's settings.
+        strong_ohm: The same.
+
+    Returns:
+        Resistances at 25 C, shape (GRID, 6) [ohm], and an activation energy of each, shape (6,) [J/mol].
+    """
+
+    def shared(ohm: Floats) -> Floats:
+        five = np.zeros((len(ohm), 6))
+        five[:, 0] = ohm[:, 0]
+        for k, tau_s in enumerate(TAU_S):
+            position = float(np.interp(np.log(tau_s), np.log(FIVE_TAU_S), np.arange(5.0)))
+            i = min(int(position), 3)
+            five[:, 1 + i] += ohm[:, 1 + k] * (i + 1 - position)
+            five[:, 2 + i] += ohm[:, 1 + k] * (position - i)
+        return five
+
+    weak, strong = shared(weak_ohm), shared(strong_ohm)
+    middle = len(weak) // 2
+    factor = weak[middle] * arrhenius(WEAK_J, COLD_C) + strong[middle] * arrhenius(STRONG_J, COLD_C)
+    ratio = np.log(np.maximum(factor / np.maximum(weak[middle] + strong[middle], 1e-9), 1.0))
+    return weak + strong, ratio / math.log(arrhenius(1.0, COLD_C))
+
+
+@njit
+def ladder_ekf(
+    time_s: Floats,
+    current_a: Floats,
+    voltage_v: Floats,
+    temperature_c: Floats,
+    soc0: float,
+    capacity_as: float,
+    ohm: Floats,
+    energy_j: Floats,
+    tau_s: Floats,
+    grid: Floats,
+) -> tuple[Floats, Floats]:
+    """Extended Kalman filter over SOC and the voltages of five RC pairs, resistances by SOC and temperature.
+
+    Args:
+        time_s: Shape (n,) [s].
+        current_a: Shape (n,), positive on discharge [A].
+        voltage_v: Shape (n,) [V].
+        temperature_c: Shape (n,) [C].
+        soc0: Where it begins, 0..1.
+        capacity_as: [A s].
+        ohm: As ``five_branches`` gives them.
+        energy_j: As ``five_branches`` gives them.
+        tau_s: Shape (5,) [s].
+        grid: Shape (2, m): OCV and its slope over SOC 0..1 [V].
+
+    Returns:
+        SOC at each sample and its std, shape (n,) each.
+    """
+    x = np.zeros(6)
+    x[0] = soc0
+    p = np.diag(np.array([0.2**2, 0.01**2, 0.01**2, 0.01**2, 0.01**2, 0.01**2]))
+    q = np.array([1e-10, 1e-9, 1e-9, 1e-9, 1e-9, 1e-9])
+    soc, std = np.empty(len(time_s)), np.empty(len(time_s))
+    h = -np.ones(6)
+    r, decay = np.empty(6), np.ones(6)
+    dt = 1.0
+    for k in range(len(time_s)):
+        position = min(max(x[0], 0.0), 1.0) * (len(ohm) - 1)
+        i = min(int(position), len(ohm) - 2)
+        for j in range(6):
+            r[j] = (ohm[i, j] + (position - i) * (ohm[i + 1, j] - ohm[i, j])) * arrhenius(energy_j[j], temperature_c[k])
+        if k > 0:
+            dt = max(time_s[k] - time_s[k - 1], 0.0)
+            decay[1:] = np.exp(-dt / tau_s)
+            x = decay * x + (1.0 - decay) * r * current_a[k - 1]
+            x[0] -= dt / capacity_as * current_a[k - 1]
+            p = decay.reshape(6, 1) * p * decay + np.diag(q * dt)
+        h[0] = (ocv(x[0] + 1e-4, grid[0], grid[1]) - ocv(x[0] - 1e-4, grid[0], grid[1])) / 2e-4
+        innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1:].sum() - current_a[k] * r[0])
+        ph = p @ h
+        s = h @ ph + FIVE_SIGMA_V**2 / min(max(dt, 0.01), 1.0)
+        x = x + ph / s * innovation
+        p = p - np.outer(ph, ph) / s
+        soc[k], std[k] = x[0], math.sqrt(max(p[0, 0], 0.0))
+    return soc, std
 
 
 @njit

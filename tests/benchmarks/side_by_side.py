@@ -141,7 +141,7 @@ def textbook_ekf(trial: Trial) -> Outcome:
     r_s, r1, c1, r2, c2 = values
     model = np.array([3600.0 * trial.cell.cell.capacity_ah, r_s, r1, r1 * c1, r2, r2 * c2])
     columns = [np.ascontiguousarray(trial.blind[name]) for name in ("time_s", "current_a", "voltage_v")]
-    soc = fixed_ekf(*columns, trial.start_soc, model, trial.grid)
+    soc, _ = fixed_ekf(*columns, trial.start_soc, model, trial.grid)
     return Outcome(
         "EKF, parameters fixed", trial.voltage_rms_mv(a[:16]), trial.soc_rmse_percent(soc), None, "learns nothing"
     )
