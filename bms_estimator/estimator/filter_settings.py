@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.kernels.ekf_state import EKF_SETTINGS, Noise
-from bms_estimator.kernels.ladder import BRANCHES, GRID, REFERENCE_C, RESISTANCES, TAU_S
+from bms_estimator.kernels.ladder import BRANCHES, GRID, RESISTANCES, TAU_S
 from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.model.settings import IdentifierSettings
 
@@ -19,6 +19,10 @@ BRANCHES_STD = 0.35
 """Relative std of resistances that come from two branches."""
 BIAS_OF_STD = 0.2
 """Resistances that are hardly known are wrong in their ratios, too: so much of their relative std is ``bias_relative``."""
+ROOM_C = 15.0, 35.0
+"""Resistances of unknown temperature are those of a room [C]."""
+LEAST_SHARE = 1e-4
+"""No branch has less than this part of the sum at SOC 0.5: time constants are means weighted by resistance."""
 LEAST_CAPACITANCE = 0.05
 """C_ts, C_tl, negative below delta1, delta2, are at least this part of a9, a12."""
 
@@ -51,9 +55,9 @@ def filter_settings(
     p["ocv_v"], p["ocv_slope_v"] = grid
     _open_circuit(p, cell, identifier.hysteresis_v)
     weak_ohm, strong_ohm, r_std, (p["low_c"], p["high_c"]) = _ladder(cell)
-    p["weak_ohm"], p["strong_ohm"] = weak_ohm, strong_ohm
     middle = GRID // 2
     p["middle_ohm"] = weak_ohm[middle].sum() + strong_ohm[middle].sum()
+    p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, LEAST_SHARE * p["middle_ohm"]), strong_ohm
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
     noise = Noise(r_std=r_std)
@@ -99,7 +103,7 @@ def _ladder(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     ladder = cell.ladder
     if ladder is None:
         half_ohm = 0.5 * ladder_of_branches(cell)
-        return half_ohm, half_ohm, BRANCHES_STD, (REFERENCE_C, REFERENCE_C)
+        return half_ohm, half_ohm, BRANCHES_STD, ROOM_C
     weak_ohm, strong_ohm = (
         np.column_stack([np.interp(SOC_GRID, ladder.soc, row) for row in rows])
         for rows in (ladder.weak_ohm, ladder.strong_ohm)

@@ -60,7 +60,7 @@ class Noise:
     """Offset of the current sensor, std [C]."""
     capacity_std: float = 0.08
     """Capacity, relative std."""
-    cell_spread: float = 0.03
+    cell_spread: float = 0.05
     """Cells in series: by how much of the charge drawn the emptiest lies below their mean, std of SOC."""
     soc_std: float = 0.2
     """SOC at switch-on, std."""
