@@ -60,8 +60,6 @@ LADDER_STD = 0.1
 """Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
 JUDGED_SOC = 0.1
 """RMS errors are given above it."""
-HYSTERESIS_SHARE = 1.0
-"""Std of how much of the gap between slow charge and discharge a load keeps."""
 NO_WORSE = 1.05
 """Scores that differ by less than this factor are the same: four replays do not tell more."""
 
@@ -321,10 +319,7 @@ def _share(ladder: Ladder) -> Floats:
 def _ocv_error(cell: CellModel) -> Floats:
     """Std of the given OCV at ``EVEN`` [V]."""
     if isinstance(cell.ocv, TableOcv) and cell.ocv.error_v is not None:
-        error_v = np.interp(EVEN, cell.ocv.soc, cell.ocv.error_v)
-        if cell.ocv.hysteresis_v is None:
-            return error_v
-        return np.hypot(error_v, HYSTERESIS_SHARE * np.interp(EVEN, cell.ocv.soc, cell.ocv.hysteresis_v))
+        return np.interp(EVEN, cell.ocv.soc, cell.ocv.error_v)
     slope_v = np.interp(EVEN, np.linspace(0.0, 1.0, ocv_grid(cell)[1].size), ocv_grid(cell)[1])
     return np.hypot(CURVE_ERROR_V * cell.cell.series_count, CURVE_ERROR_SOC * slope_v)
 

@@ -143,8 +143,9 @@ def find_sources(
     hysteresis_v = None
     if telling is not None and telling.hysteresis_v is not None:
         share = _share(telling, found)
-        hysteresis_v = np.interp(NODES, GRID, telling.hysteresis_v * (1.0 if share is None else share))
         kept_v = telling.hysteresis_v * (REST_SHARE if share is None else share)
+        given = telling in sources[len(slow) :] and share is None  # who gives a curve means what it says
+        hysteresis_v = np.interp(NODES, GRID, telling.hysteresis_v if given else kept_v)
         found = [(test, _amid_hysteresis(points, test, kept_v)) for test, points in found]
         if share is not None:
             sources = [

@@ -21,6 +21,7 @@ from bms_estimator.calibration.ocv_table import TableFit, fit_table
 from bms_estimator.calibration.relaxation import RelaxationTest, without_glitches
 from bms_estimator.calibration.rest_elements import rest_elements, typical_elements
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
+from bms_estimator.estimator.filter_settings import typical_ladder
 from bms_estimator.model.cell import Cell, CellModel
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.sources.curve import read_curve
@@ -214,7 +215,8 @@ def _cell(
         samples = next(one.samples for one in recordings if one.name == test.name)
         elements = rest_elements(samples, test, found.capacity_ah)
     ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(found.hysteresis_v)
-    return CellModel.model_validate({"cell": cell, "ocv": ocv, **elements.sections})
+    found_cell = CellModel.model_validate({"cell": cell, "ocv": ocv, **elements.sections})
+    return found_cell if test is not None else found_cell.model_copy(update={"ladder": typical_ladder(found_cell)})
 
 
 def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:

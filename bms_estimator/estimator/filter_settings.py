@@ -8,11 +8,15 @@ from numpy.typing import NDArray
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.kernels.ekf_state import EKF_SETTINGS, Noise
 from bms_estimator.kernels.ladder import BRANCHES, GRID, RESISTANCES, TAU_S
-from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.settings import IdentifierSettings
 
 CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
 """Where the cell file does not say how wrong its OCV is: std of one cell [V], and std along SOC."""
+STEEPEST_V = 3.0
+"""Where the OCV of a cell is steeper, near full and empty, its end is better known than its SOC elsewhere [V]."""
+COUNT_ERROR_SOC = 0.003
+"""However well the curve is known: how full the cell was that it was measured on, std."""
 BEYOND_BRANCHES = 0.2
 """Two branches leave out diffusion that is slower: its resistance, as a part of theirs."""
 BRANCHES_STD = 0.35
@@ -21,6 +25,8 @@ BIAS_OF_STD = 0.2
 """Resistances that are hardly known are wrong in their ratios, too: so much of their relative std is ``bias_relative``."""
 ROOM_C = 15.0, 35.0
 """Resistances of unknown temperature are those of a room [C]."""
+TYPICAL_STD, TYPICAL_V = 0.7, 0.02
+"""Relative std of elements that are typical of a capacity, and what they leave of a voltage at 1 C [V]."""
 LEAST_SHARE = 1e-4
 """No branch has less than this part of the sum at SOC 0.5: time constants are means weighted by resistance."""
 LEAST_CAPACITANCE = 0.05
@@ -84,6 +90,7 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
     """
     series, ocv = p["series"], cell.ocv
     slope_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_slope_v"].size), p["ocv_slope_v"])
+    slope_v = np.minimum(slope_v, STEEPEST_V * series)
     p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * slope_v)
     midway = False
     if isinstance(ocv, TableOcv):
@@ -92,6 +99,8 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
             column = getattr(ocv, name)
             if column is not None:
                 p["curve_error_v" if name == "error_v" else name] = np.interp(SOC_GRID, ocv.soc, column)
+        if ocv.error_v is not None:
+            p["curve_error_v"] = np.hypot(p["curve_error_v"], COUNT_ERROR_SOC * slope_v)
     if hysteresis_v is not None:
         p["hysteresis_v"] = 0.5 * hysteresis_v * series
         if not midway:  # the curve is that after discharge
@@ -109,6 +118,15 @@ def _ladder(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], 
         for rows in (ladder.weak_ohm, ladder.strong_ohm)
     )
     return weak_ohm, strong_ohm, ladder.std, ladder.temperature_c
+
+
+def typical_ladder(cell: CellModel) -> Ladder:
+    """The ladder of a cell whose elements are no more than typical of its capacity: a power cell has a quarter of them."""
+    half_ohm = 0.5 * ladder_of_branches(cell).T
+    rows = tuple(tuple(float(f"{ohm:.4g}") for ohm in row[:: GRID - 1]) for row in half_ohm)
+    return Ladder(
+        soc=(0.0, 1.0), weak_ohm=rows, strong_ohm=rows, std=TYPICAL_STD, temperature_c=ROOM_C, error_v=TYPICAL_V
+    )
 
 
 def ladder_of_branches(cell: CellModel) -> NDArray[np.float64]:

@@ -290,21 +290,3 @@ def combine(s: Record, p: Record) -> None:
         variance += weight * (s.covariance[q, SOC, SOC] + (s.mean[q, SOC] - mean) ** 2)
     spread = p.cell_spread * max(1.0 - mean, 0.0) if p.series > 1.0 else 0.0
     s.soc, s.soc_std = min(max(mean, 0.0), 1.0), math.sqrt(variance + spread * spread)
-
-
-@njit(cache=True)
-def ekf_step(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """Take one sample after the first.
-
-    Args:
-        s: Record of EKF_STATE; updated in place.
-        p: Record of EKF_SETTINGS.
-        dt_s: Since the sample before [s], above 0.
-        current_a: Current [A], positive on discharge.
-        voltage_v: Terminal voltage [V].
-        temperature_c: Of the cell [C]; NaN without a sensor.
-    """
-    count_on(s, p, dt_s, current_a, temperature_c)
-    gather(s, current_a, voltage_v)
-    if s.window.time_s >= WINDOW_S:
-        update_all(s, p)

@@ -131,7 +131,9 @@ def test_what_is_not_to_be_learned_is_taken_as_declared() -> None:
     assert "identifier.capacity_std is 0: taken as declared" in (health["capacity"].reason or "")
 
 
-@pytest.mark.parametrize(("temperature_c", "said"), [(25.0, ""), (-8.0, "no data at -8 C, the cell file knows 15 to 35 C")])
+@pytest.mark.parametrize(
+    ("temperature_c", "said"), [(25.0, ""), (-8.0, "no data at -8 C, the cell file knows 15 to 35 C")]
+)
 def test_a_temperature_that_the_cell_file_does_not_know_is_named(temperature_c: float, said: str) -> None:
     estimator = Estimator(CELL, initial_soc=1.0)
     block = pulses(0.2, 0.1)
