@@ -258,9 +258,9 @@ def unite(s: Record, a: int, b: int) -> None:
         apart[j] = s.mean[b, j] - s.mean[a, j]
         s.mean[a, j] += share * apart[j]
     for j in range(STATES):
-        for k in range(STATES):
-            s.covariance[a, j, k] += share * (s.covariance[b, j, k] - s.covariance[a, j, k])
-            s.covariance[a, j, k] += share * (1.0 - share) * apart[j] * apart[k]
+        for k in range(j, STATES):
+            both = s.covariance[a, j, k] + share * (s.covariance[b, j, k] - s.covariance[a, j, k])
+            s.covariance[a, j, k] = s.covariance[a, k, j] = both + share * (1.0 - share) * apart[j] * apart[k]
     s.ln_weight[a] = most + math.log(weight_a + weight_b)
     if s.best == b:
         s.best = a
