@@ -116,7 +116,7 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
         s.minute_u[q] = s.ten_minutes_u[q] = 0.0
         s.fast_inflation[q] = s.slow_inflation[q] = 1.0
     s.best = (s.count - 1) // 2
-    combine(s, p)
+    combine(s)
 
 
 @njit(cache=True)
@@ -211,7 +211,7 @@ def update_all(s: Record, p: Record) -> None:
     s.voltage_v = w.sum_v / w.samples - s.innovation_v
     s.best = best
     merge(s)
-    combine(s, p)
+    combine(s)
     reopen(s, p)
     clear(s)
 
@@ -277,8 +277,8 @@ def remove(s: Record, q: int) -> None:
 
 
 @njit(cache=True)
-def combine(s: Record, p: Record) -> None:
-    """Mean and std of SOC of the mixture, and of the emptiest of cells in series."""
+def combine(s: Record) -> None:
+    """Mean and std of SOC of the mixture."""
     total = mean = variance = 0.0
     for q in range(s.count):
         weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
@@ -288,5 +288,11 @@ def combine(s: Record, p: Record) -> None:
     for q in range(s.count):
         weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best]) / total
         variance += weight * (s.covariance[q, SOC, SOC] + (s.mean[q, SOC] - mean) ** 2)
-    spread = p.cell_spread * max(1.0 - mean, 0.0) if p.series > 1.0 else 0.0
-    s.soc, s.soc_std = min(max(mean, 0.0), 1.0), math.sqrt(variance + spread * spread)
+    s.soc, s.soc_std = min(max(mean, 0.0), 1.0), math.sqrt(variance)
+
+
+@njit(cache=True)
+def pack_std(s: Record, p: Record) -> float:
+    """Std of the SOC as of the emptiest of cells in series: nobody sees how far below their mean it lies."""
+    spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
+    return math.hypot(s.soc_std, spread)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import soc_from_ocv
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
+from bms_estimator.kernels.hypotheses import pack_std
 from bms_estimator.kernels.identification import identify, restart_filter, start_filter
 from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
@@ -171,7 +172,7 @@ def write_filter(row: Record, s: Record, p: Record) -> None:
     row.innovation_v = f.innovation_v
     e_o = open_circuit(f, p.filter, e, row.current_a, row.voltage_v)
     row.soc_ocv = soc_from_ocv(e_o, p.filter.ocv_v, p.filter.ocv_slope_v)
-    row.soc_std = f.soc_std
+    row.soc_std = pack_std(f, p.filter)
     row.r_s_ohm, row.r_s_std_ohm = value_and_std(e, R_S)
     row.r_ts_ohm, row.r_ts_std_ohm = value_and_std(e, R_TS)
     row.tau_ts_s, row.tau_ts_std_s = value_and_std(e, TAU_TS)

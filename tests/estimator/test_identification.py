@@ -157,6 +157,21 @@ def test_after_a_pause_the_soc_is_less_certain_and_found_again(load) -> None:
     assert np.abs(after["soc"][1800:] - true_soc[8600:]).max() < 0.015
 
 
+def test_pauses_of_a_pack_do_not_add_up_how_its_cells_differ(load) -> None:
+    """That error is there once, however often the filter begins anew from the SOC that it had."""
+    stds = []
+    for series in (1, 6):
+        block = load[0][:5000].copy()
+        block["voltage_v"] *= series
+        estimator = Estimator(TRUTH.pack(series, 1), identifier=ON, initial_soc=1.0)
+        estimator.run(block)
+        for _ in range(10):
+            estimator.resume(0.0)
+            estimator.run(block[-1:])
+        stds.append(estimator.record[0]["filter"]["soc_std"])
+    assert stds[1] < 1.1 * stds[0]
+
+
 def test_a_soc_that_is_set_is_believed_but_not_blindly(load) -> None:
     block, true_soc = load
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=0.8)

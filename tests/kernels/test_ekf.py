@@ -198,10 +198,11 @@ def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
     p = settings(series=series)
     s, weight = several(p)
     mean, covariance = mixture(s["mean"][:3], s["covariance"][:3], weight)
-    hypotheses.combine(s, p)
+    hypotheses.combine(s)
     assert s["soc"] == pytest.approx(mean[SOC])
+    assert s["soc_std"] == pytest.approx(np.sqrt(covariance[SOC, SOC]))
     spread = p["cell_spread"] * (1.0 - mean[SOC]) if series > 1.0 else 0.0
-    assert s["soc_std"] == pytest.approx(np.sqrt(covariance[SOC, SOC] + spread**2))
+    assert hypotheses.pack_std(s, p) == pytest.approx(np.sqrt(covariance[SOC, SOC] + spread**2))
 
 
 def test_two_that_become_one_keep_mean_and_covariance() -> None:
