@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.hypotheses import pack_std
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.model.sample import SampleBlock
 
@@ -41,12 +42,12 @@ class Run:
 
 def run_of(estimator: Estimator, samples: SampleBlock) -> Run:
     """Take all samples."""
-    f = estimator.record["filter"]
-    soc, std, innovation_v, variance_v2 = (f[n] for n in ("soc", "soc_std", "innovation_v", "innovation_variance"))
+    f, p = estimator.record["filter"], estimator.settings_record[0]["filter"]
+    soc, innovation_v, variance_v2 = (f[n] for n in ("soc", "innovation_v", "innovation_variance"))
     gathered = f["window"]["samples"]
     out = np.zeros((samples.size, 5))
     for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
         verdict = estimator.step(time_s, current_a, voltage_v, status, temperature_c)
         updated = verdict is Verdict.ACCEPTED and gathered[0] == 0
-        out[n] = soc[0], std[0], innovation_v[0], variance_v2[0], updated
+        out[n] = soc[0], pack_std(f[0], p), innovation_v[0], variance_v2[0], updated
     return Run(samples["time_s"], *out[:, :4].T, updated=out[:, 4] == 1.0)
