@@ -116,6 +116,19 @@ WINDOW = np.dtype(
 )
 """Samples between two updates of the filter."""
 
+STEP = np.dtype(
+    [
+        ("phase", "i8"),  # of step_resistance
+        ("current_a", "f8"),  # when it was last held,
+        ("voltage_v", "f8"),
+        ("x_a", "f8", BRANCHES),  # and in the branches
+        ("ln_ratio", "f8"),  # ln(R_s / R_0 of the file)
+        ("variance", "f8"),  # of that
+    ],
+    align=True,
+)
+"""The last step of the current, and what such steps have told of R_s."""
+
 EKF_STATE = np.dtype(
     [
         ("mean", "f8", (HYPOTHESES, STATES)),
@@ -131,6 +144,7 @@ EKF_STATE = np.dtype(
         ("reopened", "i8"),  # times the SOC became unknown: the model would have to be wrong by too much
         ("window", WINDOW),
         ("current_a", "f8"),  # of the last sample
+        ("step", STEP),
         ("x_a", "f8", BRANCHES),  # current filtered by the branches since switch-on [A]
         ("decay", "f8", BRANCHES),  # of the branches over ``decay_s``
         ("decay_s", "f8"),

@@ -13,7 +13,7 @@ from numba import njit
 
 from bms_estimator.kernels.ekf_noise import resistance_std
 from bms_estimator.kernels.ekf_state import HYST, LN_R, LN_R0, OFFSET, SOC, X
-from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, RESISTANCES, TAU_S, on_grid, resistances
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, RESISTANCES, TAU_S, TAUS, on_grid, resistances
 from bms_estimator.kernels.state import Record
 
 R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
@@ -23,6 +23,8 @@ SHORT_S = 60.0
 SHORT = sum(tau_s < SHORT_S for tau_s in TAU_S)
 SHAPE_STD = 0.03
 """How far the series resistance of the file, scaled to the cell, may be off at one SOC and temperature."""
+LONGEST_S = 2.0
+"""Samples further apart show no step of the current [s]."""
 KNOWN = 0.5
 """A scale of the resistances was identified when its variance is below this part of the first one."""
 LN_TAUS = np.log(np.array(TAU_S))
@@ -42,10 +44,16 @@ def equivalent(f: Record, p: Record, e: Record) -> None:
     """Resistances and two branches at SOC and temperature of the likeliest filter into ``e``."""
     x, cov = f.mean[f.best], f.covariance[f.best]
     resistances(x[SOC], p.weak_ohm, p.strong_ohm, f.weak, f.strong, e.ohm)
+    file_ohm, others = e.ohm[0], math.exp(x[LN_R])
     e.ohm[0] *= math.exp(x[LN_R0])
     for k in range(1, RESISTANCES):
-        e.ohm[k] *= math.exp(x[LN_R])
-    e.value[R_S], e.ln_variance[R_S] = e.ohm[0], cov[LN_R0, LN_R0] + SHAPE_STD**2
+        e.ohm[k] *= others
+    variance, ratio = cov[LN_R0, LN_R0], x[LN_R0]
+    if told_by_steps(f, p):
+        variance, ratio = f.step.variance, f.step.ln_ratio
+    half_ohm = 0.5 * within_sample(f, e)
+    e.value[R_S] = file_ohm * math.exp(ratio) + half_ohm
+    e.ln_variance[R_S] = variance + SHAPE_STD**2 + (half_ohm / e.value[R_S]) ** 2
     one_branch(e, 0, SHORT, R_TS, cov[LN_R, LN_R], p.r_std)
     one_branch(e, SHORT, BRANCHES, R_TL, cov[LN_R, LN_R], p.r_std)
 
@@ -74,9 +82,24 @@ def one_branch(e: Record, first: int, end: int, at: int, scale_variance: float, 
 
 
 @njit(cache=True)
+def within_sample(f: Record, e: Record) -> float:
+    """What the branches add to a step of the voltage within a sample [ohm]: nobody sees how much of it is R_s."""
+    ohm = 0.0
+    for k in range(BRANCHES):
+        ohm += e.ohm[1 + k] * (1.0 - math.exp(-min(f.decay_s, LONGEST_S) / TAUS[k]))
+    return ohm
+
+
+@njit(cache=True)
 def told(f: Record, p: Record, j: int) -> bool:
     """Whether data have told of the scale LN_R0 or LN_R, ``j``."""
     return f.covariance[f.best, j, j] < KNOWN * resistance_std(f, p) ** 2
+
+
+@njit(cache=True)
+def told_by_steps(f: Record, p: Record) -> bool:
+    """Whether steps of the current have told of R_s."""
+    return f.step.variance < KNOWN * resistance_std(f, p) ** 2
 
 
 @njit(cache=True)

@@ -79,6 +79,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
         for k in range(STATES):
             cov[j, k] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
+    s.step.variance = resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = (p.offset_c * p.capacity_as / 3600.0) ** 2
     cov[LN_Q, LN_Q] = p.capacity_std**2
     seed(s, p, soc, p.soc_std)

@@ -10,7 +10,7 @@ from numba import njit
 from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
-from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, equivalent, told
+from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, equivalent, told, told_by_steps
 from bms_estimator.kernels.hypotheses import WINDOW_S, clear, count_on, gather, seed, start, update_all
 from bms_estimator.kernels.input_checks import (
     SIGN_OF_CURRENT,
@@ -23,6 +23,7 @@ from bms_estimator.kernels.input_checks import (
 )
 from bms_estimator.kernels.margins import delta
 from bms_estimator.kernels.state import Record
+from bms_estimator.kernels.step_resistance import UNHELD, watch_steps
 
 FIT_EVERY_S = 120.0
 """One element is fitted this often, each in its turn [s of samples]."""
@@ -45,7 +46,7 @@ def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, tempe
 def restart_filter(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
     """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, the load before is not known."""
     f = s.filter
-    f.current_a = current_a
+    f.current_a, f.step.phase = current_a, UNHELD
     seed(f, p.filter, f.soc, f.soc_std)
     clear(f)
     s.checks.slow_v = 0.0
@@ -75,6 +76,7 @@ def identify(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: flo
     if c.suspects & SIGN_OF_CURRENT:
         wait_for_sign(c, f, p.filter, dt_s, current_a)
     elif believed(c, s.counters, f, s.elements, dt_s, change_a, current_a, voltage_v):
+        watch_steps(f, p.filter, dt_s, change_a, voltage_v)
         gather(f, current_a, voltage_v)
     if f.window.time_s >= WINDOW_S and f.window.samples > 0:
         take_window(s, p)
@@ -121,7 +123,7 @@ def learn_elements(s: Record, p: Record, dt_s: float) -> None:
     learn_one(s, 1, R_TL, branches, dt_s)
     learn_one(s, 2, C_TS, branches, dt_s)
     learn_one(s, 3, C_TL, branches, dt_s)
-    learn_one(s, 4, R_S, loaded and told(f, p.filter, LN_R0), dt_s)
+    learn_one(s, 4, R_S, loaded and (told_by_steps(f, p.filter) or told(f, p.filter, LN_R0)), dt_s)
 
 
 @njit(cache=True)

@@ -1,0 +1,152 @@
+"""Real captures, in groups of a kind, and the cell files that our own commands make for them."""
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.sources.replay import load_capture
+
+Floats = NDArray[np.float64]
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+WRONG = (-0.2, 0.2)
+IN_MID_LOAD, FROM_START = 0.35, 0.0
+"""Part of the charge before the cut."""
+LOWEST_V, HIGHEST_V = 1.5, 4.5
+"""What lies outside is no voltage of a cell."""
+PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a cell file is made of; a generic one of its chemistry and capacity alone."""
+
+    capacity_ah: float
+    ocv: tuple[str, ...] = ()
+    identify: tuple[str, ...] = ()
+    generic: str = ""
+
+
+PF_ALL = Recipe(2.9, (PF + "25_hppc",), tuple(PF + f"{t}_hppc" for t in ("25", "10", "0", "n10")))
+PF_25 = Recipe(2.9, PF_ALL.ocv, (PF + "25_hppc",))
+NCR_CELL = Recipe(
+    3.0,
+    tuple(NCR + name for name in ("cell1_discharge_c20", "cell1_charge_c20", "cell5_relaxation_c2")),
+    (NCR + "cell5_relaxation_c2", NCR + "cell5_hppc"),
+)
+LEAF = Recipe(30.5, ("leaf/hppc_25c_from_full",), ("leaf/hppc_25c_from_full",))
+LFP_CELL = Recipe(
+    2.05,
+    tuple(LFP + f"c30_{way}_{t}" for way in ("dis", "chg") for t in ("p25", "p05", "n15")),
+    tuple(LFP + f"dyn_{t}" for t in ("p25", "p05", "n15")),
+)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Captures of one kind: name, capacity that the truth is counted with [Ah], SOC at its first sample."""
+
+    name: str
+    recipe: Recipe
+    captures: tuple[tuple[str, float, float], ...]
+    cut: float = IN_MID_LOAD
+    gain: float = 1.0
+    offset_a: float = 0.0
+    capacity: float = 1.0
+    """What the estimator is told over what is true."""
+
+
+NCR_CHANGING = (
+    (NCR + "cell1_random_steps", 3.0, 0.98),
+    (NCR + "cell1_dst", 3.0, 1.0),
+    (NCR + "cell5_random_steps", 3.0, 1.0),
+    (NCR + "cell1_hppc", 3.0, 1.0),
+)
+NCR_CONSTANT = ((NCR + "cell1_discharge_c4", 3.0, 1.0), (NCR + "cell1_discharge_1c5", 3.0, 1.0))
+PF_CAPTURES = {
+    t: tuple((PF + name, 2.9, 1.0) for name in names)
+    for t, names in {
+        "25": ("25_us06", "25_cycle1"),
+        "10": ("10_us06",),
+        "0": ("0_us06", "0_cycle1"),
+        "-10": ("n10_us06",),
+    }.items()
+}
+LFP_CAPTURES = {t: ((LFP + name, 2.05, 1.0),) for t, name in (("25", "dyn_p25"), ("5", "dyn_p05"), ("-15", "dyn_n15"))}
+LEAF_CAPTURES = (("leaf/hppc_25c_from_full", 30.5, 1.0),)
+
+GROUPS = (
+    *(Group(f"PF {t} C", PF_ALL, captures) for t, captures in PF_CAPTURES.items()),
+    *(Group(f"PF {t} C from full", PF_ALL, PF_CAPTURES[t], FROM_START) for t in ("0", "-10")),
+    *(Group(f"PF {t} C, file of 25 C", PF_25, PF_CAPTURES[t]) for t in ("10", "0", "-10")),
+    Group("NCR", NCR_CELL, NCR_CHANGING),
+    Group("NCR, constant current", NCR_CELL, NCR_CONSTANT),
+    Group("NCR, current +5 %", NCR_CELL, NCR_CHANGING, gain=1.05),
+    *(Group(f"NCR, {1e3 * a:+.0f} mA", NCR_CELL, NCR_CHANGING, offset_a=a) for a in (-0.05, 0.05)),
+    *(
+        Group(f"NCR, capacity {100 * q:+.0f} %", NCR_CELL, NCR_CHANGING, capacity=1 + q)
+        for q in (-0.05, 0.05, -0.2, 0.2)
+    ),
+    Group("Leaf (its own file)", LEAF, LEAF_CAPTURES),
+    *(
+        Group(f"LFP {t} C from full (its own file)", LFP_CELL, captures, FROM_START)
+        for t, captures in LFP_CAPTURES.items()
+    ),
+    *(Group(f"LFP {t} C (its own file)", LFP_CELL, captures) for t, captures in LFP_CAPTURES.items()),
+    Group("generic nca: PF", Recipe(2.9, generic="nca"), PF_CAPTURES["25"]),
+    Group("generic nca: NCR", Recipe(3.0, generic="nca"), NCR_CHANGING),
+    Group("generic lmo: Leaf", Recipe(30.5, generic="lmo"), LEAF_CAPTURES),
+    Group("generic lfp: A123", Recipe(2.05, generic="lfp"), LFP_CAPTURES["25"]),
+    Group("generic lfp: A123 from full", Recipe(2.05, generic="lfp"), LFP_CAPTURES["25"], FROM_START),
+)
+
+
+@cache
+def cell_file(recipe: Recipe, folder: Path) -> CellModel:
+    """By `ocv`, then `identify`; what they refuse to write is not used, and said."""
+    if recipe.generic:
+        return load_cell(recipe.generic, recipe.capacity_ah)
+    stem = f"{recipe.identify[0].replace('/', '_')}_{len(recipe.identify)}"
+    curve, whole = folder / f"{stem}_ocv.toml", folder / f"{stem}.toml"
+    command("ocv", *map(path_of, recipe.ocv), "--capacity-ah", recipe.capacity_ah, "--out", curve)
+    refused = command("identify", *map(path_of, recipe.identify), "--cell", curve, "--out", whole)
+    return load_cell(curve if refused else whole)
+
+
+def command(*arguments: object) -> str:
+    """Run the program; why it refused, or nothing."""
+    done = subprocess.run([PROGRAM, *map(str, arguments)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.stderr.write(f"{arguments[0]} gave no file: {done.stderr.strip().splitlines()[-1]}\n")
+    return done.stderr if done.returncode else ""
+
+
+def path_of(name: str) -> Path:
+    """Of a capture."""
+    return DATA / f"{name}.csv.gz"
+
+
+@cache
+def load(name: str, capacity_ah: float, initial_soc: float) -> tuple[SampleBlock, Floats]:
+    """Samples without what is no voltage, and the true SOC at each."""
+    rows = load_capture(path_of(name)).rows
+    rows = rows[(rows["voltage_v"] > LOWEST_V) & (rows["voltage_v"] < HIGHEST_V)]
+    counter = DATA / f"{name}.soc.gz"
+    if counter.exists():
+        time_s, soc = np.genfromtxt(counter, delimiter=",", skip_header=1).T
+        return rows, np.interp(rows["time_s"], time_s, soc)
+    return rows, initial_soc - charge_ah(rows) / capacity_ah
+
+
+def charge_ah(samples: SampleBlock) -> Floats:
+    """Drawn before each sample, shape (n,) [Ah]; the current holds until the next."""
+    moved_as = samples["current_a"][:-1] * np.clip(np.diff(samples["time_s"]), 0.0, None)
+    return np.concatenate([[0.0], np.cumsum(moved_as)]) / 3600.0

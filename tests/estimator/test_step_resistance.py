@@ -1,0 +1,72 @@
+"""R_s is what a step of the current shows between two samples, at any rate, whatever the cell file says."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.ekf_state import LN_R0
+from bms_estimator.kernels.equivalent import R_S
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from tests.estimator.anywhere.cases import OXIDE, Case, Floats, cell_file
+from tests.estimator.anywhere.truth import simulate
+
+FULL_HZ, HOURS = 100, 0.4
+LEAST_A = 0.5 * OXIDE.capacity_ah
+FILES = {"of another such cell": Case("R_s"), "generic": Case("R_s", file_c="generic")}
+
+
+@pytest.fixture(scope="module")
+def pulses() -> tuple[SampleBlock, Floats]:
+    """Levels of some seconds, which change at any time between the samples of a slower sensor; and the true SOC."""
+    rng = np.random.default_rng(9)
+    count = round(3600 * HOURS * FULL_HZ)
+    level_a = OXIDE.capacity_ah * rng.choice([-0.5, 0.0, 0.5, 1.0, 1.5], count)
+    samples = np.zeros(count, dtype=SAMPLE)
+    samples["current_a"] = np.repeat(level_a, rng.integers(3 * FULL_HZ, 20 * FULL_HZ, count))[:count]
+    samples["time_s"], samples["temperature_c"] = np.arange(count) / FULL_HZ, 15.0
+    samples["voltage_v"], soc = simulate(
+        1.0 / FULL_HZ,
+        samples["current_a"],
+        samples["temperature_c"],
+        0.7,
+        -1.0,
+        OXIDE.capacity_ah,
+        OXIDE.ocv_v,
+        OXIDE.per_kelvin_v,
+        OXIDE.hysteresis_v,
+        OXIDE.ohm,
+    )
+    return samples, soc
+
+
+def seen_by_all(samples: SampleBlock) -> Floats:
+    """What each step of the capture shows from one sample to the next [ohm]."""
+    change_a, change_v = np.diff(samples["current_a"]), np.diff(samples["voltage_v"])
+    steps = np.abs(change_a) >= LEAST_A
+    return -change_v[steps] / change_a[steps]
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("rate_hz", [1, 10, 100])
+def test_r_s_is_what_steps_of_the_current_show(pulses, file: str, rate_hz: int) -> None:
+    samples = pulses[0][:: FULL_HZ // rate_hz].copy()
+    shown_ohm = np.median(seen_by_all(samples))
+    noise_v = np.random.default_rng(10).normal(0.0, 1e-3, samples.size)
+    samples["voltage_v"] += noise_v
+    estimator = Estimator(cell_file(FILES[file]), initial_soc=0.5)
+    trace = estimator.run(samples)
+    late = trace["time_s"] > 0.5 * trace["time_s"][-1]
+    r_s, std = trace["r_s_ohm"][late], trace["r_s_std_ohm"][late]
+    assert np.abs(r_s / shown_ohm - 1.0).max() < 0.1
+    assert (np.abs(r_s - shown_ohm) < 2.0 * std).mean() > 0.95
+    assert (std < 0.2 * r_s).all()
+
+
+def test_a_load_that_never_jumps_leaves_r_s_to_the_filter(pulses) -> None:
+    smooth = pulses[0][::FULL_HZ].copy()
+    smooth["current_a"] = OXIDE.capacity_ah * (0.5 + 0.4 * np.sin(smooth["time_s"] / 200.0))
+    estimator = Estimator(cell_file(FILES["generic"]), initial_soc=0.7)
+    estimator.run(smooth)
+    f, e = estimator.record[0]["filter"], estimator.record[0]["elements"]
+    assert f["step"]["ln_ratio"] == 0.0
+    assert e["ln_variance"][R_S] > f["covariance"][f["best"], LN_R0, LN_R0]
