@@ -11,7 +11,7 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare anywhere firmware kernels lock
+.PHONY: help venv apt check test demo benchmark compare anywhere ablation firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -49,6 +49,9 @@ compare: ## methods side by side on real captures, PyBOP among them: minutes
 
 anywhere: venv ## the SOC when switched on anywhere, on real captures, e.g. make anywhere ARGS=PF: minutes
 	@$(BIN)/python -m tests.benchmarks.anywhere $(ARGS)
+
+ablation: venv ## what each part of the filter is worth, on real captures, e.g. make ablation ARGS=LFP: minutes
+	@$(BIN)/python -m tests.benchmarks.ablation $(ARGS)
 
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \

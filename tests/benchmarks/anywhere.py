@@ -35,7 +35,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings
 from tests.benchmarks.baselines import FIVE_TAU_S, five_branches, fixed_ekf, ladder_ekf
 from tests.benchmarks.pulses import pulse_table
-from tests.benchmarks.recipes import DATA, GROUPS, WRONG, Group, cell_file, charge_ah, load
+from tests.benchmarks.recipes import GROUPS, Group, charge_ah, chosen, runs
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import Score, score
 
@@ -55,9 +55,6 @@ class Outcome:
 
 def main() -> None:
     """Print the table of the groups whose name contains an argument, or all."""
-    if not DATA.is_dir():
-        sys.exit(f"{DATA}: the captures are not there")
-    chosen = [g for g in GROUPS if not sys.argv[1:] or any(part in g.name for part in sys.argv[1:])]
     console = Console(width=None if sys.stdout.isatty() else 160)
     table = Table(title="switched on anywhere: RMSE/worst, inside/worst, std, score in %")
     table.add_column("group")
@@ -65,7 +62,7 @@ def main() -> None:
         table.add_column(column, justify="right")
     table.add_column("counting", justify="right")
     with tempfile.TemporaryDirectory() as folder:
-        for group in chosen:
+        for group in chosen(GROUPS, sys.argv[1:]):
             table.add_row(group.name, *cells_of(list(outcomes(group, Path(folder)))))
         console.print(table)
         console.print(pulse_table(Path(folder), sys.argv[1:]))
@@ -93,21 +90,10 @@ def mean(values: list[float]) -> float:
 
 def outcomes(group: Group, folder: Path) -> Iterator[Outcome]:
     """Of every capture and start of a group; those that are too short are left out."""
-    true_ah = group.recipe.capacity_ah
-    cell = cell_file(group.recipe, folder)
-    if group.capacity != 1.0:
-        capacity = cell.cell.model_copy(update={"capacity_ah": group.capacity * true_ah})
-        cell = cell.model_copy(update={"cell": capacity})
-    for name, capacity_ah, initial_soc in group.captures:
-        samples, soc = load(name, capacity_ah, initial_soc)
-        drawn_ah = charge_ah(samples)
-        begin = int(np.argmax(drawn_ah >= group.cut * drawn_ah[-1])) if group.cut else 0
-        seen, truth = samples[begin:].copy(), soc[begin:]
-        seen["current_a"] = group.gain * seen["current_a"] + group.offset_a
-        for wrong in WRONG:
-            outcome = compare(cell, seen, truth, float(np.clip(truth[0] + wrong, 0.0, 1.0)))
-            if outcome is not None:
-                yield outcome
+    for run in runs(group, folder):
+        outcome = compare(*run)
+        if outcome is not None:
+            yield outcome
 
 
 def compare(cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float) -> Outcome | None:

@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.sample import SampleBlock
-from tests.benchmarks.recipes import FROM_START, GROUPS, WRONG, Group, cell_file, load
+from tests.benchmarks.recipes import FROM_START, GROUPS, WRONG, Group, cell_file, chosen, load
 
 Floats = NDArray[np.float64]
 
@@ -30,9 +30,8 @@ def pulse_table(folder: Path, wanted: list[str]) -> Table:
     table = Table(title="R_s against pulses: ratio of the medians; within 10 %, inside 2 std [% of pulses]")
     for column in ("group", "pulses", "step s", "pulse mOhm", "ratio", "within 10 %", "inside", "std %"):
         table.add_column(column, justify="left" if column == "group" else "right")
-    for group in GROUPS:
-        plain = group.gain == group.capacity == 1.0 and group.offset_a == 0.0 and group.cut != FROM_START
-        if plain and (not wanted or any(part in group.name for part in wanted)):
+    for group in chosen(GROUPS, wanted):
+        if group.gain == group.capacity == 1.0 and group.offset_a == 0.0 and group.cut != FROM_START:
             table.add_row(group.name, *cells_of(group, folder))
     return table
 

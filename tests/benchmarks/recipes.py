@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -107,6 +108,30 @@ GROUPS = (
     Group("generic lfp: A123", Recipe(2.05, generic="lfp"), LFP_CAPTURES["25"]),
     Group("generic lfp: A123 from full", Recipe(2.05, generic="lfp"), LFP_CAPTURES["25"], FROM_START),
 )
+
+
+def chosen(groups: Iterable[Group], parts: list[str]) -> list[Group]:
+    """Those whose name contains one of ``parts``; all where there are none."""
+    if not DATA.is_dir():
+        sys.exit(f"{DATA}: the captures are not there")
+    return [g for g in groups if not parts or any(part in g.name for part in parts)]
+
+
+def runs(group: Group, folder: Path) -> Iterator[tuple[CellModel, SampleBlock, Floats, float]]:
+    """Cell file, what the estimator sees, the true SOC at each sample and the one that is told, of each capture and start."""
+    true_ah = group.recipe.capacity_ah
+    cell = cell_file(group.recipe, folder)
+    if group.capacity != 1.0:
+        capacity = cell.cell.model_copy(update={"capacity_ah": group.capacity * true_ah})
+        cell = cell.model_copy(update={"cell": capacity})
+    for name, capacity_ah, initial_soc in group.captures:
+        samples, soc = load(name, capacity_ah, initial_soc)
+        drawn_ah = charge_ah(samples)
+        begin = int(np.argmax(drawn_ah >= group.cut * drawn_ah[-1])) if group.cut else 0
+        seen, truth = samples[begin:].copy(), soc[begin:]
+        seen["current_a"] = group.gain * seen["current_a"] + group.offset_a
+        for wrong in WRONG:
+            yield cell, seen, truth, float(np.clip(truth[0] + wrong, 0.0, 1.0))
 
 
 @cache

@@ -1,0 +1,128 @@
+"""What each part of the filter is worth: the table of ``make anywhere`` without it, in kinds of groups.
+
+One part at a time is switched off in the filter's settings, in its first state or in what it sees; the cell files stay.
+Each cell of the table: RMSE, share of time inside two std, interval score, all in %.
+"""
+
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.ekf_state import HYPOTHESES, SOC
+from bms_estimator.kernels.hypotheses import combine, copy
+from bms_estimator.kernels.ladder import GRID, REFERENCE_C
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.sample import SampleBlock
+from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
+from tests.estimator.anywhere.score import Score, score
+
+Floats = NDArray[np.float64]
+Change = Callable[[np.void], None]
+
+KINDS = {
+    "oxide, 25, 10 C": ("PF 25 C", "PF 10 C", "NCR", "Leaf"),
+    "oxide, 0, -10 C": ("PF 0 C", "PF -10 C", "PF 0 C from full", "PF -10 C from full"),
+    "file of 25 C": ("PF 10 C, file", "PF 0 C, file", "PF -10 C, file"),
+    "wrong sensor": ("NCR, current", "NCR, -50", "NCR, +50", "NCR, capacity"),
+    "LFP from full": tuple(f"LFP {t} C from full" for t in (25, 5, -15)),
+    "LFP": tuple(f"LFP {t} C (its" for t in (25, 5, -15)),
+    "generic": ("generic",),
+}
+"""Groups by how their names begin; a name that is a group's own stands for that group alone."""
+
+
+def setting(**values: float) -> Change:
+    """Of the filter's settings, ``p``."""
+
+    def change(p: np.void) -> None:
+        for name, value in values.items():
+            p[name] = value
+
+    return change
+
+
+def known_resistances_of_the_middle(p: np.void) -> None:
+    """The resistances do not change with SOC."""
+    for name in ("weak_ohm", "strong_ohm"):
+        p[name] = p[name][GRID // 2]
+
+
+PARTS: dict[str, Change] = {
+    "as it is": setting(),
+    "R of 5 mV, not 50": setting(model_v=0.005),
+    "no biases": setting(bias_relative=0.0, bias_grown=0.0, bias_soc=0.0),
+    "no error of R along SOC": setting(bias_soc=0.0),
+    "no error of what R has grown by": setting(bias_grown=0.0),
+    "scales of R as in the file": setting(r_std=1e-6),
+    "R the same at any SOC": known_resistances_of_the_middle,
+    "no entropy": setting(per_kelvin_v=0.0),
+    "no error of the OCV": setting(curve_error_v=0.0),
+    "no hysteresis": setting(hysteresis_v=0.0),
+    "no offset": setting(offset_c=0.0),
+    "no error of the capacity": setting(capacity_std=0.0),
+    "polarisation from the first current": setting(load_c=0.0, load_level_c=1e-3),
+    "weights not tempered": setting(temper=0.5),
+}
+ONE_FILTER, NO_TEMPERATURE = "one hypothesis", "temperature not used"
+
+
+def main() -> None:
+    """Print the table; arguments are parts of the names of kinds."""
+    kinds = {k: v for k, v in KINDS.items() if not sys.argv[1:] or any(part in k for part in sys.argv[1:])}
+    table = Table("without", *kinds, title="RMSE / inside / score in %")
+    with tempfile.TemporaryDirectory() as folder:
+        for part in (*PARTS, ONE_FILTER, NO_TEMPERATURE):
+            cells = []
+            for begins in kinds.values():
+                groups = [g for g in chosen(GROUPS, []) if any(belongs(g, begin) for begin in begins)]
+                found = np.array([[s.rmse, s.cover, s.score] for g in groups for s in scores(g, part, Path(folder))])
+                cells.append("{:.2f} / {:.0f} / {:.1f}".format(*found.mean(axis=0)))
+            table.add_row(part, *cells)
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+def belongs(group: Group, begin: str) -> bool:
+    """Whether a group is meant by how its name begins."""
+    return group.name == begin or (group.name.startswith(begin) and begin not in {g.name for g in GROUPS})
+
+
+def scores(group: Group, part: str, folder: Path) -> list[Score]:
+    """Of every run of a group."""
+    found = [judge(part, *run) for run in runs(group, folder)]
+    return [s for s in found if s is not None]
+
+
+def judge(part: str, cell: CellModel, seen: SampleBlock, truth: Floats, start_soc: float) -> Score | None:
+    """One run without a part."""
+    estimator = Estimator(cell, initial_soc=start_soc)
+    PARTS.get(part, setting())(estimator.settings_record[0]["filter"])
+    if part == NO_TEMPERATURE:
+        seen = seen.copy()
+        seen["temperature_c"] = REFERENCE_C
+    begun = estimator.run(seen[:1])
+    if part == ONE_FILTER:
+        unite_all(estimator.record[0]["filter"], estimator.settings_record[0]["filter"])
+    trace = np.concatenate([begun, estimator.run(seen[1:])])
+    true = np.interp(trace["time_s"], seen["time_s"], truth)
+    return score(trace["time_s"], trace["soc"], trace["soc_std"], true)
+
+
+def unite_all(s: np.void, p: np.void) -> None:
+    """The one in the middle stays, with the std of all."""
+    if s["count"] == HYPOTHESES:
+        copy(s, HYPOTHESES // 2, 0)
+        s["count"], s["best"] = 1, 0
+        s["ln_weight"][0] = 0.0
+        s["covariance"][0, SOC, SOC] = p["soc_std"] ** 2
+        combine(s)
+
+
+if __name__ == "__main__":
+    main()
