@@ -13,8 +13,10 @@ from bms_estimator.estimator.learned import (
     relative_capacity,
 )
 from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Parameter, ParameterReport
+from bms_estimator.snapshot.ocv_formula import formula
 from bms_estimator.snapshot.topics import finite
 
 CONFIGURED = "configured value: no data has identified it"
@@ -37,6 +39,8 @@ _FUNCTIONS = {
 def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
     """Topic ``parameters``: a1..a15 as the observer holds them, a16..a21 of the cell file, elements at the present SOC.
 
+    Where the cell file gives the OCV as a table, a16..a21 are (2.10) fitted to it.
+
     Args:
         estimator: Read only.
         now_s: Wall clock [s since 1970].
@@ -44,10 +48,10 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
     a, state = estimator.cell.a.copy(), estimator.state[0]
     if not state["started"]:
         return ParameterReport(
-            publish_time=iso_utc(now_s), soc=None, a=_of_cell_file(a), elements={}, state_of_health={}
+            publish_time=iso_utc(now_s), soc=None, a=_of_cell_file(estimator.cell, a), elements={}, state_of_health={}
         )
     a[1:16] = state["a"][1:16]
-    parameters, elements = _of_cell_file(a), _elements_of(estimator, a)
+    parameters, elements = _of_cell_file(estimator.cell, a), _elements_of(estimator, a)
     health: dict[str, Parameter] = {}
     if estimator.identifying:
         record = estimator.record[0]
@@ -65,8 +69,15 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
     )
 
 
-def _of_cell_file(a: np.ndarray) -> dict[str, Parameter]:
-    return {f"a{i}": _configured(a[i], "the OCV is a table: (2.10) does not apply") for i in range(1, 22)}
+def _of_cell_file(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:
+    parameters = {f"a{i}": _configured(a[i], "") for i in range(1, 22)}
+    fit = formula(cell)
+    if fit is None:
+        return parameters
+    reason = f"(2.10) fitted to the table of the cell file, {1e3 * fit.rms_v:.1f} mV RMS off it"
+    for i, (value, std) in enumerate(zip(fit.a, fit.std, strict=True), start=16):
+        parameters[f"a{i}"] = Parameter(value=value, std=finite(std), valid=False, source="configured", reason=reason)
+    return parameters
 
 
 def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:

@@ -122,6 +122,22 @@ def test_nothing_is_identified_before_a_load_has_told_of_it() -> None:
     assert {p.valid for p in report.state_of_health.values()} == {False}
 
 
+@pytest.mark.parametrize("name", ["ncr18650", "nmc", "lfp"])
+def test_a_table_has_its_formula_too(name: str) -> None:
+    """Packs and single cells: the same curve, as near as (2.10) can come to it."""
+    for cells in (1, 6):
+        estimator = Estimator(load_cell(name, 3.0).pack(cells, 1))
+        a = parameter_report(estimator, NOW_S).a
+        values = np.array([math.nan] * 16 + [a[f"a{i}"].value for i in range(16, 22)])
+        curve_v = estimator.settings[0]["ocv_v"][::4]
+        off_v = np.array([chen_mora.emf(soc, values) for soc in np.linspace(0.0, 1.0, curve_v.size)]) - curve_v
+        rms_mv = 1e3 * np.sqrt(np.mean(off_v**2))
+        assert rms_mv < 30.0 * cells
+        assert a["a18"].reason == f"(2.10) fitted to the table of the cell file, {rms_mv:.1f} mV RMS off it"
+        assert (a["a18"].source, a["a18"].valid) == ("configured", False)
+        assert 0.0 < (a["a18"].std or 0.0) < 0.02 * cells
+
+
 def test_what_is_not_to_be_learned_is_taken_as_declared() -> None:
     off = IdentifierSettings(capacity_std=0.0, current_offset_std_a=0.0)
     estimator = Estimator(CELL, identifier=off, initial_soc=1.0)
