@@ -196,7 +196,34 @@ def relaxation_test(
     soc = soc_by_counting(good, capacity_ah, initial_soc)
     resting = resting_samples(good, capacity_ah)
     _check_charge(name, good, soc, resting, capacity_ah)
-    rests, rejected = [], []
+    rests, rejected = find_rests(good, soc, resting, series_count)
+    _check_rests(name, good, rests, rejected, resting)
+    return RelaxationTest(
+        name=name,
+        rests=tuple(rests),
+        rejected=tuple(rejected),
+        glitches=samples.size - good.size,
+        start_soc=initial_soc,
+        end_soc=float(soc[-1]),
+        mean_load_a=float(good["current_a"][~resting].mean()),
+        empty_v=_empty_v(good, soc, resting, rests),
+        full_v=float(good["voltage_v"][0]) if resting[0] and initial_soc > NEAR_FULL else float("nan"),
+    )
+
+
+def find_rests(
+    good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], series_count: int
+) -> tuple[list[Rest], list[str]]:
+    """The rests of a capture that are good for a point, and why the others are not, one line each.
+
+    Args:
+        good: Dtype ``SAMPLE``, without glitches.
+        soc: SOC at each sample.
+        resting: Which samples belong to a rest.
+        series_count: Cells in series, for limits that are given per cell.
+    """
+    rests: list[Rest] = []
+    rejected: list[str] = []
     for first, last in runs(resting):
         duration_s = float(good["time_s"][last - 1] - good["time_s"][first])
         if duration_s < SHORTEST_REST_S:
@@ -213,18 +240,7 @@ def relaxation_test(
             )
             continue
         rests.append(rest)
-    _check_rests(name, good, rests, rejected, resting)
-    return RelaxationTest(
-        name=name,
-        rests=tuple(rests),
-        rejected=tuple(rejected),
-        glitches=samples.size - good.size,
-        start_soc=initial_soc,
-        end_soc=float(soc[-1]),
-        mean_load_a=float(good["current_a"][~resting].mean()),
-        empty_v=_empty_v(good, soc, resting, rests),
-        full_v=float(good["voltage_v"][0]) if resting[0] and initial_soc > NEAR_FULL else float("nan"),
-    )
+    return rests, rejected
 
 
 def _empty_v(good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], rests: list[Rest]) -> float:

@@ -1,0 +1,261 @@
+"""Capacity from anchors: SOC by the open-circuit voltage of rests, and the charge counted between them.
+
+    z_k = z_c - Ah_k / Q + (offset / Q) t_k
+
+for anchor k of the continuous part c of a capture, linear in 1/Q, offset/Q and each part's z_c. All anchors are solved
+jointly by generalised least squares (Plett 2011 weighs both axes; here charge has the offset as an unknown of known size).
+Errors of the curve go together for anchors at SOCs near each other: a capacity between two of the same SOC has none of it.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.capture_checks import GAP_CHARGE, GAP_STEPS
+from bms_estimator.calibration.ocv_points import COLD_V, LONG_REST_S, RELAXED_V, coldness
+from bms_estimator.calibration.relaxation import Rest, find_rests, resting_samples, runs, without_glitches
+from bms_estimator.estimator.filter_settings import filter_settings
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels.cell import ocv, soc_from_ocv
+from bms_estimator.kernels.ladder import REFERENCE_C, on_grid
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import IdentifierSettings
+
+Floats = NDArray[np.float64]
+
+LARGEST_STD = 0.1
+"""An anchor whose SOC is less certain is none."""
+LEAST_SWING = 0.15
+"""SOC between the lowest and the highest anchor that a capacity needs."""
+LARGEST_RELATIVE_STD = 0.2
+"""A capacity less certain than that is none."""
+HYST_LEFT = 0.3
+"""Part of the hysteresis that is not known even when the way is."""
+FAR = 20.0
+"""Charge further back, in those that the hysteresis forgets within, does not count."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A rest that tells the SOC.
+
+    Attributes:
+        capture: Where it is.
+        part: Number of the continuous part, over all captures.
+        time_s: Of its end, on the capture's clock [s].
+        rest: As it was found.
+        soc: By its voltage.
+        soc_std: Of that, errors of the curve included.
+        counted_ah: Drawn since the part began [Ah].
+        moved_ah: Magnitude of the charge moved since then [Ah].
+        slope_v: Of the curve there [V].
+        own_v: Standard deviation of its voltage that is its own [V].
+        curve_v: Of the curve there [V].
+    """
+
+    capture: str
+    part: int
+    time_s: float
+    rest: Rest
+    soc: float
+    soc_std: float
+    counted_ah: float
+    moved_ah: float
+    slope_v: float
+    own_v: float
+    curve_v: float
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """What was measured.
+
+    Attributes:
+        capacity_ah: [Ah].
+        std_ah: Its standard deviation [Ah].
+        offset_a: Offset of the current sensor, as far as the anchors tell [A].
+        offset_std_a: Of that [A].
+        anchors: Used.
+        residual: Of each anchor, SOC by its voltage less that by the charge.
+        rejected: Why other rests were not, one line each.
+    """
+
+    capacity_ah: float
+    std_ah: float
+    offset_a: float
+    offset_std_a: float
+    anchors: tuple[Anchor, ...]
+    residual: tuple[float, ...]
+    rejected: tuple[str, ...]
+
+
+def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std_a: float | None = None) -> Capacity:
+    """Capacity from the anchors of one or more captures of a cell.
+
+    Args:
+        captures: Of the same cell, within weeks.
+        cell: Its open-circuit voltage counts, with its error; its capacity for what is small only.
+        offset_std_a: Standard deviation of the offset of the current sensor [A]; None: as the identifier takes it.
+
+    Raises:
+        UserError: No two anchors that are apart; why is said for each rest.
+    """
+    p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(current_offset_std_a=offset_std_a), 1e-3, None)[0]
+    anchors: list[Anchor] = []
+    rejected: list[str] = []
+    parts = 0
+    for capture in captures:
+        good = without_glitches(capture.rows, capture.name)
+        for first, last in continuous(good, cell.cell.capacity_ah):
+            of_part(capture.name, parts, good[first:last], p, anchors, rejected)
+            parts += 1
+    alone = {a.part for a in anchors if sum(b.part == a.part for b in anchors) == 1}
+    rejected += [f"{_where(a)}: no other anchor without a gap between" for a in anchors if a.part in alone]
+    used = [a for a in anchors if a.part not in alone]
+    _check_swing(used, rejected)
+    return _solved(used, rejected, p)
+
+
+def continuous(good: SampleBlock, capacity_ah: float) -> list[tuple[int, int]]:
+    """Parts of a capture without a gap over which the charge is unknown, each as first and one past its last index."""
+    step_s = np.diff(good["time_s"])
+    charge_ah = np.abs(good["current_a"][:-1]) * step_s / 3600.0
+    gap = np.r_[(step_s > GAP_STEPS * np.median(step_s)) & (charge_ah > GAP_CHARGE * capacity_ah), True]
+    edges = np.r_[0, np.flatnonzero(gap) + 1]
+    return [(int(a), int(b)) for a, b in itertools.pairwise(edges) if b - a > 1]
+
+
+def of_part(name: str, part: int, good: SampleBlock, p: np.void, anchors: list[Anchor], rejected: list[str]) -> None:
+    """The anchors of a continuous part, and why its other rests are none, into the lists."""
+    capacity_ah, series = p["capacity_as"] / 3600.0, int(p["series"])
+    step_ah = good["current_a"][:-1] * np.diff(good["time_s"]) / 3600.0
+    counted_ah, moved_ah = np.r_[0.0, np.cumsum(step_ah)], np.r_[0.0, np.cumsum(np.abs(step_ah))]
+    resting = resting_samples(good, capacity_ah)
+    rests, why_not = find_rests(good, -counted_ah / capacity_ah, resting, series)
+    rejected += [f"{name}: {line}" for line in why_not]
+    ends = {float(good["time_s"][first]): last - 1 for first, last in runs(resting)}
+    for rest in rests:
+        end = ends[rest.start_s]
+        hyst, hyst_std = _hysteresis(moved_ah[: end + 1] / capacity_ah, step_ah[:end], float(p["hysteresis_soc"]))
+        anchor = _anchor(name, part, rest, p, (hyst, hyst_std), (float(counted_ah[end]), float(moved_ah[end])))
+        if anchor.soc_std > LARGEST_STD:
+            rejected.append(
+                f"{_where(anchor)}: {rest.ocv_v:.4f} V tells SOC to {anchor.soc_std:.2f} only, the curve rises by "
+                f"{anchor.slope_v:.3f} V there and is wrong by {1e3 * anchor.curve_v:.0f} mV"
+            )
+        else:
+            anchors.append(anchor)
+
+
+def _hysteresis(moved: Floats, step_ah: Floats, length: float) -> tuple[float, float]:
+    """Hysteresis -1..1 after the charge moved, as the filter has it, and its standard deviation."""
+    back = (moved - moved[-1]) / length
+    near = back > -FAR
+    decay = np.exp(back[near])
+    steps = np.diff(decay) * -np.sign(step_ah[near[1:] & near[:-1]])
+    return float(steps.sum()), float(np.hypot(HYST_LEFT, 0.7 * decay[0]) if near.all() else HYST_LEFT)
+
+
+def _anchor(
+    name: str, part: int, rest: Rest, p: np.void, hysteresis: tuple[float, float], charge_ah: tuple[float, float]
+) -> Anchor:
+    hyst, hyst_std = hysteresis
+    series, curve = p["series"], (p["ocv_v"], p["ocv_slope_v"])
+    warmer = float(np.nan_to_num(rest.temperature_c, nan=REFERENCE_C)) - REFERENCE_C
+    soc = soc_from_ocv(rest.ocv_v, *curve)
+    for _ in range(3):  # hysteresis and entropy hardly change with SOC
+        beside_v = hyst * on_grid(soc, p["hysteresis_v"]) + warmer * on_grid(soc, p["per_kelvin_v"])
+        soc = soc_from_ocv(rest.ocv_v - beside_v, *curve)
+    cold_v = COLD_V * float(coldness(np.array([rest.temperature_c]))[0]) * min(1.0, LONG_REST_S / rest.duration_s)
+    own_v = np.sqrt(
+        rest.std_v**2 + (series * (RELAXED_V + cold_v)) ** 2 + (hyst_std * on_grid(soc, p["hysteresis_v"])) ** 2
+    )
+    curve_v = on_grid(soc, p["curve_error_v"])
+    reach = 0.02
+    slope_v = (ocv(soc + reach, *curve) - ocv(soc - reach, *curve)) / (2.0 * reach)
+    return Anchor(
+        capture=name,
+        part=part,
+        time_s=rest.start_s + rest.duration_s,
+        rest=rest,
+        soc=soc,
+        soc_std=float(np.hypot(own_v, curve_v) / slope_v),
+        counted_ah=charge_ah[0],
+        moved_ah=charge_ah[1],
+        slope_v=float(slope_v),
+        own_v=float(own_v),
+        curve_v=float(curve_v),
+    )
+
+
+def _check_swing(anchors: Sequence[Anchor], rejected: Sequence[str]) -> None:
+    reasons = "".join(f"\n  {line}" for line in rejected[:8])
+    if not anchors:
+        raise UserError(
+            "no capacity: no two rests tell the SOC with the charge between them counted; rest the cell for half an hour "
+            f"near full and again near empty, or give a whole slow discharge to `ocv`{':' if reasons else ''}{reasons}"
+        )
+    swing = max(np.ptp([a.soc for a in anchors if a.part == part]) for part in {a.part for a in anchors})
+    if swing < LEAST_SWING:
+        raise UserError(
+            f"no capacity: the anchors of a capture are at most {swing:.2f} of SOC apart, at least {LEAST_SWING} are "
+            f"needed: rest again after more charge{':' if reasons else ''}{reasons}"
+        )
+
+
+def _solved(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> Capacity:
+    """Generalised least squares for 1/Q, offset/Q and each part's first SOC."""
+    capacity_ah = float(p["capacity_as"]) / 3600.0
+    parts = sorted({a.part for a in anchors})
+    z, counted_ah = (np.array([getattr(a, name) for a in anchors]) for name in ("soc", "counted_ah"))
+    hours = np.array([a.time_s for a in anchors]) / 3600.0
+    of_parts = np.array([[float(a.part == part) for part in parts] for a in anchors])
+    rows = np.column_stack([-counted_ah, hours, of_parts])
+    precision = np.linalg.inv(_covariance(anchors, p))
+    prior = np.zeros((rows.shape[1], rows.shape[1]))
+    offset_a = float(p["offset_c"]) * capacity_ah
+    prior[1, 1] = (capacity_ah / max(offset_a, 1e-9)) ** 2
+    covariance = np.linalg.inv(rows.T @ precision @ rows + prior)
+    x = covariance @ rows.T @ precision @ z
+    left = z - rows @ x
+    freedom = len(anchors) - len(parts) - 1
+    worse = float(left @ precision @ left) / freedom if freedom > 0 else 1.0
+    covariance *= max(1.0, worse)
+    relative = float(np.sqrt(covariance[0, 0]) / abs(x[0]))
+    if x[0] <= 0.0 or relative > LARGEST_RELATIVE_STD:
+        raise UserError(
+            f"no capacity: {len(anchors)} anchors tell it to {100.0 * relative:.0f} % only: longer rests, further apart, "
+            "or a cell file whose curve is better known"
+        )
+    q = 1.0 / float(x[0])
+    return Capacity(
+        capacity_ah=q,
+        std_ah=relative * q,
+        offset_a=float(x[1]) * q,
+        offset_std_a=float(np.sqrt(covariance[1, 1])) * q,
+        anchors=tuple(anchors),
+        residual=tuple(map(float, left)),
+        rejected=tuple(rejected),
+    )
+
+
+def _covariance(anchors: Sequence[Anchor], p: np.void) -> Floats:
+    """Of the anchors' SOCs: what each voltage errs by itself, what the curve errs, what counting between them does."""
+    z, slope_v, own_v, curve_v, moved, part = (
+        np.array([getattr(a, name) for a in anchors])
+        for name in ("soc", "slope_v", "own_v", "curve_v", "moved_ah", "part")
+    )
+    alike = np.exp(-np.abs(z[:, None] - z) / p["curve_length"])
+    voltage = (np.diag(own_v**2) + alike * np.outer(curve_v, curve_v)) / np.outer(slope_v, slope_v)
+    counting = p["charge_error"] ** 2 * np.minimum.outer(moved, moved) * 3600.0 / p["capacity_as"]
+    return np.asarray(voltage + np.where(part[:, None] == part, counting, 0.0))
+
+
+def _where(anchor: Anchor) -> str:
+    return f"{anchor.capture}: rest until {anchor.time_s:.0f} s"

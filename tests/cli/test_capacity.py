@@ -1,0 +1,68 @@
+import json
+
+import numpy as np
+import pytest
+
+from tests.calibration.simulated_load import TRUTH
+from tests.calibration.simulated_relaxation import relaxation
+from tests.command_line import run
+
+CAPACITY_AH = TRUTH.cell.capacity_ah
+
+
+def save(path, samples):
+    rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
+    np.savetxt(path, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
+    return path
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return save(tmp_path / "rests.csv", relaxation())
+
+
+def test_the_capacity_of_a_capture_as_json(capsys, capture):
+    code, text, err = run(capsys, "capacity", capture, "--cell", "ncr18650", "--capacity-ah", "2.5", "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(text)
+    assert found["declared_ah"] == 2.5
+    assert abs(found["capacity_ah"] - CAPACITY_AH) < 2.0 * found["capacity_std_ah"]
+    assert found["capacity_std_ah"] < 0.1 * CAPACITY_AH
+    assert len(found["anchors"]) >= 15
+    assert {one["capture"] for one in found["anchors"]} == {"rests.csv"}
+    off = np.array([[one["off"], one["soc_std"]] for one in found["anchors"]])
+    assert (np.abs(off[:, 0]) < 3.0 * off[:, 1]).all()
+
+
+def test_a_known_sensor_makes_it_more_certain(capsys, capture):
+    stds = []
+    for offset in ("0.02", "0.0"):
+        arguments = ("capacity", capture, "--cell", "ncr18650", "--current-offset-std-a", offset, "--json")
+        stds.append(json.loads(run(capsys, *arguments)[1])["capacity_std_ah"])
+    assert stds[1] < 0.7 * stds[0]
+
+
+def test_people_see_the_anchors_and_the_capacity(capsys, capture):
+    code, text, _ = run(capsys, "capacity", capture, "--cell", "ncr18650")
+    assert code == 0
+    assert "15 min" in text
+    assert "Ah, declared 3 Ah" in text
+
+
+def test_a_real_cell_holds_what_a_slow_discharge_gave(capsys, shared_data):
+    """C/20 gave 2.99 Ah of cell 1."""
+    capture = shared_data / "ncr18650" / "cell1_hppc.csv.gz"
+    arguments = ("capacity", capture, "--cell", "ncr18650", "--current-offset-std-a", "0.002", "--json")
+    found = json.loads(run(capsys, *arguments)[1])
+    assert abs(found["capacity_ah"] - 2.99) < 2.0 * found["capacity_std_ah"]
+    assert found["capacity_std_ah"] < 0.15
+
+
+def test_no_rests_are_refused_with_what_to_do(tmp_path, capsys):
+    samples = relaxation()
+    samples["current_a"] += 0.5
+    capture = save(tmp_path / "loaded.csv", samples)
+    code, text, err = run(capsys, "capacity", capture, "--cell", "ncr18650")
+    assert (code, text) == (2, "")
+    assert "error: no capacity: no two rests tell the SOC" in err
+    assert "rest the cell for half an hour" in err
