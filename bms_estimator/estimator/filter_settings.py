@@ -15,6 +15,9 @@ CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
 """Where the cell file does not say how wrong its OCV is: std of one cell [V], and std along SOC."""
 STEEPEST_V = 3.0
 """Where the OCV of a cell is steeper, near full and empty, its end is better known than its SOC elsewhere [V]."""
+LEARNED, LEARNED_SLOPE_V = 0.97, 0.15
+"""Part of the variance of the OCV that is learned for good, where its slope is at least so much everywhere [V]: on a
+plateau a voltage does not tell the error of the curve from the SOC, nor do the knees stay where they are."""
 COUNT_ERROR_SOC = 0.003
 """However well the curve is known: how full the cell was that it was measured on, std."""
 BEYOND_BRANCHES = 0.2
@@ -101,6 +104,7 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
                 p["curve_error_v" if name == "error_v" else name] = np.interp(SOC_GRID, ocv.soc, column)
         if ocv.error_v is not None:
             p["curve_error_v"] = np.hypot(p["curve_error_v"], COUNT_ERROR_SOC * slope_v)
+    p["learned"] = LEARNED if slope_v.min() >= LEARNED_SLOPE_V * series else 0.0
     if hysteresis_v is not None:
         p["hysteresis_v"] = 0.5 * hysteresis_v * series
         if not midway:  # the curve is that after discharge

@@ -1,14 +1,27 @@
 """What the filter has learned, read from the estimator's records."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bms_estimator.kernels.ekf_state import LN_Q, OFFSET
+from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.kernels.cell import emf
+from bms_estimator.kernels.ekf_state import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
 from bms_estimator.kernels.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS
 from bms_estimator.kernels.identification import LEAST_BINS
+from bms_estimator.kernels.ladder import on_grid
+from bms_estimator.kernels.ocv_learning import per_node_v, place
+from bms_estimator.model.cell import CellModel, TableOcv
+
+WIDEST_CAPACITY_STD = 0.3
+"""What a cell file may say."""
+EVEN = tuple(np.round(np.linspace(0.0, 1.0, 101), 2).tolist())
+"""SOCs of a table that comes from (2.10)."""
+LEAST_RISE_V = 1e-6
+"""An OCV increases, from one SOC of its table to the next by so much at least [V]."""
 
 
 class Learned(NamedTuple):
@@ -67,3 +80,68 @@ def _bias(record: np.void, j: int) -> tuple[float, float]:
     f = record["filter"]
     best = f["best"]
     return float(f["mean"][best, j]), math.sqrt(f["covariance"][best, j, j])
+
+
+def learned_ocv(
+    record: np.void, settings: np.void, soc: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What the true OCV is above that of the cell file, of the likeliest hypothesis, and how sure that is.
+
+    Args:
+        record: Of dtype ESTIMATOR_STATE.
+        settings: Of dtype ESTIMATOR_SETTINGS.
+        soc: Shape (n,), 0..1.
+
+    Returns:
+        Two arrays of shape (n,) [V]: the correction, and the standard deviation of the corrected curve.
+    """
+    f, p = record["filter"], settings["filter"]
+    mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]][NODE:, NODE:]
+    correction_v, std_v = np.zeros(soc.size), np.zeros(soc.size)
+    for n, x in enumerate(soc):
+        i, t = place(x)
+        row = np.zeros(NODES)
+        row[i : i + 2] = per_node_v(p, x, t) * np.array([1.0 - t, t])
+        own_v2 = (1.0 - p["learned"]) * on_grid(x, p["curve_error_v"]) ** 2
+        correction_v[n], std_v[n] = row @ mean[NODE:], math.sqrt(row @ covariance @ row + own_v2)
+    return correction_v, std_v
+
+
+def learned_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
+    """A cell file's values with what the filter has learned: OCV, capacity, resistances, each with its error.
+
+    Args:
+        estimator: Of a pack of that cell, after samples, identifying.
+        cell: As its file has it, before ``CellModel.pack``.
+        series: Of them in the pack.
+    """
+    record, settings = estimator.record[0], estimator.settings_record[0]
+    capacity = relative_capacity(record)
+    (ln_r0, r0_std), (ln_r, r_std) = _bias(record, LN_R0), _bias(record, LN_R)
+    ohm, branch_ohm = math.exp(ln_r0), math.exp(ln_r)
+    values = cell.model_dump()
+    values["cell"]["capacity_ah"] *= capacity.value
+    values["cell"]["capacity_std"] = min(capacity.relative_std, WIDEST_CAPACITY_STD)
+    for name, factor in (("r_s", ohm), ("r_ts", branch_ohm), ("r_tl", branch_ohm)):
+        values[name] |= {key: factor * values[name][key] for key in ("amplitude_ohm", "offset_ohm")}
+    for name in ("c_ts", "c_tl"):  # the time constants stay
+        values[name] |= {key: values[name][key] / branch_ohm for key in ("amplitude_farad", "offset_farad")}
+    if cell.ladder is not None:
+        factors = [ohm, *(len(cell.ladder.weak_ohm) - 1) * [branch_ohm]]
+        for name in ("weak_ohm", "strong_ohm"):
+            rows = zip(factors, values["ladder"][name], strict=True)
+            values["ladder"][name] = [[factor * r for r in row] for factor, row in rows]
+        values["ladder"]["std"] = max(r0_std, r_std)
+    if settings["filter"]["learned"] > 0.0:
+        values["ocv"] = _corrected(record, settings, cell, series)
+    return CellModel.model_validate(values)
+
+
+def _corrected(record: np.void, settings: np.void, cell: CellModel, series: int) -> dict[str, Any]:
+    """The OCV of a cell as a table, corrected, other columns as they are."""
+    table = cell.ocv.model_dump() if isinstance(cell.ocv, TableOcv) else {"form": "table", "soc": EVEN}
+    soc = np.array(table["soc"])
+    correction_v, std_v = learned_ocv(record, settings, soc)
+    ocv_v = np.array(table["ocv_v"]) if "ocv_v" in table else np.array([emf(x, cell.a) for x in soc])
+    rising_v = np.maximum.accumulate(ocv_v + correction_v / series) + LEAST_RISE_V * np.arange(soc.size)
+    return table | {"ocv_v": rising_v.tolist(), "error_v": (std_v / series).tolist()}

@@ -17,12 +17,14 @@ from bms_estimator.kernels.ekf_state import (
     LN_Q,
     LN_R,
     LN_R0,
+    NODE,
     OFFSET,
     SOC,
     STATES,
     X,
 )
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, TAUS, on_grid, resistances
+from bms_estimator.kernels.ocv_learning import learned_v, per_node_v, place
 from bms_estimator.kernels.state import Record
 
 NARROWEST, WIDEST = 0.02, 0.3
@@ -65,7 +67,7 @@ def predict(s: Record, p: Record, q: int) -> None:
     bias_v2 = bias_variance(s, p, x[SOC])
     capacity_as = p.capacity_as * math.exp(x[LN_Q])
     moved = (w.charge_as - x[OFFSET] * w.time_s) / capacity_as
-    for j in range(STATES):
+    for j in range(NODE):  # of the nodes it is 1
         x[j] *= f[j]
         for k in range(j, STATES):
             cov[j, k] = cov[k, j] = cov[j, k] * f[j] * f[k]
@@ -108,11 +110,13 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
     innovation_v = s.window.sum_v / s.window.samples - predicted_v
     total_v2 = variance_v2 + curved_v * curved_v
     for j in range(STATES):
-        along = 0.0
-        for k in range(STATES):
-            along += cov[j, k] * h[k]
-        ph[j] = along
-        total_v2 += h[j] * along
+        ph[j] = 0.0
+    for k in range(STATES):
+        if h[k] != 0.0:  # of the nodes two
+            for j in range(STATES):
+                ph[j] += cov[k, j] * h[k]
+    for j in range(STATES):
+        total_v2 += h[j] * ph[j]
     total_v2 = max(total_v2, (innovation_v / HUBER) ** 2)
     for j in range(STATES):
         gain = ph[j] / total_v2
@@ -131,8 +135,8 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
 def linearise(s: Record, p: Record, q: int) -> tuple[float, float]:
     """Predicted mean voltage of the window [V], H into ``s.h``, and what the secant of the OCV leaves out [V].
 
-    v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. How the resistances
-    change with SOC is no part of H: it would take an error of the resistance for one of the SOC.
+    v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. How the resistances,
+    and what was learned of the OCV, change with SOC is no part of H: it would take an error of theirs for one of the SOC.
     """
     x, h, ohm, w = s.mean[q], s.h, s.ohm, s.window
     soc = x[SOC] + (w.charge_as - w.sum_as / w.samples) / p.capacity_as  # in the middle of the samples
@@ -154,9 +158,12 @@ def linearise(s: Record, p: Record, q: int) -> tuple[float, float]:
         h[LN_R] += h[X + k] * (w.sum_x_a[k] / w.samples + x[X + k])
     h[OFFSET] = first * ohm[0]
     h[B_SLOW] = h[B_FAST] = 1.0
-    h[HYST], h[CURVE] = on_grid(soc, p.hysteresis_v), on_grid(soc, p.curve_error_v)
+    h[HYST], h[CURVE] = on_grid(soc, p.hysteresis_v), math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v)
+    i, t = place(soc)
+    node_v = per_node_v(p, soc, t)
+    h[NODE + i], h[NODE + i + 1] = (1.0 - t) * node_v, t * node_v
     voltage_v = e_o + h[HYST] * x[HYST] + h[CURVE] * x[CURVE] + h[LN_R0] + h[LN_R] + x[B_SLOW] + x[B_FAST]
-    voltage_v += (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
+    voltage_v += learned_v(p, x, soc) + (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
     return voltage_v, 0.5 * (above + below - 2.0 * e_o) * min(variance / (reach * reach), 1.0)
 
 

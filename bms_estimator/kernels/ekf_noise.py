@@ -13,6 +13,8 @@ from bms_estimator.kernels.ekf_state import (
     HYST,
     LN_R,
     LN_R0,
+    NODE,
+    NODES,
     SOC,
     X,
 )
@@ -25,6 +27,8 @@ INDEPENDENT_S = 30.0
 """A sample after a longer pause tells no more [s]."""
 UNSENSED_R_STD = 0.25
 """Std of ln of the resistances where nobody measures the temperature: 10 K either way."""
+AGED_SOC = 400.0
+"""Charge over which the curve of a cell becomes another with age: 200 full cycles [SOC]."""
 OUTSIDE_K = 10.0
 """So far outside the temperatures of the cell file, errors are twice as large [K]."""
 
@@ -93,6 +97,8 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
         cov[j, j] += resistance_std(s, p) ** 2 * (1.0 - f[j] * f[j])
     cov[HYST, HYST] += 0.1 * (1.0 - f[HYST] ** 2)
     cov[CURVE, CURVE] += 1.0 - f[CURVE] ** 2
+    for j in range(NODE, NODE + NODES):
+        cov[j, j] += moved / AGED_SOC
 
 
 @njit(cache=True)

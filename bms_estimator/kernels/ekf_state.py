@@ -12,7 +12,8 @@ The state vector, in this order (also of the rows and columns of the covariance)
  11   OFFSET     measured less true current [A]
  12   LN_Q       ln(true / declared capacity); a wrong gain of the current sensor looks the same
  13   HYST       hysteresis h, -1 after discharge, 1 after charge
- 14   CURVE      error of the OCV curve at this SOC, in units of its standard deviation
+ 14   CURVE      error of the OCV at this SOC, here and now, in units of its standard deviation
+15-   NODE       error of the OCV curve at ``NODES`` SOCs from 0 to 1, in the same units: learned (``ocv_learning``)
 ====  =========  ==============================================================================================
 
 Several such filters run side by side from different SOCs until they agree (``hypotheses``).
@@ -27,7 +28,8 @@ from bms_estimator.kernels.ladder import BRANCHES, GRID, RESISTANCES
 
 SOC, X = 0, 1
 LN_R0, LN_R, B_SLOW, B_FAST, OFFSET, LN_Q, HYST, CURVE = range(X + BRANCHES, X + BRANCHES + 8)
-STATES = CURVE + 1
+NODE, NODES = CURVE + 1, 21
+STATES = NODE + NODES
 HYPOTHESES = 7
 
 
@@ -87,6 +89,7 @@ EKF_SETTINGS = np.dtype(
         ("ocv_v", "f8", OCV_POINTS),  # E_o over SOC 0..1 at 25 C [V]
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
         ("curve_error_v", "f8", GRID),  # std of E_o [V]
+        ("learned", "f8"),  # part of its variance that is of the curve, the same each time: ``ocv_learning``
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
         ("hysteresis_v", "f8", GRID),  # half of what E_o is higher after charge than after discharge [V]
         ("weak_ohm", "f8", (GRID, RESISTANCES)),  # at 25 C, activation energy WEAK_J [ohm]

@@ -14,6 +14,7 @@ from numba import njit
 from bms_estimator.kernels.ekf_noise import resistance_std
 from bms_estimator.kernels.ekf_state import HYST, LN_R, LN_R0, OFFSET, SOC, X
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, RESISTANCES, TAU_S, TAUS, on_grid, resistances
+from bms_estimator.kernels.ocv_learning import learned_v
 from bms_estimator.kernels.state import Record
 
 R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
@@ -109,5 +110,5 @@ def open_circuit(f: Record, p: Record, e: Record, current_a: float, voltage_v: f
     e_o = voltage_v + e.ohm[0] * (current_a - x[OFFSET])
     for k in range(BRANCHES):
         e_o += e.ohm[1 + k] * (f.x_a[k] + x[X + k])
-    e_o -= on_grid(x[SOC], p.hysteresis_v) * x[HYST]
+    e_o -= on_grid(x[SOC], p.hysteresis_v) * x[HYST] + learned_v(p, x, x[SOC])
     return e_o - (f.temperature_c - REFERENCE_C) * on_grid(x[SOC], p.per_kelvin_v)

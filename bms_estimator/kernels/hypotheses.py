@@ -30,6 +30,7 @@ from bms_estimator.kernels.ekf_state import (
     X,
 )
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius
+from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.state import Record
 
 WINDOW_S = 0.99
@@ -82,6 +83,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     s.step.variance = resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = (p.offset_c * p.capacity_as / 3600.0) ** 2
     cov[LN_Q, LN_Q] = p.capacity_std**2
+    forget_curve(x, cov)
     seed(s, p, soc, p.soc_std)
     clear(s)
 
@@ -224,6 +226,7 @@ def reopen(s: Record, p: Record) -> None:
         return
     bias_v = s.mean[0, B_SLOW] + s.mean[0, B_FAST]
     if bias_v * bias_v > REOPEN_STDS**2 * bias_variance(s, p, s.mean[0, SOC]):
+        forget_curve(s.mean[0], s.covariance[0])
         seed(s, p, s.mean[0, SOC], REOPEN_STD)
         s.reopened += 1
 

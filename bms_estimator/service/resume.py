@@ -17,6 +17,8 @@ from bms_estimator.service.checkpoint import fields
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
 OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
+GROWING = ("filter.mean", "filter.covariance", "checks.good_mean", "checks.good_covariance")
+"""Fields along the states of the filter; states that a version adds come last."""
 SAME_SOC = 0.03
 """Where the SOC of the filter is further from the observer's, it was switched off."""
 
@@ -24,8 +26,8 @@ SAME_SOC = 0.03
 def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
     """Go on from a checkpoint's state, saved ``unseen_s`` ago, on the board's new clock. The counters count from this start.
 
-    A field that the checkpoint does not have, or has in another shape, is what a first sample makes it; one that only the
-    checkpoint has is left.
+    A field that the checkpoint does not have, or has in another shape, is what a first sample makes it, and so are states
+    that the filter has more; a field that only the checkpoint has is left.
 
     Args:
         estimator: A new one; as it was when the state cannot be used.
@@ -57,8 +59,12 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
 def _fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
     for name, field in fields(record):
         known = saved.get(name)
-        if known is not None and known.shape == field.shape:
+        if known is None or known.ndim != field.ndim:
+            continue
+        if known.shape == field.shape:
             field[...] = known
+        elif name in GROWING and all(a <= b for a, b in zip(known.shape, field.shape, strict=True)):
+            field[tuple(map(slice, known.shape))] = known
 
 
 def _open_new_states(estimator: Estimator) -> None:
