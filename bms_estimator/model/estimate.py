@@ -63,12 +63,21 @@ class Parameter(Report):
     reason: str | None = Field(default=None, description="why not valid, with the numbers")
 
 
+class OcvCurve(Report):
+    """The open-circuit voltage at 25 C over SOC, as it is used now."""
+
+    soc: list[float] = Field(description="0, 0.05 ... 1")
+    ocv_v: list[float] = Field(description="of the pack [V]: of the cell file, and what was learned on top of it")
+    std_v: list[float] = Field(description="standard deviation of ocv_v [V]")
+
+
 class ParameterReport(Report):
     """Topic ``parameters``: a1..a21 and the elements at the present SOC."""
 
     publish_time: str = Field(description="when this message was made, ISO 8601, UTC")
     soc: float | None = Field(description="state of charge the elements belong to, 0..1")
     a: dict[str, Parameter] = Field(description="a1..a21 of (2.5)-(2.10)")
+    ocv: OcvCurve | None = Field(description="null before the first sample, and without the identifier")
     elements: dict[str, Parameter] = Field(description="r_s_ohm, r_ts_ohm, c_ts_farad, r_tl_ohm, c_tl_farad, e_o_v")
     state_of_health: dict[str, Parameter] = Field(
         description="capacity and r_s over those of the cell file: 1 is as new; r_s at the present SOC; "

@@ -9,16 +9,19 @@ from bms_estimator.estimator.learned import (
     Learned,
     current_offset,
     fitted_parameter,
+    learned_ocv,
     present_elements,
     relative_capacity,
 )
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Parameter, ParameterReport
+from bms_estimator.model.estimate import OcvCurve, Parameter, ParameterReport
 from bms_estimator.snapshot.ocv_formula import formula
 from bms_estimator.snapshot.topics import finite
 
+OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
+"""Where the OCV is published."""
 CONFIGURED = "configured value: no data has identified it"
 VALID_STD = 0.3
 """An element known better than this, relative, is identified."""
@@ -48,7 +51,12 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
     a, state = estimator.cell.a.copy(), estimator.state[0]
     if not state["started"]:
         return ParameterReport(
-            publish_time=iso_utc(now_s), soc=None, a=_of_cell_file(estimator.cell, a), elements={}, state_of_health={}
+            publish_time=iso_utc(now_s),
+            soc=None,
+            a=_of_cell_file(estimator.cell, a),
+            ocv=None,
+            elements={},
+            state_of_health={},
         )
     a[1:16] = state["a"][1:16]
     parameters, elements = _of_cell_file(estimator.cell, a), _elements_of(estimator, a)
@@ -65,7 +73,12 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
             elements[name] = _identified(one, held, VALID_STD, now_s)
         health = _state_of_health(estimator, present["r_s_ohm"], now_s)
     return ParameterReport(
-        publish_time=iso_utc(now_s), soc=finite(state["soc"]), a=parameters, elements=elements, state_of_health=health
+        publish_time=iso_utc(now_s),
+        soc=finite(state["soc"]),
+        a=parameters,
+        ocv=_ocv(estimator) if estimator.identifying else None,
+        elements=elements,
+        state_of_health=health,
     )
 
 
@@ -78,6 +91,15 @@ def _of_cell_file(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:
     for i, (value, std) in enumerate(zip(fit.a, fit.std, strict=True), start=16):
         parameters[f"a{i}"] = Parameter(value=value, std=finite(std), valid=False, source="configured", reason=reason)
     return parameters
+
+
+def _ocv(estimator: Estimator) -> OcvCurve:
+    """The filter's curve with its error: the cell file's, and what was learned on top."""
+    record, settings = estimator.record[0], estimator.settings_record[0]
+    p = settings["filter"]
+    correction_v, std_v = learned_ocv(record, settings, OCV_SOC)
+    given_v = np.array([chen_mora.ocv(soc, p["ocv_v"], p["ocv_slope_v"]) for soc in OCV_SOC])
+    return OcvCurve(soc=OCV_SOC.tolist(), ocv_v=(given_v + correction_v).tolist(), std_v=std_v.tolist())
 
 
 def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:

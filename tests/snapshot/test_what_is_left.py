@@ -122,6 +122,25 @@ def test_nothing_is_identified_before_a_load_has_told_of_it() -> None:
     assert {p.valid for p in report.state_of_health.values()} == {False}
 
 
+def test_the_curve_is_published_with_what_was_learned() -> None:
+    """Generic cells of another make: from rest at SOC 0.9 the true curve's 20 mV are found, and said to be known there."""
+    estimator = Estimator(load_cell("nmc", 3.0), initial_soc=0.9, identifier=IdentifierSettings(soc_std=0.005))
+    p = estimator.settings_record[0]["filter"]
+    truth_v = chen_mora.ocv(0.9, p["ocv_v"], p["ocv_slope_v"]) + 0.020
+    estimator.step(0.0, 0.0, truth_v)
+    first = parameter_report(estimator, NOW_S).ocv
+    for i in range(1, 3600):
+        estimator.step(float(i), 0.0, truth_v)
+    curve = parameter_report(estimator, NOW_S).ocv
+    assert first is not None
+    assert curve is not None
+    at, far = curve.soc.index(0.9), curve.soc.index(0.2)
+    assert abs(curve.ocv_v[at] - truth_v) < 0.3 * 0.020
+    assert curve.std_v[at] < 0.5 * float(np.interp(0.9, np.linspace(0.0, 1.0, 41), p["curve_error_v"]))
+    assert curve.std_v[far] > 0.8 * float(np.interp(0.2, np.linspace(0.0, 1.0, 41), p["curve_error_v"]))
+    assert abs(curve.ocv_v[far] - chen_mora.ocv(0.2, p["ocv_v"], p["ocv_slope_v"])) < curve.std_v[far]
+
+
 @pytest.mark.parametrize("name", ["ncr18650", "nmc", "lfp"])
 def test_a_table_has_its_formula_too(name: str) -> None:
     """Packs and single cells: the same curve, as near as (2.10) can come to it."""
