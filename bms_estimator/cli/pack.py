@@ -24,6 +24,11 @@ def load_pack(path: Path) -> tuple[Settings, CellModel]:
     return settings, _model(settings, _found(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
+def unpacked_cell(path: Path, settings: Settings) -> CellModel:
+    """The cell of a pack file as ``load_pack`` finds it, one of those that the pack is made of."""
+    return load_cell(_found(path, settings.pack.cell), settings.pack.capacity_ah)
+
+
 def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None) -> tuple[Settings, CellModel]:
     """The settings of ``pack``; ``cell`` and ``capacity_ah`` [Ah] in place of its own where they are given.
 
