@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET
+from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.hypotheses import forget
-from bms_estimator.kernels.input_checks import COUNTERS
+from bms_estimator.kernels.input_checks import COUNTERS, keep
+from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.service.checkpoint import fields
 
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
 OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
-GROWING = ("filter.mean", "filter.covariance", "checks.good_mean", "checks.good_covariance")
+GROWING = ("filter.mean", "filter.covariance")
 """Fields along the states of the filter; states that a version adds come last."""
 SAME_SOC = 0.03
 """Where the SOC of the filter is further from the observer's, it was switched off."""
@@ -47,6 +48,8 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
         return wrong
     if not was_on or abs(estimator.record["filter"]["soc"][0] - estimator.state["soc"][0]) > SAME_SOC:
         unseen_s = math.inf
+    if was_on and saved["filter.mean"].shape[-1] < STATES:
+        _open_curve(estimator)
     _open_new_states(estimator)
     estimator.resume(unseen_s)
     for name in OBSERVER_COUNTERS:
@@ -65,6 +68,14 @@ def _fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
             field[...] = known
         elif name in GROWING and all(a <= b for a, b in zip(known.shape, field.shape, strict=True)):
             field[tuple(map(slice, known.shape))] = known
+
+
+def _open_curve(estimator: Estimator) -> None:
+    """Of the error of the OCV nothing is known where it was no state of the filter before."""
+    f, c = estimator.record[0]["filter"], estimator.record[0]["checks"]
+    for mean, covariance in zip(f["mean"], f["covariance"], strict=True):
+        forget_curve(mean, covariance)
+    keep(c, f)
 
 
 def _open_new_states(estimator: Estimator) -> None:

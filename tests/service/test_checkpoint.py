@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.ekf_state import OFFSET
+from bms_estimator.kernels.ekf_state import NODE, OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Health
@@ -128,6 +128,25 @@ def test_a_version_with_other_fields_reads_what_it_knows() -> None:
     assert estimator.record["checks"]["good_soc"] == fresh.record["checks"]["good_soc"]
     assert not estimator.record["map"]["dwell_s"].any()
     assert estimator.record["filter"]["ohm"].shape == fresh.record["filter"]["ohm"].shape
+
+
+def test_a_version_whose_filter_has_more_states_keeps_those_it_knows() -> None:
+    """Those of the curve came last: capacity and offset are known as well as before, of the curve nothing is."""
+    learned = a_used_pack()
+    cut = {"filter.mean": 1, "filter.covariance": 2, "checks.good_mean": 1, "checks.good_covariance": 2}
+    saved = dict(fields(learned.record.copy()))
+    for name, axes in cut.items():
+        saved[name] = saved[name][(..., *axes * (slice(NODE),))]
+    estimator = new_estimator(SETTINGS, CELL)
+    assert resume(estimator, saved, 1.0) == ""
+    now, before = (one.record[0]["filter"] for one in (estimator, learned))
+    assert np.array_equal(now["covariance"][:, :NODE, :NODE], before["covariance"][:, :NODE, :NODE])
+    assert np.array_equal(now["mean"][:, :NODE], before["mean"][:, :NODE])
+    for q in range(now["count"]):
+        assert (now["mean"][q, NODE:] == 0.0).all()
+        assert (np.diag(now["covariance"][q])[NODE:] == 1.0).all()
+    assert np.linalg.eigvalsh(now["covariance"][0]).min() > -1e-12
+    assert np.array_equal(estimator.record[0]["checks"]["good_mean"], now["mean"][now["best"]])
 
 
 async def test_a_checkpoint_of_the_format_before_is_taken_over(tmp_path: Path) -> None:
