@@ -69,8 +69,10 @@ def predict(s: Record, p: Record, q: int) -> None:
     moved = (w.charge_as - x[OFFSET] * w.time_s) / capacity_as
     for j in range(NODE):  # of the nodes it is 1
         x[j] *= f[j]
-        for k in range(j, STATES):
-            cov[j, k] = cov[k, j] = cov[j, k] * f[j] * f[k]
+    for j in range(STATES):
+        along, row = f[j], cov[j]
+        for k in range(STATES if j < NODE else NODE):
+            row[k] *= along * f[k]
     x[SOC] -= moved  # (2.1)
     x[HYST] -= math.copysign(1.0 - f[HYST], w.charge_as)
     for k in range(X, X + BRANCHES):
@@ -90,6 +92,11 @@ def couple(cov: Floats, f: Floats, by_offset: float, moved: float) -> None:
         cov[k, SOC] += by_offset * cov[k, OFFSET] + moved * cov[k, LN_Q]
         for j in range(X, X + BRANCHES):
             cov[k, j] -= (1.0 - f[j]) * cov[k, OFFSET]
+    for j in range(SOC, X + BRANCHES):  # rounded otherwise above
+        for k in range(j):
+            cov[j, k] = cov[k, j]
+        for k in range(X + BRANCHES, STATES):
+            cov[k, j] = cov[j, k]
 
 
 @njit(cache=True)
@@ -118,12 +125,14 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
     for j in range(STATES):
         total_v2 += h[j] * ph[j]
     total_v2 = max(total_v2, (innovation_v / HUBER) ** 2)
+    scale = 1.0 / math.sqrt(total_v2)
     for j in range(STATES):
-        gain = ph[j] / total_v2
-        x[j] += gain * innovation_v
-        for k in range(j, STATES):
-            cov[j, k] -= gain * ph[k]
-            cov[k, j] = cov[j, k]
+        ph[j] *= scale
+    for j in range(STATES):
+        along, row = ph[j], cov[j]
+        x[j] += along * scale * innovation_v
+        for k in range(STATES):
+            row[k] -= along * ph[k]  # the same at k, j to the last bit
     x[SOC] = min(max(x[SOC], LOWEST), HIGHEST)
     most = MOST_STDS * resistance_std(s, p)
     for j in (LN_R0, LN_R):
