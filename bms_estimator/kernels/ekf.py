@@ -53,6 +53,7 @@ def decay(s: Record, p: Record) -> None:
         f[X + k] = math.exp(-dt_s / TAUS[k])
     f[B_SLOW], f[B_FAST] = math.exp(-dt_s / p.slow_s), math.exp(-dt_s / p.fast_s)
     f[HYST], f[CURVE] = math.exp(-through / p.hysteresis_soc), math.exp(-through / p.curve_length)
+    f[OFFSET], f[LN_Q] = math.exp(-dt_s / p.offset_s), math.exp(-through / p.aged_soc)
     if not s.sensed:
         f[LN_R0] = f[LN_R] = math.exp(-dt_s / p.unsensed_s)
 

@@ -11,10 +11,12 @@ from bms_estimator.kernels.ekf_state import (
     B_SLOW,
     CURVE,
     HYST,
+    LN_Q,
     LN_R,
     LN_R0,
     NODE,
     NODES,
+    OFFSET,
     SOC,
     X,
 )
@@ -43,6 +45,12 @@ def outside(p: Record, temperature_c: float) -> float:
 def resistance_std(s: Record, p: Record) -> float:
     """Std of ln of the true over the file's resistances: without a temperature they may be anything near."""
     return p.r_std if s.sensed else max(p.r_std, UNSENSED_R_STD)
+
+
+@njit(cache=True)
+def offset_variance(p: Record) -> float:
+    """Of OFFSET before anything is learned [A^2]."""
+    return (p.offset_c * p.capacity_as / 3600.0) ** 2
 
 
 @njit(cache=True)
@@ -93,6 +101,8 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
         cov[k, k] += a2 * (1.0 - f[k] * f[k])
     cov[B_SLOW, B_SLOW] += 0.5 * bias_v2 * s.slow_inflation[q] * (1.0 - f[B_SLOW] ** 2)
     cov[B_FAST, B_FAST] += 0.5 * bias_v2 * s.fast_inflation[q] * (1.0 - f[B_FAST] ** 2)
+    cov[OFFSET, OFFSET] += offset_variance(p) * (1.0 - f[OFFSET] ** 2)
+    cov[LN_Q, LN_Q] += p.capacity_std**2 * (1.0 - f[LN_Q] ** 2)
     for j in (LN_R0, LN_R):
         cov[j, j] += resistance_std(s, p) ** 2 * (1.0 - f[j] * f[j])
     cov[HYST, HYST] += 0.1 * (1.0 - f[HYST] ** 2)

@@ -59,9 +59,13 @@ class Noise:
     unsensed_s: float = 3600.0
     """Where no temperature is told, resistances follow an unknown one with this time constant [s]."""
     offset_c: float = 0.007
-    """Offset of the current sensor, std [C]."""
+    """Offset of the current sensor, std [C] ..."""
+    offset_s: float = 30.0 * 86400.0
+    """... and the time in which it becomes another [s]."""
     capacity_std: float = 0.08
-    """Capacity, relative std."""
+    """Capacity, relative std, ..."""
+    aged_soc: float = 1000.0
+    """... and the charge in which it becomes another with age: 500 full cycles [SOC]."""
     cell_spread: float = 0.05
     """Cells in series: by how much of the charge drawn the emptiest lies below their mean, std of SOC."""
     soc_std: float = 0.2

@@ -14,7 +14,13 @@ from numba import njit
 
 from bms_estimator.kernels.charge import LONGEST_FLOW_S, UNMEASURED_S, held_current
 from bms_estimator.kernels.ekf import HIGHEST, LOWEST, decay, inflate, predict, update
-from bms_estimator.kernels.ekf_noise import bias_variance, measurement_variance, resistance_std, switch_on
+from bms_estimator.kernels.ekf_noise import (
+    bias_variance,
+    measurement_variance,
+    offset_variance,
+    resistance_std,
+    switch_on,
+)
 from bms_estimator.kernels.ekf_state import (
     B_FAST,
     B_SLOW,
@@ -81,7 +87,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
             cov[j, k] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
     s.step.variance = resistance_std(s, p) ** 2
-    cov[OFFSET, OFFSET] = (p.offset_c * p.capacity_as / 3600.0) ** 2
+    cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
     forget_curve(x, cov)
     seed(s, p, soc, p.soc_std)
