@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import sample_step as kernel
-from bms_estimator.kernels.ekf_noise import resistance_std
-from bms_estimator.kernels.ekf_state import LN_R, LN_R0
+from bms_estimator.kernels.ekf_noise import offset_variance, resistance_std
+from bms_estimator.kernels.ekf_state import LN_R, LN_R0, OFFSET
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
 from bms_estimator.kernels.hypotheses import forget, seed
 from bms_estimator.kernels.input_checks import keep
@@ -132,7 +132,8 @@ class Estimator:
 
         Time begins with the next sample, which is taken as a clock set back. The SOC may have moved, and the load before
         it is not known, as at a first sample. After a long time the cell may be at another temperature or SOC: its
-        resistances are those of the cell file again. The map is kept, and what was learned of capacity and current offset.
+        resistances are those of the cell file again. The map is kept, and what was learned of capacity; of the current's
+        offset as much as it does not change in that time.
 
         Args:
             unseen_s: How long nobody measured [s]; infinite when nobody knows.
@@ -141,8 +142,12 @@ class Estimator:
         f, p = self.record[0]["filter"], self.settings_record[0]["filter"]
         moved = min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST)
         f["soc"], f["soc_std"] = self.state["soc"][0], math.hypot(f["soc_std"], moved)
+        best, same = f["best"], math.exp(-unseen_s / p["offset_s"])
+        f["mean"][best, OFFSET] *= same
+        f["covariance"][best, OFFSET, :] *= same
+        f["covariance"][best, :, OFFSET] *= same
+        f["covariance"][best, OFFSET, OFFSET] += offset_variance(p) * (1.0 - same * same)
         if unseen_s > SAME_ELEMENTS_S:
-            best = f["best"]
             for j in (LN_R0, LN_R):
                 forget(f["mean"][best], f["covariance"][best], j)
                 f["covariance"][best, j, j] = resistance_std(f, p) ** 2

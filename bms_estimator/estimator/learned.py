@@ -76,10 +76,14 @@ def current_offset(record: np.void) -> Learned:
 
 
 def _bias(record: np.void, j: int) -> tuple[float, float]:
-    """Mean and standard deviation of state ``j`` of the likeliest hypothesis."""
+    """Mean and standard deviation of state ``j`` of the hypotheses together, as that of the SOC is."""
     f = record["filter"]
-    best = f["best"]
-    return float(f["mean"][best, j]), math.sqrt(f["covariance"][best, j, j])
+    n = f["count"]
+    weight = np.exp(f["ln_weight"][:n] - f["ln_weight"][f["best"]])
+    weight /= weight.sum()
+    values, variances = f["mean"][:n, j], f["covariance"][:n, j, j]
+    mean = float(weight @ values)
+    return mean, math.sqrt(weight @ (variances + (values - mean) ** 2))
 
 
 def learned_ocv(

@@ -60,7 +60,7 @@ class Noise:
     """Where no temperature is told, resistances follow an unknown one with this time constant [s]."""
     offset_c: float = 0.007
     """Offset of the current sensor, std [C] ..."""
-    offset_s: float = 30.0 * 86400.0
+    offset_s: float = 10.0 * 86400.0
     """... and the time in which it becomes another [s]."""
     capacity_std: float = 0.08
     """Capacity, relative std, ..."""

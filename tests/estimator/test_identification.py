@@ -6,6 +6,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter, present_elements
 from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.ekf_noise import offset_variance
 from bms_estimator.kernels.ekf_state import LN_Q, LN_R0, OFFSET, SOC
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS
 from bms_estimator.kernels.identification import hand_over
@@ -108,16 +109,21 @@ def test_time_that_nobody_measured_teaches_the_map_nothing(load) -> None:
     assert (estimator.record[0]["map"]["weight"] <= before).all()  # it forgets meanwhile
 
 
-def test_a_long_pause_leaves_what_was_learned_of_sensor_and_capacity(load) -> None:
+def test_a_long_pause_leaves_what_was_learned_of_capacity_and_of_the_sensor_what_stays(load) -> None:
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     estimator.run(load[0])
     f = estimator.record[0]["filter"]
-    learned = f["mean"][f["best"], [OFFSET, LN_Q]].copy()
-    estimator.resume(86400.0)
+    (offset_a, ln_q), first = f["mean"][f["best"], [OFFSET, LN_Q]], f["covariance"][f["best"]].copy()
+    p = estimator.settings_record[0]["filter"]
+    unseen_s = 0.1 * p["offset_s"]
+    estimator.resume(unseen_s)
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]]
-    assert learned.all()
-    assert np.array_equal(mean[[OFFSET, LN_Q]], learned)
-    assert covariance[LN_Q, LN_Q] < estimator.settings_record[0]["filter"]["capacity_std"] ** 2
+    assert mean[LN_Q] == ln_q != 0.0
+    assert covariance[LN_Q, LN_Q] == first[LN_Q, LN_Q] < p["capacity_std"] ** 2
+    assert mean[OFFSET] == pytest.approx(np.exp(-0.1) * offset_a)
+    at_first = offset_variance(p)
+    assert at_first - covariance[OFFSET, OFFSET] == pytest.approx(np.exp(-0.2) * (at_first - first[OFFSET, OFFSET]))
+    assert np.array_equal(covariance, covariance.T)
     assert (mean[LN_R0], covariance[LN_R0, LN_R0]) == (0.0, estimator.settings_record[0]["filter"]["r_std"] ** 2)
 
 

@@ -81,6 +81,8 @@ class Case:
     offset_a: float = 0.0
     capacity: float = 1.01
     """Capacity in the cell file over the true one."""
+    curve_error: float = 1.0
+    """Error of the OCV in the cell file over that of a common one; a capacity can be learned no better than it allows."""
     weak_cell: float = 1.0
     """Below 1: six cells in series, one with this part of the capacity of the others."""
     sensed: bool = True
@@ -155,10 +157,11 @@ def load_a(case: Case, seconds: int) -> Floats:
     return current_a
 
 
-def capture(case: Case) -> Capture:
-    """Simulate one."""
+def capture(case: Case, current_a: Floats | None = None) -> Capture:
+    """Simulate one; under ``current_a`` at ``rate_hz`` [A], where it is given."""
     rng = np.random.default_rng(1000 + case.seed)
-    current_a = np.repeat(load_a(case, round(PER_HOUR_S * (case.unseen_h + case.hours))), round(case.rate_hz))
+    if current_a is None:
+        current_a = np.repeat(load_a(case, round(PER_HOUR_S * (case.unseen_h + case.hours))), round(case.rate_hz))
     dt_s = 1.0 / case.rate_hz
     time_s = dt_s * np.arange(current_a.size)
     temperature_c = case.temperature_c + case.rising_k * time_s / time_s[-1]
@@ -192,12 +195,13 @@ def cell_file(case: Case) -> CellModel:
         return generic
     rng = np.random.default_rng(2000 + case.seed)
     slope_v = np.gradient(case.truth.ocv_v, GRID)
-    wrong_v = OCV_STD_V[kind] * smooth(rng, OCV_LENGTH_SOC) + OCV_STD_SOC * slope_v * smooth(rng, OCV_LENGTH_SOC)
+    std_v, std_soc_v = case.curve_error * OCV_STD_V[kind], case.curve_error * OCV_STD_SOC * slope_v
+    wrong_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
     told_v = (case.truth.ocv_v + wrong_v)[OCV_NODES]
     table = {
         "soc": GRID[OCV_NODES],
         "ocv_v": np.maximum.accumulate(told_v) + 1e-6 * np.arange(OCV_NODES.size),
-        "error_v": np.hypot(OCV_STD_V[kind], OCV_STD_SOC * slope_v)[OCV_NODES],
+        "error_v": np.hypot(std_v, std_soc_v)[OCV_NODES],
         "hysteresis_v": np.full(OCV_NODES.size, case.truth.hysteresis_v[GRID.size // 2]),
     }
     ocv = TableOcv(form="table", **{name: tuple(column) for name, column in table.items()})
