@@ -18,6 +18,9 @@ STEEPEST_V = 3.0
 LEARNED, LEARNED_SLOPE_V = 0.97, 0.15
 """Part of the variance of the OCV that is learned for good, where its slope is at least so much everywhere [V]: on a
 plateau a voltage does not tell the error of the curve from the SOC, nor do the knees stay where they are."""
+CURVE_SOC, KNEE_V = 0.3, 1.0
+"""The error of the OCV changes over so much charge [SOC]; where a cell's curve is steeper than this [V], at its knees, over
+as much less as it is steeper: what is wrong there is the shape of the knee."""
 COUNT_ERROR_SOC = 0.003
 """However well the curve is known: how full the cell was that it was measured on, std."""
 BEYOND_BRANCHES = 0.2
@@ -93,8 +96,8 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
     """
     series, ocv = p["series"], cell.ocv
     slope_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_slope_v"].size), p["ocv_slope_v"])
-    slope_v = np.minimum(slope_v, STEEPEST_V * series)
-    p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * slope_v)
+    p["curve_soc"] = CURVE_SOC * np.minimum(1.0, KNEE_V * series / np.maximum(slope_v, 1e-9))
+    p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * np.minimum(slope_v, STEEPEST_V * series))
     midway = False
     if isinstance(ocv, TableOcv):
         midway = ocv.hysteresis_v is not None

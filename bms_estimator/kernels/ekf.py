@@ -45,14 +45,14 @@ MOST_STDS = 3.0
 
 @njit(cache=True)
 def decay(s: Record, p: Record) -> None:
-    """The diagonal of F over the window into ``s.f``; the same for all hypotheses."""
+    """The diagonal of F over the window into ``s.f``; the same for all hypotheses but that of CURVE."""
     f, dt_s, through = s.f, s.window.time_s, s.window.throughput_as / p.capacity_as
     for j in range(STATES):
         f[j] = 1.0
     for k in range(BRANCHES):
         f[X + k] = math.exp(-dt_s / TAUS[k])
     f[B_SLOW], f[B_FAST] = math.exp(-dt_s / p.slow_s), math.exp(-dt_s / p.fast_s)
-    f[HYST], f[CURVE] = math.exp(-through / p.hysteresis_soc), math.exp(-through / p.curve_length)
+    f[HYST] = math.exp(-through / p.hysteresis_soc)
     f[OFFSET], f[LN_Q] = math.exp(-dt_s / p.offset_s), math.exp(-through / p.aged_soc)
     if not s.sensed:
         f[LN_R0] = f[LN_R] = math.exp(-dt_s / p.unsensed_s)
@@ -68,6 +68,7 @@ def predict(s: Record, p: Record, q: int) -> None:
     bias_v2 = bias_variance(s, p, x[SOC])
     capacity_as = p.capacity_as * math.exp(x[LN_Q])
     moved = (w.charge_as - x[OFFSET] * w.time_s) / capacity_as
+    f[CURVE] = math.exp(-w.throughput_as / capacity_as / on_grid(x[SOC], p.curve_soc))
     for j in range(NODE):  # of the nodes it is 1
         x[j] *= f[j]
     for j in range(STATES):

@@ -80,8 +80,6 @@ class Noise:
     """... and for how long it stays the same [s]."""
     temper: float = 0.2
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
-    curve_length: float = 0.3
-    """Charge over which the error of the OCV curve changes [SOC]."""
     hysteresis_soc: float = 0.05
     """Charge that leads from one branch of the hysteresis to the other [SOC]."""
 
@@ -94,6 +92,7 @@ EKF_SETTINGS = np.dtype(
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
         ("curve_error_v", "f8", GRID),  # std of E_o [V]
         ("learned", "f8"),  # part of its variance that is of the curve, the same each time: ``ocv_learning``
+        ("curve_soc", "f8", GRID),  # charge over which that error changes [SOC]
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
         ("hysteresis_v", "f8", GRID),  # half of what E_o is higher after charge than after discharge [V]
         ("weak_ohm", "f8", (GRID, RESISTANCES)),  # at 25 C, activation energy WEAK_J [ohm]
