@@ -13,7 +13,7 @@ from bms_estimator.model.settings import IdentifierSettings
 
 CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
 """Where the cell file does not say how wrong its OCV is: std of one cell [V], and std along SOC."""
-STEEPEST_V = 3.0
+STEEPEST_V = 5.0
 """Where the OCV of a cell is steeper, near full and empty, its end is better known than its SOC elsewhere [V]."""
 LEARNED, LEARNED_SLOPE_V = 0.97, 0.15
 """Part of the variance of the OCV that is learned for good, where its slope is at least so much everywhere [V]: on a
@@ -21,7 +21,7 @@ plateau a voltage does not tell the error of the curve from the SOC, nor do the 
 CURVE_SOC, KNEE_V = 0.3, 1.0
 """The error of the OCV changes over so much charge [SOC]; where a cell's curve is steeper than this [V], at its knees, over
 as much less as it is steeper: what is wrong there is the shape of the knee."""
-COUNT_ERROR_SOC = 0.003
+COUNT_ERROR_SOC = 0.004
 """However well the curve is known: how full the cell was that it was measured on, std."""
 BEYOND_BRANCHES = 0.2
 """Two branches leave out diffusion that is slower: its resistance, as a part of theirs."""
@@ -96,8 +96,9 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
     """
     series, ocv = p["series"], cell.ocv
     slope_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_slope_v"].size), p["ocv_slope_v"])
-    p["curve_soc"] = CURVE_SOC * np.minimum(1.0, KNEE_V * series / np.maximum(slope_v, 1e-9))
-    p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * np.minimum(slope_v, STEEPEST_V * series))
+    p["curve_soc"] = CURVE_SOC * KNEE_V * series / np.maximum(slope_v, KNEE_V * series)
+    slope_v = np.minimum(slope_v, STEEPEST_V * series)
+    p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * slope_v)
     midway = False
     if isinstance(ocv, TableOcv):
         midway = ocv.hysteresis_v is not None
