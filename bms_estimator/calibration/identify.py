@@ -60,6 +60,8 @@ LADDER_STD = 0.1
 """Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
 JUDGED_SOC = 0.1
 """RMS errors are given above it."""
+COUNT_PASSES = 3
+"""Fits from which the miscount of each capture is found: a knee is not linear."""
 NO_WORSE = 1.05
 """Scores that differ by less than this factor are the same: four replays do not tell more."""
 
@@ -74,6 +76,7 @@ class CaptureFit:
         glitches: How many were left out as glitches.
         initial_soc: At the first sample, 0..1.
         temperature_c: Lowest and highest [C]; None without a sensor.
+        miscount: By how much more charge was moved than its samples say, relative; the SOC of the fit has it.
         voltage_rms_v: What the ladder leaves, each second weighing the same, SOC above 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
         score_after: The same with the identified one.
@@ -85,6 +88,7 @@ class CaptureFit:
     glitches: int
     initial_soc: float
     temperature_c: tuple[float, float] | None
+    miscount: float
     voltage_rms_v: float
     score_before: float
     score_after: float
@@ -121,6 +125,14 @@ class Run:
     load: Load
     soc: Floats
     temperature_c: Floats
+    miscount: float = 0.0
+    """By how much more charge was moved than the capture says, relative; ``soc`` counts it."""
+
+    def recounted(self, more: float) -> "Run":
+        """The same with a miscount that is larger by ``more``."""
+        miscount = self.miscount + more
+        moved = (self.soc - self.soc[0]) / (1.0 + self.miscount)
+        return replace(self, soc=self.soc[0] + (1.0 + miscount) * moved, miscount=miscount)
 
     @property
     def mean_c(self) -> float:
@@ -156,6 +168,7 @@ def identify(
     if found:
         raise UserError("\n".join(found))
     runs = [_run(load, cell, initial_soc, temperature_c) for load in loads]
+    runs = _recounted(runs, cell, refine_ocv=refine_ocv)
     left_out = tuple(load.name for load in whole if without_excitation(load, cell))
     candidates = [_Candidate(runs, cell, refine_ocv=refine) for refine in ((True, False) if refine_ocv else (False,))]
     before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
@@ -195,9 +208,14 @@ class _Candidate:
                     run.temperature_c,
                     self._scale_ohm,
                     cell.cell.series_count,
+                    run.miscount,
                 )
             )
         self.fit, self.cell = self._fitted(range(len(runs)))
+
+    def miscounts(self) -> list[float]:
+        """Of each capture, beyond that it was counted with: by what more its voltage lies on the fit's."""
+        return [one.miscount(self.fit) for one in self._moments]
 
     def scores(self) -> Floats:
         """Of each capture's replays, with a cell that did not see it where there are others like it [%]."""
@@ -217,6 +235,7 @@ class _Candidate:
                 glitches=run.load.glitches,
                 initial_soc=float(run.soc[0]),
                 temperature_c=_temperature_range([run]) if np.isfinite(run.load.temperature_c).any() else None,
+                miscount=run.miscount,
                 voltage_rms_v=_rms(self.cell, run),
                 score_before=float(before[j]),
                 score_after=float(after[j]),
@@ -285,6 +304,14 @@ def _run(load: Load, cell: CellModel, soc: float | None, temperature_c: float | 
     if soc is None and cold and abs(full_v - load.start_v) < FULL_V * cell.cell.series_count:
         start = 1.0
     return Run(load, start - load.discharged_ah / cell.cell.capacity_ah, temperature)
+
+
+def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
+    """With the charge that each capture's knees tell it has moved."""
+    for _ in range(COUNT_PASSES):
+        miscounts = _Candidate(runs, cell, refine_ocv=refine_ocv).miscounts()
+        runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
+    return runs
 
 
 def _beside_mean(cell: CellModel, run: Run) -> Floats:

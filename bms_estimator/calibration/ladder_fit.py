@@ -60,6 +60,9 @@ WORTH = 30.0
 """Independent rows that a capture counts as."""
 ERROR_V, ERROR_J = 4e-3, 22e3
 """Std of a row at 25 C, per cell [V], and how it grows in the cold [J/mol]."""
+SOC_STD = 0.008
+"""The same of the SOC gained over the whole range, by the root of the charge: at a knee far from the start a cell is not
+where its curve is, and what the voltage is off there is no resistance."""
 RELATIVE = 0.1
 """Std relative to the drop that ``TYPICAL_V`` makes of the largest current of the last half minute."""
 STEPS_WORTH, STEP_V = 30.0, 1e-3
@@ -85,10 +88,25 @@ LOWEST, HIGHEST = 0.02, 1.01
 
 @dataclass(frozen=True)
 class Moments:
-    """What one capture says: X'WX and X'Wy of its rows, y less the given OCV."""
+    """What one capture says: X'WX and X'Wy of its rows, y less the given OCV, whatever its miscount.
+
+    Attributes:
+        information: X'WX, the miscount marginalised.
+        right: X'Wy, the same.
+        along: X'Wc, with c what a miscount of 1 would do to the voltage.
+        own: c'Wc with what is known of the miscount beforehand.
+        seen: c'Wy, the same.
+    """
 
     information: Floats
     right: Floats
+    along: Floats
+    own: float
+    seen: float
+
+    def miscount(self, fit: "LadderFit") -> float:
+        """What the count is off beyond that of the moments, relative: the fit's voltage lies on the capture's then."""
+        return float((self.seen - self.along @ fit.coefficients) / self.own)
 
 
 @dataclass(frozen=True)
@@ -108,6 +126,11 @@ class LadderFit:
     weak_ohm: Floats
     strong_ohm: Floats
     covariance: Floats
+
+    @property
+    def coefficients(self) -> Floats:
+        """All that was sought, in the order of the columns."""
+        return np.r_[self.correction, self.per_kelvin_v, self.weak_ohm.ravel(), self.strong_ohm.ravel()]
 
     def branches(self, soc: float, first: int, end: int) -> tuple[float, float]:
         """Sum of resistances ``first`` to before ``end`` at ``soc`` and 25 C, and its standard error [ohm]."""
@@ -151,18 +174,26 @@ def correction_at(soc: Floats) -> Floats:
 
 
 def moments(
-    load: Load, soc: Floats, given_v: Floats, slope_v: Floats, temperature_c: Floats, scale_ohm: float, series: int
+    load: Load,
+    soc: Floats,
+    given_v: Floats,
+    slope_v: Floats,
+    temperature_c: Floats,
+    scale_ohm: float,
+    series: int,
+    miscount: float,
 ) -> Moments:
     """What ``load`` says.
 
     Args:
         load: From rest.
-        soc: Shape (n,), counted.
+        soc: Shape (n,), counted, less the miscount.
         given_v: Shape (n,), the given OCV at SOC and temperature [V].
         slope_v: Shape (n,), its slope dE_o/dSOC [V].
         temperature_c: Shape (n,) [C].
         scale_ohm: Of the resistances [ohm].
         series: Cells in series.
+        miscount: What the count was taken to be off, relative.
     """
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
     weight, last = _weights(load)
@@ -170,6 +201,7 @@ def moments(
     kept = (_apart(load.time_s) | last) & inside
     load_a = np.abs(currents[:, :4]).max(axis=1)
     std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE * scale_ohm * load_a)
+    std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)
     weight = np.where(kept, weight, 0.0)
     root = (np.sqrt(WORTH * weight / weight.sum()) / std_v)[kept, None]
     first_root = root[:, 0]
@@ -188,8 +220,9 @@ def moments(
         target = np.r_[target, (left_v[after] - left_v[before]) * root[:, 0]]
     counted = np.zeros(target.size)  # what the charge, wrong by its own size, would do
     counted[: kept.sum()] = slope_v[kept] * (soc[kept] - soc[0]) * first_root
-    both, known = rows.T @ counted, counted @ counted + 1.0 / COUNT_STD**2
-    return Moments(rows.T @ rows - np.outer(both, both) / known, rows.T @ target - both * (counted @ target) / known)
+    along, own = rows.T @ counted, float(counted @ counted + 1.0 / COUNT_STD**2)
+    seen = float(counted @ target - miscount / COUNT_STD**2)
+    return Moments(rows.T @ rows - np.outer(along, along) / own, rows.T @ target - along * seen / own, along, own, seen)
 
 
 def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:

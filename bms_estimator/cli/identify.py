@@ -85,6 +85,7 @@ def _json(out: Path, found: Identification, seconds: float) -> dict[str, Any]:
                 "glitches": c.glitches,
                 "initial_soc": c.initial_soc,
                 "temperature_c": c.temperature_c,
+                "miscount_percent": 100.0 * c.miscount,
                 "voltage_rms_mv_soc_above_0_1": 1e3 * c.voltage_rms_v,
                 "score_before_percent": _number(c.score_before),
                 "score_after_percent": _number(c.score_after),
@@ -142,7 +143,7 @@ def _tables(out: Path, found: Identification, seconds: float) -> Group:
         cells = (found.elements[soc][name] for soc in found.elements)
         shown.add_row(f"{name} \\[mohm], 25 °C", *(f"{1e3 * value:.4g} ± {1e3 * std:.2g}" for value, std in cells))
     fits = Table(box=box.SIMPLE_HEAD)
-    for column in ("capture", "°C", "SOC", "RMS", "before", "after", "held back"):
+    for column in ("capture", "°C", "SOC", "count", "RMS", "before", "after", "held back"):
         fits.add_column(column, justify="left" if column in ("capture", "held back") else "right")
     for c in found.captures:
         fits.add_row(*_row(c))
@@ -159,4 +160,5 @@ def _row(c: CaptureFit) -> tuple[str, ...]:
     temperature = "no sensor" if c.temperature_c is None else f"{c.temperature_c[0]:.0f} to {c.temperature_c[1]:.0f}"
     scores = (f"{x:.2f} %" if math.isfinite(x) else "-" for x in (c.score_before, c.score_after))
     name, rms = c.name.split(".")[0], f"{1e3 * c.voltage_rms_v:.1f} mV"
-    return name, temperature, f"{c.initial_soc:.3f}", rms, *scores, "yes" if c.held_back else "no"
+    count = f"{100.0 * c.miscount:+.1f} %"
+    return name, temperature, f"{c.initial_soc:.3f}", count, rms, *scores, "yes" if c.held_back else "no"

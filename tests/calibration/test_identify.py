@@ -137,6 +137,17 @@ def test_a_wrong_ocv_is_corrected(warm):
     assert (np.diff(found.ocv_v) > 0.0).all()
 
 
+def test_charge_that_the_rows_of_a_capture_miss_is_found(warm):
+    lacking = warm.rows.copy()
+    lacking["current_a"] *= 0.98
+    found = {
+        name: identify([Columns(rows, name)], wrong_start(), refine_ocv=False).captures[0].miscount
+        for name, rows in (("whole", warm.rows), ("lacking", lacking))
+    }
+    assert abs(found["whole"]) < 0.001
+    assert 0.005 < found["lacking"] < 0.02  # two per cent, pulled to nothing: it is five of its std
+
+
 def test_ocv_and_its_growth_with_temperature_are_kept_when_asked(warm, cold):
     found = identify([warm, cold], wrong_start(), refine_ocv=False)
     assert found.cell.ocv == wrong_start().ocv
