@@ -60,7 +60,7 @@ WORTH = 30.0
 """Independent rows that a capture counts as."""
 ERROR_V, ERROR_J = 4e-3, 22e3
 """Std of a row at 25 C, per cell [V], and how it grows in the cold [J/mol]."""
-SOC_STD = 0.008
+SOC_STD = 0.01
 """The same of the SOC gained over the whole range, by the root of the charge: at a knee far from the start a cell is not
 where its curve is, and what the voltage is off there is no resistance."""
 RELATIVE = 0.1
@@ -130,7 +130,8 @@ class LadderFit:
     @property
     def coefficients(self) -> Floats:
         """All that was sought, in the order of the columns."""
-        return np.r_[self.correction, self.per_kelvin_v, self.weak_ohm.ravel(), self.strong_ohm.ravel()]
+        parts = self.correction, self.per_kelvin_v, self.weak_ohm.ravel(), self.strong_ohm.ravel()
+        return np.concatenate(parts)
 
     def branches(self, soc: float, first: int, end: int) -> tuple[float, float]:
         """Sum of resistances ``first`` to before ``end`` at ``soc`` and 25 C, and its standard error [ohm]."""

@@ -68,7 +68,7 @@ def predict(s: Record, p: Record, q: int) -> None:
     bias_v2 = bias_variance(s, p, x[SOC])
     capacity_as = p.capacity_as * math.exp(x[LN_Q])
     moved = (w.charge_as - x[OFFSET] * w.time_s) / capacity_as
-    f[CURVE] = math.exp(-w.throughput_as / capacity_as / on_grid(x[SOC], p.curve_soc))
+    f[CURVE] = math.exp(-w.throughput_as / p.capacity_as / on_grid(x[SOC], p.curve_soc))
     for j in range(NODE):  # of the nodes it is 1
         x[j] *= f[j]
     for j in range(STATES):
