@@ -5,7 +5,7 @@
 
 from numba import njit
 
-from bms_estimator.kernels.cell import Floats
+from bms_estimator.kernels.cell import Floats, ocv
 from bms_estimator.kernels.ekf_state import (
     B_FAST,
     B_SLOW,
@@ -31,6 +31,10 @@ UNSENSED_R_STD = 0.25
 """Std of ln of the resistances where nobody measures the temperature: 10 K either way."""
 AGED_SOC = 400.0
 """Charge over which the curve of a cell becomes another with age: 200 full cycles [SOC]."""
+LOWER_HALF = 0.5
+"""SOC below which a cell may be empty early."""
+STEEP_V = 1.0
+"""Slope of the OCV of a cell that is its last fall [V]; where it is less, ``curve_error_v`` says how wrong the curve is."""
 OUTSIDE_K = 10.0
 """So far outside the temperatures of the cell file, errors are twice as large [K]."""
 
@@ -62,13 +66,23 @@ def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> flo
 
 @njit(cache=True)
 def bias_variance(s: Record, p: Record, soc: float) -> float:
-    """Variance of B_SLOW + B_FAST [V^2] at a steady state: resistances and OCV are wrong in proportion."""
+    """Variance of B_SLOW + B_FAST [V^2] at a steady state: resistances are wrong in proportion, and along SOC.
+
+    A cold cell is empty early, and no file says well by how much: in its lower half the shift along SOC grows in the cold as R
+    does, and moves the last fall of the OCV, too.
+    """
     ohm = total_resistance(s, p, soc)
-    steep = total_resistance(s, p, soc - p.bias_soc) - total_resistance(s, p, soc + p.bias_soc)
+    shift, early_v = p.bias_soc, 0.0
+    if soc < LOWER_HALF:
+        shift *= arrhenius(p.model_j, s.temperature_c)
+        early_v = 0.5 * (ocv(soc + shift, p.ocv_v, p.ocv_slope_v) - ocv(soc - shift, p.ocv_v, p.ocv_slope_v))
+        early_v = max(early_v - STEEP_V * p.series * shift, 0.0)
+    steep = total_resistance(s, p, soc - shift) - total_resistance(s, p, soc + shift)
     grown = max(ohm - p.middle_ohm, 0.0)
     floor_a = FLOOR_C * p.capacity_as / 3600.0
     wrong_ohm2 = (p.bias_relative * ohm) ** 2 + (p.bias_grown * grown) ** 2 + (0.5 * steep) ** 2
-    return outside(p, s.temperature_c) ** 2 * wrong_ohm2 * max(s.rms_a2, floor_a * floor_a)
+    wrong_v2 = wrong_ohm2 * max(s.rms_a2, floor_a * floor_a) + early_v * early_v
+    return outside(p, s.temperature_c) ** 2 * wrong_v2
 
 
 @njit(cache=True)

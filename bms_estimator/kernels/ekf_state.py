@@ -43,10 +43,10 @@ class Noise:
     """It grows in the cold with this activation energy [J/mol]."""
     bias_relative: float = 0.04
     """B: error of the model that stays, relative to the sum of the resistances times the RMS current of 10 min."""
-    bias_grown: float = 0.1
+    bias_grown: float = 0.15
     """B: the same by which resistances have grown, in the cold and near empty, beyond those at 25 C and SOC 0.5."""
-    bias_soc: float = 0.015
-    """B: the same from a shift of the resistances along SOC."""
+    bias_soc: float = 0.025
+    """B: the same from a shift of resistances and of the OCV's last fall along SOC, at 25 C; it grows with ``model_j``."""
     slow_s: float = 2.0 * 3600.0
     fast_s: float = 90.0
     """B: half of its variance each changes within so long [s]."""
