@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.capture_checks import GAP_CHARGE, GAP_STEPS
 from bms_estimator.calibration.ocv_points import COLD_V, LONG_REST_S, RELAXED_V, coldness
 from bms_estimator.calibration.relaxation import Rest, find_rests, resting_samples, runs, without_glitches
-from bms_estimator.estimator.filter_settings import filter_settings
+from bms_estimator.estimator.filter_settings import CURVE_SOC, filter_settings
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv, soc_from_ocv
 from bms_estimator.kernels.ladder import REFERENCE_C, on_grid
@@ -251,7 +251,7 @@ def _covariance(anchors: Sequence[Anchor], p: np.void) -> Floats:
         np.array([getattr(a, name) for a in anchors])
         for name in ("soc", "slope_v", "own_v", "curve_v", "moved_ah", "part")
     )
-    alike = np.exp(-np.abs(z[:, None] - z) / p["curve_length"])
+    alike = np.exp(-np.abs(z[:, None] - z) / CURVE_SOC)
     voltage = (np.diag(own_v**2) + alike * np.outer(curve_v, curve_v)) / np.outer(slope_v, slope_v)
     counting = p["charge_error"] ** 2 * np.minimum.outer(moved, moved) * 3600.0 / p["capacity_as"]
     return np.asarray(voltage + np.where(part[:, None] == part, counting, 0.0))
