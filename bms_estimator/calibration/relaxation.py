@@ -205,7 +205,7 @@ def relaxation_test(
         glitches=samples.size - good.size,
         start_soc=initial_soc,
         end_soc=float(soc[-1]),
-        mean_load_a=float(good["current_a"][~resting].mean()),
+        mean_load_a=float(np.mean(good["current_a"], where=~resting)) if not resting.all() else 0.0,
         empty_v=_empty_v(good, soc, resting, rests),
         full_v=float(good["voltage_v"][0]) if resting[0] and initial_soc > NEAR_FULL else float("nan"),
     )

@@ -57,7 +57,9 @@ def capacity(
     current_offset_std_a: Annotated[
         float | None,
         typer.Option(
-            min=0.0, help="how wrong the sensor's zero may be [A]; else as [identifier] takes it", show_default=False
+            min=0.0,
+            help="how wrong the sensor's zero may be [A]; else as `identifier.current_offset_std_a` has it",
+            show_default=False,
         ),
     ] = None,
     current_sign: SignOfCurrent = None,
@@ -67,7 +69,7 @@ def capacity(
 
     Each rest tells the SOC by the cell's OCV, as well as the curve is known and steep there. From all of them together,
     over any load, comes the charge from full to empty with its standard deviation. A cell file is not written:
-    `capacity_ah` and `capacity_std` of [cell] are the place for what was measured.
+    `cell.capacity_ah` and `cell.capacity_std` of a cell file are the place for what was measured.
     """
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]

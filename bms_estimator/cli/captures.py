@@ -24,14 +24,14 @@ SignOfCurrent = Annotated[
 ]
 
 
-def check_out(out: Path, captures: Sequence[Path], *, force: bool) -> None:
-    """Refuse to write over a file unasked, and over a capture in any case.
+def check_out(out: Path, read: Sequence[Path], *, force: bool) -> None:
+    """Refuse to write over a file unasked, and over what is read in any case.
 
     Raises:
-        UserError: ``out`` is one of ``captures``, or it is a file already and ``force`` is not given.
+        UserError: ``out`` is one of ``read``, or it is a file already and ``force`` is not given.
     """
-    if any(out.exists() and path.exists() and out.samefile(path) for path in captures):
-        raise UserError(f"--out {out}: is a capture itself")
+    if any(out.exists() and path.exists() and out.samefile(path) for path in read):
+        raise UserError(f"--out {out}: is what is read; name another file")
     if out.is_file() and not force:
         raise UserError(f"--out {out}: exists already; --force replaces it")
 

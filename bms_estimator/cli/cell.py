@@ -56,11 +56,11 @@ def export(
 
     A service that starts from it, here or on a replacement, begins with what this one has learned.
     """
-    check_out(out, [], force=force)
     settings, model = load_pack(pack)
     file = CheckpointFile(checkpoint.parent if checkpoint else state_folder(settings), settings, model)
     if checkpoint:
         file.path = checkpoint
+    check_out(out, [pack, file.path], force=force)
     if checkpoint and not checkpoint.exists():
         raise UserError(f"--checkpoint {checkpoint}: no such file")
     found = file.load()

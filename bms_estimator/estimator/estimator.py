@@ -151,6 +151,7 @@ class Estimator:
             for j in (LN_R0, LN_R):
                 forget(f["mean"][best], f["covariance"][best], j)
                 f["covariance"][best, j, j] = resistance_std(f, p) ** 2
+            f["step"]["ln_ratio"], f["step"]["variance"] = 0.0, resistance_std(f, p) ** 2
         if math.isfinite(unseen_s):
             self.record["unlearned_s"] += unseen_s
 

@@ -122,7 +122,7 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     cov[HYST, HYST] += 0.1 * (1.0 - f[HYST] ** 2)
     cov[CURVE, CURVE] += 1.0 - f[CURVE] ** 2
     for j in range(NODE, NODE + NODES):
-        cov[j, j] += moved / AGED_SOC
+        cov[j, j] += max(1.0 - cov[j, j], 0.0) * moved / AGED_SOC
 
 
 @njit(cache=True)

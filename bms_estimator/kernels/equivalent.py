@@ -105,7 +105,7 @@ def told_by_steps(f: Record, p: Record) -> bool:
 
 @njit(cache=True)
 def open_circuit(f: Record, p: Record, e: Record, current_a: float, voltage_v: float) -> float:
-    """Voltage less overpotential, hysteresis and what temperature does to the OCV: E_o at 25 C [V], (2.4)."""
+    """Voltage less overpotential, hysteresis and what temperature does to the OCV: E_o of the cell file's curve, at 25 C [V], (2.4)."""
     x = f.mean[f.best]
     e_o = voltage_v + e.ohm[0] * (current_a - x[OFFSET])
     for k in range(BRANCHES):

@@ -59,6 +59,8 @@ LOAD_S = 600.0
 """The load is judged over so long [s]."""
 TEMPERATURE_S = 10.0
 """A temperature sensor's noise is averaged over so long [s]."""
+COLDEST_C, HOTTEST_C = -60.0, 120.0
+"""Where a cell's temperature may be [C]."""
 IDLE_C = 0.1
 """Std of a current that nobody measured [C]."""
 HYST_STD = 0.7
@@ -72,9 +74,9 @@ REOPEN_STD = 0.2
 @njit(cache=True)
 def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: float) -> None:
     """First sample: nothing is known but the told ``soc``, to ``p.soc_std``."""
-    s.started = 1
+    s.started, s.best = 1, 0
     s.current_a = current_a
-    s.sensed = 1 if math.isfinite(temperature_c) else 0
+    s.sensed = 1 if is_temperature(temperature_c) else 0
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     s.rms_a2 = max(current_a * current_a, (p.load_mean_c * p.capacity_as / 3600.0) ** 2)
@@ -86,12 +88,18 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
         for k in range(STATES):
             cov[j, k] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
-    s.step.variance = resistance_std(s, p) ** 2
+    s.step.phase, s.step.ln_ratio, s.step.variance = 0, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
     forget_curve(x, cov)
     seed(s, p, soc, p.soc_std)
     clear(s)
+
+
+@njit(cache=True)
+def is_temperature(temperature_c: float) -> bool:
+    """Whether a cell can have it: sensors say -127 or -300 C where a wire is off. NaN is none."""
+    return COLDEST_C <= temperature_c <= HOTTEST_C
 
 
 @njit(cache=True)
@@ -162,7 +170,7 @@ def clear(s: Record) -> None:
 @njit(cache=True)
 def count_on(s: Record, p: Record, dt_s: float, current_a: float, temperature_c: float) -> None:
     """Charge and branches from the sample before to this one."""
-    if math.isfinite(temperature_c):
+    if is_temperature(temperature_c):
         share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
         s.temperature_c += share * (temperature_c - s.temperature_c)
         s.sensed = 1

@@ -78,6 +78,8 @@ def identify(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: flo
     elif believed(c, s.counters, f, s.elements, dt_s, change_a, current_a, voltage_v):
         watch_steps(f, p.filter, dt_s, change_a, voltage_v)
         gather(f, current_a, voltage_v)
+    else:
+        f.step.phase = UNHELD
     if f.window.time_s >= WINDOW_S and f.window.samples > 0:
         take_window(s, p)
     s.observer.soc = f.soc

@@ -13,6 +13,7 @@ from bms_estimator.kernels.hypotheses import pack_std
 from bms_estimator.kernels.identification import identify, restart_filter, start_filter
 from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
+from bms_estimator.kernels.step_resistance import UNHELD
 
 Records = NDArray[np.void]
 
@@ -96,6 +97,7 @@ def step(
     s.time_s = time_s
     if dt_s < 0.0:  # the clock was set back: go on from here
         s.current_a = state[0].filter.current_a = current_a
+        state[0].filter.step.phase = UNHELD
         if math.isfinite(dt_s):
             s.time_steps_back += 1
         elif settings[0].identify:  # a new clock after a restart

@@ -39,7 +39,8 @@ def watch_steps(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: f
     step.variance += SHAPE_STD**2 * abs(s.current_a) * dt_s / p.capacity_as
     if dt_s > LONGEST_S:
         return
-    if before == STEPPED and abs(change_a) <= HELD_SHARE * abs(s.current_a - step.current_a):
+    stepped_a = abs(s.current_a - step.current_a)
+    if before == STEPPED and stepped_a >= least_a and abs(change_a) <= HELD_SHARE * stepped_a:
         take_step(s, p, voltage_v)
     elif before == HELD and abs(change_a) >= least_a:
         step.phase = STEPPED

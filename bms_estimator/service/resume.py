@@ -18,8 +18,8 @@ from bms_estimator.service.checkpoint import fields
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
 OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
-GROWING = ("filter.mean", "filter.covariance")
-"""Fields along the states of the filter; states that a version adds come last."""
+GROWING = {"filter.mean": 1, "filter.covariance": 2}
+"""Fields whose last axes, so many, are along the states of the filter; states that a version adds come last."""
 SAME_SOC = 0.03
 """Where the SOC of the filter is further from the observer's, it was switched off."""
 
@@ -48,7 +48,7 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
         return wrong
     if not was_on or abs(estimator.record["filter"]["soc"][0] - estimator.state["soc"][0]) > SAME_SOC:
         unseen_s = math.inf
-    if was_on and saved["filter.mean"].shape[-1] < STATES:
+    if was_on and saved.get("filter.mean", np.zeros(0)).shape[-1] < STATES:
         _open_curve(estimator)
     _open_new_states(estimator)
     estimator.resume(unseen_s)
@@ -66,8 +66,13 @@ def _fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
             continue
         if known.shape == field.shape:
             field[...] = known
-        elif name in GROWING and all(a <= b for a, b in zip(known.shape, field.shape, strict=True)):
+        elif name in GROWING and _is_shorter(known.shape, field.shape, GROWING[name]):
             field[tuple(map(slice, known.shape))] = known
+
+
+def _is_shorter(known: tuple[int, ...], field: tuple[int, ...], axes: int) -> bool:
+    """Whether the shapes are the same but for the last ``axes``, along which less is known."""
+    return known[:-axes] == field[:-axes] and max(known[-axes:]) <= field[-1]
 
 
 def _open_curve(estimator: Estimator) -> None:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.filter_settings import CURVE_SOC
 from bms_estimator.kernels.ekf_state import HYPOTHESES, SOC
 from bms_estimator.kernels.hypotheses import combine, copy
 from bms_estimator.kernels.ladder import GRID, REFERENCE_C
@@ -58,15 +59,18 @@ PARTS: dict[str, Change] = {
     "as it is": setting(),
     "R of 5 mV, not 50": setting(model_v=0.005),
     "no biases": setting(bias_relative=0.0, bias_grown=0.0, bias_soc=0.0),
-    "no error of R along SOC": setting(bias_soc=0.0),
+    "no error of R and early end along SOC": setting(bias_soc=0.0),
     "no error of what R has grown by": setting(bias_grown=0.0),
     "scales of R as in the file": setting(r_std=1e-6),
     "R the same at any SOC": known_resistances_of_the_middle,
     "no entropy": setting(per_kelvin_v=0.0),
     "no error of the OCV": setting(curve_error_v=0.0),
+    "curve not learned": setting(learned=0.0),
+    "knees as sure as the rest of the curve": setting(curve_soc=CURVE_SOC),
     "no hysteresis": setting(hysteresis_v=0.0),
     "no offset": setting(offset_c=0.0),
     "no error of the capacity": setting(capacity_std=0.0),
+    "offset and capacity do not change": setting(offset_s=1e12, aged_soc=1e9),
     "polarisation from the first current": setting(load_c=0.0, load_level_c=1e-3),
     "weights not tempered": setting(temper=0.5),
 }

@@ -135,3 +135,13 @@ def test_a_file_is_not_replaced_unasked(tmp_path, capsys, pack):
     assert code == 2
     assert "exists already" in err
     assert out.read_text() == "mine"
+
+
+def test_it_does_not_write_over_what_it_reads(capsys, pack):
+    checkpoint = next((pack.parent / "state").glob("*.npz"))
+    for out in (pack, checkpoint):
+        before = out.read_bytes()
+        code, _, err = run(capsys, "cell", "export", pack, "--checkpoint", checkpoint, "--out", out, "--force")
+        assert code == 2
+        assert "is what is read" in err
+        assert out.read_bytes() == before

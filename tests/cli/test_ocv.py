@@ -124,7 +124,7 @@ def test_a_capture_is_not_overwritten(captures, capsys):
     before = captures[0].read_bytes()
     code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0], "--force")
     assert code == 2
-    assert "is a capture itself" in err
+    assert "is what is read" in err
     assert captures[0].read_bytes() == before
 
 

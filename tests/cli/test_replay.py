@@ -192,7 +192,7 @@ def test_the_capture_is_never_written_over(capture, tmp_path, capsys):
     for out in (capture, link):
         code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--force")
         assert code == 2
-        assert "is a capture itself" in err
+        assert "is what is read" in err
     assert capture.read_bytes() == before
 
 

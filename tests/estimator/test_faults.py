@@ -240,3 +240,14 @@ def test_every_suspect_says_what_to_do() -> None:
     assert Suspect.OFFSET.text in both.text
     assert Suspect.CAPACITY.text in both.text
     assert not Suspect(0).text
+
+
+@pytest.mark.parametrize("wrong_c", [-127.0, -300.0, 850.0, np.inf])
+def test_a_temperature_that_no_cell_has_is_none(wrong_c: float) -> None:
+    block = pulses()[0][:1200]
+    block["temperature_c"][600:] = np.nan
+    without = Estimator(TRUTH, initial_soc=0.9).run(block.copy())
+    block["temperature_c"][600:] = wrong_c
+    trace = Estimator(TRUTH, initial_soc=0.9).run(block)
+    assert np.array_equal(trace["soc"], without["soc"])
+    assert np.array_equal(trace["soc_std"], without["soc_std"])

@@ -124,6 +124,7 @@ def test_a_long_pause_leaves_what_was_learned_of_capacity_and_of_the_sensor_what
     at_first = offset_variance(p)
     assert at_first - covariance[OFFSET, OFFSET] == pytest.approx(np.exp(-0.2) * (at_first - first[OFFSET, OFFSET]))
     assert np.array_equal(covariance, covariance.T)
+    assert f["step"]["ln_ratio"] == 0.0
     assert (mean[LN_R0], covariance[LN_R0, LN_R0]) == (0.0, estimator.settings_record[0]["filter"]["r_std"] ** 2)
 
 

@@ -62,6 +62,24 @@ def test_r_s_is_what_steps_of_the_current_show(pulses, file: str, rate_hz: int) 
     assert (std < 0.2 * r_s).all()
 
 
+def learned_of(rows: list[tuple[float, float, float]]) -> float:
+    """ln(R_s / R_0 of the file) after a minute without current and then these rows: time [s], current [A], voltage [V]."""
+    estimator = Estimator(cell_file(FILES["generic"]), initial_soc=0.5)
+    for n in range(60):
+        estimator.step(float(n), 0.0, 3.7)
+    for time_s, current_a, voltage_v in rows:
+        estimator.step(time_s, current_a, voltage_v)
+    return float(estimator.record[0]["filter"]["step"]["ln_ratio"])
+
+
+@pytest.mark.parametrize("back_a", [0.0, 0.004])
+def test_a_step_that_was_none_in_the_end_teaches_nothing(back_a: float) -> None:
+    """A sample that is not believed, or a clock set back, between the current's step and its return."""
+    not_believed = [(60.0, 3.0, 3.55), (60.5, 0.0, 2.6), (61.0, back_a, 3.69)]
+    set_back = [(60.0, 3.0, 3.55), (59.0, 0.0, 3.7), (60.0, back_a, 3.7)]
+    assert learned_of(not_believed) == learned_of(set_back) == 0.0
+
+
 def test_a_load_that_never_jumps_leaves_r_s_to_the_filter(pulses) -> None:
     smooth = pulses[0][::FULL_HZ].copy()
     smooth["current_a"] = OXIDE.capacity_ah * (0.5 + 0.4 * np.sin(smooth["time_s"] / 200.0))

@@ -28,7 +28,7 @@ def test_the_first_variance_is_the_curve_s_at_nodes_and_between() -> None:
         assert np.isclose(row @ covariance @ row, p["learned"] * error_v**2, rtol=1e-12)
 
 
-def test_it_is_linear_between_nodes_in_units_of_the_error() -> None:
+def test_it_is_that_of_the_nodes_in_units_of_the_error() -> None:
     p = Estimator(GENERIC).settings_record[0]["filter"]
     x = np.zeros(STATES)
     x[NODE:] = np.arange(NODES)
