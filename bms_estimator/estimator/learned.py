@@ -10,7 +10,7 @@ from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell import emf
 from bms_estimator.kernels.ekf_state import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
 from bms_estimator.kernels.element_map import ELEMENT_NAMES
-from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS
+from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
 from bms_estimator.kernels.identification import LEAST_BINS
 from bms_estimator.kernels.ladder import on_grid
 from bms_estimator.kernels.ocv_learning import per_node_v, place
@@ -68,6 +68,18 @@ def relative_capacity(record: np.void) -> Learned:
     """True over declared capacity."""
     ln_q, std = _bias(record, LN_Q)
     return Learned(math.exp(ln_q), math.exp(ln_q) * std, 0.0)
+
+
+def relative_series_resistance(record: np.void, settings: np.void) -> Learned:
+    """R_s over that of the cell file at the same SOC and temperature.
+
+    Args:
+        record: Of dtype ESTIMATOR_STATE, after a sample, identifying.
+        settings: Of dtype ESTIMATOR_SETTINGS.
+    """
+    ratio, variance = ln_r_s_ratio(record["filter"], settings["filter"])
+    value = math.exp(ratio)
+    return Learned(value, value * math.sqrt(variance), float(record["unlearned_s"][ELEMENT_NAMES.index("r_s_ohm")]))
 
 
 def current_offset(record: np.void) -> Learned:

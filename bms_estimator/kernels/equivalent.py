@@ -49,14 +49,20 @@ def equivalent(f: Record, p: Record, e: Record) -> None:
     e.ohm[0] *= math.exp(x[LN_R0])
     for k in range(1, RESISTANCES):
         e.ohm[k] *= others
-    variance, ratio = cov[LN_R0, LN_R0], x[LN_R0]
-    if told_by_steps(f, p):
-        variance, ratio = f.step.variance, f.step.ln_ratio
+    ratio, variance = ln_r_s_ratio(f, p)
     half_ohm = 0.5 * within_sample(f, e)
     e.value[R_S] = file_ohm * math.exp(ratio) + half_ohm
-    e.ln_variance[R_S] = variance + SHAPE_STD**2 + (half_ohm / e.value[R_S]) ** 2
+    e.ln_variance[R_S] = variance + (half_ohm / e.value[R_S]) ** 2
     one_branch(e, 0, SHORT, R_TS, cov[LN_R, LN_R], p.r_std)
     one_branch(e, SHORT, BRANCHES, R_TL, cov[LN_R, LN_R], p.r_std)
+
+
+@njit(cache=True)
+def ln_r_s_ratio(f: Record, p: Record) -> tuple[float, float]:
+    """Ln of R_s over R_0 of the file at the same SOC and temperature, and its variance: by steps, else as the filter has it."""
+    if told_by_steps(f, p):
+        return f.step.ln_ratio, f.step.variance + SHAPE_STD**2
+    return f.mean[f.best, LN_R0], f.covariance[f.best, LN_R0, LN_R0] + SHAPE_STD**2
 
 
 @njit(cache=True)

@@ -38,6 +38,7 @@ from bms_estimator.kernels.ekf_state import (
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius
 from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.state import Record
+from bms_estimator.kernels.step_resistance import UNHELD
 
 WINDOW_S = 0.99
 """Samples of about a second make one update [s]."""
@@ -88,7 +89,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
         for k in range(STATES):
             cov[j, k] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
-    s.step.phase, s.step.ln_ratio, s.step.variance = 0, 0.0, resistance_std(s, p) ** 2
+    s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
     forget_curve(x, cov)

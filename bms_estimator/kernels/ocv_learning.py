@@ -1,8 +1,8 @@
 """The OCV learned while the filter runs: the error of the curve of the cell file as states of the filter, along SOC.
 
 ``learned`` of the variance of that error belongs to the curve itself: it is the same whenever the SOC comes back. It is
-blended between ``NODES`` states so that its variance stays, each in units of the curve's std there, correlated with their neighbours over ``ALIKE_SOC``.
-The rest, CURVE, is of temperature, load and history, and is another each time.
+blended between ``NODES`` states so that its variance stays, each in units of the curve's std there, correlated with its
+neighbours over ``ALIKE_SOC``. The rest, CURVE, is of temperature, load and history, and is another each time.
 
 A voltage tells SOC and curve together: what it tells of the curve is no more certain than the SOC was without it. The
 joint covariance holds exactly that, so no rule is needed which voltages may be learned from (the same with a map and a

@@ -11,6 +11,7 @@ import math
 
 from numba import njit
 
+from bms_estimator.kernels.ekf import HUBER
 from bms_estimator.kernels.ekf_state import LN_R, SOC
 from bms_estimator.kernels.equivalent import LONGEST_S
 from bms_estimator.kernels.ladder import BRANCHES, resistances
@@ -27,8 +28,6 @@ FAST_STD = 0.5
 """Relative std of what the branches change by within the step."""
 SHAPE_STD = 0.3
 """By how much ln(R_s / R_0 of the file) changes over the whole range of SOC, std of a random walk."""
-HUBER = 2.0
-"""A step more than so many std away counts as one of so many."""
 
 
 @njit(cache=True)

@@ -80,7 +80,7 @@ class ParameterReport(Report):
     ocv: OcvCurve | None = Field(description="null before the first sample, and without the identifier")
     elements: dict[str, Parameter] = Field(description="r_s_ohm, r_ts_ohm, c_ts_farad, r_tl_ohm, c_tl_farad, e_o_v")
     state_of_health: dict[str, Parameter] = Field(
-        description="capacity and r_s over those of the cell file: 1 is as new; r_s at the present SOC; "
+        description="capacity and r_s over those of the cell file: 1 is as new; r_s at the same SOC and temperature; "
         "current_offset_a: what the current sensor shows at no current [A]"
     )
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.ekf_noise import offset_variance
 from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.hypotheses import forget
 from bms_estimator.kernels.input_checks import COUNTERS, keep
@@ -87,11 +88,10 @@ def _open_new_states(estimator: Estimator) -> None:
     """Offset and capacity begin as configured where they were no states of the filter before, or are none now."""
     f, p = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
     best = f["best"]
-    stds = {OFFSET: p["offset_c"] * p["capacity_as"] / 3600.0, LN_Q: p["capacity_std"]}
-    for j, std in stds.items():
-        if (f["covariance"][best, j, j] > 0.0) != (std > 0.0):
+    for j, variance in ((OFFSET, offset_variance(p)), (LN_Q, p["capacity_std"] ** 2)):
+        if (f["covariance"][best, j, j] > 0.0) != (variance > 0.0):
             forget(f["mean"][best], f["covariance"][best], j)
-            f["covariance"][best, j, j] = std**2
+            f["covariance"][best, j, j] = variance
 
 
 def _insane(estimator: Estimator) -> str:

@@ -1,14 +1,12 @@
 """a16..a21 of (2.10) for a cell file that gives its OCV as a table: fitted to it, once for each table."""
 
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from bms_estimator.model.cell import CellModel, TableOcv
 
-KEPT = 16
-"""Fits of so many tables are kept: those of the packs of one process."""
 POINTS = 101
 """Evenly spaced SOCs that the fit is made at."""
 
@@ -32,7 +30,7 @@ def formula(cell: CellModel) -> Formula | None:
     return _fitted(cell.ocv) if isinstance(cell.ocv, TableOcv) else None
 
 
-@lru_cache(maxsize=KEPT)
+@cache
 def _fitted(ocv: TableOcv) -> Formula:
     from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - what fits is loaded only where there is a table
 

@@ -12,6 +12,7 @@ from bms_estimator.estimator.learned import (
     learned_ocv,
     present_elements,
     relative_capacity,
+    relative_series_resistance,
 )
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.model.cell import CellModel
@@ -71,7 +72,7 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
         for e, (name, one) in enumerate(present.items()):
             held = _of_source(elements[name], led[3 * e + 1 : 3 * e + 4].any())
             elements[name] = _identified(one, held, VALID_STD, now_s)
-        health = _state_of_health(estimator, present["r_s_ohm"], now_s)
+        health = _state_of_health(estimator, now_s)
     return ParameterReport(
         publish_time=iso_utc(now_s),
         soc=finite(state["soc"]),
@@ -116,11 +117,10 @@ def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
     return elements
 
 
-def _state_of_health(estimator: Estimator, r_s: Learned, now_s: float) -> dict[str, Parameter]:
+def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]:
     """Capacity and R_s over those of the cell file."""
-    new = chen_mora.r_s(float(estimator.state[0]["soc"]), estimator.cell.a)
-    ratio = Learned(r_s.value / new, r_s.std / new, r_s.unlearned_s)
-    record, p = estimator.record[0], estimator.settings_record[0]["filter"]
+    record, settings = estimator.record[0], estimator.settings_record[0]
+    ratio, p = relative_series_resistance(record, settings), settings["filter"]
     capacity, offset_a = relative_capacity(record), current_offset(record)
     first_std_a = float(p["offset_c"] * p["capacity_as"]) / 3600.0
     return {

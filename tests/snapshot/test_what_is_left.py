@@ -16,6 +16,7 @@ from bms_estimator.service.resume import resume
 from bms_estimator.snapshot.health import identifier_counters, suspicions
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
+from tests.estimator.anywhere.cases import Case, capture
 
 CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})  # starts at its own values
 Q_AH = CELL.cell.capacity_ah
@@ -191,3 +192,16 @@ def test_a_current_of_the_wrong_sign_is_named() -> None:
     good = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     good.run(pulses(0.2, 1.0))
     assert suspicions(good.record[0], good.settings_record[0]) == []
+
+
+def test_the_series_resistance_of_a_cold_cell_is_compared_with_that_of_its_file_in_the_cold() -> None:
+    ratios = []
+    for temperature_c in (25.0, 0.0):
+        seen = capture(Case("R_s", temperature_c=temperature_c, hours=0.5))
+        estimator = Estimator(seen.cell, initial_soc=float(seen.soc[0]))
+        estimator.run(seen.samples)
+        r_s = parameter_report(estimator, NOW_S).state_of_health["r_s"]
+        assert r_s.source == "identified"
+        ratios.append(r_s.value)
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.15)  # the file is of another such cell, and errs by 10 %
+    assert ratios[1] == pytest.approx(ratios[0], rel=0.1)
