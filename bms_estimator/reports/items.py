@@ -9,7 +9,12 @@ class Verdict(Enum):
 
     REPRODUCED = "reproduced"
     CORRECTED = "reproduced after correction"
+    RECOMPUTED = "recomputed"
+    """Computed from printed values, compared with nothing: the thesis prints no value of it."""
     NOT = "cannot be reproduced"
+    CLAIM_HOLDS = "claim tested on other data: holds"
+    """What the thesis claims of its recordings, tested on others."""
+    CLAIM_FAILS = "claim tested on other data: fails"
     GIVEN = "given"
     """Input data, a diagram or a photograph: there is nothing to compute."""
     ADDED = "added"
