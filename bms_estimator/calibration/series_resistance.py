@@ -3,8 +3,13 @@
 (4.2) is printed with the opposite sign: solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive.
 x2 and x3 are those of the model with frozen a1..a12: the observer's own settle so that (4.1) meets y, and leave nothing
 for R_s.
+
+(4.2) as printed divides by the current: an error of the open-circuit voltage of 10 mV is 65 mohm at C/20 and 2 mohm at
+1.5C, and a plain mean over currents takes both for the same (E19). Here R_s is least squares on the voltage that is
+missing, i R_s: each value of (4.2) weighs as its current squared.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +23,7 @@ from bms_estimator.model.errors import UserError
 Floats = NDArray[np.float64]
 
 LEAST_CURRENT_C = 0.02
-"""Below this C-rate (4.2) divides noise by little [1/h]."""
+"""Below this C-rate a current is none: the sensor's noise [1/h]."""
 BIN = 0.01
 """R_s is averaged over such steps of SOC."""
 EXPONENTS = np.geomspace(2.0, 200.0, 200)
@@ -29,15 +34,17 @@ LEAST_BINS = 5
 
 @dataclass(frozen=True)
 class SeriesResistance:
-    """R_s over SOC.
+    """R_s over SOC, one value for each bin of ``BIN`` that holds data. All arrays have shape (n,).
 
     Attributes:
-        soc: Mean SOC in each bin that holds data, 0..1.
-        r_s_ohm: Mean of (4.2) in each bin [ohm].
+        soc: Mean SOC of the bin's samples, 0..1.
+        r_s_ohm: (4.2) over the bin, by least squares on the voltage [ohm].
+        weight: Mean of the current squared over the bin, summed over the loads [A^2].
     """
 
     soc: Floats
     r_s_ohm: Floats
+    weight: Floats
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,7 @@ class SeriesResistanceFit:
     Attributes:
         a: a13 [ohm], a14, a15 [ohm].
         std: Their standard errors; NaN for one at its bound.
-        rms_ohm: Of the residual [ohm].
+        rms_ohm: Of the residual, weighted as the fit is [ohm].
     """
 
     a: Floats
@@ -81,27 +88,38 @@ def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
             f"R_s by (4.2) needs a current: none above {LEAST_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
             f"{np.abs(run.current_a).max():.3f} A"
         )
-    missing_v = open_circuit(cell, run.soc) - run.overpotential_v - run.voltage_v
-    r_s = missing_v[flowing] / run.current_a[flowing]  # (4.2), with the sign of (2.4)
-    bins = np.clip((run.soc[flowing] / BIN).astype(int), 0, round(1.0 / BIN) - 1)
+    missing_v = (open_circuit(cell, run.soc) - run.overpotential_v - run.voltage_v)[flowing]
+    soc, current_a = run.soc[flowing], run.current_a[flowing]
+    bins = _bins(soc)
     count = np.bincount(bins)
     used = np.flatnonzero(count)
+    squares = np.bincount(bins, current_a**2)[used]
     return SeriesResistance(
-        soc=np.bincount(bins, run.soc[flowing])[used] / count[used], r_s_ohm=np.bincount(bins, r_s)[used] / count[used]
+        soc=np.bincount(bins, soc)[used] / count[used],
+        r_s_ohm=np.bincount(bins, current_a * missing_v)[used] / squares,  # (4.2), with the sign of (2.4)
+        weight=squares / count[used],
     )
 
 
-def mean_of(curves: list[SeriesResistance]) -> SeriesResistance:
-    """The mean over several currents where at least one has data, as in Fig. 22 and 31."""
-    soc = (np.arange(round(1.0 / BIN)) + 0.5) * BIN
-    rows = [np.interp(soc, c.soc, c.r_s_ohm, left=np.nan, right=np.nan) for c in curves]
-    stacked = np.array(rows)
-    known = np.isfinite(stacked).any(axis=0)
-    return SeriesResistance(soc=soc[known], r_s_ohm=np.nanmean(stacked[:, known], axis=0))
+def mean_of(curves: Sequence[SeriesResistance]) -> SeriesResistance:
+    """The mean over several currents, each with its weight, where at least one has data: Fig. 22 and 31."""
+    soc, r_s, weight = (np.concatenate([getattr(c, name) for c in curves]) for name in ("soc", "r_s_ohm", "weight"))
+    bins = _bins(soc)
+    total: Floats = np.bincount(bins, weight).astype(np.float64)
+    used = np.flatnonzero(total)
+    return SeriesResistance(
+        soc=np.bincount(bins, weight * soc)[used] / total[used],
+        r_s_ohm=np.bincount(bins, weight * r_s)[used] / total[used],
+        weight=total[used],
+    )
+
+
+def _bins(soc: Floats) -> NDArray[np.int64]:
+    return np.clip((soc / BIN).astype(np.int64), 0, round(1.0 / BIN) - 1)
 
 
 def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> SeriesResistanceFit:
-    """Fit (2.9): for each exponent a14 non-negative linear least squares, the best of them taken.
+    """Fit (2.9): for each exponent a14 non-negative weighted linear least squares, the best of them taken.
 
     Raises:
         UserError: Too few bins of SOC with data.
@@ -110,15 +128,16 @@ def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> S
     soc, r_s = curve.soc[used], curve.r_s_ohm[used]
     if soc.size < LEAST_BINS:
         raise UserError(f"R_s is known in {soc.size} steps of SOC, at least {LEAST_BINS} are needed for a13..a15")
+    root = np.sqrt(curve.weight[used] / curve.weight[used].mean())
     fits = []
     for exponent in EXPONENTS:
         basis = np.column_stack([np.exp(-exponent * soc), np.ones_like(soc)])
-        values, norm = nnls(basis, r_s)
+        values, norm = nnls(root[:, None] * basis, root * r_s)
         fits.append((float(norm), exponent, values))
     norm, exponent, (a13, a15) = min(fits, key=lambda fit: fit[0])
     a = np.array([a13, exponent, a15])
     decay = np.exp(-exponent * soc)
-    jacobian = np.column_stack([decay, -a13 * soc * decay, np.ones_like(soc)])
+    jacobian = root[:, None] * np.column_stack([decay, -a13 * soc * decay, np.ones_like(soc)])
     free = np.array([a13 > 0.0, a13 > 0.0 and EXPONENTS[0] < exponent < EXPONENTS[-1], a15 > 0.0])
     std = np.full(3, np.nan)
     variance = norm**2 / max(soc.size - int(free.sum()), 1)

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.reports.claims import claim
+from bms_estimator.reports.items import Verdict
 from bms_estimator.reports.protocol import Capture, Protocol, kind_of
 from bms_estimator.reports.simulated_pack import SensorChain, captures, experiments, pack
 
@@ -61,6 +63,20 @@ class Experiment:
         if self.recorded is not None:
             return None
         return Protocol(pack(), captures(self._true, COARSE), COARSE.voltage_step_v)
+
+    def tested(self, *keys: str) -> tuple[Verdict, str]:
+        """Verdict on one or more of ``claims.CLAIMS``, all of which must hold on the captures, and why, in words.
+
+        Nothing is tested on the simulated pack: it has the model's own form.
+        """
+        if self.recorded is None:
+            return Verdict.NOT, ""
+        found = [claim(key, [self.protocol]) for key in keys]
+        words = "".join(f"{one.words} " for one in found)
+        verdicts = {one.verdict for one in found} - {Verdict.NOT}
+        if not verdicts:
+            return Verdict.NOT, words
+        return (Verdict.CLAIM_FAILS if Verdict.CLAIM_FAILS in verdicts else Verdict.CLAIM_HOLDS), words
 
     @property
     def truth(self) -> Floats | None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.reports import printed
 from bms_estimator.reports.experiment import Experiment
 from bms_estimator.reports.items import Figure, Verdict
 from bms_estimator.reports.plot import COLOURS, FAINT, plot, thin
@@ -19,8 +20,11 @@ PER_FIGURE = 4
 """Loads in one figure, as in Fig. 32."""
 
 
-def _figure(key: str, title: str, svg: str, experiment: Experiment, reason: str) -> Figure:
-    return Figure(key, title, svg, Verdict.NOT, f"{experiment.unpublished} {reason}")
+def _figure(
+    key: str, title: str, svg: str, experiment: Experiment, reason: str, *, claims: tuple[str, ...] = ()
+) -> Figure:
+    verdict, tested = experiment.tested(*claims) if claims else (Verdict.NOT, "")
+    return Figure(key, title, svg, verdict, f"{experiment.unpublished} {tested}{reason}")
 
 
 def figure_26(experiment: Experiment) -> Figure:
@@ -103,6 +107,7 @@ def figure_29(experiment: Experiment) -> Figure:
         plot(draw, columns=2, salt="figure-29"),
         experiment,
         "They are the products of the bounds' limits (E3).",
+        claims=("RC products",),
     )
 
 
@@ -137,7 +142,11 @@ def figure_31(experiment: Experiment) -> Figure:
         axes.legend(ncols=2)
 
     return _figure(
-        "31", "R_s by (4.2) for different loads", plot(draw, salt="figure-31"), experiment, "Sign of (4.2) as (2.4)."
+        "31",
+        "R_s by (4.2) for different loads",
+        plot(draw, salt="figure-31"),
+        experiment,
+        "Sign of (4.2) as (2.4); the mean is weighted by the current squared (E19).",
     )
 
 
@@ -196,9 +205,10 @@ def figure_32(experiment: Experiment) -> Figure:
 def figure_33(experiment: Experiment) -> Figure:
     """Constant loads, errors."""
     p = experiment.protocol
-    worst = max(p.dynamic[name].max_percent for name in _constant(p))
+    worst = max((p.dynamic[name].max_percent for name in _constant(p)), default=float("nan"))
     svg = _grid(_constant(p), _errors(p), "33")
-    return _figure("33", "Constant loads: error", svg, experiment, f"Largest {worst:.2f} % (printed 0.9 %).")
+    reason = f"Largest {worst:.2f} % (printed {printed.MAX_CONSTANT:g} %)."
+    return _figure("33", "Constant loads: error", svg, experiment, reason, claims=("constant loads, largest",))
 
 
 def figure_34(experiment: Experiment) -> Figure:
@@ -210,7 +220,7 @@ def figure_34(experiment: Experiment) -> Figure:
 def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> Figure:
     p = experiment.protocol
     names = _steps(p)[index : index + 1] or _steps(p)[-1:]
-    worst = max(p.dynamic[name].max_percent for name in names)
+    worst = max((p.dynamic[name].max_percent for name in names), default=float("nan"))
     return _figure(key, title, _grid(names, _voltages(p), key), experiment, f"Largest error {worst:.2f} %.")
 
 
@@ -234,7 +244,9 @@ def figure_37(experiment: Experiment) -> Figure:
 def figure_38(experiment: Experiment) -> Figure:
     """Errors of the steps."""
     p = experiment.protocol
-    return _figure("38", "Steps: error", _grid(_steps(p), _errors(p), "38"), experiment, "Printed: at most 1.5 %.")
+    reason = f"Printed: at most {printed.MAX_STEPS:g} %."
+    svg = _grid(_steps(p), _errors(p), "38")
+    return _figure("38", "Steps: error", svg, experiment, reason, claims=("steps, largest",))
 
 
 def figure_40(experiment: Experiment) -> Figure:
@@ -248,7 +260,7 @@ def figure_40(experiment: Experiment) -> Figure:
 def figure_41(experiment: Experiment) -> Figure:
     """SOC by interpolation."""
     p = experiment.protocol
-    run, (soc, _) = p.dynamic[p.largest], p.interpolated
+    run, (soc, _) = p.dynamic[p.largest], p.interpolated(p.largest)
     rms = float(np.sqrt(np.mean((soc - run.soc) ** 2)))
 
     def draw(axes: Any) -> None:
@@ -267,13 +279,14 @@ def figure_41(experiment: Experiment) -> Figure:
         plot(draw, columns=2, salt="figure-41"),
         experiment,
         f"They differ by {100 * rms:.2f} % of SOC RMS.",
+        claims=("SOC by interpolation",),
     )
 
 
 def figure_42(experiment: Experiment) -> Figure:
     """E_o over both SOCs."""
     p = experiment.protocol
-    run, (soc, e_o) = p.dynamic[p.largest], p.interpolated
+    run, (soc, e_o) = p.dynamic[p.largest], p.interpolated(p.largest)
 
     def draw(axes: Any) -> None:
         x, y = thin(run.soc, e_o)

@@ -9,7 +9,7 @@ from bms_estimator.calibration.ocv_points import max_v, pooled, rms_v
 from bms_estimator.reports import printed
 from bms_estimator.reports.experiment import Experiment
 from bms_estimator.reports.items import Table, Verdict, number
-from bms_estimator.reports.protocol import LOWEST_SOC, STATIC_SOC
+from bms_estimator.reports.protocol import KNEE_SOC, LOWEST_SOC, STATIC_SOC
 
 
 def table_8(experiment: Experiment) -> Table:
@@ -63,8 +63,8 @@ def table_9(experiment: Experiment) -> Table:
         columns,
         tuple(rows),
         Verdict.NOT,
-        f"{experiment.unpublished} R_s by (4.2), with the sign of (2.4), over {len(protocol.r_s_curves)} constant loads; "
-        f"residual of the fit {1e3 * fit.rms_ohm:.2f} mΩ RMS. It takes up what R_ts + R_tl, which come from the bounds, have "
+        f"{experiment.unpublished} R_s by (4.2), with the sign of (2.4) and each value weighted by its current squared (E19), "
+        f"over {len(protocol.r_s_curves)} constant loads and relaxation tests; residual of the fit {1e3 * fit.rms_ohm:.2f} mΩ RMS. It takes up what R_ts + R_tl, which come from the bounds, have "
         "wrong; a13 at 0 says that no rise towards empty is left for it.",
     )
 
@@ -98,7 +98,7 @@ def table_10(experiment: Experiment) -> Table:
         "estimates ten follow to 0.3 % from bounds, weights and initial values alone, without any data, as a mean over the "
         "first 10 h: 1800 adds 0.0005 to a1, 42,000,000 adds 38.9 to a12. a4 = 6.2585 does not come out (5.51). "
         if printed_bounds
-        else "Bounds are those of the cell file, not the printed ones. "
+        else "Bounds are the printed ones scaled to this cell's capacity, where its file has none of its own. "
     )
     return Table(
         "10",
@@ -114,31 +114,39 @@ def table_10(experiment: Experiment) -> Table:
 def table_11(experiment: Experiment) -> Table:
     """Validation."""
     protocol, coarse = experiment.protocol, experiment.coarse
-    columns = ["load", "mean current [A]", "printed mean %", "mean %", "max %", "RMS [mV]"]
+    columns = ["load", "mean current [A]", "serves", "printed mean %", "mean %", "max %", "RMS [mV]"]
+    columns += ["at SOC", f"mean %, SOC > {KNEE_SOC:g}", f"max %, SOC > {KNEE_SOC:g}"]
     columns += ["mean %, 10 bit", "max %, 10 bit"] if coarse else []
     rows = []
+    validating = [capture.name for capture in protocol.validating]
     for name, run in protocol.dynamic.items():
         flowing = np.abs(run.current_a) > 0.01 * protocol.cell.cell.capacity_ah
+        above = run.error_percent[run.soc > KNEE_SOC]
         row = [
             name,
             number(float(run.current_a[flowing].mean()), 3),
+            "validation" if name in validating else "step 2",
             number(printed.TABLE_11[name]) if name in printed.TABLE_11 else "-",
             number(run.mean_percent, 3),
             number(run.max_percent, 3),
             number(1e3 * rms_v(run.error_v), 3),
+            number(float(run.soc[np.argmax(run.error_percent)]), 2),
+            *(number(float(x), 3) for x in ((above.mean(), above.max()) if above.size else (np.nan, np.nan))),
         ]
         if coarse:
             other = coarse.dynamic[name]
             row += [number(other.mean_percent, 3), number(other.max_percent, 3)]
         rows.append(tuple(row))
+    verdict, tested = experiment.tested("constant loads, mean", "steps, mean")
     return Table(
         "11",
         "Validation: error of the output voltage with frozen parameters",
         tuple(columns),
         tuple(rows),
-        Verdict.NOT,
-        f"{experiment.unpublished} Parameters from {protocol.smallest.name} alone and from the relaxation tests; SOC "
-        f"{LOWEST_SOC:g} to 1. "
+        verdict,
+        f"{experiment.unpublished} {tested}a1 to a12 from {protocol.smallest.name}, a16 to a21 from the relaxation tests, a13 "
+        f"to a15 from all constant loads and relaxation tests but the one of the row. Error of the measured voltage, from the "
+        f"first sample until SOC {LOWEST_SOC:g}, counted from full. "
         + (
             "The pack has the very form of the model, so the errors are smaller than a real pack's."
             if experiment.recorded is None
@@ -150,10 +158,9 @@ def table_11(experiment: Experiment) -> Table:
 def table_13(experiment: Experiment) -> Table:
     """Dynamic and static."""
     protocol = experiment.protocol
-    means = {
-        "dynamic": [run.mean_percent for run in protocol.dynamic.values()],
-        "static": [run.mean_percent for run in protocol.static.values()],
-    }
+    loads = [capture.name for capture in protocol.validating]
+    runs = {"dynamic": protocol.dynamic, "static": protocol.static}
+    means = {kind: [of_kind[name].mean_percent for name in loads] for kind, of_kind in runs.items()}
     rows = tuple(
         (
             f"estimated {kind} model",
@@ -163,14 +170,15 @@ def table_13(experiment: Experiment) -> Table:
         )
         for kind, values in means.items()
     )
+    verdict, tested = experiment.tested("dynamic against static")
     return Table(
         "13",
         "Dynamic and static model, experiment: mean error of the output voltage [%]",
         ("model", "printed", "mean over the loads", "worst load"),
         rows,
-        Verdict.NOT,
-        f"{experiment.unpublished} The static model is frozen at SOC {STATIC_SOC:g}; the thesis does not print its own. The "
-        "printed 0.003 % of the dynamic model is a hundredth of the errors of Table 11: its definition must differ.",
+        verdict,
+        f"{experiment.unpublished} {tested}The static model is frozen at SOC {STATIC_SOC:g}; the thesis does not print its own. "
+        "The printed 0.003 % of the dynamic model is a hundredth of the errors of Table 11: its definition must differ.",
     )
 
 

@@ -1,6 +1,10 @@
 """The experimental protocol of chapter 5 on captures: steps 1 to 3, validation, SOC by interpolation.
 
 The captures are real ones, or those of the simulated pack. Each result is made when it is first asked for.
+
+No parameter comes from the capture that it is validated on. Step 1 takes the relaxation tests alone; step 2 the constant
+load of the smallest current, with bounds that no capture has a part in; step 3 all constant loads and the loads of the
+relaxation tests, but for a constant load's own validation all others.
 """
 
 from collections.abc import Sequence
@@ -26,7 +30,7 @@ from bms_estimator.calibration.series_resistance import (
 )
 from bms_estimator.calibration.soc_lookup import soc_by_interpolation
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell import Bounds, CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import ObserverSettings
@@ -35,6 +39,8 @@ Floats = NDArray[np.float64]
 
 LOWEST_SOC = 0.05
 """Validation ends here: below, the elements and the open-circuit voltage run off (E14)."""
+KNEE_SOC = 0.1
+"""Errors are given above it as well: below it real cells leave the form of the elements under any large current."""
 STATIC_SOC = 0.5
 """SOC at which the static model is frozen."""
 REST_SHARE = 0.05
@@ -81,23 +87,43 @@ def kind_of(name: str, samples: SampleBlock, capacity_ah: float) -> Kind:
     return Kind.STEPS
 
 
+def printed_bounds(cell: CellModel) -> dict[str, Bounds]:
+    """Table 10's bounds and initial values of a1..a12, scaled from its pack to ``cell``.
+
+    Resistances go with the cells in series over the capacity, capacitances against it; exponents stay. They are known
+    before anything is measured: no capture has a part in them.
+    """
+    printed = load_cell("thunder_power_6s")
+    ohm = (cell.cell.series_count * printed.cell.capacity_ah) / (printed.cell.series_count * cell.cell.capacity_ah)
+    found = {}
+    for name, bounds in printed.adaptation.items():
+        element, place = divmod(int(name[1:]) - 1, 3)
+        factor = 1.0 if place == 1 else 1.0 / ohm if element in (2, 3) else ohm
+        table = bounds.model_dump()
+        scaled = {key: factor * table[key] for key in ("upper", "lower", "initial") if table[key] is not None}
+        found[name] = Bounds.model_validate(table | scaled)
+    return found
+
+
 class Protocol:
     """Chapter 5 on one pack.
 
     Args:
-        cell: Its capacity, its limits and the bounds of (3.18); its elements and OCV are not used but estimated.
-        captures: At least one relaxation test and one constant load, discharging.
+        cell: Its capacity, its limits, and the bounds of (3.18) where it has any, else those of Table 10; its elements
+            and OCV are not used but estimated.
+        captures: At least one relaxation test, and one constant load or steps; discharging.
         voltage_step_v: One step of the voltage converter [V].
     """
 
     def __init__(self, cell: CellModel, captures: Sequence[Capture], voltage_step_v: float) -> None:
-        self.cell = cell
+        self.cell = cell.model_copy(update={"adaptation": printed_bounds(cell) | cell.adaptation})
         self.voltage_step_v = voltage_step_v
         self.captures = list(captures)
-        for kind in (Kind.RELAXATION, Kind.CONSTANT):
-            if not self.of(kind):
+        for kinds in ((Kind.RELAXATION,), (Kind.CONSTANT, Kind.STEPS)):
+            if not self.of(*kinds):
+                needed = " or ".join(kind.value for kind in kinds)
                 listed = ", ".join(f"{c.name} ({c.kind.value})" for c in self.captures)
-                raise UserError(f"the protocol needs a {kind.value}; given: {listed or 'nothing'}")
+                raise UserError(f"the protocol needs a {needed}; given: {listed or 'nothing'}")
 
     def of(self, *kinds: Kind) -> list[Capture]:
         """The captures of given kinds."""
@@ -105,9 +131,13 @@ class Protocol:
 
     @property
     def loads(self) -> list[Capture]:
-        """What validates: constant loads and steps; where there are no steps, the relaxation tests are."""
-        steps = self.of(Kind.STEPS) or self.of(Kind.RELAXATION)
-        return [*self.of(Kind.CONSTANT), *steps]
+        """What the model is compared on: constant loads and steps. All but ``smallest`` validate."""
+        return self.of(Kind.CONSTANT, Kind.STEPS)
+
+    @property
+    def validating(self) -> list[Capture]:
+        """Loads that gave the model they are compared with no parameter."""
+        return [capture for capture in self.loads if capture is not self.smallest]
 
     # Step 1 -----------------------------------------------------------------------------------------------------
 
@@ -156,8 +186,12 @@ class Protocol:
 
     @cached_property
     def smallest(self) -> Capture:
-        """The constant load of the smallest current: Algorithm 1 asks for a very small one."""
-        return min(self.of(Kind.CONSTANT), key=lambda c: float(np.median(c.samples["current_a"])))
+        """The constant load of the smallest current: Algorithm 1 asks for a very small one.
+
+        Where it is all there is to validate, or there is none, a relaxation test.
+        """
+        spare = len(self.loads) > 1 and self.of(Kind.CONSTANT)
+        return min(spare or self.of(Kind.RELAXATION), key=lambda c: float(np.mean(c.samples["current_a"])))
 
     @cached_property
     def adaptive(self) -> AdaptiveRun:
@@ -175,17 +209,16 @@ class Protocol:
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
-        """R_s by (4.2) for each constant load."""
+        """R_s by (4.2) for each constant load and each relaxation test."""
+        a = self.adaptive.average
         return {
-            c.name: series_resistance(
-                self.with_ocv, self._predict(self.with_ocv, c, a=self.adaptive.average, lowest_soc=0.02)
-            )
-            for c in self.of(Kind.CONSTANT)
+            c.name: series_resistance(self.with_ocv, self._predict(self.with_ocv, c, a=a, lowest_soc=0.02))
+            for c in self.of(Kind.CONSTANT, Kind.RELAXATION)
         }
 
     @cached_property
     def r_s_mean(self) -> SeriesResistance:
-        """Their mean, as in Fig. 31."""
+        """Their mean, as in Fig. 31, each weighted by its current squared (E19)."""
         return mean_of(list(self.r_s_curves.values()))
 
     @cached_property
@@ -193,17 +226,18 @@ class Protocol:
         """a13..a15."""
         return fit_series_resistance(self.r_s_mean, LOWEST_SOC)
 
-    @cached_property
-    def a(self) -> Floats:
-        """a1..a15 as estimated, shape (16,)."""
-        a = self.adaptive.average.copy()
-        a[13:16] = self.r_s_fit.a
-        return a
+    def r_s_without(self, name: str) -> SeriesResistanceFit:
+        """The same without the capture ``name``."""
+        if name not in self.r_s_curves:
+            return self.r_s_fit
+        others = [curve for load, curve in self.r_s_curves.items() if load != name]
+        return fit_series_resistance(mean_of(others), LOWEST_SOC)
 
-    @cached_property
-    def model(self) -> CellModel:
-        """The estimated model, R_s included."""
-        return self.with_ocv.model_copy(update={"r_s": self.r_s_fit.element})
+    def a_for(self, name: str) -> Floats:
+        """a1..a15 for the load ``name``, with nothing of it in a13..a15. Shape (16,)."""
+        a = self.adaptive.average.copy()
+        a[13:16] = self.r_s_without(name).a
+        return a
 
     # Validation -------------------------------------------------------------------------------------------------
 
@@ -213,20 +247,23 @@ class Protocol:
     @cached_property
     def dynamic(self) -> dict[str, Prediction]:
         """The estimated model, frozen, on every load (5.3)."""
-        return {c.name: self._predict(self.with_ocv, c, a=self.a) for c in self.loads}
+        return {c.name: self._predict(self.with_ocv, c, a=self.a_for(c.name)) for c in self.loads}
 
     @cached_property
     def static(self) -> dict[str, Prediction]:
         """The same with its elements frozen at one SOC (chapter 6)."""
-        frozen = static_elements(self.a, STATIC_SOC)
-        return {c.name: self._predict(self.with_ocv, c, a=frozen) for c in self.loads}
+        return {
+            c.name: self._predict(self.with_ocv, c, a=static_elements(self.a_for(c.name), STATIC_SOC))
+            for c in self.loads
+        }
 
     @cached_property
     def largest(self) -> str:
-        """Name of the constant load of the largest current, the bulb of Fig. 41."""
-        return max(self.of(Kind.CONSTANT), key=lambda c: float(np.median(c.samples["current_a"]))).name
+        """Name of the constant load of the largest current, the bulb of Fig. 41; without one, of the first load."""
+        constant = self.of(Kind.CONSTANT) or self.loads[:1]
+        return max(constant, key=lambda c: float(np.median(c.samples["current_a"]))).name
 
-    @cached_property
-    def interpolated(self) -> tuple[Floats, Floats]:
-        """SOC and E_o by 7.1 over the run of ``largest``."""
-        return soc_by_interpolation(self.model, self.dynamic[self.largest])
+    def interpolated(self, name: str) -> tuple[Floats, Floats]:
+        """SOC and E_o by 7.1 over the run of the load ``name``."""
+        cell = self.with_ocv.model_copy(update={"r_s": self.r_s_without(name).element})
+        return soc_by_interpolation(cell, self.dynamic[name])
