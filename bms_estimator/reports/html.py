@@ -10,6 +10,9 @@ from bms_estimator.reports.thesis import Report
 BADGE = {
     Verdict.REPRODUCED: "reproduced",
     Verdict.CORRECTED: "corrected",
+    Verdict.RECOMPUTED: "recomputed",
+    Verdict.CLAIM_HOLDS: "holds",
+    Verdict.CLAIM_FAILS: "fails",
     Verdict.NOT: "not",
     Verdict.GIVEN: "given",
     Verdict.ADDED: "added",
@@ -38,6 +41,9 @@ p { margin: .5rem 0; } .reason { color: var(--soft); font-size: .9rem; max-width
 .badge { font-size: .72rem; font-weight: 600; padding: .08rem .5rem; border-radius: 1rem; white-space: nowrap; }
 .reproduced { background: #dff2e6; color: #17613a; border-color: #2f8f5b; }
 .corrected { background: #e0ecfa; color: #174c88; border-color: #1f5fa8; }
+.recomputed { background: #e3f1f3; color: #1d5661; border-color: #4aa3b5; }
+.holds { background: #dff2e6; color: #17613a; border-color: #2f8f5b; }
+.fails { background: #f9dfdf; color: #8a1c1c; border-color: #c23b3b; }
 .not { background: #fbeadf; color: #8c3b12; border-color: #d1602b; }
 .given { background: #eceff2; color: #515c68; border-color: #8a97a6; }
 .added { background: #f0e6f5; color: #643579; border-color: #8a4fa3; }
