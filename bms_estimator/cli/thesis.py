@@ -20,7 +20,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports import items
 from bms_estimator.reports.experiment import Recorded
-from bms_estimator.reports.html import write
+from bms_estimator.reports.html import LONG_CELL, write
 from bms_estimator.reports.thesis import Report, build
 from bms_estimator.sources.replay import load_capture
 
@@ -88,9 +88,10 @@ def _show(console: Console, report: Report) -> None:
     """What was asked for, in the terminal."""
     for item in report.items:
         if isinstance(item, items.Table):
-            shown = Table(title=f"Table {item.key}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)
-            for column in item.columns:
-                shown.add_column(textwrap.fill(column, 12), justify="right", no_wrap=True)
+            shown = Table(title=f"{items.name(item)}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)
+            for column, cells in zip(item.columns, zip(*item.rows, strict=True), strict=True):
+                text = max(map(len, cells)) > LONG_CELL
+                shown.add_column(textwrap.fill(column, 12), justify="left" if text else "right", no_wrap=not text)
             for row in item.rows:
                 shown.add_row(*row)
             Console(width=max(console.width, WIDE)).print(shown)

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.calibration.ocv import chen_mora
 from bms_estimator.reports import printed
 from bms_estimator.reports.experiment import Experiment
 from bms_estimator.reports.items import Figure, Verdict
 from bms_estimator.reports.plot import COLOURS, FAINT, plot, thin
 from bms_estimator.reports.protocol import Kind, Protocol
-from bms_estimator.reports.simulation import SOC_GRID, element
-from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot
+from bms_estimator.reports.simulation import SOC_GRID
+from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot, products_plot
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +36,8 @@ def figure_26(experiment: Experiment) -> Figure:
         grid = np.linspace(0.0, 1.0, 600)
         for colour, test in zip(np.resize(COLOURS, len(p.tests)), p.tests, strict=True):
             axes[0].errorbar(test.soc, test.ocv_v, 2.0 * test.std_v, fmt="o", ms=3, color=colour, label=test.name)
+        if experiment.recorded is None:
+            axes[0].plot(grid, chen_mora(np.array(printed.TABLE_8), grid), ":", linewidth=2.4, label="(2.10), Table 8")
         axes[0].plot(grid, p.joint_fit(grid), color="black", linewidth=1.0, label="(2.10), joint fit")
         axes[0].plot(grid, p.table(grid), color=FAINT, linewidth=1.0, label="table")
         axes[0].set(xlabel="SOC", ylabel="E_o [V]")
@@ -49,7 +52,8 @@ def figure_26(experiment: Experiment) -> Figure:
         "E_o over SOC from voltage relaxation tests",
         plot(draw, columns=2, salt="figure-26"),
         experiment,
-        "Bars: two standard deviations of the extrapolation to infinite rest.",
+        "Bars: two standard deviations of the extrapolation to infinite rest."
+        + (" Dotted: the printed curve, from Table 8." if experiment.recorded is None else ""),
     )
 
 
@@ -91,20 +95,11 @@ def figure_28(experiment: Experiment) -> Figure:
 
 def figure_29(experiment: Experiment) -> Figure:
     """Products."""
-    run, truth = experiment.protocol.adaptive, experiment.truth
-
-    def draw(axes: Any) -> None:
-        for ax, name in zip(axes, ("R_ts C_ts", "R_tl C_tl"), strict=True):
-            if truth is not None:
-                ax.plot(SOC_GRID, element(name, truth), label="true")
-            ax.plot(SOC_GRID, element(name, run.average), "--", label="estimated")
-            ax.set(xlabel="SOC", ylabel="s", title=name.replace(" ", " · "))
-            ax.legend()
-
+    run = experiment.protocol.adaptive
     return _figure(
         "29",
         "R_ts·C_ts and R_tl·C_tl as estimated",
-        plot(draw, columns=2, salt="figure-29"),
+        plot(lambda axes: products_plot(axes, None, run.average), columns=2, salt="figure-29"),
         experiment,
         "They are the products of the bounds' limits (E3).",
         claims=("RC products",),
@@ -113,11 +108,12 @@ def figure_29(experiment: Experiment) -> Figure:
 
 def figure_30(experiment: Experiment) -> Figure:
     """Elements."""
-    run, truth = experiment.protocol.adaptive, experiment.truth
+    run = experiment.protocol.adaptive
+    stop_at = [c.soc for c in run.crossings]
     return _figure(
         "30",
         "R_tl, R_ts, C_tl, C_ts with the stability conditions",
-        plot(lambda axes: elements_plot(axes, truth, run.average, run), rows=2, columns=2, salt="figure-30"),
+        plot(lambda axes: elements_plot(axes, None, run.average, stop_at), rows=2, columns=2, salt="figure-30"),
         experiment,
         "",
     )
@@ -134,7 +130,7 @@ def figure_31(experiment: Experiment) -> Figure:
         axes.plot(SOC_GRID, 1e3 * p.r_s_fit(SOC_GRID), "k--", label="fit (2.9)")
         if truth is not None:
             true = truth[13] * np.exp(-truth[14] * SOC_GRID) + truth[15]
-            axes.plot(SOC_GRID, 1e3 * true, color=FAINT, linewidth=2.4, label="true")
+            axes.plot(SOC_GRID, 1e3 * true, color=FAINT, linewidth=2.4, label="(2.9), Table 9")
         middle = 1e3 * float(np.median(p.r_s_mean.r_s_ohm))
         axes.set(
             xlabel="SOC", ylabel="R_s [mΩ]", ylim=(min(0.5 * middle, 1.5 * middle), max(0.5 * middle, 1.5 * middle))
@@ -146,7 +142,8 @@ def figure_31(experiment: Experiment) -> Figure:
         "R_s by (4.2) for different loads",
         plot(draw, salt="figure-31"),
         experiment,
-        "Sign of (4.2) as (2.4); the mean is weighted by the current squared (E19).",
+        "Sign of (4.2) as (2.4); the mean is weighted by the current squared (E19)."
+        + (" Grey: the printed curve, from Table 9." if truth is not None else ""),
     )
 
 

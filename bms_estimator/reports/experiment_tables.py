@@ -78,7 +78,7 @@ def table_10(experiment: Experiment) -> Table:
     columns += ("mean from t0 over 10 h",) if printed_bounds else ()
     columns += () if truth is None else ("true",)
     rows = []
-    for i, (initial, estimate) in printed.TABLE_10.items():
+    for i, (_, estimate) in printed.TABLE_10.items():
         b = protocol.cell.bounds(i)
         row: tuple[str, ...] = (
             f"a{i}",
@@ -90,13 +90,15 @@ def table_10(experiment: Experiment) -> Table:
             number(b.limit, 6),
         )
         if printed_bounds:
-            row += (number(printed.mean_from_start(i, initial, printed.START_MEAN_S["10"]), 6),)
+            row += (number(printed.mean_from_start("10", i), 6),)
         rows.append(row if truth is None else (*row, number(float(truth[i]))))
     w = run.window
     corrected = (
-        "Weights of a8 as E4; printed a5 = 30 contradicts its bounds and weights, which give 150 (E5). Of the printed "
-        "estimates ten follow to 0.3 % from bounds, weights and initial values alone, without any data, as a mean over the "
-        "first 10 h: 1800 adds 0.0005 to a1, 42,000,000 adds 38.9 to a12. a4 = 6.2585 does not come out (5.51). "
+        "Weights of a8 as E4, of a4 and a7 as E24, inferred from the printed estimates; printed a5 = 30 contradicts its bounds "
+        "and weights, which give 150 (E5). The run gives the limits, which are not what is printed; the other eleven printed "
+        "estimates follow to 0.3 % from bounds, weights and initial values alone, without any data, as a mean over the first "
+        f"10 h, a fitted time: 1800 adds 0.0005 to a1, 42,000,000 adds 38.9 to a12, a4 becomes "
+        f"{printed.mean_from_start('10', 4):.4f}. "
         if printed_bounds
         else "Bounds are the printed ones scaled to this cell's capacity, where its file has none of its own. "
     )

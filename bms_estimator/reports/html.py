@@ -4,11 +4,10 @@ from html import escape
 from pathlib import Path
 
 from bms_estimator import __version__
-from bms_estimator.reports.items import Figure, Item, Table, Verdict
+from bms_estimator.reports.items import Figure, Item, Table, Verdict, name
 from bms_estimator.reports.thesis import Report
 
 BADGE = {
-    Verdict.REPRODUCED: "reproduced",
     Verdict.CORRECTED: "corrected",
     Verdict.RECOMPUTED: "recomputed",
     Verdict.CLAIM_HOLDS: "holds",
@@ -39,7 +38,6 @@ h3 { font-size: 1.02rem; margin: 0 0 .5rem; display: flex; flex-wrap: wrap; gap:
 h3 .no { color: var(--accent); white-space: nowrap; }
 p { margin: .5rem 0; } .reason { color: var(--soft); font-size: .9rem; max-width: 54rem; }
 .badge { font-size: .72rem; font-weight: 600; padding: .08rem .5rem; border-radius: 1rem; white-space: nowrap; }
-.reproduced { background: #dff2e6; color: #17613a; border-color: #2f8f5b; }
 .corrected { background: #e0ecfa; color: #174c88; border-color: #1f5fa8; }
 .recomputed { background: #e3f1f3; color: #1d5661; border-color: #4aa3b5; }
 .holds { background: #dff2e6; color: #17613a; border-color: #2f8f5b; }
@@ -51,7 +49,7 @@ p { margin: .5rem 0; } .reason { color: var(--soft); font-size: .9rem; max-width
 table { border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid var(--line); vertical-align: bottom; }
 th { font-weight: 600; max-width: 9.5rem; line-height: 1.3; border-bottom: 1.5px solid var(--ink); }
-td { white-space: nowrap; } .account td { white-space: normal; }
+td { white-space: nowrap; } td.text { white-space: normal; text-align: left; min-width: 14rem; } .account td { white-space: normal; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; white-space: nowrap; }
 tbody tr:hover { background: var(--shade); }
 td.own { font-weight: 600; } td.print { color: var(--soft); }
@@ -66,9 +64,13 @@ footer { color: var(--soft); font-size: .85rem; margin-top: 3rem; }
 @media print { nav { display: none; } body { display: block; } article { break-inside: avoid; } }
 """
 
+LONG_CELL = 40
+"""A cell with more characters than this wraps."""
+
 DECLARED = """
 <p>Every table and figure of “Adaptive estimation of Li-ion battery model parameters”, recomputed beside what is printed.
-Where the two differ the reason stands with it; E1 to E14 are the errata of the thesis that this project carries corrected.
+Where the two differ the reason stands with it; <a href="#table-errata">E1 to E26</a> are the errata of the thesis that this project
+carries corrected.
 What the thesis does not print is declared: N(k) = E<sub>2.5</sub>(-k<sup>2.5</sup>), k<sub>0</sub> = 0,
 x<sub>2</sub>(0) = x<sub>3</sub>(0) = 0, simulations at 100 Hz (C/10 runs at 10 Hz) with the semi-exact step, which is stable at
 any step length. Errors are always in percent of the true value.</p>
@@ -99,7 +101,7 @@ def write(report: Report, folder: Path) -> Path:
 
 
 def _anchor(item: Item) -> str:
-    return f"{item.kind.lower()}-{item.key.lower()}"
+    return f"{item.kind}-{item.key}".lower().replace(" ", "-")
 
 
 def _navigation(report: Report) -> str:
@@ -115,17 +117,17 @@ def _navigation(report: Report) -> str:
 
 def _short(item: Item) -> str:
     if item.verdict is Verdict.ADDED:
-        return "Theorem 4.1.2"
+        return item.key
     return f"{'T' if isinstance(item, Table) else 'F'} {item.key}"
 
 
 def _counts(report: Report) -> str:
     parts = []
-    for verdict, name in BADGE.items():
+    for verdict, css in BADGE.items():
         count = sum(item.verdict is verdict for item in report.items)
         if count:
             label = "diagram, photograph or input" if verdict is Verdict.GIVEN else verdict.value
-            parts.append(f'<li class="{name}"><strong>{count}</strong>{escape(label)}</li>')
+            parts.append(f'<li class="{css}"><strong>{count}</strong>{escape(label)}</li>')
     return f'<ul class="counts">{"".join(parts)}</ul>'
 
 
@@ -134,15 +136,16 @@ def _badge(verdict: Verdict) -> str:
 
 
 def _article(item: Item) -> str:
-    number = "Theorem 4.1.2" if item.verdict is Verdict.ADDED else f"{item.kind} {item.key}"
-    head = f'<h3><span class="no">{number}</span> {escape(item.title)} {_badge(item.verdict)}</h3>'
+    head = f'<h3><span class="no">{escape(name(item))}</span> {escape(item.title)} {_badge(item.verdict)}</h3>'
     body = item.svg if isinstance(item, Figure) else _table(item)
     brief = ' class="brief"' if isinstance(item, Figure) and not item.svg and item.verdict is Verdict.GIVEN else ""
     return f'<article id="{_anchor(item)}"{brief}>{head}{body}<p class="reason">{escape(item.reason)}</p></article>'
 
 
 def _table(table: Table) -> str:
-    def style(column: str) -> str:
+    def style(column: str, cell: str) -> str:
+        if len(cell) > LONG_CELL:
+            return ' class="text"'
         if column.startswith("printed"):
             return ' class="print"'
         return ' class="own"' if column.startswith(("recomputed", "joint")) else ""
@@ -150,7 +153,7 @@ def _table(table: Table) -> str:
     heads = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
     rows = "".join(
         "<tr>"
-        + "".join(f"<td{style(c)}>{escape(cell)}</td>" for c, cell in zip(table.columns, row, strict=True))
+        + "".join(f"<td{style(c, cell)}>{escape(cell)}</td>" for c, cell in zip(table.columns, row, strict=True))
         + "</tr>"
         for row in table.rows
     )

@@ -7,7 +7,6 @@ from enum import Enum
 class Verdict(Enum):
     """What became of a table or figure."""
 
-    REPRODUCED = "reproduced"
     CORRECTED = "reproduced after correction"
     RECOMPUTED = "recomputed"
     """Computed from printed values, compared with nothing: the thesis prints no value of it."""
@@ -26,7 +25,7 @@ class Table:
     """A table: printed beside recomputed.
 
     Attributes:
-        key: "5" for Table 5 of the thesis.
+        key: "5" for Table 5 of the thesis; the name of one that is not in it.
         title: Its caption.
         columns: Headings.
         rows: One list of cells for each row.
@@ -66,6 +65,11 @@ class Figure:
 
 
 Item = Table | Figure
+
+
+def name(item: Item) -> str:
+    """Table 5, Figure 19; what is not in the thesis by its key alone."""
+    return item.key if item.verdict is Verdict.ADDED else f"{item.kind} {item.key}"
 
 
 def number(value: float, digits: int = 4) -> str:

@@ -1,6 +1,11 @@
 """The numbers as the thesis prints them, misprints included."""
 
 import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.cell import Bounds
+
+Floats = NDArray[np.float64]
 
 CHEN_MORA_ROUNDED = (0.30, 29.0, 0.04, 6.0, 155.0, 0.04, 752.0, 13.0, 703.0, 6050.0, 27.0, 4475.0, 0.1, 24.0, 0.07)
 """a1..a15, "Chen and Mora's Values" and initial values of Tables 2 and 3."""
@@ -79,6 +84,8 @@ BOUNDS = {
 """Tables 5 and 10, index: upper bound, lower bound, lambda_x, lambda_y, as printed (a8: E4)."""
 A8_WEIGHTS = (10.0, 20.0)
 """What the printed estimates of a8 belong to (E4)."""
+A5 = 150.0
+"""a5 of Table 10, printed as 30 (E5)."""
 
 TABLE_5 = {
     1: (180.0, 0.5555, 0.3208, 42.25),
@@ -137,30 +144,53 @@ TABLE_13 = {"dynamic": 0.003, "static": 0.358}
 
 CURRENTS_A = {"25 ohm": 0.860, "50 ohm": 0.416, "12.5 ohm": 1.741, "50 W bulb": 3.652}
 """Average current of each load (5.2.1)."""
+RESISTORS_OHM = {"25 ohm": 25.0, "50 ohm": 50.0, "12.5 ohm": 12.5}
+"""Of the loads that are resistors (5.1)."""
+SENSOR_RANGE_V = 25.0
+"""Of the voltage sensor (5.1)."""
 
-
-def limit(index: int) -> float:
-    """Where (3.18) leads with the bounds and weights of Tables 5 and 10, Lemma 4.1.3; a8 as E4."""
-    upper, lower, x, y = BOUNDS[index]
-    if index == 8:
-        x, y = A8_WEIGHTS
-    return (x * upper + y * lower) / (x + y)
-
-
+INFERRED_WEIGHTS = {
+    "5": {7: (70.0, 65.0), 8: A8_WEIGHTS},
+    "10": {4: (70.0, 50.0), 7: (70.0, 65.0), 8: A8_WEIGHTS},
+}
+"""Table: index: the weights that its printed estimate belongs to, where those printed beside it have another limit (E4, E24)."""
 START_MEAN_S = {"5": 328.0, "10": 36_000.0}
 """The means (3.19) from the first sample on over these times come out as the printed estimates of Tables 5 and 10 [s]."""
 
 
-def mean_from_start(index: int, initial: float, seconds: float) -> float:
-    """The mean (3.19) of (3.18) over the first ``seconds`` from ``initial`` on, e = 0: the integral of (4.5)."""
-    _, _, x, y = BOUNDS[index]
-    rate = sum(A8_WEIGHTS) if index == 8 else x + y
-    return limit(index) + (initial - limit(index)) / (rate * seconds)
+def bounds(table: str, index: int) -> Bounds:
+    """What (3.18) runs with for Table 5 or 10: as printed, the weights those of ``INFERRED_WEIGHTS``."""
+    upper, lower, x, y = BOUNDS[index]
+    x, y = INFERRED_WEIGHTS[table].get(index, (x, y))
+    return Bounds(upper=upper, lower=lower, weight_upper=x, weight_lower=y, initial=initial(table, index))
 
 
-def table_5_estimates() -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """a1..a12 of Table 5's printed estimates at index 1..12, shape (16,)."""
+def initial(table: str, index: int) -> float:
+    """a_i(t0) of Table 5 or 10."""
+    return TABLE_5[index][0] if table == "5" else TABLE_10[index][0]
+
+
+def mean_from_start(table: str, index: int) -> float:
+    """The mean (3.19) of (3.18) over the first ``START_MEAN_S`` of Table 5 or 10, e = 0: the integral of (4.5)."""
+    b = bounds(table, index)
+    return b.limit + (initial(table, index) - b.limit) / (b.rate * START_MEAN_S[table])
+
+
+def tables_5_and_6() -> Floats:
+    """a1..a15 of the printed estimates of Tables 5 and 6 at index 1..15, shape (16,)."""
     a = np.zeros(16)
     for index, (_, estimate, _, _) in TABLE_5.items():
         a[index] = estimate
+    for index, (_, estimate, _) in TABLE_6.items():
+        a[index] = estimate
+    return a
+
+
+def tables_8_to_10() -> Floats:
+    """a1..a21 of the printed estimates of Tables 8 to 10 at index 1..21, shape (22,); a5 = 150 (E5)."""
+    a = np.zeros(22)
+    for index, (_, estimate) in TABLE_10.items():
+        a[index] = estimate
+    a[5] = A5
+    a[13:16], a[16:22] = TABLE_9, TABLE_8
     return a

@@ -1,9 +1,9 @@
 """A simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5, seen through the simulated sensor chain.
 
 The pack has the open-circuit voltage of Table 8, the R_s of Table 9 and, as Fig. 29 compares with, the R_ts, R_tl, C_ts,
-C_tl of Chen and Mora: they lie within the bounds of Table 10 but not at their Lemma 4.1.3 limits. Loads are resistors, as
-in 5.1, chosen so that their mean current is the printed one. The voltage goes through a divider, the current
-through a +-10 A sensor; noise is half a step either way, rounding comes on top.
+C_tl of Chen and Mora: they lie within the bounds of Table 10 but not at their Lemma 4.1.3 limits. Loads are the resistors of
+5.1, whose currents are not the printed ones (E21); the bulb is the resistor that draws its printed current. The voltage goes
+through a divider, the current through a +-10 A sensor; noise is half a step either way, rounding comes on top.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.cell import cell_step, terminal_voltage
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.reports.printed import CURRENTS_A
+from bms_estimator.reports import printed
 from bms_estimator.reports.protocol import Capture, Kind
 
 Floats = NDArray[np.float64]
@@ -24,7 +24,7 @@ VOLTAGE_RANGE_V = 30.0
 CURRENT_RANGE_A = 20.0
 """From -10 to +10 A."""
 MEAN_VOLTAGE_V = 23.0
-"""Of the pack over a discharge: turns a mean current into a resistance."""
+"""Of the pack over a discharge: turns the bulb's mean current into a resistance."""
 QUARTER_HOUR_S = 900.0
 LOWEST_SOC = 0.012
 """Discharges end here, just above delta2 of the true pack."""
@@ -63,16 +63,19 @@ class SensorChain:
 
 
 def pack() -> CellModel:
-    """The true pack, with the bounds of Table 10."""
+    """The true pack, with what (3.18) runs with for Table 10."""
     model, chen_mora = load_cell("thunder_power_6s"), load_cell("chen_mora")
     elements = {name: getattr(chen_mora, name) for name in ("r_ts", "r_tl", "c_ts", "c_tl")}
+    adaptation = {f"a{i}": printed.bounds("10", i) for i in printed.BOUNDS}
     named = model.cell.model_copy(update={"name": "simulated 6S pack"})
-    return model.model_copy(update=elements | {"cell": named})
+    return model.model_copy(update=elements | {"cell": named, "adaptation": adaptation})
 
 
 def resistance_ohm(load: str) -> float:
     """Of a load; infinite for none."""
-    return MEAN_VOLTAGE_V / CURRENTS_A[load] if load else float("inf")
+    if not load:
+        return float("inf")
+    return printed.RESISTORS_OHM.get(load, MEAN_VOLTAGE_V / printed.CURRENTS_A[load])
 
 
 def run_down(cell: CellModel, schedule: list[tuple[float, str]], step_s: float = 1.0) -> SampleBlock:
@@ -105,12 +108,12 @@ def experiments() -> list[Capture]:
     rest, pulse = (QUARTER_HOUR_S, ""), (QUARTER_HOUR_S, "12.5 ohm")
     found = [
         Capture(f"relaxation {load}", Kind.RELAXATION, run_down(cell, [(QUARTER_HOUR_S, load), rest]))
-        for load in CURRENTS_A
+        for load in printed.CURRENTS_A
     ]
     # the observer runs on the smallest current: at 5 Hz; the others only validate
     found += [
         Capture(load, Kind.CONSTANT, run_down(cell, [(QUARTER_HOUR_S, load)], 0.2 if load == "50 ohm" else 1.0))
-        for load in CURRENTS_A
+        for load in printed.CURRENTS_A
     ]
     found.append(Capture("constant steps", Kind.STEPS, run_down(cell, [rest, pulse])))
     found.append(Capture("variable steps", Kind.STEPS, run_down(cell, list(VARIABLE_STEPS))))

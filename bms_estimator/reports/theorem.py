@@ -5,6 +5,7 @@ with several bounds on a cell whose truth is known.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,13 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.adaptive import adaptive_run
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import Bounds, CellModel
-from bms_estimator.reports.simulation import discharge, mean_error_percent, observer_settings, with_bounds
+from bms_estimator.reports.simulation import (
+    discharge,
+    mean_error_percent,
+    observer_settings,
+    table_5_cell,
+    with_bounds,
+)
 
 Floats = NDArray[np.float64]
 
@@ -65,16 +72,17 @@ def bounds_sets(cell: CellModel) -> dict[str, dict[int, Bounds]]:
     }
 
 
-def measure(cell: CellModel) -> list[Measured]:
-    """Every set of bounds at every current."""
-    found = []
+@cache
+def measure() -> tuple[Measured, ...]:
+    """Every set of bounds at every current, on the cell of Table 5."""
+    cell, found = table_5_cell(), []
     for name, bounds in bounds_sets(cell).items():
         bounded = with_bounds(cell, bounds)
         limit = np.zeros(16)
         for i, b in bounds.items():
             limit[i] = b.limit
         found += [_measure(bounded, name, c_rate, limit) for c_rate in C_RATES]
-    return found
+    return tuple(found)
 
 
 def _measure(cell: CellModel, name: str, c_rate: float, limit: Floats) -> Measured:

@@ -4,9 +4,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports import experiment_figures, experiment_tables, simulation_figures, simulation_tables
+from bms_estimator.reports import (
+    errata,
+    experiment_figures,
+    experiment_tables,
+    printed_pack,
+    simulation_figures,
+    simulation_tables,
+)
 from bms_estimator.reports.experiment import Experiment, Recorded
-from bms_estimator.reports.items import Figure, Item, Table, Verdict
+from bms_estimator.reports.items import Figure, Item, Verdict
 from bms_estimator.reports.simulation import Simulation
 
 DIAGRAMS = {
@@ -33,7 +40,7 @@ FUEL_CELL = dict.fromkeys(
 CHAPTERS: dict[str, tuple[str, ...]] = {
     "2  The model and the Nussbaum gain": ("F1", "F2", "F3", "F4", "F5", "F6", "F7", "F8", "F9", "F10"),
     "3  Three schemes": ("F11", "T1", "F12", "F13", "F14", "T2", "F15", "T3", "F16", "F17", "T4"),
-    "4  The improved method": ("F18", "F19", "F20", "T5", "F21", "F22", "T6", "F23", "T7", "TT412"),
+    "4  The improved method": ("F18", "F19", "F20", "T5", "F21", "F22", "T6", "F23", "T7", "TTheorem 4.1.2"),
     "5  Experiments": (
         "F24",
         "F25",
@@ -57,6 +64,7 @@ CHAPTERS: dict[str, tuple[str, ...]] = {
     "6  Comparison": ("F39", "T11", "T12", "F40", "T13"),
     "7  SOC, faults, fuel cell": ("F41", "F42", "F43", "F44", "F45", "F46"),
     "A  Simulink models": ("F47", "F48", "F49", "F50"),
+    "Errata": ("TErrata",),
 }
 """Chapter -> its tables (T) and figures (F) in the order of the thesis."""
 
@@ -93,6 +101,9 @@ def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Calla
     found |= {f"F{key}": of_simulation(make) for key, make in simulation_figures.FIGURES.items()}
     found |= {f"T{key}": of_experiment(make) for key, make in experiment_tables.TABLES.items()}
     found |= {f"F{key}": of_experiment(make) for key, make in experiment_figures.FIGURES.items()}
+    if experiment.recorded is None:  # what is printed says these without any recording
+        found |= {f"F{key}": make for key, make in printed_pack.FIGURES.items()}
+    found["TErrata"] = of_simulation(errata.table)
     found |= {f"F{key}": _diagram(key) for key in DIAGRAMS}
     return found
 
@@ -158,13 +169,3 @@ def _wanted(
         for chapter, marks in CHAPTERS.items()
         if set(marks) & set(asked)
     ]
-
-
-def account(report: Report) -> list[tuple[str, str, str, str]]:
-    """The closing note: mark, title, verdict and reason of every item."""
-    return [(_name(item), item.title, item.verdict.value, item.reason) for item in report.items]
-
-
-def _name(item: Item) -> str:
-    number = "" if item.verdict is Verdict.ADDED else f" {item.key}"
-    return f"{'Table' if isinstance(item, Table) else 'Figure'}{number}"

@@ -1,0 +1,105 @@
+"""The pack as Tables 8 to 10 print it: Figures 28 to 30 follow from it without any recording, and Ohm's law checks it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.cell import emf, r_s
+from bms_estimator.kernels.margins import delta
+from bms_estimator.model.cell import load_cell
+from bms_estimator.reports import printed
+from bms_estimator.reports.items import Figure, Verdict
+from bms_estimator.reports.plot import plot
+from bms_estimator.reports.simulation import element, mean_error_percent
+from bms_estimator.reports.simulation_figures import NO_VALUES, condition_plot, elements_plot, products_plot
+from bms_estimator.reports.theorem import PRODUCTS
+
+Floats = NDArray[np.float64]
+
+A = printed.tables_8_to_10()
+EMPTY_SOC = 0.02
+"""A discharge through a resistor ends here, above delta2."""
+GRID = np.linspace(EMPTY_SOC, 1.0, 9801)
+
+
+def deltas() -> tuple[float, float]:
+    """delta1 and delta2 of Table 10, (2.11) and (2.12)."""
+    return float(delta(A[8], A[9], A[7])), float(delta(A[11], A[12], A[10]))
+
+
+def product_errors() -> tuple[float, float]:
+    """Mean error of R_ts C_ts and R_tl C_tl over SOC against Chen and Mora's, as Fig. 29 compares them [%]."""
+    true = load_cell("chen_mora").a
+    return mean_error_percent(PRODUCTS[0], A, true), mean_error_percent(PRODUCTS[1], A, true)
+
+
+def mean_current_a(ohm: float) -> float:
+    """Mean current of a slow discharge through ``ohm`` [A]: Ohm's law with E_o and all resistances of Tables 8 to 10.
+
+    The mean over time of a charge Q is Q over the integral of dq / i.
+    """
+    inner = element("R_ts", A, GRID) + element("R_tl", A, GRID) + np.array([r_s(x, A) for x in GRID])
+    current_a = np.array([emf(x, A) for x in GRID]) / (ohm + inner)
+    return float(1.0 / np.mean(1.0 / current_a))
+
+
+def current_errors_percent() -> dict[str, float]:
+    """How far each printed current is from Ohm's law [%]."""
+    return {
+        load: 100.0 * (printed.CURRENTS_A[load] / mean_current_a(ohm) - 1.0)
+        for load, ohm in printed.RESISTORS_OHM.items()
+    }
+
+
+def saturated_above_soc() -> float:
+    """SOC whose E_o of Table 8 is the end of the voltage sensor's range."""
+    e_o = np.array([emf(x, A) for x in GRID])
+    return float(np.interp(printed.SENSOR_RANGE_V, e_o, GRID))
+
+
+def figure_28() -> Figure:
+    """Crossings."""
+    at = deltas()
+
+    def draw(axes: Any) -> None:
+        for ax, i, met_at in zip(axes, (8, 11), at, strict=True):
+            ax.plot((0.4 * met_at, 12.0 * met_at), (A[i], A[i]), label=f"$a_{{{i}}}$ of Table 10")
+            condition_plot(ax, i, float(A[i]), met_at)
+
+    return Figure(
+        "28",
+        "a8 and a11 meet their stability conditions",
+        plot(draw, columns=2, salt="figure-28"),
+        Verdict.RECOMPUTED,
+        f"{NO_VALUES} From Table 10 alone: delta1 = {at[0]:.6f}, delta2 = {at[1]:.6f}.",
+    )
+
+
+def figure_29() -> Figure:
+    """Products."""
+    true, errors = load_cell("chen_mora").a, product_errors()
+    return Figure(
+        "29",
+        "R_ts·C_ts and R_tl·C_tl as estimated",
+        plot(lambda axes: products_plot(axes, true, A), columns=2, salt="figure-29"),
+        Verdict.RECOMPUTED,
+        f"{NO_VALUES} From Table 10 alone, beside Chen and Mora's as in print: {errors[0]:.1f} and {errors[1]:.1f} % off on "
+        "average over SOC 0.05 to 1 (a5 = 150, E5). They are the products of the bounds' limits (E3), and the truth they are "
+        "held against is that of another battery (E22).",
+    )
+
+
+def figure_30() -> Figure:
+    """Elements."""
+    return Figure(
+        "30",
+        "R_tl, R_ts, C_tl, C_ts with the stability conditions",
+        plot(lambda axes: elements_plot(axes, None, A, deltas()), rows=2, columns=2, salt="figure-30"),
+        Verdict.RECOMPUTED,
+        f"{NO_VALUES} From Table 10 alone (a5 = 150, E5). Dashed and dotted: delta1 and delta2.",
+    )
+
+
+FIGURES: dict[str, Callable[[], Figure]] = {"28": figure_28, "29": figure_29, "30": figure_30}

@@ -1,0 +1,69 @@
+"""What (3.1)-(3.3) do under a constant current with every parameter true: E15 and E16.
+
+Both branches are driven by one u, where the cell's are by i/C_ts and i/C_tl. Once x2^, x3^ change slowly, u = x2^/tau_ts =
+x3^/tau_tl: they stand as tau_ts to tau_tl, the cell's as R_ts to R_tl. And u = -N e is not zero, so e is not.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell import c_tl, c_ts, cell_step, r_tl, r_ts, terminal_voltage
+from bms_estimator.model.cell import Bounds, CellModel
+from bms_estimator.reports.simulation import block, observer_settings, with_bounds
+
+STEP_S = 0.1
+HELD_S = 1800.0
+"""The current is held so long: eight times tau_tl."""
+
+
+@dataclass(frozen=True)
+class QuasiSteady:
+    """Cell and observer at the end of the held current.
+
+    Attributes:
+        cell_v: x2 and x3 of the cell [V].
+        observer_v: x2^ and x3^ [V].
+        tau_s: tau_ts and tau_tl of both [s].
+        error_v: e as the observer has it [V].
+        predicted_v: -x2^ / (N tau_ts), the e that keeps x2^ where it is [V].
+    """
+
+    cell_v: tuple[float, float]
+    observer_v: tuple[float, float]
+    tau_s: tuple[float, float]
+    error_v: float
+    predicted_v: float
+
+
+def quasi_steady(cell: CellModel, current_a: float) -> QuasiSteady:
+    """Hold ``current_a`` [A] on a full cell while the observer runs with a1..a12 at the cell's own."""
+    a, capacity_as = cell.a, cell.cell.capacity_ah * 3600.0
+    x = (1.0, 0.0, 0.0)
+    time_s = np.arange(0.0, HELD_S, STEP_S)
+    voltage_v = np.empty(time_s.size)
+    for n in range(time_s.size):
+        voltage_v[n] = terminal_voltage(x, current_a, a)
+        x = cell_step(x, current_a, STEP_S, capacity_as, a)
+    own = {
+        i: Bounds(upper=1.5 * a[i], lower=0.5 * a[i], weight_upper=50.0, weight_lower=50.0, initial=a[i])
+        for i in range(1, 13)
+    }
+    estimator = Estimator(
+        with_bounds(cell, own),
+        observer_settings("improved"),
+        identifier=None,
+        voltage_resolution_v=1e-6,
+        initial_soc=1.0,
+    )
+    estimator.run(block(time_s, np.full(time_s.size, current_a), voltage_v))
+    s = estimator.state[0]
+    tau_ts, tau_tl = r_ts(x[0], a) * c_ts(x[0], a), r_tl(x[0], a) * c_tl(x[0], a)
+    return QuasiSteady(
+        cell_v=(x[1], x[2]),
+        observer_v=(float(s["v_ts"]), float(s["v_tl"])),
+        tau_s=(tau_ts, tau_tl),
+        error_v=float(s["innovation_v"]),
+        predicted_v=-float(s["v_ts"]) / (float(s["gain"]) * tau_ts),
+    )
