@@ -11,10 +11,10 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare anywhere ablation firmware kernels lock
+.PHONY: help venv apt check test demo benchmark compare anywhere chapter5 ablation firmware kernels lock
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 venv: $(READY) ## the environment in .venv, from the hash-locked list
 
@@ -49,6 +49,9 @@ compare: ## methods side by side on real captures, PyBOP among them: minutes
 
 anywhere: venv ## the SOC when switched on anywhere, on real captures, e.g. make anywhere ARGS=PF: minutes
 	@$(BIN)/python -m tests.benchmarks.anywhere $(ARGS)
+
+chapter5: venv ## the experiments of the thesis's chapter 5 on real captures, beside Tables 11 and 13
+	@$(BIN)/python -m tests.benchmarks.chapter5
 
 ablation: venv ## what each part of the filter is worth, on real captures, e.g. make ablation ARGS=LFP: minutes
 	@$(BIN)/python -m tests.benchmarks.ablation $(ARGS)

@@ -3,7 +3,7 @@
 The dynamic model has elements that follow SOC; the static one has them frozen at one SOC. Both keep E_o(SOC).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 
 EMPTY = 0.0
 """SOC where a prediction ends: below it the curves of the model mean nothing."""
+JUMP = 0.1
+"""A change of the current between two samples is a jump above this share of the largest current."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,20 @@ class Prediction:
         return float(self.error_percent.mean())
 
     @property
+    def aligned(self) -> NDArray[np.bool_]:
+        """All samples but the first after a jump of the current: many a logger's voltage there is from before it."""
+        jump_a = np.abs(np.diff(self.current_a, prepend=self.current_a[0]))
+        return np.asarray(jump_a <= JUMP * np.abs(self.current_a).max())
+
+    @property
     def max_percent(self) -> float:
-        """Largest error [%]."""
-        return float(self.error_percent.max())
+        """Largest error over the samples that are ``aligned`` [%]."""
+        return float(self.error_percent[self.aligned].max())
+
+    def above(self, soc: float) -> "Prediction":
+        """The same until SOC falls to ``soc``; at least its first sample."""
+        end = max(int(np.argmax(np.r_[self.soc <= soc, True])), 1)
+        return Prediction(**{column.name: getattr(self, column.name)[:end] for column in fields(self)})
 
 
 def predict(

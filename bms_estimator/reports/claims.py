@@ -174,4 +174,5 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Protocol], list[Result]]]] = {
 def claim(key: str, protocols: Sequence[Protocol]) -> Claim:
     """One claim on the captures of one or more cells."""
     where, criterion, test = CLAIMS[key]
-    return Claim(key, where, criterion, tuple(result for p in protocols for result in test(p)))
+    results = {result.capture: result for p in protocols for result in test(p)}  # a relaxation test may serve two cells
+    return Claim(key, where, criterion, tuple(results.values()))

@@ -123,7 +123,7 @@ def table_11(experiment: Experiment) -> Table:
     validating = [capture.name for capture in protocol.validating]
     for name, run in protocol.dynamic.items():
         flowing = np.abs(run.current_a) > 0.01 * protocol.cell.cell.capacity_ah
-        above = run.error_percent[run.soc > KNEE_SOC]
+        aligned, above = run.aligned, run.above(KNEE_SOC)
         row = [
             name,
             number(float(run.current_a[flowing].mean()), 3),
@@ -132,8 +132,9 @@ def table_11(experiment: Experiment) -> Table:
             number(run.mean_percent, 3),
             number(run.max_percent, 3),
             number(1e3 * rms_v(run.error_v), 3),
-            number(float(run.soc[np.argmax(run.error_percent)]), 2),
-            *(number(float(x), 3) for x in ((above.mean(), above.max()) if above.size else (np.nan, np.nan))),
+            number(float(run.soc[aligned][np.argmax(run.error_percent[aligned])]), 2),
+            number(above.mean_percent, 3),
+            number(above.max_percent, 3),
         ]
         if coarse:
             other = coarse.dynamic[name]

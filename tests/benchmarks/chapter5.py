@@ -1,0 +1,205 @@
+"""Chapter 5 on every real cell whose captures the protocol can be run on: ``make chapter5``."""
+
+import itertools
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.reports import printed
+from bms_estimator.reports.claims import CLAIMS, claim
+from bms_estimator.reports.protocol import KNEE_SOC, Capture, Kind, Protocol
+from bms_estimator.sources.replay import load_capture
+from tests.benchmarks.recipes import DATA, NCR, PF, charge_ah, path_of
+
+WIDTH = 150
+RELAXATION, CONSTANT, STEPS = Kind
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One cell at one temperature.
+
+    Attributes:
+        name: In the table.
+        cell: File that capacity and limits are taken of; nothing else of it is used.
+        capacity_ah: As the captures count from full [Ah].
+        captures: Name in the folder of captures, and what it serves for.
+        room: At room temperature, as the thesis's experiments.
+    """
+
+    name: str
+    cell: str
+    capacity_ah: float
+    captures: tuple[tuple[str, Kind], ...]
+    room: bool = True
+
+
+def _panasonic(name: str, at: str, *captures: tuple[str, Kind]) -> Experiment:
+    """Its HPPC, discharges with a rest after each, is its relaxation test."""
+    found = tuple((f"{PF}{at}_{capture}", kind) for capture, kind in (("hppc", RELAXATION), *captures))
+    return Experiment(f"18650PF {name}", "nca", 2.9, found, room=at == "25")
+
+
+EXPERIMENTS = (
+    Experiment(
+        "NCR18650 cell 1, OCV of cell 5",
+        "ncr18650",
+        3.0,
+        (
+            (NCR + "cell5_relaxation_c2", RELAXATION),
+            (NCR + "cell1_discharge_c20", CONSTANT),
+            (NCR + "cell1_discharge_c4", CONSTANT),
+            (NCR + "cell1_discharge_1c5", CONSTANT),
+            (NCR + "cell1_hppc", STEPS),
+            (NCR + "cell1_random_steps", STEPS),
+            (NCR + "cell1_dst", STEPS),
+        ),
+    ),
+    Experiment(
+        "NCR18650 cell 5",
+        "ncr18650",
+        3.0,
+        (
+            (NCR + "cell5_relaxation_c2", RELAXATION),
+            (NCR + "cell5_hppc", STEPS),
+            (NCR + "cell5_random_steps", STEPS),
+        ),
+    ),
+    _panasonic("25 C", "25", ("c20", CONSTANT), ("us06", STEPS), ("cycle1", STEPS)),
+    _panasonic("10 C", "10", ("us06", STEPS)),
+    _panasonic("0 C", "0", ("us06", STEPS), ("cycle1", STEPS)),
+    _panasonic("-10 C", "n10", ("us06", STEPS)),
+    Experiment("Leaf", "leaf", 30.5, (("leaf/hppc_25c_from_full", RELAXATION), ("leaf/cc_1c", CONSTANT))),
+)
+"""LG M50 and A123 have no relaxation test beside what would have to validate: step 1 cannot be run."""
+CONSTANT_C = 0.01
+"""Above this C-rate a capture charges or discharges [1/h]."""
+VOLTAGE_STEP_V = 1e-3
+
+
+def protocol(experiment: Experiment) -> Protocol:
+    """The protocol on one cell; a constant load is cut to its discharge."""
+    found = load_cell(experiment.cell, experiment.capacity_ah)
+    captures = [
+        Capture(name.split("/")[1], kind, _samples(name, kind, experiment)) for name, kind in experiment.captures
+    ]
+    return Protocol(found, captures, VOLTAGE_STEP_V)
+
+
+def _samples(name: str, kind: Kind, experiment: Experiment) -> SampleBlock:
+    rows = load_capture(path_of(name)).rows
+    return discharge(rows, CONSTANT_C * experiment.capacity_ah) if kind is Kind.CONSTANT else rows
+
+
+def discharge(rows: SampleBlock, least_a: float) -> SampleBlock:
+    """What lies between two charges and draws the most, until its last sample under load [A]."""
+    edges = np.r_[0, np.flatnonzero(np.diff((rows["current_a"] < -least_a).astype(np.int8))) + 1, rows.size]
+    stretches = [rows[first:last] for first, last in itertools.pairwise(edges)]
+    most = max(stretches, key=lambda stretch: charge_ah(stretch)[-1])
+    return most[: int(np.flatnonzero(most["current_a"] > least_a)[-1]) + 1]
+
+
+def lines(name: str, p: Protocol) -> Iterator[tuple[str, ...]]:
+    """One row of the table for each load."""
+    validating = [capture.name for capture in p.validating]
+    for load, run in p.dynamic.items():
+        aligned, above = run.aligned, run.above(KNEE_SOC)
+        soc, _ = p.interpolated(load)
+        yield (
+            name,
+            load,
+            "validation" if load in validating else "step 2",
+            f"{run.mean_percent:.2f}",
+            f"{run.max_percent:.1f}",
+            f"{run.soc[aligned][np.argmax(run.error_percent[aligned])]:.2f}",
+            f"{above.mean_percent:.2f}",
+            f"{above.max_percent:.1f}",
+            f"{p.static[load].mean_percent:.2f}",
+            f"{100.0 * np.sqrt(np.mean((soc - run.soc) ** 2)):.1f}",
+        )
+
+
+def main() -> None:
+    """Print errors by load, the steps' outcomes by cell, and the verdicts."""
+    if not DATA.is_dir():
+        sys.exit(f"{DATA}: the captures are not there")
+    console = Console(width=WIDTH)
+    protocols = {experiment.name: protocol(experiment) for experiment in EXPERIMENTS}
+    console.print(errors(protocols))
+    console.print(parameters(protocols))
+    console.print(verdicts("all captures", list(protocols.values())))
+    room = [protocols[experiment.name] for experiment in EXPERIMENTS if experiment.room]
+    console.print(verdicts("captures at room temperature", room))
+
+
+def errors(protocols: dict[str, Protocol]) -> Table:
+    """Tables 11 and 13."""
+    printed_means = ", ".join(f"{load} {value}" for load, value in printed.TABLE_11.items())
+    table = Table(
+        title=f"error of the voltage in %; printed means: {printed_means}; largest {printed.MAX_CONSTANT} (constant), "
+        f"{printed.MAX_STEPS} (steps); static {printed.TABLE_13['static']}, dynamic {printed.TABLE_13['dynamic']}"
+    )
+    heads = (
+        "mean",
+        "max",
+        "at SOC",
+        f"mean, SOC > {KNEE_SOC}",
+        f"max, SOC > {KNEE_SOC}",
+        "static",
+        "SOC by E_o, RMS %",
+    )
+    for column in ("cell", "load", "serves"):
+        table.add_column(column)
+    for column in heads:
+        table.add_column(column, justify="right")
+    for name, p in protocols.items():
+        for row in lines(name, p):
+            table.add_row(*row)
+    return table
+
+
+def parameters(protocols: dict[str, Protocol]) -> Table:
+    """What the three steps gave."""
+    table = Table(title="steps 1 to 3")
+    for column in ("cell", "step 1: points", "residual [mV]", "step 2 on", "outcome", "a13..a15 [ohm, -, ohm]"):
+        table.add_column(column)
+    for name, p in protocols.items():
+        residual_v = p.joint_fit.residual_v
+        table.add_row(
+            name,
+            str(residual_v.size),
+            f"{1e3 * np.sqrt(np.mean(residual_v**2)):.1f}",
+            p.smallest.name,
+            p.adaptive.outcome,
+            ", ".join(f"{value:.4g}" for value in p.r_s_fit.a),
+        )
+    return table
+
+
+def verdicts(on: str, protocols: list[Protocol]) -> Table:
+    """The claims, each on the captures of several cells."""
+    table = Table(title=f"claims on {on}; each must be met on more than half of them")
+    for column in ("claim", "where", "criterion", "met", "found", "verdict"):
+        table.add_column(column)
+    for key in CLAIMS:
+        found = claim(key, protocols)
+        values = [result.found for result in found.results]
+        table.add_row(
+            key,
+            found.where,
+            found.criterion,
+            f"{found.met} of {len(values)}",
+            f"{min(values):.3g} to {max(values):.3g}",
+            found.verdict.value,
+        )
+    return table
+
+
+if __name__ == "__main__":
+    main()
