@@ -66,12 +66,31 @@ def test_steps_with_rests_serve_as_well():
     assert fit(soc) == pytest.approx(true_ohm(soc, TRUTH), rel=0.02)
 
 
-def test_mean_over_the_currents_is_taken_where_any_has_data():
-    first = SeriesResistance(np.array([0.205, 0.305, 0.405]), np.array([1.0, 1.0, 1.0]))
-    second = SeriesResistance(np.array([0.305, 0.405, 0.505]), np.array([3.0, 3.0, 3.0]))
+def test_mean_over_the_currents_weighs_each_by_its_square_where_any_has_data():
+    first = SeriesResistance(np.array([0.205, 0.305, 0.405]), np.full(3, 1.0), np.full(3, 3.0))
+    second = SeriesResistance(np.array([0.305, 0.405, 0.505]), np.full(3, 3.0), np.full(3, 1.0))
     both = mean_of([first, second])
-    assert (both.soc.min(), both.soc.max()) == pytest.approx((0.205, 0.505))
-    assert np.interp([0.22, 0.35, 0.49], both.soc, both.r_s_ohm) == pytest.approx([1.0, 2.0, 3.0])
+    assert both.soc == pytest.approx([0.205, 0.305, 0.405, 0.505])
+    assert both.r_s_ohm == pytest.approx([1.0, 1.5, 1.5, 3.0])
+    assert both.weight == pytest.approx([3.0, 4.0, 4.0, 1.0])
+
+
+def test_an_error_of_the_open_circuit_voltage_counts_by_the_current_that_it_is_divided_by():
+    """10 mV are 65 mohm at C/20 of a cell of 3 Ah (E19): beside 1.5 A they move R_s by their share of the squares."""
+    cell = TRUTH.model_copy(
+        update={"ocv": TRUTH.ocv.model_copy(update={"ocv_v": tuple(v + 0.01 for v in TRUTH.ocv.ocv_v)})}
+    )
+    runs = [
+        predict(TRUTH, capture(constant(amps, seconds), soc=0.9, noise_v=0.0), 0.9, lowest_soc=0.3)
+        for amps, seconds in ((0.153, 40_000), (1.5, 5_000))
+    ]
+    slow, fast = (series_resistance(cell, run) for run in runs)
+    slow_off, fast_off = (curve.r_s_ohm - true_ohm(curve.soc, TRUTH) for curve in (slow, fast))
+    assert np.median(slow_off) == pytest.approx(0.01 / 0.153, rel=0.01)
+    assert np.median(fast_off) == pytest.approx(0.01 / 1.5, rel=0.01)
+    both = mean_of([slow, fast])
+    expected = (0.153 * 0.01 + 1.5 * 0.01) / (0.153**2 + 1.5**2)
+    assert np.median(both.r_s_ohm - true_ohm(both.soc, TRUTH)) == pytest.approx(expected, rel=0.01)
 
 
 def test_what_the_branches_have_wrong_goes_into_r_s():
@@ -86,7 +105,7 @@ def test_what_the_branches_have_wrong_goes_into_r_s():
 
 def test_a_flat_resistance_has_no_rise_and_says_so():
     soc = np.linspace(0.05, 0.95, 60)
-    fit = fit_series_resistance(SeriesResistance(soc, np.full(60, 0.08)))
+    fit = fit_series_resistance(SeriesResistance(soc, np.full(60, 0.08), np.ones(60)))
     assert fit(soc) == pytest.approx(np.full(60, 0.08), rel=1e-6)
     assert fit.a[0] == pytest.approx(0.0, abs=1e-6)
     assert fit.element.amplitude_ohm > 0.0
