@@ -182,7 +182,7 @@ def _experiments(s: Simulation) -> list[Erratum]:
             "judged against Chen and Mora",
             f"a pack of {six.series_count} cells in series and {six.capacity_ah:g} Ah against a cell of {1e3 * small.capacity_ah:g} "
             f"mAh, with its bounds: of such cells it had {six.series_count / parallel:.2f} times the resistances and "
-            f"{parallel / six.series_count:.0f} times the capacitances",
+            f"{parallel / six.series_count:.0f} times the capacitances, only the products alike",
         ),
         Erratum(
             "(4.60), (4.63), (4.71)-(4.72)",

@@ -96,7 +96,7 @@ def table_10(experiment: Experiment) -> Table:
     corrected = (
         "Weights of a8 as E4, of a4 and a7 as E24, inferred from the printed estimates; printed a5 = 30 contradicts its bounds "
         "and weights, which give 150 (E5). The run gives the limits, which are not what is printed; the other eleven printed "
-        "estimates follow to 0.3 % from bounds, weights and initial values alone, without any data, as a mean over the first "
+        f"estimates follow to {printed.worst_mean_percent('10'):.1f} % from bounds, weights and initial values alone, without any data, as a mean over the first "
         f"10 h, a fitted time: 1800 adds 0.0005 to a1, 42,000,000 adds 38.9 to a12, a4 becomes "
         f"{printed.mean_from_start('10', 4):.4f}. "
         if printed_bounds

@@ -72,7 +72,7 @@ DECLARED = """
 Where the two differ the reason stands with it; <a href="#table-errata">E1 to E26</a> are the errata of the thesis that this project
 carries corrected.
 What the thesis does not print is declared: N(k) = E<sub>2.5</sub>(-k<sup>2.5</sup>), k<sub>0</sub> = 0,
-x<sub>2</sub>(0) = x<sub>3</sub>(0) = 0, simulations at 100 Hz (C/10 runs at 10 Hz) with the semi-exact step, which is stable at
+x<sub>2</sub>(0) = x<sub>3</sub>(0) = 0 (schemes 1 and 2: start and λ of E25), simulations at 100 Hz (C/10 runs at 10 Hz) with the semi-exact step, which is stable at
 any step length. Errors are always in percent of the true value.</p>
 """
 

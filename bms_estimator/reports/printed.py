@@ -176,6 +176,12 @@ def mean_from_start(table: str, index: int) -> float:
     return b.limit + (initial(table, index) - b.limit) / (b.rate * START_MEAN_S[table])
 
 
+def worst_mean_percent(table: str) -> float:
+    """The largest difference between ``mean_from_start`` and a printed estimate, of the estimate; a5 as E5 [%]."""
+    estimates = {i: row[1] for i, row in (TABLE_5 if table == "5" else TABLE_10 | {5: (0.0, A5)}).items()}
+    return max(100.0 * abs(mean_from_start(table, i) / estimate - 1.0) for i, estimate in estimates.items())
+
+
 def tables_5_and_6() -> Floats:
     """a1..a15 of the printed estimates of Tables 5 and 6 at index 1..15, shape (16,)."""
     a = np.zeros(16)

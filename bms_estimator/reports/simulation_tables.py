@@ -216,8 +216,8 @@ def table_5(simulation: Simulation) -> Table:
         Verdict.CORRECTED,
         f"The run gives the Lemma 4.1.3 limits, weighted means of the bounds whatever the data say (E3): a6 = {a6[0]}, printed "
         f"{a6[1]}. The printed digits are no result of the observer but of a closed form, the limits averaged from the very "
-        f"first sample on, over 328 s, a fitted time ({a6[2]}): a1 to a6 and a9 come out to the last printed digit (a4 cut off, "
-        "not rounded), the others to 0.03 %. The weights of a7 and a8 are inferred from the printed estimates (E24, E4). Errors "
+        f"first sample on, over {printed.START_MEAN_S['5']:g} s, a fitted time ({a6[2]}): so all twelve come out within "
+        f"{printed.worst_mean_percent('5'):.2f} %. The weights of a7 and a8 are inferred from the printed estimates (E24, E4). Errors "
         f"are of the desired value (E7). The conditions of Lemma 4.1.1 do not all hold (E6): with the {failing}. delta1 and "
         f"delta2 (E13): {deltas[0]} from the desired values, {deltas[1]} from the printed estimates, {deltas[2]} from the "
         f"recomputed ones. The run is at {SMALL_CURRENT_A} A.",
@@ -322,8 +322,8 @@ def table_12(simulation: Simulation) -> Table:
         Verdict.NOT,
         f"Neither the load nor the SOC at which the static model is frozen is printed; here {CURRENT_A:g} A for 10 minutes in 20 "
         f"down to SOC {FINAL_SOC:g}, frozen at SOC {STATIC_SOC:g}. From the printed Tables 5 and 6 the order reverses: dynamic "
-        f"{dynamic}, static {static} % (down to SOC {LOWEST_SOC:g} {higher[0]} and {higher[1]} %). The printed order comes only "
-        "with a13 to a15 fitted anew; the sizes never do.",
+        f"{dynamic}, static {static} % (down to SOC {LOWEST_SOC:g} {higher[0]} and {higher[1]} %: as good as the same). Plainly "
+        "the printed order comes only with a13 to a15 fitted anew; the sizes never do.",
     )
 
 

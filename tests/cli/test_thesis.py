@@ -1,3 +1,4 @@
+import html
 import re
 from collections import Counter
 from html.parser import HTMLParser
@@ -104,7 +105,7 @@ def test_every_figure_is_drawn(page):
 
 
 def test_every_item_has_a_verdict_and_a_reason(page):
-    verdicts = {"reproduced", "reproduced after correction", NOT_REPRODUCED, "given", "added"}
+    verdicts = {"reproduced after correction", "recomputed", NOT_REPRODUCED, "given", "added"}
     for key, article in page.articles.items():
         assert article["verdict"] in verdicts, key
         assert len(article["reason"]) > 30, key
@@ -140,6 +141,57 @@ def test_the_document_gives_each_title_and_verdict_in_the_reports_order_and_how_
     assert rows == [[item["number"], item["title"].strip(), item["verdict"]] for item in items]
     for verdict, count in Counter(item["verdict"] for item in items).items():
         assert f" {count} {verdict}" in " ".join(text.split())
+
+
+def cells(whole, key):
+    """Rows of the table of one article."""
+    article = re.search(rf'<article id="{key}">.*?</article>', whole, re.DOTALL).group()
+    return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(<td.*?)</tr>", article)]
+
+
+def document_rows(pattern):
+    text = DOCUMENT.read_text(encoding="utf-8")
+    return [
+        [cell.replace("\\|", "|") for cell in row.split(" | ")]
+        for row in re.findall(rf"^\| ({pattern} \| .*) \|$", text, re.MULTILINE)
+    ]
+
+
+def test_the_document_gives_the_errata_as_the_report_computes_them(whole):
+    reported = [[html.unescape(cell) for cell in row] for row in cells(whole, "table-errata")]
+    assert [row[0] for row in reported] == [f"E{n}" for n in range(1, 27)]
+    assert document_rows(r"E\d+") == reported
+
+
+def test_every_number_in_the_document_is_in_the_reports_reason_or_title(page):
+    reasons = {article["number"]: article["title"] + article["reason"] for article in page.articles.values()}
+    number = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w])")
+    checked = 0
+    for mark, _, _, why in document_rows(r"(?:Table|Figure) \d+"):
+        said = number.findall(why)
+        assert set(said) <= set(number.findall(reasons[mark])), mark
+        checked += len(said)
+    assert checked > 40
+
+
+def test_one_start_gives_what_tables_2_and_3_print(whole):
+    """To the printed digits, which are four to seven; small parameters of Table 3 as they began."""
+    for key in ("table-2", "table-3"):
+        rows = cells(whole, key)
+        assert len(rows) == 15
+        for row in rows:
+            assert float(row[4]) == pytest.approx(float(row[3]), rel=2e-5), (key, row)
+
+
+def test_small_parameters_of_table_3_are_off_by_what_the_start_was(whole):
+    off = {row[0]: float(row[8]) for row in cells(whole, "table-3")}
+    assert [off[f"a{i}"] for i in (1, 3, 6, 13, 15)] == pytest.approx([6.48, 14.3, 19.7, 36.0, 5.99], abs=0.05)
+
+
+def test_static_beats_dynamic_with_the_printed_parameters(whole):
+    dynamic, static = ([float(cell) for cell in row[2:]] for row in cells(whole, "table-12"))
+    assert (dynamic[0], static[0]) == pytest.approx((0.0826, 0.0812), abs=5e-5)
+    assert dynamic[2] < 0.5 * static[2]  # a13 to a15 fitted anew
 
 
 def test_one_table(tmp_path, capsys):

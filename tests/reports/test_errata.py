@@ -1,0 +1,142 @@
+"""The errata's own computations against others: by hand, by simulation, by the identity that is claimed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator.lemma import lemma_conditions
+from bms_estimator.kernels.cell import c_ts, cell_step, emf, r_s, terminal_voltage
+from bms_estimator.kernels.margins import crossing
+from bms_estimator.model.cell import load_cell
+from bms_estimator.reports import printed, printed_pack
+from bms_estimator.reports.errata import ocv_error_ohm
+from bms_estimator.reports.quasi_steady import quasi_steady
+from bms_estimator.reports.simulated_pack import pack, resistance_ohm
+from bms_estimator.reports.simulation import table_5_cell
+
+CHEN_MORA = load_cell("chen_mora")
+CAPACITY_AS = CHEN_MORA.cell.capacity_ah * 3600.0
+
+
+@pytest.fixture(scope="module")
+def held():
+    return quasi_steady(CHEN_MORA, 0.275)
+
+
+def test_branches_stand_as_their_time_constants_where_the_cells_stand_as_its_resistances(held):
+    """E15: 32.8 s and 223 s, 46.7 and 49.8 mOhm."""
+    assert held.tau_s == pytest.approx((32.81, 223.03), abs=0.01)
+    assert held.observer_v[1] / held.observer_v[0] == pytest.approx(223.03 / 32.81, rel=0.002)
+    assert held.cell_v[1] / held.cell_v[0] == pytest.approx(0.04984 / 0.04669, rel=0.001)
+    assert 1e3 * np.array(held.observer_v) == pytest.approx([6.01, 40.83], abs=0.01)
+    assert 1e3 * np.array(held.cell_v) == pytest.approx([12.84, 13.70], abs=0.01)
+
+
+def test_error_does_not_vanish_while_current_flows(held):
+    """E16: e = -x2 / (N tau_ts), in proportion to the current."""
+    assert 1e3 * held.error_v == pytest.approx(-0.183, abs=0.0005)
+    assert held.error_v == pytest.approx(held.predicted_v, rel=1e-3)
+    small = quasi_steady(CHEN_MORA, 1e-4)
+    assert 1e6 * small.error_v == pytest.approx(-0.0666, abs=0.0001)
+
+
+def test_voltage_of_an_empty_cell_is_not_zero():
+    assert emf(0.0, CHEN_MORA.a) == pytest.approx(3.685 - 1.031)  # E17
+
+
+def test_condition_on_a8_is_the_capacitance_itself():
+    """E18: a8 above its bound exactly where C_ts > 0, whatever the values, so the Lemma assumes what it proves."""
+    random = np.random.default_rng(0)
+    both = set()
+    for a7, a8, a9, soc in random.uniform((100.0, 1.0, 100.0, 0.001), (1000.0, 50.0, 1000.0, 1.0), (2000, 4)):
+        a = np.zeros(16)
+        a[7:10] = a7, a8, a9
+        positive = c_ts(soc, a) > 0.0
+        assert (a8 > crossing(soc, a9, a7)) == positive
+        both.add(positive)
+    assert both == {True, False}
+
+
+def test_initial_values_of_table_10_violate_the_lemma():
+    conditions = {c.name: c for c in lemma_conditions(pack())}
+    for name, left, right in (
+        ("1: a9(0) < a7(0)", 5_100_000, 4_512_000),
+        ("2: a12(0) < a10(0)", 42_000_000, 36_300_000),
+        ("1: rate of a7 < rate of a9", 135, 130),
+    ):
+        assert (conditions[name].holds, conditions[name].left, conditions[name].right) == (False, left, right)
+    assert conditions["1: P9.l9 < P7.l7"].holds
+
+
+def test_either_pair_of_weights_of_a7_breaks_one_condition_of_table_5():
+    """E6 with the printed ones; with those of E24 the rate."""
+    failing = [[c.name for c in lemma_conditions(cell) if not c.holds] for cell in (CHEN_MORA, table_5_cell())]
+    assert failing == [["1: P9.l9 < P7.l7"], ["1: rate of a7 < rate of a9"]]
+
+
+def test_series_resistance_by_the_printed_sign_is_negative():
+    """E19, on a cell at rest before, half full, 0.275 A."""
+    x, a = (0.5, 0.004, 0.007), CHEN_MORA.a
+    y = terminal_voltage(x, 0.275, a)
+    assert (y + x[1] + x[2] - emf(0.5, a)) / 0.275 == pytest.approx(-r_s(0.5, a))
+
+
+@pytest.mark.parametrize(("cell", "ohm"), [("chen_mora", 0.727), ("ncr18650", 0.0667), ("thunder_power_6s", 0.0303)])
+def test_ten_millivolts_of_the_ocv_at_c_20(cell, ohm):
+    assert ocv_error_ohm(load_cell(cell)) == pytest.approx(ohm, rel=1e-3)
+
+
+def test_sensor_saturates():
+    """E20, by hand: 22.195 + 1.9215 x - 1.7590 x^2 + 3.0435 x^3 = 25 (the exponential is below 1e-16 there)."""
+    soc = printed_pack.saturated_above_soc()
+    assert soc == pytest.approx(0.9437, abs=1e-4)
+    assert 22.195 + 1.9215 * soc - 1.7590 * soc**2 + 3.0435 * soc**3 == pytest.approx(25.0, abs=1e-6)
+    assert emf(1.0, printed_pack.A) == pytest.approx(25.401)
+
+
+def test_printed_currents_contradict_ohms_law():
+    errors = printed_pack.current_errors_percent()
+    assert [errors[load] for load in ("50 ohm", "25 ohm", "12.5 ohm")] == pytest.approx([-9.9, -6.3, -3.8], abs=0.05)
+
+
+def test_mean_current_is_that_of_a_simulated_discharge():
+    """The same pack through the same resistor, step by step with its transients."""
+    a, capacity_as = printed_pack.A, 6.6 * 3600.0
+    x, drawn_as, seconds, current_a = (1.0, 0.0, 0.0), 0.0, 0, 0.0
+    while x[0] > printed_pack.EMPTY_SOC:
+        current_a = terminal_voltage(x, current_a, a) / 12.5
+        x = cell_step(x, current_a, 5.0, capacity_as, a)
+        drawn_as, seconds = drawn_as + 5.0 * current_a, seconds + 5
+    assert printed_pack.mean_current_a(12.5) == pytest.approx(drawn_as / seconds, rel=0.003)
+
+
+def test_simulated_loads_are_what_they_are_called():
+    for load in ("50 ohm", "25 ohm", "12.5 ohm"):
+        assert f"{resistance_ohm(load):g} ohm" == load
+    assert math.isinf(resistance_ohm(""))
+
+
+def test_products_of_table_10_against_another_battery():
+    assert printed_pack.product_errors() == pytest.approx((13.096, 8.942), abs=0.001)
+
+
+def test_derivative_of_the_overpotential_needs_the_rate_of_soc():
+    """E23: (4.60) with dE/dx1 x1' is y1', with dE/dx1 alone it is not. Constant current, so di/dt = 0."""
+    a, current_a, dt_s = CHEN_MORA.a, 0.275, 1e-3
+    here = (0.5, 0.004, 0.007)
+    later = cell_step(here, current_a, dt_s, CAPACITY_AS, a)
+    y_rate = (terminal_voltage(later, current_a, a) - terminal_voltage(here, current_a, a)) / dt_s
+    y1_rate = -(later[1] + later[2] - here[1] - here[2]) / dt_s
+    r_s_rate = (r_s(later[0], a) - r_s(here[0], a)) / dt_s
+    slope = (emf(0.5 + 1e-6, a) - emf(0.5 - 1e-6, a)) / 2e-6
+    soc_rate = -current_a / CAPACITY_AS
+    assert y_rate - slope * soc_rate + current_a * r_s_rate == pytest.approx(y1_rate, rel=1e-4)
+    assert abs(y_rate - slope + current_a * r_s_rate) > 1e3 * abs(y1_rate)
+
+
+def test_bounds_of_table_5_and_10_differ_in_a4_only():
+    differing = [
+        i for i in printed.BOUNDS if printed.bounds("5", i).limit != pytest.approx(printed.bounds("10", i).limit)
+    ]
+    assert differing == [4]
