@@ -22,6 +22,8 @@ free: the NCR18650 points fit to 9.6 mV RMS, with all positive to 10.6. Below an
 over all SOC, and nothing tells it from the cubic."""
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
 """Above an exponent of 300 the exponential is gone at SOC 0.01."""
+AT_BOUND_V = 1e-5
+"""An amplitude this near to its bound is at it: no converter reads so little [V]."""
 EXPONENTS = np.geomspace(5.0, 300.0, 60)
 """Exponents a17 the search starts from."""
 
@@ -95,7 +97,7 @@ def _standard_errors(a: Floats, soc: Floats, residual_v: Floats) -> Floats:
     a16, a17 = a[0], a[1]
     decay = np.exp(-a17 * soc)
     jacobian = np.column_stack([-decay, a16 * soc * decay, np.ones_like(soc), soc, -(soc**2), soc**3])
-    free = (a > LOWER * 1.001 + 1e-7) & (a < UPPER * 0.999)
+    free = (a > LOWER * 1.001 + AT_BOUND_V) & (a < UPPER * 0.999)
     std = np.full(6, np.nan)
     freedom = soc.size - int(free.sum())
     if freedom > 0:

@@ -210,14 +210,20 @@ class Protocol:
 
     # Step 3 -----------------------------------------------------------------------------------------------------
 
+    @property
+    def step_3(self) -> list[Capture]:
+        """Each relaxation test, and each constant load up to ``LARGEST_C``."""
+        largest_a = LARGEST_C * self.cell.cell.capacity_ah
+        constant = [c for c in self.of(Kind.CONSTANT) if np.median(c.samples["current_a"]) <= largest_a]
+        return [*constant, *self.of(Kind.RELAXATION)]
+
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
-        """R_s by (4.2) for each relaxation test and each constant load up to ``LARGEST_C``."""
-        a, largest_a = self.adaptive.average, LARGEST_C * self.cell.cell.capacity_ah
+        """R_s by (4.2) for each of these."""
+        a = self.adaptive.average
         return {
             c.name: series_resistance(self.with_ocv, self._predict(self.with_ocv, c, a=a, lowest_soc=0.02))
-            for c in self.of(Kind.CONSTANT, Kind.RELAXATION)
-            if c.kind is Kind.RELAXATION or np.median(c.samples["current_a"]) <= largest_a
+            for c in self.step_3
         }
 
     @cached_property

@@ -3,12 +3,14 @@
 import itertools
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.calibration.series_resistance import SeriesResistance, SeriesResistanceFit
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.reports import printed
@@ -81,6 +83,8 @@ EXPERIMENTS = (
 CONSTANT_C = 0.01
 """Above this C-rate a capture charges or discharges [1/h]."""
 VOLTAGE_STEP_V = 1e-3
+R_S_SOC = (0.98, 0.9, 0.7, 0.5, 0.3, 0.1)
+"""Where R_s is looked at."""
 
 
 def protocol(experiment: Experiment) -> Protocol:
@@ -133,6 +137,8 @@ def main() -> None:
     protocols = {experiment.name: protocol(experiment) for experiment in EXPERIMENTS}
     console.print(errors(protocols))
     console.print(parameters(protocols))
+    console.print(resistances(EXPERIMENTS[0]))
+    console.print(ablation(EXPERIMENTS[0]))
     console.print(verdicts("all captures", list(protocols.values())))
     room = [protocols[experiment.name] for experiment in EXPERIMENTS if experiment.room]
     console.print(verdicts("captures at room temperature", room))
@@ -187,17 +193,88 @@ def verdicts(on: str, protocols: list[Protocol]) -> Table:
     table = Table(title=f"claims on {on}; each must be met on more than half of them")
     for column in ("claim", "where", "criterion", "met", "found", "verdict"):
         table.add_column(column)
+    for key, *outcome in outcomes(protocols):
+        where, criterion, _ = CLAIMS[key]
+        table.add_row(key, where, criterion, *outcome)
+    return table
+
+
+def outcomes(protocols: list[Protocol]) -> Iterator[tuple[str, str, str, str]]:
+    """Of each claim: key, how often it was met, the range of what was found, verdict."""
     for key in CLAIMS:
         found = claim(key, protocols)
-        values = [result.found for result in found.results]
-        table.add_row(
-            key,
-            found.where,
-            found.criterion,
-            f"{found.met} of {len(values)}",
-            f"{min(values):.3g} to {max(values):.3g}",
-            found.verdict.value,
+        yield key, f"{found.met} of {len(found.results)}", found.span, found.verdict.value
+
+
+class FastInStep3(Protocol):
+    """Constant loads of any current give R_s."""
+
+    @property
+    def step_3(self) -> list[Capture]:
+        """All of them."""
+        return self.of(Kind.CONSTANT, Kind.RELAXATION)
+
+
+class OwnInStep3(FastInStep3):
+    """A load that validates has a part in its own R_s."""
+
+    def r_s_without(self, name: str) -> SeriesResistanceFit:  # noqa: ARG002 - none is left out
+        """With it."""
+        return self.r_s_fit
+
+
+class Unweighted(Protocol):
+    """The plain mean of (4.2) as printed, whatever the current (E19)."""
+
+    @cached_property
+    def r_s_curves(self) -> dict[str, SeriesResistance]:
+        """Each value of the same weight."""
+        return {name: replace(curve, weight=np.ones_like(curve.weight)) for name, curve in super().r_s_curves.items()}
+
+
+VARIANTS = {
+    "as it is": Protocol,
+    "(4.2) not weighted by the current": Unweighted,
+    "1.5C in step 3 of the other loads": FastInStep3,
+    "each load in its own step 3 as well": OwnInStep3,
+}
+
+
+def variants(experiment: Experiment) -> Iterator[tuple[str, ...]]:
+    """Mean and largest error on each load of one cell, by how step 3 is done; last with other bounds."""
+    made = protocol(experiment)
+    model = load_cell(experiment.cell, experiment.capacity_ah)
+    found = {name: make(model, made.captures, VOLTAGE_STEP_V) for name, make in VARIANTS.items()}
+    bounds = {f"a{i}": model.bounds(i) for i in range(1, 13)}
+    own_bounds = model.model_copy(update={"adaptation": bounds})
+    found["bounds around the cell file's elements"] = Protocol(own_bounds, made.captures, VOLTAGE_STEP_V)
+    for name, p in found.items():
+        yield (
+            name,
+            *(f"{p.dynamic[c.name].mean_percent:.2f} / {p.dynamic[c.name].max_percent:.1f}" for c in made.validating),
         )
+
+
+def ablation(experiment: Experiment) -> Table:
+    """What the parts of step 3 and the bounds are worth on one cell."""
+    table = Table(title=f"{experiment.name}: mean / largest error in % when one thing is done otherwise")
+    table.add_column("")
+    for capture in protocol(experiment).validating:
+        table.add_column(capture.name, justify="right")
+    for row in variants(experiment):
+        table.add_row(*row)
+    return table
+
+
+def resistances(experiment: Experiment) -> Table:
+    """R_s by (4.2) of each load of one cell, over SOC."""
+    table = Table(title=f"{experiment.name}: R_s by (4.2) in mohm, by SOC")
+    for column in ("load", *map(str, R_S_SOC)):
+        table.add_column(column, justify="right")
+    made = protocol(experiment)
+    for load, curve in FastInStep3(made.cell, made.captures, VOLTAGE_STEP_V).r_s_curves.items():
+        at = np.interp(R_S_SOC, curve.soc, curve.r_s_ohm)
+        table.add_row(load, *(f"{1e3 * ohm:.0f}" for ohm in at))
     return table
 
 
