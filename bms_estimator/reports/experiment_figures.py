@@ -64,6 +64,8 @@ def figure_27(experiment: Experiment) -> Figure:
 
 
 def _currents(captures: list[Any], key: str) -> str:
+    if not captures:
+        return ""
     columns = 2 if len(captures) > 1 else 1
     rows = -(-len(captures) // columns)
 
@@ -155,9 +157,17 @@ def _steps(p: Protocol) -> list[str]:
     return [name for name in p.dynamic if name not in _constant(p)][:2]
 
 
+def _largest(p: Protocol, names: list[str]) -> str:
+    if not names:
+        return "None of the captures is such a load."
+    return f"Largest error {max(p.dynamic[name].max_percent for name in names):.2f} %."
+
+
 def _grid(names: list[str], one: Callable[[Any, str], None], key: str) -> str:
+    if not names:
+        return ""
     columns = 2 if len(names) > 1 else 1
-    rows = max(-(-len(names) // columns), 1)
+    rows = -(-len(names) // columns)
 
     def draw(axes: Any) -> None:
         flat = np.atleast_1d(axes).flat
@@ -202,9 +212,8 @@ def figure_32(experiment: Experiment) -> Figure:
 def figure_33(experiment: Experiment) -> Figure:
     """Constant loads, errors."""
     p = experiment.protocol
-    worst = max((p.dynamic[name].max_percent for name in _constant(p)), default=float("nan"))
     svg = _grid(_constant(p), _errors(p), "33")
-    reason = f"Largest {worst:.2f} % (printed {printed.MAX_CONSTANT:g} %)."
+    reason = f"{_largest(p, _constant(p))} Printed: at most {printed.MAX_CONSTANT:g} %."
     return _figure("33", "Constant loads: error", svg, experiment, reason, claims=("constant loads, largest",))
 
 
@@ -217,8 +226,7 @@ def figure_34(experiment: Experiment) -> Figure:
 def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> Figure:
     p = experiment.protocol
     names = _steps(p)[index : index + 1] or _steps(p)[-1:]
-    worst = max((p.dynamic[name].max_percent for name in names), default=float("nan"))
-    return _figure(key, title, _grid(names, _voltages(p), key), experiment, f"Largest error {worst:.2f} %.")
+    return _figure(key, title, _grid(names, _voltages(p), key), experiment, _largest(p, names))
 
 
 def figure_35(experiment: Experiment) -> Figure:
@@ -241,7 +249,7 @@ def figure_37(experiment: Experiment) -> Figure:
 def figure_38(experiment: Experiment) -> Figure:
     """Errors of the steps."""
     p = experiment.protocol
-    reason = f"Printed: at most {printed.MAX_STEPS:g} %."
+    reason = f"{_largest(p, _steps(p))} Printed: at most {printed.MAX_STEPS:g} %."
     svg = _grid(_steps(p), _errors(p), "38")
     return _figure("38", "Steps: error", svg, experiment, reason, claims=("steps, largest",))
 

@@ -9,6 +9,8 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.claims import CLAIMS, Claim, Result, claim
+from bms_estimator.reports.experiment import Experiment, Recorded
+from bms_estimator.reports.experiment_figures import FIGURES
 from bms_estimator.reports.items import Verdict
 from bms_estimator.reports.protocol import Capture, Kind, Protocol, kind_of, printed_bounds
 from bms_estimator.sources.replay import load_capture
@@ -134,6 +136,18 @@ def test_what_is_missing_is_named(samples, missing, words):
 def test_a_lone_constant_load_validates_and_step_2_runs_on_the_relaxation_test(leaf):
     assert leaf.smallest.name == "hppc"
     assert [c.name for c in leaf.validating] == ["cc"]
+
+
+@pytest.mark.parametrize(("kept", "missing"), [("steps", ("33", "34")), ("constant", ("36", "37", "38"))])
+def test_a_figure_of_a_load_that_is_missing_is_empty_and_says_so(samples, kept, missing):
+    recorded = Recorded(TRUTH, tuple((name, samples[name]) for name in ("relaxation", kept)), 1e-3)
+    experiment = Experiment(recorded)
+    drawn = {key: FIGURES[key](experiment) for key in ("33", "34", "36", "37", "38")}
+    assert {key for key, figure in drawn.items() if not figure.svg} == set(missing)
+    assert all(
+        "None of the captures is such a load." in drawn[key].reason for key in missing if key not in ("34", "36")
+    )
+    assert not any("None of the captures" in figure.reason for key, figure in drawn.items() if key not in missing)
 
 
 def test_leaf_figures(leaf):
