@@ -9,7 +9,7 @@ from bms_estimator.calibration.ocv_points import max_v, pooled, rms_v
 from bms_estimator.reports import printed
 from bms_estimator.reports.experiment import Experiment
 from bms_estimator.reports.items import Table, Verdict, number
-from bms_estimator.reports.protocol import KNEE_SOC, LOWEST_SOC, STATIC_SOC
+from bms_estimator.reports.protocol import KNEE_SOC, STATIC_SOC
 
 
 def table_8(experiment: Experiment) -> Table:
@@ -149,7 +149,7 @@ def table_11(experiment: Experiment) -> Table:
         verdict,
         f"{experiment.unpublished} {tested}a1 to a12 from {protocol.smallest.name}, a16 to a21 from the relaxation tests, a13 "
         f"to a15 from all constant loads and relaxation tests but the one of the row. Error of the measured voltage, from the "
-        f"first sample until SOC {LOWEST_SOC:g}, counted from full. "
+        f"first sample until SOC {protocol.lowest_soc:.2g}, counted from full. "
         + (
             "The pack has the very form of the model, so the errors are smaller than a real pack's."
             if experiment.recorded is None

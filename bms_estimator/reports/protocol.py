@@ -170,6 +170,11 @@ class Protocol:
         return fit_table(pooled(self.tests))
 
     @cached_property
+    def lowest_soc(self) -> float:
+        """Where validation ends: ``LOWEST_SOC``, or above it the last point of step 1. Below that (2.10) is a guess."""
+        return max(LOWEST_SOC, *(float(test.soc.min()) for test in self.tests))
+
+    @cached_property
     def with_ocv(self) -> CellModel:
         """The cell with the fitted (2.10)."""
         return self.cell.model_copy(update={"ocv": self.joint_fit.ocv})
@@ -221,10 +226,7 @@ class Protocol:
     def r_s_curves(self) -> dict[str, SeriesResistance]:
         """R_s by (4.2) for each of these."""
         a = self.adaptive.average
-        return {
-            c.name: series_resistance(self.with_ocv, self._predict(self.with_ocv, c, a=a, lowest_soc=0.02))
-            for c in self.step_3
-        }
+        return {c.name: series_resistance(self.with_ocv, self._predict(c, a)) for c in self.step_3}
 
     @cached_property
     def r_s_mean(self) -> SeriesResistance:
@@ -234,14 +236,14 @@ class Protocol:
     @cached_property
     def r_s_fit(self) -> SeriesResistanceFit:
         """a13..a15."""
-        return fit_series_resistance(self.r_s_mean, LOWEST_SOC)
+        return fit_series_resistance(self.r_s_mean, self.lowest_soc)
 
     def r_s_without(self, name: str) -> SeriesResistanceFit:
         """The same without the capture ``name``."""
         if name not in self.r_s_curves:
             return self.r_s_fit
         others = [curve for load, curve in self.r_s_curves.items() if load != name]
-        return fit_series_resistance(mean_of(others), LOWEST_SOC)
+        return fit_series_resistance(mean_of(others), self.lowest_soc)
 
     def a_for(self, name: str) -> Floats:
         """a1..a15 for the load ``name``, with nothing of it in a13..a15. Shape (16,)."""
@@ -251,21 +253,18 @@ class Protocol:
 
     # Validation -------------------------------------------------------------------------------------------------
 
-    def _predict(self, cell: CellModel, capture: Capture, *, a: Floats, lowest_soc: float = LOWEST_SOC) -> Prediction:
-        return predict(cell, capture.samples, self.initial_soc(capture), a=a, lowest_soc=lowest_soc)
+    def _predict(self, capture: Capture, a: Floats) -> Prediction:
+        return predict(self.with_ocv, capture.samples, self.initial_soc(capture), a=a, lowest_soc=self.lowest_soc)
 
     @cached_property
     def dynamic(self) -> dict[str, Prediction]:
         """The estimated model, frozen, on every load (5.3)."""
-        return {c.name: self._predict(self.with_ocv, c, a=self.a_for(c.name)) for c in self.loads}
+        return {c.name: self._predict(c, self.a_for(c.name)) for c in self.loads}
 
     @cached_property
     def static(self) -> dict[str, Prediction]:
         """The same with its elements frozen at one SOC (chapter 6)."""
-        return {
-            c.name: self._predict(self.with_ocv, c, a=static_elements(self.a_for(c.name), STATIC_SOC))
-            for c in self.loads
-        }
+        return {c.name: self._predict(c, static_elements(self.a_for(c.name), STATIC_SOC)) for c in self.loads}
 
     @cached_property
     def largest(self) -> str:

@@ -17,7 +17,7 @@ from bms_estimator.reports import printed
 from bms_estimator.reports.claims import CLAIMS, claim
 from bms_estimator.reports.protocol import KNEE_SOC, Capture, Kind, Protocol
 from bms_estimator.sources.replay import load_capture
-from tests.benchmarks.recipes import DATA, NCR, PF, charge_ah, path_of
+from tests.benchmarks.recipes import DATA, LFP, NCR, PF, charge_ah, path_of
 
 WIDTH = 150
 RELAXATION, CONSTANT, STEPS = Kind
@@ -46,6 +46,12 @@ def _panasonic(name: str, at: str, *captures: tuple[str, Kind]) -> Experiment:
     """Its HPPC, discharges with a rest after each, is its relaxation test."""
     found = tuple((f"{PF}{at}_{capture}", kind) for capture, kind in (("hppc", RELAXATION), *captures))
     return Experiment(f"18650PF {name}", "nca", 2.9, found, room=at == "25")
+
+
+def _a123(name: str, at: str) -> Experiment:
+    """Its drive cycles have a rest of 5 min each half hour: a relaxation test, and the only load but C/30."""
+    captures = ((f"{LFP}dyn_{at}", RELAXATION), (f"{LFP}c30_dis_{at}", CONSTANT))
+    return Experiment(f"A123 {name}", "lfp", 2.05, captures, room=at == "p25")
 
 
 EXPERIMENTS = (
@@ -78,8 +84,11 @@ EXPERIMENTS = (
     _panasonic("0 C", "0", ("us06", STEPS), ("cycle1", STEPS)),
     _panasonic("-10 C", "n10", ("us06", STEPS)),
     Experiment("Leaf", "leaf", 30.5, (("leaf/hppc_25c_from_full", RELAXATION), ("leaf/cc_1c", CONSTANT))),
+    _a123("25 C", "p25"),
+    _a123("5 C", "p05"),
+    _a123("-15 C", "n15"),
 )
-"""LG M50 and A123 have no relaxation test beside what would have to validate: step 1 cannot be run."""
+"""The LG M50 has no relaxation test: step 1 cannot be run."""
 CONSTANT_C = 0.01
 """Above this C-rate a capture charges or discharges [1/h]."""
 VOLTAGE_STEP_V = 1e-3
