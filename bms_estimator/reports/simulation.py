@@ -170,7 +170,7 @@ class Simulation:
                 for run, shift in zip(runs, shifts.values(), strict=True)
             ]
 
-        start_v, lambda_ = least_squares(off, (1.4, 9.0), bounds=((1.0, 1.0), (2.0, 12.0)), xtol=1e-6).x
+        start_v, lambda_ = least_squares(off, (1.4, 9.0), bounds=((1.0, 1.0), (2.0, 12.0)), xtol=1e-3).x
         runs = [self._started(law, start_v, lambda_) for law in shifts]
         return OneStart(float(abs(runs[0].error_v[0])), float(lambda_), runs[0], runs[1])
 

@@ -186,7 +186,7 @@ def table_5(simulation: Simulation) -> Table:
         )
     conditions = {"printed": load_cell("chen_mora"), "inferred": simulation.cell}
     failing = "; with the ".join(
-        f"{kind} weights of a7 {c.name} fails, {number(c.left, 6)} against {number(c.right, 6)}"
+        f"{kind} weights of a7 condition {c.name} fails, {number(c.left, 6)} against {number(c.right, 6)}"
         for kind, cell in conditions.items()
         for c in lemma_conditions(cell)
         if not c.holds
