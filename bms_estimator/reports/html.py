@@ -49,7 +49,7 @@ p { margin: .5rem 0; } .reason { color: var(--soft); font-size: .9rem; max-width
 table { border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid var(--line); vertical-align: bottom; }
 th { font-weight: 600; max-width: 9.5rem; line-height: 1.3; border-bottom: 1.5px solid var(--ink); }
-td { white-space: nowrap; } td.text { white-space: normal; text-align: left; min-width: 14rem; } .account td { white-space: normal; }
+td { white-space: nowrap; } .account td { white-space: normal; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; white-space: nowrap; }
 tbody tr:hover { background: var(--shade); }
 td.own { font-weight: 600; } td.print { color: var(--soft); }
@@ -65,7 +65,7 @@ footer { color: var(--soft); font-size: .85rem; margin-top: 3rem; }
 """
 
 LONG_CELL = 40
-"""A cell with more characters than this wraps."""
+"""A table with a cell of more characters than this is one of words: left-aligned, and it wraps."""
 
 DECLARED = """
 <p>Every table and figure of “Adaptive estimation of Li-ion battery model parameters”, recomputed beside what is printed.
@@ -143,9 +143,7 @@ def _article(item: Item) -> str:
 
 
 def _table(table: Table) -> str:
-    def style(column: str, cell: str) -> str:
-        if len(cell) > LONG_CELL:
-            return ' class="text"'
+    def style(column: str) -> str:
         if column.startswith("printed"):
             return ' class="print"'
         return ' class="own"' if column.startswith(("recomputed", "joint")) else ""
@@ -153,11 +151,12 @@ def _table(table: Table) -> str:
     heads = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
     rows = "".join(
         "<tr>"
-        + "".join(f"<td{style(c, cell)}>{escape(cell)}</td>" for c, cell in zip(table.columns, row, strict=True))
+        + "".join(f"<td{style(c)}>{escape(cell)}</td>" for c, cell in zip(table.columns, row, strict=True))
         + "</tr>"
         for row in table.rows
     )
-    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
+    words = ' class="account"' if any(len(cell) > LONG_CELL for row in table.rows for cell in row) else ""
+    return f'<div class="scroll"><table{words}><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
 def _account(report: Report) -> str:
