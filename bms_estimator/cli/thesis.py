@@ -40,7 +40,7 @@ def thesis(
     ] = TABLE_RESOLUTION_V,
     current_sign: SignOfCurrent = None,
     out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
-    table: Annotated[str | None, typer.Option(help="this table only, 1 to 13", show_default=False)] = None,
+    table: Annotated[str | None, typer.Option(help="this table only, 1 to 13 or Errata", show_default=False)] = None,
     figure: Annotated[str | None, typer.Option(help="this figure only, 1 to 50", show_default=False)] = None,
 ) -> None:
     """Recompute the thesis's tables and figures, and write them beside the printed ones as one HTML page.
