@@ -21,7 +21,8 @@ LOWER = np.array([1e-6, 5.0, 1e-6, -np.inf, -np.inf, -np.inf])
 free: the NCR18650 points fit to 9.6 mV RMS, with all positive to 10.6. Below an exponent of 5 the exponential reaches
 over all SOC, and nothing tells it from the cubic."""
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
-"""Above an exponent of 300 the exponential is gone at SOC 0.01."""
+"""Above an exponent of 300 the exponential is gone at SOC 0.01. a16 is bounded by the highest point: E_o(0) is
+not far below 0 V, however steep the last points are and wherever they end."""
 AT_BOUND_V = 1e-5
 """An amplitude this near to its bound is at it: no converter reads so little [V]."""
 EXPONENTS = np.geomspace(5.0, 300.0, 60)
@@ -70,34 +71,35 @@ def fit_chen_mora(points: Points) -> ChenMoraFit:
         UserError: Too few points, or points that span too little SOC.
     """
     check_points(points)
-    starts = [_with_exponent(points, exponent) for exponent in EXPONENTS]
+    upper = np.r_[points.ocv_v.max(), UPPER[1:]]
+    starts = [_with_exponent(points, exponent, upper) for exponent in EXPONENTS]
     _, start = min(starts, key=lambda found: found[0])
-    inside = np.clip(start, LOWER + 1e-9, UPPER * 0.999)
+    inside = np.clip(start, LOWER + 1e-9, upper * 0.999)
     scale = np.array([0.1, 10.0, 1.0, 1.0, 1.0, 1.0])
     found = least_squares(
-        lambda a: chen_mora(a, points.soc) - points.ocv_v, inside, bounds=(LOWER, UPPER), x_scale=scale, xtol=1e-12
+        lambda a: chen_mora(a, points.soc) - points.ocv_v, inside, bounds=(LOWER, upper), x_scale=scale, xtol=1e-12
     )
     a = found.x if 2.0 * found.cost < min(starts, key=lambda x: x[0])[0] else start
     residual_v = points.ocv_v - chen_mora(a, points.soc)
-    return ChenMoraFit(a=a, std=_standard_errors(a, points.soc, residual_v), residual_v=residual_v)
+    return ChenMoraFit(a=a, std=_standard_errors(a, upper, points.soc, residual_v), residual_v=residual_v)
 
 
-def _with_exponent(points: Points, exponent: float) -> tuple[float, Floats]:
+def _with_exponent(points: Points, exponent: float, upper: Floats) -> tuple[float, Floats]:
     """Squared residual and a16..a21 with a17 given."""
     x = points.soc
     basis = np.column_stack([-np.exp(-exponent * x), np.ones_like(x), x, -(x**2), x**3])
     free = [0, 2, 3, 4, 5]
-    found = lsq_linear(basis, points.ocv_v, bounds=(LOWER[free], UPPER[free]), tol=1e-14)
+    found = lsq_linear(basis, points.ocv_v, bounds=(LOWER[free], upper[free]), tol=1e-14)
     a16, a18, a19, a20, a21 = found.x
     return 2.0 * float(found.cost), np.array([a16, exponent, a18, a19, a20, a21])
 
 
-def _standard_errors(a: Floats, soc: Floats, residual_v: Floats) -> Floats:
+def _standard_errors(a: Floats, upper: Floats, soc: Floats, residual_v: Floats) -> Floats:
     """Standard errors of a16..a21 from the Jacobian of (2.10); a parameter at its bound is held and has none."""
     a16, a17 = a[0], a[1]
     decay = np.exp(-a17 * soc)
     jacobian = np.column_stack([-decay, a16 * soc * decay, np.ones_like(soc), soc, -(soc**2), soc**3])
-    free = (a > LOWER * 1.001 + AT_BOUND_V) & (a < UPPER * 0.999)
+    free = (a > LOWER * 1.001 + AT_BOUND_V) & (a < upper * 0.999)
     std = np.full(6, np.nan)
     freedom = soc.size - int(free.sum())
     if freedom > 0:

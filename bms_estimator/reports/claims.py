@@ -4,7 +4,7 @@ A claim holds when what is printed is reached on more than half of the captures.
 that could be a limit; those are ours.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +75,8 @@ class Claim:
     @property
     def span(self) -> str:
         """What was found, from the least to the most."""
+        if not self.results:
+            return "-"
         ends = [f"{end([result.found for result in self.results]):.3g}" for end in (min, max)]
         return ends[0] if ends[0] == ends[1] else " to ".join(ends)
 
@@ -118,8 +120,8 @@ def _soc(p: Protocol) -> list[Result]:
     ]
 
 
-def _products(p: Protocol) -> list[Result]:
-    found = []
+def products(p: Protocol) -> Iterator[tuple[str, float, float]]:
+    """Each relaxation test's name and product, as estimated and as its rests show it [s]."""
     for test, capture in zip(p.tests, p.of(Kind.RELAXATION), strict=True):
         try:
             seen = rest_elements(capture.samples, test, p.cell.cell.capacity_ah)
@@ -127,8 +129,13 @@ def _products(p: Protocol) -> list[Result]:
             continue
         for name, seen_s in (("R_ts C_ts", seen.tau_ts_s), ("R_tl C_tl", seen.tau_tl_s)):
             estimated_s = float(element(name, p.adaptive.average, np.array([MIDDLE_SOC]))[0])
-            found.append(Result(f"{capture.name}, {name}", 100.0 * abs(estimated_s / seen_s - 1.0), PRODUCTS_PERCENT))
-    return found
+            yield f"{capture.name}, {name}", estimated_s, seen_s
+
+
+def _products(p: Protocol) -> list[Result]:
+    return [
+        Result(name, 100.0 * abs(found_s / seen_s - 1.0), PRODUCTS_PERCENT) for name, found_s, seen_s in products(p)
+    ]
 
 
 LARGEST_CONSTANT = max(printed.TABLE_11[load] for load in printed.CURRENTS_A)

@@ -14,7 +14,7 @@ from bms_estimator.calibration.series_resistance import SeriesResistance, Series
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.reports import printed
-from bms_estimator.reports.claims import CLAIMS, claim
+from bms_estimator.reports.claims import CLAIMS, claim, products
 from bms_estimator.reports.protocol import KNEE_SOC, Capture, Kind, Protocol
 from bms_estimator.sources.replay import load_capture
 from tests.benchmarks.recipes import DATA, LFP, NCR, PF, charge_ah, path_of
@@ -182,10 +182,11 @@ def errors(protocols: dict[str, Protocol]) -> Table:
 def parameters(protocols: dict[str, Protocol]) -> Table:
     """What the three steps gave."""
     table = Table(title="steps 1 to 3")
-    for column in ("cell", "step 1: points", "residual [mV]", "step 2 on", "outcome", "a13..a15 [ohm, -, ohm]"):
+    heads = ("cell", "step 1: points", "residual [mV]", "step 2 on", "outcome", "a13..a15 [ohm, -, ohm]")
+    for column in (*heads, "RC products [s]", "of the rests [s]"):
         table.add_column(column)
     for name, p in protocols.items():
-        residual_v = p.joint_fit.residual_v
+        residual_v, found = p.joint_fit.residual_v, list(products(p))
         table.add_row(
             name,
             str(residual_v.size),
@@ -193,6 +194,8 @@ def parameters(protocols: dict[str, Protocol]) -> Table:
             p.smallest.name,
             p.adaptive.outcome,
             ", ".join(f"{value:.4g}" for value in p.r_s_fit.a),
+            ", ".join(f"{estimated_s:.3g}" for _, estimated_s, _ in found),
+            ", ".join(f"{seen_s:.3g}" for _, _, seen_s in found),
         )
     return table
 

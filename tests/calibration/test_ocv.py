@@ -48,6 +48,16 @@ def test_standard_errors_are_those_of_the_scatter():
     assert np.mean([rms_v(fit.residual_v) for fit in fits]) == pytest.approx(1e-3, rel=0.1)
 
 
+def test_points_that_end_on_their_way_down_leave_a_curve_above_0_v():
+    """Nothing below SOC 0.07 says how large the exponential grows: its amplitude is held by the highest point."""
+    soc = np.linspace(0.07, 1.0, 19)
+    ocv_v = 3.2 + 0.1 * soc
+    ocv_v[0] -= 0.15
+    fit = fit_chen_mora(points(soc, ocv_v))
+    assert fit.a[0] <= ocv_v.max()
+    assert fit(np.array([0.0]))[0] > -0.1
+
+
 def test_a_parameter_at_its_bound_has_no_standard_error():
     soc = np.linspace(0.0, 1.0, 40)
     fit = fit_chen_mora(points(soc, 3.5 + 0.6 * soc))  # no exponential in it
