@@ -101,5 +101,18 @@ def test_charging_from_empty(data):
     found = validate(first, load_cell("leaf"))
     assert found.initial_soc < 0.02
     assert found.final_soc > 0.98
-    assert found.above.voltage_rms_v < 30e-3
+    assert found.above.voltage_rms_v == pytest.approx(6.32e-3, abs=0.05e-3)
     assert found.warnings == ()
+
+
+def test_the_leaf_s_pulses_by_their_figures(data):
+    """The capture that its cell file is made of: what the form of the elements leaves."""
+    found = validate(load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz"), load_cell("leaf"))
+    assert (found.initial_soc, found.final_soc) == pytest.approx((1.0, 0.001), abs=0.0005)
+    assert (found.above.samples, found.all.samples) == (11715, 13000)
+    above, whole = (
+        (1e3 * errors.voltage_rms_v, errors.mean_abs_percent, errors.max_abs_percent)
+        for errors in (found.above, found.all)
+    )
+    assert above == pytest.approx((6.45, 0.0999, 0.915), rel=0.005)
+    assert whole == pytest.approx((16.14, 0.1996, 4.644), rel=0.005)
