@@ -7,10 +7,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import sample_step as kernel
-from bms_estimator.kernels.ekf_noise import offset_variance, resistance_std
-from bms_estimator.kernels.ekf_state import LN_R, LN_R0, OFFSET
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.hypotheses import forget, seed
+from bms_estimator.kernels.hypotheses import seed
 from bms_estimator.kernels.input_checks import keep
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
@@ -27,10 +25,6 @@ IDENTIFIER = IdentifierSettings()
 """How an estimator identifies unless told otherwise."""
 SET_SOC_STD = 0.01
 """How far an SOC that someone sets may be off."""
-SAME_ELEMENTS_S = 600.0
-"""After a pause no longer than this the elements are those of before [s]."""
-UNSEEN_PER_H, UNSEEN_MOST = 0.5, 0.3
-"""How far the SOC may have gone while nobody measured: so much in an hour, and at most."""
 
 
 class Estimator:
@@ -130,28 +124,13 @@ class Estimator:
     def resume(self, unseen_s: float) -> None:
         """Prepare for samples of another clock, after a time in which nobody measured.
 
-        Time begins with the next sample, which is taken as a clock set back. The SOC may have moved, and the load before
-        it is not known, as at a first sample. After a long time the cell may be at another temperature or SOC: its
-        resistances are those of the cell file again. The map is kept, and what was learned of capacity; of the current's
-        offset as much as it does not change in that time.
+        The next sample comes after a gap of ``unseen_s``, as gaps in the samples do: the load may have gone on or changed.
 
         Args:
             unseen_s: How long nobody measured [s]; infinite when nobody knows.
         """
-        self.state["time_s"] = np.inf
-        f, p = self.record[0]["filter"], self.settings_record[0]["filter"]
-        moved = min(UNSEEN_PER_H * unseen_s / 3600.0, UNSEEN_MOST)
-        f["soc"], f["soc_std"] = self.state["soc"][0], math.hypot(f["soc_std"], moved)
-        best, same = f["best"], math.exp(-unseen_s / p["offset_s"])
-        f["mean"][best, OFFSET] *= same
-        f["covariance"][best, OFFSET, :] *= same
-        f["covariance"][best, :, OFFSET] *= same
-        f["covariance"][best, OFFSET, OFFSET] += offset_variance(p) * (1.0 - same * same)
-        if unseen_s > SAME_ELEMENTS_S:
-            for j in (LN_R0, LN_R):
-                forget(f["mean"][best], f["covariance"][best], j)
-                f["covariance"][best, j, j] = resistance_std(f, p) ** 2
-            f["step"]["ln_ratio"], f["step"]["variance"] = 0.0, resistance_std(f, p) ** 2
+        self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
+        self.record["filter"]["soc"] = self.state["soc"]
         if math.isfinite(unseen_s):
             self.record["unlearned_s"] += unseen_s
 

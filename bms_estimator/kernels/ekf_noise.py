@@ -108,9 +108,10 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     """
     cov, f, w = s.covariance[q], s.f, s.window
     dt_s = w.time_s
-    unknown = w.unknown_as / p.capacity_as
-    cov[SOC, SOC] += p.charge_error**2 * moved + unknown * unknown
-    a2 = (p.x_relative * w.charge_as / dt_s) ** 2 + (w.unknown_as / dt_s) ** 2
+    if w.unknown_as > 0.0:
+        add_unseen(cov, f, w.unknown_as / dt_s, dt_s / p.capacity_as)
+    cov[SOC, SOC] += p.charge_error**2 * moved
+    a2 = (p.x_relative * w.charge_as / dt_s) ** 2
     for k in range(X, X + BRANCHES):
         cov[k, k] += a2 * (1.0 - f[k] * f[k])
     cov[B_SLOW, B_SLOW] += 0.5 * bias_v2 * s.slow_inflation[q] * (1.0 - f[B_SLOW] ** 2)
@@ -123,6 +124,23 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     cov[CURVE, CURVE] += 1.0 - f[CURVE] ** 2
     for j in range(NODE, NODE + NODES):
         cov[j, j] += max(1.0 - cov[j, j], 0.0) * moved / AGED_SOC
+
+
+@njit(cache=True)
+def add_unseen(cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
+    """A current that nobody saw, the same all the time, moved the SOC and the branches together.
+
+    Args:
+        cov: Shape (STATES, STATES), updated.
+        f: Diagonal of F over that time.
+        std_a: Of the current [A].
+        soc_per_a: What it takes of the SOC [1/A].
+    """
+    for j in range(SOC, X + BRANCHES):
+        by_j = -soc_per_a if j == SOC else 1.0 - f[j]
+        for k in range(SOC, X + BRANCHES):
+            by_k = -soc_per_a if k == SOC else 1.0 - f[k]
+            cov[j, k] += std_a * std_a * by_j * by_k
 
 
 @njit(cache=True)

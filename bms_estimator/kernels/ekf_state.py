@@ -154,7 +154,10 @@ EKF_STATE = np.dtype(
         ("x_a", "f8", BRANCHES),  # current filtered by the branches since switch-on [A]
         ("decay", "f8", BRANCHES),  # of the branches over ``decay_s``
         ("decay_s", "f8"),
-        ("rms_a2", "f8"),  # mean square of the current over 10 min [A^2]
+        ("mean_a", "f8"),  # of the current, and ...
+        ("rms_a2", "f8"),  # ... of its square, over 10 min [A^2]
+        ("usual_a", "f8"),  # the same over hours
+        ("usual_a2", "f8"),
         ("temperature_c", "f8"),
         ("weak", "f8"),  # Arrhenius factors at it
         ("strong", "f8"),

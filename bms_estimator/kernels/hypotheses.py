@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.charge import LONGEST_FLOW_S, UNMEASURED_S, held_current
+from bms_estimator.kernels.charge import LONGEST_FLOW_S, held_current
 from bms_estimator.kernels.ekf import HIGHEST, LOWEST, decay, inflate, predict, update
 from bms_estimator.kernels.ekf_noise import (
     bias_variance,
@@ -39,6 +39,7 @@ from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, 
 from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
+from bms_estimator.kernels.unseen import first_load, unseen_charge, unseen_current, watch_load
 
 WINDOW_S = 0.99
 """Samples of about a second make one update [s]."""
@@ -56,14 +57,10 @@ UNLIKELY = -9.0
 """ln of a relative weight below which a hypothesis goes."""
 ALIKE_STDS = 0.7
 """Two hypotheses closer than this many std of SOC are one."""
-LOAD_S = 600.0
-"""The load is judged over so long [s]."""
 TEMPERATURE_S = 10.0
 """A temperature sensor's noise is averaged over so long [s]."""
 COLDEST_C, HOTTEST_C = -60.0, 120.0
 """Where a cell's temperature may be [C]."""
-IDLE_C = 0.1
-"""Std of a current that nobody measured [C]."""
 HYST_STD = 0.7
 """Std of the first hysteresis."""
 REOPEN_STDS = 4.0
@@ -80,7 +77,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     s.sensed = 1 if is_temperature(temperature_c) else 0
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
-    s.rms_a2 = max(current_a * current_a, (p.load_mean_c * p.capacity_as / 3600.0) ** 2)
+    first_load(s, p, current_a)
     for k in range(BRANCHES):
         s.x_a[k] = 0.0
     x, cov = s.mean[0], s.covariance[0]
@@ -169,14 +166,16 @@ def clear(s: Record) -> None:
 
 
 @njit(cache=True)
-def count_on(s: Record, p: Record, dt_s: float, current_a: float, temperature_c: float) -> None:
-    """Charge and branches from the sample before to this one."""
+def count_on(s: Record, p: Record, dt_s: float, seen: bool, current_a: float, temperature_c: float) -> None:
+    """Charge and branches from the sample before to this one; not ``seen``: nobody measured between them."""
     if is_temperature(temperature_c):
         share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
         s.temperature_c += share * (temperature_c - s.temperature_c)
         s.sensed = 1
     w = s.window
     held_a, flow_s = held_current(dt_s, s.current_a, current_a), min(dt_s, LONGEST_FLOW_S)
+    if not seen:
+        held_a = unseen_current(s, held_a, dt_s)
     if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
         s.decay_s = dt_s
         for k in range(BRANCHES):
@@ -186,8 +185,8 @@ def count_on(s: Record, p: Record, dt_s: float, current_a: float, temperature_c:
     w.time_s += dt_s
     w.charge_as += held_a * flow_s
     w.throughput_as += abs(held_a) * flow_s
-    if dt_s > UNMEASURED_S:
-        w.unknown_as += (0.5 * max(abs(current_a), abs(s.current_a)) + IDLE_C * p.capacity_as / 3600.0) * dt_s
+    if not seen:
+        w.unknown_as += unseen_charge(s, p, held_a, dt_s)
     s.soc = min(max(s.soc - held_a * flow_s / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
 
@@ -210,7 +209,8 @@ def update_all(s: Record, p: Record) -> None:
     w = s.window
     dt_s = w.time_s
     if dt_s > 0.0:
-        s.rms_a2 += min(1.0, dt_s / LOAD_S) * ((w.charge_as / dt_s) ** 2 - s.rms_a2)
+        if w.unknown_as == 0.0:
+            watch_load(s, w.charge_as / dt_s, dt_s)
         decay(s, p)
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)

@@ -8,10 +8,11 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.charge import UNMEASURED_S
+from bms_estimator.kernels.ekf import decay, predict
 from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
 from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, equivalent, told, told_by_steps
-from bms_estimator.kernels.hypotheses import WINDOW_S, clear, count_on, gather, seed, start, update_all
+from bms_estimator.kernels.hypotheses import ONE_STD, WINDOW_S, clear, count_on, gather, seed, start, update_all
 from bms_estimator.kernels.input_checks import (
     SIGN_OF_CURRENT,
     believed,
@@ -29,6 +30,8 @@ FIT_EVERY_S = 120.0
 """One element is fitted this often, each in its turn [s of samples]."""
 LEAST_BINS = 3
 """Three parameters of an element need so many bins of SOC."""
+UNSEEN_MOST = 0.3
+"""How far the SOC may have gone while nobody measured, at most, std."""
 EXCITING_C = 0.05
 """A load of so much, RMS over 10 min, tells of the resistances [C]."""
 
@@ -43,11 +46,11 @@ def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, tempe
 
 
 @njit(cache=True)
-def restart_filter(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
-    """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, the load before is not known."""
+def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, voltage_v: float) -> None:
+    """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, to ``soc_std``; the load before is not known."""
     f = s.filter
     f.current_a, f.step.phase = current_a, UNHELD
-    seed(f, p.filter, f.soc, f.soc_std)
+    seed(f, p.filter, f.soc, min(soc_std, UNSEEN_MOST))
     clear(f)
     s.checks.slow_v = 0.0
     s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
@@ -67,11 +70,19 @@ def take_first(s: Record, p: Record, current_a: float, voltage_v: float) -> None
 
 
 @njit(cache=True)
-def identify(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float, temperature_c: float) -> None:
+def identify(
+    s: Record, p: Record, dt_s: float, seen: bool, current_a: float, voltage_v: float, temperature_c: float
+) -> None:
     """Take one sample: SOC for the observer, elements for the map, every now and then a fit for (3.18)."""
     f, c = s.filter, s.checks
     change_a = current_a - f.current_a
-    count_on(f, p.filter, dt_s, current_a, temperature_c)
+    count_on(f, p.filter, dt_s, seen, current_a, temperature_c)
+    unknown = f.window.unknown_as / p.filter.capacity_as
+    if unknown > ONE_STD:
+        decay(f, p.filter)
+        predict(f, p.filter, f.best)
+        restart_filter(s, p, math.hypot(f.soc_std, unknown), current_a, voltage_v)
+        return
     watch_sign(c, p.filter, dt_s, current_a, voltage_v)
     if c.suspects & SIGN_OF_CURRENT:
         wait_for_sign(c, f, p.filter, dt_s, current_a)

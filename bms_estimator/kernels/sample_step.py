@@ -8,9 +8,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import soc_from_ocv
+from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
 from bms_estimator.kernels.hypotheses import pack_std
-from bms_estimator.kernels.identification import identify, restart_filter, start_filter
+from bms_estimator.kernels.identification import UNSEEN_MOST, identify, restart_filter, start_filter
 from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
@@ -95,20 +96,25 @@ def step(
         return verdict
     dt_s = time_s - s.time_s
     s.time_s = time_s
-    if dt_s < 0.0:  # the clock was set back: go on from here
+    restarted = dt_s == -math.inf
+    if restarted:  # a new clock
+        dt_s = state[0].unseen_s
+    if not 0.0 <= dt_s < math.inf:  # the clock was set back, or nobody knows how long nobody measured: go on from here
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
-        if math.isfinite(dt_s):
+        if not restarted:
             s.time_steps_back += 1
-        elif settings[0].identify:  # a new clock after a restart
-            restart_filter(state[0], settings[0], current_a, voltage_v)
+        elif settings[0].identify:
+            restart_filter(state[0], settings[0], UNSEEN_MOST, current_a, voltage_v)
         return verdict
-    if dt_s > max(p.gap_s, GAP_RATIO * s.step_s):
+    gap = restarted or dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
+    if gap:
         s.gaps += 1
     s.step_s = dt_s
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
-        identify(state[0], settings[0], dt_s, current_a, voltage_v, temperature_c)
+        seen = dt_s <= UNMEASURED_S and not gap
+        identify(state[0], settings[0], dt_s, seen, current_a, voltage_v, temperature_c)
     else:
         s.soc = s.soc_coulomb
     observer_step(s, p, dt_s, voltage_v)

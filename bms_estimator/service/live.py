@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
@@ -23,6 +24,10 @@ from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources import Source
 
+SAVED_SOC = 0.002
+"""How far the SOC may go from that of the checkpoint: a kill costs no more, beside what moves until the next start."""
+LOOK_S = 1.0
+"""How often it is seen how far it has gone [s]."""
 LAG_STEP_S = 0.1
 """How often the loop's lag is measured [s]: what blocks it for longer is always seen."""
 
@@ -65,6 +70,7 @@ async def run_live(
     notifier = notifier or Notifier([name])
     estimator = new_estimator(settings, cell)
     restarts, restored = _restore(estimator, checkpoint)
+    restored_s = clock.monotonic()
     publisher = Publisher(
         settings,
         cell,
@@ -84,7 +90,7 @@ async def run_live(
         await stack.enter_async_context(source)
         notifier.ready(name)
         tasks = [
-            _estimate(source, estimator, publisher),
+            _estimate(source, estimator, publisher, lambda: clock.monotonic() - restored_s),
             _keep_alive(publisher, notifier, name),
             _measure_lag(publisher),
         ]
@@ -117,8 +123,11 @@ def new_estimator(settings: Settings, cell: CellModel) -> Estimator:
     return make()
 
 
-async def _estimate(source: Source, estimator: Estimator, publisher: Publisher) -> None:
+async def _estimate(source: Source, estimator: Estimator, publisher: Publisher, waited_s: Callable[[], float]) -> None:
+    """Take what the source gives; ``waited_s`` is how long it has given nothing since the state was restored [s]."""
     async for block in source:
+        if estimator.state["started"][0] and not estimator.state["samples"][0]:
+            estimator.record["unseen_s"] += waited_s()
         publisher.add(block, estimator.run(block))
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
@@ -160,9 +169,15 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None) -> tuple[i
 async def _save_often(
     checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, every_s: float, restarts: int
 ) -> None:
+    """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC`` or there is a first sample."""
+    loop = asyncio.get_running_loop()
+    due_s = 0.0
     while True:
-        await asyncio.sleep(every_s)
-        await _save(checkpoint, estimator, publisher, restarts)
+        await asyncio.sleep(min(LOOK_S, every_s))
+        saved_soc = checkpoint.saved[1] if checkpoint.saved else math.inf
+        if loop.time() >= due_s or abs(estimator.state["soc"][0] - saved_soc) >= SAVED_SOC:
+            await _save(checkpoint, estimator, publisher, restarts)
+            due_s = loop.time() + every_s
 
 
 async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, restarts: int) -> None:

@@ -25,15 +25,20 @@ def wrong_cell(factor: float) -> CellModel:
 def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleBlock, np.ndarray]:
     """Random pulses and rests at 1 Hz that empty the true cell, and its true SOC."""
     rng = np.random.default_rng(seed)
-    block = np.zeros(int(3600 * hours), dtype=SAMPLE)
+    seconds = int(3600 * hours)
+    return measured(np.repeat(rng.choice([0.0, 0.0, 0.75, 1.5, 3.0, -0.5], seconds // 60), 60), soc, rng)
+
+
+def measured(current_a: np.ndarray, soc: float, rng: np.random.Generator) -> tuple[SampleBlock, np.ndarray]:
+    """What a sensor sees of the true cell, from rest at ``soc``, under a current at 1 Hz [A], and its true SOC."""
+    block = np.zeros(current_a.size, dtype=SAMPLE)
     block["temperature_c"] = 25.0
     block["time_s"] = np.arange(block.size)
-    steps = np.repeat(rng.choice([0.0, 0.0, 0.75, 1.5, 3.0, -0.5], block.size // 60), 60)
-    block["current_a"] = steps
+    block["current_a"] = current_a
     ocv_v, slope_v = ocv_grid(TRUTH)
     a, capacity_as = TRUTH.a, TRUTH.cell.capacity_ah * 3600.0
     x, true_soc = (soc, 0.0, 0.0), np.empty(block.size)
-    for n, i in enumerate(steps):
+    for n, i in enumerate(current_a):
         block["voltage_v"][n] = chen_mora.ocv(x[0], ocv_v, slope_v) - x[1] - x[2] - i * chen_mora.r_s(x[0], a)
         true_soc[n] = x[0]
         x = chen_mora.cell_step(x, i, 1.0, capacity_as, a)

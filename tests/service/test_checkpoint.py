@@ -19,6 +19,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Health
 from bms_estimator.model.settings import Settings
+from bms_estimator.service import live
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import FORMAT, KEPT, CheckpointFile, fields, pack_identity
 from bms_estimator.service.live import new_estimator, run_live
@@ -73,7 +74,9 @@ async def test_a_restart_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
     first = await ran(tmp_path)
     assert first.estimator.state["soc_coulomb"][0] == pytest.approx(0.4)
     second = await ran(tmp_path, samples=2)  # the board's clock has started anew
-    assert second.estimator.state["soc_coulomb"][0] == pytest.approx(0.4 - 1.0 / 3600.0, abs=1e-9)
+    unseen_s = second.estimator.record["unseen_s"][0]  # the load went on meanwhile
+    assert 0.0 < unseen_s < LONG_S
+    assert second.estimator.state["soc_coulomb"][0] == pytest.approx(0.4 - (unseen_s + 1.0) / 3600.0, abs=1e-9)
     assert second.estimator.state["samples"][0] == 2
     assert second.health.restarts == 1
     assert second.health.checkpoint == f"restored: SOC {first.estimator.state['soc'][0]:.4f}"
@@ -211,7 +214,8 @@ async def test_each_of_several_cells_that_were_tried_finds_its_own_checkpoint(tm
     tried = [CELL, CELL.pack(2, 1), CELL.pack(3, 1), CELL]
     runs = [await ran(tmp_path, cell=cell) for cell in tried]
     assert [run.health.restarts for run in runs] == [0, 0, 0, 1]
-    assert runs[-1].estimator.state["soc_coulomb"][0] == pytest.approx(0.3, abs=1e-6)
+    last = runs[-1].estimator
+    assert last.state["soc_coulomb"][0] == pytest.approx(0.3 - last.record["unseen_s"][0] / 3600.0, abs=1e-6)
 
 
 def test_the_checkpoints_of_a_pack_are_bounded_in_number(tmp_path: Path) -> None:
@@ -314,6 +318,38 @@ async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_
     state = file.load().state
     for name, field in fields(last.record):
         assert state[name].tobytes() == field.tobytes()
+
+
+async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first sample is saved, and the state whenever the SOC has gone by so much."""
+    monkeypatch.setattr(live, "LOOK_S", 0.01)
+    saved: asyncio.Queue[float] = asyncio.Queue()
+    loop = asyncio.get_running_loop()
+
+    class Noting(CheckpointFile):
+        def save(self, state: Any, restarts: int) -> None:
+            super().save(state, restarts)
+            loop.call_soon_threadsafe(saved.put_nowait, float(state["observer"]["soc"][0]))
+
+    tables = {"state": {"checkpoint_s": 1e6}, "identifier": {"enabled": False}}
+    settings = Settings.model_validate(SETTINGS.model_dump(by_alias=True, exclude_none=True) | tables)
+    source = ScriptedSource()
+    task = asyncio.create_task(
+        run_live(
+            settings,
+            CELL,
+            source=source,
+            sinks=[Collector()],
+            stop=asyncio.Event(),
+            checkpoint=Noting(tmp_path, settings, CELL),
+        )
+    )
+    for i in range(4):
+        source.give((i * 10.0, 0.275, 3.8))  # 0.28 % of the capacity in 10 s
+        soc = await asyncio.wait_for(saved.get(), LONG_S)
+        assert soc == pytest.approx(0.5 - i * 10.0 / 3600.0)
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
 
 
 async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes_on(tmp_path: Path) -> None:

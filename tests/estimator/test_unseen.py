@@ -1,0 +1,81 @@
+"""Kills, restarts and gaps: what moved while nobody measured is inside the band, and what was known stays known."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.sample import SampleBlock
+from tests.estimator.simulated_cell import TRUTH, measured, pulses
+
+FULL_LOAD_A = 1.5 * TRUTH.cell.capacity_ah
+SEEN_S = 900
+
+
+def killed(block: SampleBlock, every_s: int, age_s: int, down_s: int, initial_soc: float) -> np.ndarray:
+    """The trace of an estimator that goes on, each time, ``down_s`` later from what it was ``age_s`` before."""
+    estimator, traces, begin = Estimator(TRUTH, initial_soc=initial_soc), [], 0
+    while begin < block.size:
+        traces.append(estimator.run(block[begin : begin + every_s - age_s]).copy())
+        kept = estimator.record.copy()
+        traces.append(estimator.run(block[begin + every_s - age_s : begin + every_s]).copy())
+        estimator.record[...] = kept
+        estimator.resume(float(age_s + down_s))
+        begin += every_s + down_s
+    return np.concatenate(traces)
+
+
+def outside(trace: np.ndarray, true_soc: np.ndarray) -> float:
+    """Share of the samples, after a quarter of an hour, whose true SOC is outside two standard deviations."""
+    error = trace["soc"] - true_soc[trace["time_s"].astype(int)]
+    return float(np.mean((np.abs(error) > 2.0 * trace["soc_std"])[trace["time_s"] >= SEEN_S]))
+
+
+@pytest.mark.parametrize("initial_soc", [0.7, 1.0])
+@pytest.mark.parametrize("age_s", [2, 60])
+@pytest.mark.parametrize("load", ["pulses", "constant"])
+def test_kills_under_load_leave_the_true_soc_in_the_band(load: str, age_s: int, initial_soc: float) -> None:
+    """Every 100 s, with checkpoints that are up to a minute old and 12 s until the next start."""
+    constant = np.full(2000, FULL_LOAD_A)
+    block, true_soc = pulses() if load == "pulses" else measured(constant, 0.9, np.random.default_rng(1))
+    assert outside(killed(block, 100, age_s, 12, initial_soc), true_soc) < 0.02
+
+
+def test_a_crash_loop_before_the_soc_is_known_does_not_make_it_known() -> None:
+    """Each start sees the same polarisation, and must not take it for news."""
+    block, true_soc = measured(np.full(1500, FULL_LOAD_A), 0.9, np.random.default_rng(2))
+    assert outside(killed(block, 40, 2, 12, 0.7), true_soc) < 0.02
+
+
+@pytest.mark.parametrize("every_s", [60, 600, 3600])
+def test_restarts_at_rest_change_nothing(every_s: int) -> None:
+    """However often: an error of the OCV is one error, not a new one with each start."""
+    block = measured(np.zeros(4 * 3600), 0.6, np.random.default_rng(3))[0]
+    block["voltage_v"] += 0.02
+    straight = Estimator(TRUTH, initial_soc=0.5).run(block)[-1]
+    again = killed(block, every_s, 1, 3, 0.5)[-1]
+    assert again["soc"] == pytest.approx(straight["soc"], abs=1e-3)
+    assert again["soc_std"] == pytest.approx(straight["soc_std"], rel=0.05)
+
+
+@pytest.mark.parametrize("unseen_s", [40, 400, 1500])
+@pytest.mark.parametrize("restart", [False, True], ids=["gap", "restart"])
+def test_a_load_in_a_gap_is_inside_the_band(unseen_s: int, restart: bool) -> None:
+    """At rest before and after, and a load as it was earlier while nobody measured."""
+    load_a = np.repeat([0.0, 3.0, 0.0, 3.0, 0.0], [1200, 1200, 1200, unseen_s, 600])
+    block, true_soc = measured(load_a, 0.9, np.random.default_rng(4))
+    estimator = Estimator(TRUTH, initial_soc=0.9)
+    estimator.run(block[:3600])
+    if restart:
+        estimator.resume(unseen_s + 1.0)
+    after = estimator.run(block[3600 + unseen_s :])
+    error = np.abs(after["soc"] - true_soc[3600 + unseen_s :])
+    assert (error < 2.0 * after["soc_std"]).all()
+    assert error[-1] < 0.02
+
+
+def test_without_the_filter_the_load_is_counted_through_a_restart() -> None:
+    block, true_soc = measured(np.full(1000, 1.0), 0.9, np.random.default_rng(5))
+    estimator = Estimator(TRUTH, initial_soc=0.9, identifier=None)
+    estimator.run(block[:400])
+    estimator.resume(201.0)
+    assert estimator.run(block[600:])["soc"][-1] == pytest.approx(true_soc[-1], abs=1e-9)
