@@ -18,6 +18,11 @@ class Clock:
         return iso_utc(self.wall())
 
 
+def since_boot() -> float:
+    """A clock that never steps and goes on while the machine sleeps [s]: the cell does not sleep."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
 def iso_utc(epoch_s: float) -> str:
     """Seconds since 1970 as ISO 8601 in UTC with milliseconds: ``2024-05-01T12:00:00.250Z``."""
     return datetime.fromtimestamp(epoch_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -7,6 +7,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from bms_estimator.model.clock import since_boot
+
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 TIME_ERROR = 5
 """What adjtimex(2) returns while nothing sets the wall clock."""
@@ -50,6 +52,6 @@ def moment() -> Moment:
     return Moment(
         wall_s=time.time(),
         synchronised=synchronised(),
-        boot_s=time.clock_gettime(time.CLOCK_BOOTTIME),
+        boot_s=since_boot(),
         boot=boot.strip().replace("-", ""),
     )

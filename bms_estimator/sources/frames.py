@@ -56,6 +56,8 @@ class FrameCounters:
     overruns: int = 0
     """Samples before which the board had no room on the line."""
     resets: int = 0
+    clock_jumps: int = 0
+    """Samples that came long before their time stamp: from then on the board's clock counts anew, by arrival."""
 
     def as_dict(self) -> dict[str, int]:
         """By name."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
+from bms_estimator.model.clock import since_boot
 from bms_estimator.sources.ports import NoPortError, open_port, resolve_port
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ log = structlog.get_logger(__name__)
 class Line:
     """A port, its bytes as they come, and what is sent.
 
-    Arrival times are the wall clock at start plus the monotonic clock since, so that they never step.
+    Arrival times are the wall clock at start plus a clock that never steps since; it goes on while the machine sleeps.
 
     Args:
         port: Device path, or ``auto``.
@@ -52,7 +53,7 @@ class Line:
         *,
         say: Callable[[str], None],
         wall: Callable[[], float] = time.time,
-        monotonic: Callable[[], float] = time.monotonic,
+        monotonic: Callable[[], float] = since_boot,
         first_retry_s: float = FIRST_RETRY_S,
     ) -> None:
         self._name, self._baud, self._say = port, baud, say

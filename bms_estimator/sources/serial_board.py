@@ -9,6 +9,7 @@ from typing import Protocol, Self
 
 import structlog
 
+from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
@@ -66,7 +67,7 @@ class SerialBoard:
         *,
         tap: Tap | None = None,
         wall: Callable[[], float] = time.time,
-        monotonic: Callable[[], float] = time.monotonic,
+        monotonic: Callable[[], float] = since_boot,
         first_retry_s: float = FIRST_RETRY_S,
         silent_s: float = SILENT_S,
     ) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -42,9 +43,21 @@ def frames(first: int, count: int, **options: Any) -> bytes:
     return b"".join(sample(n, **options).encode() for n in range(first, first + count))
 
 
+class SkippingClock:
+    """The host's, which a test lets go on by ``skipped_s``."""
+
+    def __init__(self) -> None:
+        self.skipped_s = 0.0
+
+    def __call__(self) -> float:
+        return time.monotonic() + self.skipped_s
+
+
 class Service:
-    def __init__(self, line: Line, sink: Collector, task: asyncio.Task[Estimator], stop: asyncio.Event) -> None:
-        self.line, self.sink, self.task, self._stop = line, sink, task, stop
+    def __init__(
+        self, line: Line, sink: Collector, task: asyncio.Task[Estimator], stop: asyncio.Event, clock: SkippingClock
+    ) -> None:
+        self.line, self.sink, self.task, self._stop, self.clock = line, sink, task, stop, clock
 
     async def until(self, wanted: Callable[[Snapshot], bool]) -> Snapshot:
         return await self.sink.until(wanted)
@@ -67,7 +80,8 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
         sensor=SensorSettings(port=str(line.path), **sensor),
         publish=PublishSettings(rate_hz=10.0),
     )
-    board = SerialBoard(settings.sensor, first_retry_s=0.05, silent_s=0.3)
+    clock = SkippingClock()
+    board = SerialBoard(settings.sensor, first_retry_s=0.05, silent_s=0.3, monotonic=clock)
     sink, stop = Collector(), asyncio.Event()
     task = asyncio.create_task(run_live(settings, CELL, source=board, sinks=[sink], stop=stop))
     async with asyncio.timeout(LONG_S):
@@ -75,7 +89,7 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
             await asyncio.sleep(0.01)
     line.write(hello)
     try:
-        yield Service(line, sink, task, stop)
+        yield Service(line, sink, task, stop, clock)
     finally:
         stop.set()
         await asyncio.wait_for(task, LONG_S)
@@ -168,7 +182,8 @@ async def test_ten_seconds_without_frames_are_one_gap_and_the_lock_holds(line: L
     async with service(line) as live:
         live.line.write(frames(0, 50))
         await live.received(50)
-        live.line.write(frames(1050, 50))  # the board's own clock: ten seconds later
+        live.clock.skipped_s += 10.0
+        live.line.write(frames(1050, 50))
         await live.received(100)
         estimator, health = await live.end()
     assert health.line["frames_lost"] == 1000

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +85,50 @@ def test_it_begins_anew_after_a_reset_of_the_board() -> None:
 def test_an_outage_of_the_line_spoils_nothing() -> None:
     heard = (read for read in reads(300.0) if not 60.0 < read[0] - START_S < 200.0)
     assert ppm(fed(heard)) == pytest.approx(3000.0, abs=TOLERANCE_PPM)
+
+
+def stamped(board_us: Callable[[int, int], int], seconds: int = 60) -> FrameDecoder:
+    """After samples at 10 Hz that came in time, with stamps changed by ``board_us`` of number and true stamp."""
+    decoder = FrameDecoder()
+    decoder.feed(START_S, HELLO)
+    for i in range(10 * seconds):
+        true_us = 100_000 * (i + 1)
+        message = SampleMessage(i, board_us(i, true_us) % 2**32, 34_571, 21_405, 38, 225, 1, 16)
+        decoder.feed(START_S + true_us * 1e-6, message.encode())
+    return decoder
+
+
+@pytest.mark.parametrize(
+    ("board_us", "jumps"),
+    [
+        (lambda i, us: us + (3_000_000_000 if i == 300 else 0), 2),
+        (lambda i, us: us + (3_000_000_000 if i >= 300 else 0), 1),
+        (lambda i, us: us - (20_000_000 if i >= 300 else 0), 1),
+        (lambda i, us: us if not 300 <= i < 330 else 2_654_435_761 * (i + 1), None),
+    ],
+    ids=["one ahead", "ahead from now on", "back", "at random for 3 s"],
+)
+def test_a_clock_that_jumps_is_not_believed(board_us: Callable[[int, int], int], jumps: int | None) -> None:
+    """Time goes on by arrival: no charge is counted for time that was none."""
+    decoder = stamped(board_us)
+    last = decoder.feed(
+        START_S + 60.1, SampleMessage(600, board_us(600, 60_100_000) % 2**32, 34_571, 21_405, 38, 225, 1, 16).encode()
+    )
+    assert last["time_s"][0] == pytest.approx(60.0, abs=1e-3)
+    assert decoder.counters.clock_jumps == jumps if jumps else 3 <= decoder.counters.clock_jumps <= 40
+
+
+def test_a_host_that_was_held_up_for_a_minute_believes_the_board() -> None:
+    """What waited in the buffer comes at once, then what the buffer had no room for is missing."""
+    decoder = FrameDecoder()
+    decoder.feed(START_S, HELLO)
+    frames = {i: SampleMessage(i, 100_000 * (i + 1), 34_571, 21_405, 38, 225, 1, 16).encode() for i in range(1200)}
+    for i in range(300):
+        decoder.feed(START_S + 0.1 * (i + 1), frames[i])
+    decoder.feed(START_S + 90.0, b"".join(frames[i] for i in range(300, 450)))
+    last = decoder.feed(START_S + 90.1, frames[900])
+    assert decoder.counters.clock_jumps == 0
+    assert last["time_s"][0] == pytest.approx(90.0)
 
 
 def test_time_stamps_stay_the_boards_own() -> None:

@@ -52,6 +52,7 @@ DECODER = np.dtype(
         ("origin_s", "f8"),  # time at which elapsed_us was 0
         ("time_s", "f8"),  # of the last sample
         ("arrival_s", "f8"),  # of the last sample
+        ("least_late_s", "f8"),  # least arrival beyond origin_s and elapsed_us of late
         ("clock_windows", "i8"),  # for the clock's rate, since the first sample or the reset
         ("clock_begin_us", "i8"),  # elapsed_us at the begin of the last window
         ("clock_origin_s", "f8"),  # arrival from which lateness counts
@@ -72,12 +73,17 @@ DECODER = np.dtype(
         ("before_hello", "i8"),
         ("overruns", "i8"),
         ("resets", "i8"),
+        ("clock_jumps", "i8"),  # times the board's clock was not believed
     ],
     align=True,
 )
 
 _MASK = MODULUS - 1
 _HALF = MODULUS >> 1
+EARLY_S = 2.0
+"""A sample that came so much before the others would have the board's clock wrong [s]."""
+SLOWEST = 0.01
+"""No board's clock is slower than the host's by more than this, relative."""
 _REORDER_WINDOW = 64  # a sample further behind comes from a board that counts anew
 _US = 1e-6
 _WRAP_S = MODULUS * _US
@@ -207,25 +213,33 @@ def take_hello(d: Record, s: Record) -> None:
 
 
 @njit(cache=True)
-def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> None:
-    """Go on by the board's clock. Whole turns of its 32 bits, which only an outage can hide, are told by arrival."""
+def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
+    """Go on by the board's clock. Whole turns of its 32 bits, which only an outage can hide, are told by arrival.
+
+    Returns:
+        Whether the clock can be right: a sample may come late, but not before it was taken.
+    """
     step_us = (board_us - d.board_us) & _MASK
     if lost > 0:
         turns = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
         step_us += max(turns, 0) * MODULUS
+    late_s = arrival_s - d.origin_s - (d.elapsed_us + step_us) * _US
+    if late_s < d.least_late_s - EARLY_S:
+        return False
+    d.least_late_s = min(d.least_late_s + SLOWEST * step_us * _US, late_s)
     d.elapsed_us += step_us
     d.time_s = d.origin_s + d.elapsed_us * _US
+    return True
 
 
 @njit(cache=True)
-def restart_clock(d: Record, board_us: int, arrival_s: float) -> None:
-    """The board counts anew: go on by arrival, and by no less than the time the board has run since."""
-    d.origin_s = d.time_s + max(arrival_s - d.arrival_s, board_us * _US)
+def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
+    """The board counts anew: go on by arrival, and by no less than ``least_s``."""
+    d.origin_s = d.time_s + max(arrival_s - d.arrival_s, least_s)
     d.time_s = d.origin_s
     d.elapsed_us = 0
-    d.reset_pending = 0
+    d.least_late_s = arrival_s - d.origin_s
     forget_clock(d)
-    d.resets += 1
 
 
 @njit(cache=True)
@@ -234,13 +248,16 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
     status = 0
     if not d.started:
         d.started = 1
+        d.least_late_s = arrival_s - d.origin_s
     else:
         ahead = (sequence - d.expected) & _MASK
         behind = MODULUS - ahead if ahead >= _HALF else 0
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
                 d.boot_id = -1  # its hello was lost: the next one is no further reset
-            restart_clock(d, board_us, arrival_s)
+            restart_clock(d, arrival_s, board_us * _US)  # the board has run since its reset
+            d.reset_pending = 0
+            d.resets += 1
             status = _RESET
         elif behind == 1:
             d.duplicates += 1
@@ -249,7 +266,9 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
             d.out_of_order += 1
             return -1
         else:
-            follow_clock(d, board_us, arrival_s, ahead)
+            if not follow_clock(d, board_us, arrival_s, ahead):
+                restart_clock(d, arrival_s, 0.0)
+                d.clock_jumps += 1
             d.frames_lost += ahead
             status = _GAP if ahead else 0
     d.expected = (sequence + 1) & _MASK
