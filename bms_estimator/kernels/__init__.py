@@ -5,6 +5,7 @@ those of the constants it compiles in, and would go on running the old ones. So 
 content of all of them.
 
 A kernel that cannot be kept there, or cannot be read from there, is compiled at each start: a full disk ends nothing.
+Machine code with zeros in its middle, as a power cut leaves, would run: what is kept ends with its digest.
 """
 
 import contextlib
@@ -17,9 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import Cache
+from numba.core.caching import Cache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
+DIGEST_BYTES = 32
+_FILE: Any = IndexDataCacheFile
+_DUMP, _LOAD = _FILE._dump, _FILE._load_data  # noqa: SLF001 - numba has no other place for a check
 _HERE = Path(__file__).parent
 _PACKAGE = _HERE.parent
 COMPILED_IN = (
@@ -64,6 +68,24 @@ def _go_on(cache: Any) -> Iterator[None]:
             cache.flush()
 
 
+def _sealed(file: Any, kernel: Any) -> bytes:
+    """What is kept of a kernel, or of the list of them: numba's content, which tells its own end, and its digest."""
+    content: bytes = _DUMP(file, kernel)
+    return content + hashlib.sha256(content).digest()
+
+
+def _opened(file: Any, name: str) -> Any:
+    """A kernel that was kept.
+
+    Raises:
+        ValueError: The file is not as it was written.
+    """
+    kept = Path(file._data_path(name)).read_bytes()  # noqa: SLF001 - as numba's own method has it
+    if hashlib.sha256(kept[:-DIGEST_BYTES]).digest() != kept[-DIGEST_BYTES:]:
+        raise ValueError(f"{name} is damaged")
+    return _LOAD(file, name)
+
+
 def _keep(folder: Path | None) -> None:
     """Have numba keep compiled kernels in ``folder``."""
     cache: Any = Cache  # methods of both are replaced, which types do not know
@@ -74,6 +96,7 @@ def _keep(folder: Path | None) -> None:
         return
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
     cache._guard_against_spurious_io_errors = _go_on  # noqa: SLF001 - numba's place for it, empty but on Windows
+    _FILE._dump, _FILE._load_data = _sealed, _opened  # noqa: SLF001
 
 
 _keep(_cache_folder())

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -61,12 +62,31 @@ def test_a_kernel_runs_for_a_user_without_a_home() -> None:
     assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in crc16_with_cache_in(Path("~"))
 
 
-@pytest.mark.parametrize("kind", ["nbi", "nbc"])
-def test_a_kept_kernel_that_was_damaged_is_compiled_and_kept_again(tmp_path: Path, kind: str) -> None:
+def cut(content: bytes) -> bytes:
+    return content[:20]
+
+
+def emptied(_: bytes) -> bytes:
+    return b""
+
+
+def zeros_in_the_middle(content: bytes) -> bytes:
+    """What a power cut leaves where the file system knew the length already."""
+    middle = len(content) // 2
+    return content[:middle] + bytes(512) + content[middle + 512 :]
+
+
+@pytest.mark.parametrize(
+    ("kind", "damaged"),
+    [("nbi", cut), ("nbi", emptied), ("nbc", cut), ("nbc", emptied), ("nbc", zeros_in_the_middle)],
+)
+def test_a_kept_kernel_that_was_damaged_is_compiled_and_kept_again(
+    tmp_path: Path, kind: str, damaged: Callable[[bytes], bytes]
+) -> None:
     assert crc16_with_cache_in(tmp_path) == ""
     (kept,) = tmp_path.rglob(f"*.{kind}")
     whole = kept.stat().st_size
-    kept.write_bytes(kept.read_bytes()[:20])
+    kept.write_bytes(damaged(kept.read_bytes()))
     assert "RuntimeWarning: a compiled kernel cannot be read" in crc16_with_cache_in(tmp_path)
     assert kept.stat().st_size == whole
     assert crc16_with_cache_in(tmp_path) == ""
