@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.filter_settings import filter_settings
+from bms_estimator.estimator.learning_settings import learning_settings
 from bms_estimator.kernels.cell import OCV_POINTS, emf
 from bms_estimator.kernels.estimator_state import ESTIMATOR_SETTINGS
 from bms_estimator.kernels.mittag_leffler import decay_table, series_coefficients
@@ -60,6 +61,7 @@ def estimator_settings(
     record = np.zeros(1, dtype=ESTIMATOR_SETTINGS)
     p = record[0]
     p["observer"] = observer_settings(cell, observer, voltage_resolution_v, initial_soc)[0]
+    p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
     p["hand_over"] = observer.law in ("improved", "scheme-3")  # (3.16) and (3.17) have no limit to set
     p["map_memory_s"] = identifier.map_memory_h * 3600.0

@@ -1,4 +1,4 @@
-"""The records of the whole estimator, in one each: observer, filter and its checks, map of the elements, fit to it."""
+"""The records of the whole estimator, in one each: observer, learning law, filter and its checks, map of the elements, fit to it."""
 
 import numpy as np
 
@@ -6,11 +6,13 @@ from bms_estimator.kernels.ekf_state import EKF_SETTINGS, EKF_STATE
 from bms_estimator.kernels.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS
 from bms_estimator.kernels.equivalent import EQUIVALENT
 from bms_estimator.kernels.input_checks import CHECKS, COUNTERS
+from bms_estimator.kernels.learning_state import LEARNING_SETTINGS, LEARNING_STATE
 from bms_estimator.kernels.state import OBSERVER_SETTINGS, OBSERVER_STATE, PARAMETERS
 
 ESTIMATOR_SETTINGS = np.dtype(
     [
         ("observer", OBSERVER_SETTINGS),
+        ("learning", LEARNING_SETTINGS),
         ("filter", EKF_SETTINGS),
         ("identify", "i8"),  # 0: SOC by coulomb counting, parameters as configured
         ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
@@ -25,6 +27,7 @@ ESTIMATOR_SETTINGS = np.dtype(
 ESTIMATOR_STATE = np.dtype(
     [
         ("observer", OBSERVER_STATE),
+        ("learning", LEARNING_STATE),
         ("filter", EKF_STATE),
         ("elements", EQUIVALENT),  # what the filter's ladder amounts to now
         ("checks", CHECKS),

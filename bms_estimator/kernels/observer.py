@@ -17,6 +17,7 @@ from bms_estimator.kernels.state import Record
 
 SMALLEST_LOOP = 0.1
 """Least 1 + N R_s the algebraic loop of (3.14) is closed with; below it N has turned the loop's sign."""
+LOST, REGAINED = -1, 1
 
 
 @njit(cache=True)
@@ -148,25 +149,36 @@ def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) 
     ``rearm_gain`` at k0: N1 to N3 begin at or near 0.
     """
     beyond = not abs(s.innovation_v) <= p.lock_error_v
+    turned = beyond and s.gain <= 0.0
+    overflow = not (math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and abs(s.gain) < p.gain_limit)
+    change = change_of_lock(s, p, dt_s, turned or overflow)
+    if change == LOST:
+        recover(s, p, voltage_v, e_o)
+    elif change == 0 and s.gain < p.rearm_gain and not beyond and nussbaum_gain(p.k0, p) > p.rearm_gain:
+        s.k = p.k0
+        s.gain = nussbaum_gain(s.k, p)
+        s.gain_rearms += 1
+
+
+@njit(cache=True)
+def change_of_lock(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
+    """``LOST`` when the error has been beyond for long enough, or ``at_once``; ``REGAINED`` when it has been within; else 0."""
+    beyond = not abs(s.innovation_v) <= p.lock_error_v
     if beyond == (s.lock == 1):
         # a single sample after a long gap must not decide: at most a fifth of the time counts per sample
         s.unlocked_s += min(dt_s, 0.2 * p.lock_time_s)
     else:
         s.unlocked_s = 0.0
-    turned = beyond and s.gain <= 0.0
-    overflow = not (math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and abs(s.gain) < p.gain_limit)
     expired = s.unlocked_s >= p.lock_time_s
-    if turned or overflow or (expired and s.lock == 1):
+    if not (at_once or expired):
+        return 0
+    s.unlocked_s = 0.0
+    if at_once or s.lock == 1:
         s.lock = 0
         s.lock_losses += 1
-        recover(s, p, voltage_v, e_o)
-    elif expired:
-        s.lock = 1
-        s.unlocked_s = 0.0
-    elif s.gain < p.rearm_gain and not beyond and nussbaum_gain(p.k0, p) > p.rearm_gain:
-        s.k = p.k0
-        s.gain = nussbaum_gain(s.k, p)
-        s.gain_rearms += 1
+        return LOST
+    s.lock = 1
+    return REGAINED
 
 
 @njit(cache=True)
@@ -179,5 +191,4 @@ def recover(s: Record, p: Record, voltage_v: float, e_o: float) -> None:
     for i in range(1, 16):
         s.a[i] = s.target[i]
     s.voltage_estimate_v = voltage_v
-    s.unlocked_s = 0.0
     update_margins(s)

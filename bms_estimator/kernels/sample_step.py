@@ -12,6 +12,7 @@ from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
 from bms_estimator.kernels.hypotheses import pack_std
 from bms_estimator.kernels.identification import UNSEEN_MOST, identify, restart_filter, start_filter
+from bms_estimator.kernels.learning import begin_learning, learning_step, take_as_rest
 from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
@@ -93,6 +94,8 @@ def step(
         start(s, p, time_s, current_a, voltage_v)
         if settings[0].identify:
             start_filter(state[0], settings[0], current_a, voltage_v, temperature_c)
+        if settings[0].learning.enabled:
+            begin_learning(state[0], settings[0], voltage_v)
         return verdict
     dt_s = time_s - s.time_s
     s.time_s = time_s
@@ -104,21 +107,34 @@ def step(
         state[0].filter.step.phase = UNHELD
         if not restarted:
             s.time_steps_back += 1
-        elif settings[0].identify:
-            restart_filter(state[0], settings[0], UNSEEN_MOST, current_a, voltage_v)
+        else:
+            after_restart(state[0], settings[0], current_a, voltage_v)
         return verdict
     gap = restarted or dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
     if gap:
         s.gaps += 1
     s.step_s = dt_s
+    before_a = s.current_a
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
         seen = dt_s <= UNMEASURED_S and not gap
         identify(state[0], settings[0], dt_s, seen, current_a, voltage_v, temperature_c)
     else:
         s.soc = s.soc_coulomb
-    observer_step(s, p, dt_s, voltage_v)
+    if settings[0].learning.enabled:
+        learning_step(state[0], settings[0], dt_s, before_a, voltage_v)
+    else:
+        observer_step(s, p, dt_s, voltage_v)
     return verdict
+
+
+@njit(cache=True)
+def after_restart(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
+    """The first sample of a new clock: nobody knows how long nobody measured. Records as in ``step``."""
+    if p.identify:
+        restart_filter(s, p, UNSEEN_MOST, current_a, voltage_v)
+    if p.learning.enabled:
+        take_as_rest(s, p, voltage_v)
 
 
 @njit(cache=True)

@@ -61,8 +61,10 @@ class SensorSettings(Strict):
 class ObserverSettings(Strict):
     """The adaptive observer, Algorithm 1."""
 
-    law: Literal["improved", "scheme-1", "scheme-2", "scheme-3"] = Field(
-        default="improved", description="improved: (3.18) with output (4.1); scheme-1..3: (3.16)..(3.18) with (3.14)"
+    law: Literal["improved", "scheme-1", "scheme-2", "scheme-3", "learning"] = Field(
+        default="improved",
+        description="improved: (3.18) with output (4.1); scheme-1..3: (3.16)..(3.18) with (3.14); "
+        "learning: sensitivity times e, docs/observer.md",
     )
     nussbaum: Literal["mittag-leffler", "k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"] = "mittag-leffler"
     alpha: Annotated[float, Field(gt=2, le=3)] = Field(default=2.5, description="a of (3.10), in (2, 3]")

@@ -1,0 +1,63 @@
+"""From typed settings to the records of the learning law."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.chen_mora import NAMES
+from bms_estimator.kernels.learning_model import Model
+from bms_estimator.kernels.learning_state import LEARNING_SETTINGS
+from bms_estimator.kernels.margins import delta
+from bms_estimator.kernels.state import PARAMETERS
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.settings import ObserverSettings
+
+MEMORY_S = 3600.0
+"""Under load data are forgotten with this time constant [s]."""
+OFFSET_S = 1800.0
+"""The injection takes up an error of the open-circuit voltage with this time constant [s]."""
+RATE_HZ = 1.0 / 60.0
+"""gamma: the parameters go where the data lead with its inverse as time constant, at k = 1 [1/s]."""
+ERROR_S = 60.0
+"""Errors of the model are alike for so long [s]."""
+REACH = 0.5
+"""Of theta: sensitivities of parameters so far away, as a sum of ln, are no longer the present ones."""
+TAU_TS, TAU_TL = NAMES.index("tau_ts"), NAMES.index("tau_tl")
+SCALED = {"r_s": (13, 15), "r_ts": (1, 3), "tau_ts": (7, 9), "r_tl": (4, 6), "tau_tl": (10, 12)}
+"""Parameters that scale with each that is learned: a time constant is bounded as its capacitance is, at the file's R."""
+
+
+def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: np.void) -> NDArray[np.void]:
+    """The learning law's settings record.
+
+    Args:
+        cell: The pack as one object.
+        observer: Its ``[observer]`` section.
+        of_observer: Of dtype ``OBSERVER_SETTINGS``.
+
+    Returns:
+        Shape (1,), dtype ``LEARNING_SETTINGS``.
+    """
+    record = np.zeros(1, dtype=LEARNING_SETTINGS)
+    q, a, n = record[0], cell.a, len(NAMES)
+    q["enabled"], q["model"], q["count"] = observer.law == "learning", Model.CHEN_MORA, n
+    q["file"][1:] = a[1:PARAMETERS]
+    for j, name in enumerate(NAMES):
+        q["lower"][j], q["upper"][j] = _bounds(cell, SCALED[name])
+    between = 0.5 * np.log(a[6] * a[12] / (a[3] * a[9]))  # a branch stays on its side of the mean of both ln tau
+    q["upper"][TAU_TS], q["lower"][TAU_TL] = min(q["upper"][TAU_TS], between), max(q["lower"][TAU_TL], -between)
+    q["middle"] = 0.5 * (q["lower"] + q["upper"])
+    error_v = float(of_observer["epsilon_v"])
+    half = 0.5 * (q["upper"] - q["lower"])
+    q["leak_v2s"][:n] = ERROR_S * error_v**2 / np.maximum(half[:n], 1e-3) ** 2
+    q["memory_s"], q["offset_s"], q["rate"], q["reach"] = MEMORY_S, OFFSET_S, RATE_HZ, REACH
+    q["told_v"] = error_v
+    q["soc_floor"] = max(delta(a[8], a[9], a[7]), delta(a[11], a[12], a[10])) + observer.margin_guard
+    return record
+
+
+def _bounds(cell: CellModel, scaled: tuple[int, ...]) -> tuple[float, float]:
+    """Of theta: what the bounds of all ``scaled`` parameters allow, and the file's own values."""
+    bounds = [(cell.bounds(i), cell.a[i]) for i in scaled]
+    lower = max(np.log(b.lower / value) for b, value in bounds)
+    upper = min(np.log(b.upper / value) for b, value in bounds)
+    return min(lower, 0.0), max(upper, 0.0)

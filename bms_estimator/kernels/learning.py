@@ -1,0 +1,165 @@
+"""The learning law: sensitivity times e with a memory, for any model of ``learning_model``.
+
+``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS; ``m`` and ``q`` are the law's own parts of them, ``o`` is
+the observer's.
+"""
+
+import math
+
+from numba import njit
+
+from bms_estimator.kernels.charge import UNMEASURED_S, held_current
+from bms_estimator.kernels.learning_model import advance, give, output, write
+from bms_estimator.kernels.observer import LOST, change_of_lock, update_margins
+from bms_estimator.kernels.state import Record
+
+
+@njit(cache=True)
+def begin_learning(s: Record, p: Record, voltage_v: float) -> None:
+    """The file's parameters, nothing remembered, and a cell at rest."""
+    m, n = s.learning, p.learning.count
+    for j in range(n):
+        m.theta[j] = min(max(0.0, p.learning.lower[j]), p.learning.upper[j])
+        m.pull[j] = 0.0
+        for i in range(n):
+            m.information[j, i] = 0.0
+    s.observer.k = max(p.observer.k0, 1.0)
+    take_as_rest(s, p, voltage_v)
+
+
+@njit(cache=True)
+def take_as_rest(s: Record, p: Record, voltage_v: float) -> None:
+    """The states of a cell at rest. What else is in the voltage is the offset's, and tells nothing of the parameters."""
+    m, q, o = s.learning, p.learning, s.observer
+    for j in range(q.count):
+        m.dx[0, j] = m.dx[1, j] = 0.0
+    m.x[0] = m.x[1] = 0.0
+    give(q.model, m.given, p, o.soc)
+    m.offset_v = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi)
+    for j in range(q.count):
+        m.d_offset[j] = -m.psi[j]
+    o.innovation_v = 0.0
+    show(s, p, voltage_v)
+
+
+@njit(cache=True)
+def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v: float) -> None:
+    """Advance by one sample at the SOC that the observer has; the current was ``before_a`` [A] at the sample before."""
+    m, q, o = s.learning, p.learning, s.observer
+    give(q.model, m.given, p, o.soc)
+    advance(q.model, m.x, m.dx, m.theta, m.given, held_current(dt_s, before_a, o.current_a), dt_s)
+    e = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) - m.offset_v
+    o.innovation_v = e
+    inject(m, q, dt_s, e)
+    o.adapting = 1 if o.soc > q.soc_floor else 0
+    if o.adapting and dt_s <= UNMEASURED_S:
+        remember(m, q, dt_s, e)
+        if find_step(m, q):
+            take_step(m, q, -math.expm1(-q.rate * o.k * dt_s))
+        excess = max(abs(e) - p.observer.dead_zone_v, 0.0)
+        o.k += excess * excess * dt_s  # (3.13) with the dead zone of E2
+    estimate = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) + m.offset_v
+    show(s, p, estimate)
+    if change_of_lock(o, p.observer, dt_s, not math.isfinite(estimate)) == LOST and not math.isfinite(estimate):
+        begin_learning(s, p, voltage_v)
+
+
+@njit(cache=True)
+def inject(m: Record, q: Record, dt_s: float, e: float) -> None:
+    """The offset follows e, and the sensitivities know: ``m.psi`` becomes that of y^ with the offset."""
+    share = -math.expm1(-dt_s / q.offset_s)
+    m.offset_v += share * e
+    for j in range(q.count):
+        m.psi[j] += m.d_offset[j]
+        m.d_offset[j] -= share * m.psi[j]
+
+
+@njit(cache=True)
+def remember(m: Record, q: Record, dt_s: float, e: float) -> None:
+    """Kreisselmeier's filters: psi psi' and psi (e + psi' theta), forgotten as the load tells anew."""
+    told, known = 0.0, e
+    for j in range(q.count):
+        told += m.psi[j] * m.psi[j]
+        known += m.psi[j] * m.theta[j]
+    forget(m, q, dt_s / q.memory_s * told / (told + q.told_v * q.told_v))
+    for j in range(q.count):
+        m.pull[j] += dt_s * m.psi[j] * known
+        for i in range(j + 1):
+            m.information[j, i] += dt_s * m.psi[j] * m.psi[i]
+
+
+@njit(cache=True)
+def forget(m: Record, q: Record, times: float) -> None:
+    """What is remembered counts e^-times as much."""
+    keep = math.exp(-times)
+    for j in range(q.count):
+        m.pull[j] *= keep
+        for i in range(j + 1):
+            m.information[j, i] *= keep
+
+
+@njit(cache=True)
+def find_step(m: Record, q: Record) -> bool:
+    """The way from theta to where memory and leakage balance, into ``m.step``; False where there is none."""
+    n = q.count
+    for j in range(n):
+        m.step[j] = m.pull[j] + q.leak_v2s[j] * (q.middle[j] - m.theta[j])
+        for i in range(n):
+            m.step[j] -= m.information[max(i, j), min(i, j)] * m.theta[i]
+    if not factorise(m, q):
+        return False
+    for j in range(n):
+        for i in range(j):
+            m.step[j] -= m.factor[j, i] * m.step[i]
+        m.step[j] /= m.factor[j, j]
+    for j in range(n - 1, -1, -1):
+        for i in range(j + 1, n):
+            m.step[j] -= m.factor[i, j] * m.step[i]
+        m.step[j] /= m.factor[j, j]
+    return True
+
+
+@njit(cache=True)
+def factorise(m: Record, q: Record) -> bool:
+    """Cholesky's factor of information and leakage; False where rounding has left no positive matrix."""
+    for j in range(q.count):
+        rest = m.information[j, j] + q.leak_v2s[j]
+        for i in range(j):
+            inner = m.information[j, i]
+            for h in range(i):
+                inner -= m.factor[j, h] * m.factor[i, h]
+            m.factor[j, i] = inner / m.factor[i, i]
+            rest -= m.factor[j, i] ** 2
+        if not rest > 0.0:
+            return False
+        m.factor[j, j] = math.sqrt(rest)
+    return True
+
+
+@njit(cache=True)
+def take_step(m: Record, q: Record, share: float) -> None:
+    """Move theta within its bounds, and the states with it: as though it had been so all along.
+
+    Sensitivities were of another theta: what is remembered fades with the way that theta goes.
+    """
+    way = 0.0
+    for j in range(q.count):
+        moved = min(max(m.theta[j] + share * m.step[j], q.lower[j]), q.upper[j])
+        m.step[j] = moved - m.theta[j]
+        m.theta[j] = moved
+        m.offset_v += m.d_offset[j] * m.step[j]
+        for branch in range(2):
+            m.x[branch] += m.dx[branch, j] * m.step[j]
+        way += abs(m.step[j])
+    forget(m, q, way / q.reach)
+
+
+@njit(cache=True)
+def show(s: Record, p: Record, estimate_v: float) -> None:
+    """What the observer's record says of the law: states, parameters, gain, estimated voltage."""
+    m, q, o = s.learning, p.learning, s.observer
+    o.v_ts, o.v_tl = m.x[0], m.x[1]
+    o.voltage_estimate_v = estimate_v
+    o.gain = q.rate * o.k
+    write(q.model, m.theta, q.file, o.a)
+    update_margins(o)

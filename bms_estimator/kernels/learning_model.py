@@ -1,0 +1,53 @@
+"""The models that the learning law knows, chosen by an integer: numba's disk cache keeps no first-class functions.
+
+A model is a file of the shape of ``chen_mora``; what the law asks of it goes through the functions here.
+"""
+
+import math
+from enum import IntEnum
+
+from numba import njit
+
+from bms_estimator.kernels import chen_mora
+from bms_estimator.kernels.cell import Floats
+from bms_estimator.kernels.state import Record
+
+
+class Model(IntEnum):
+    """Which model is learned."""
+
+    CHEN_MORA = 0
+
+
+_CHEN_MORA = int(Model.CHEN_MORA)
+NAMES = {Model.CHEN_MORA: chen_mora.NAMES}
+"""What is learned of each, in the order of theta."""
+
+
+@njit(cache=True)
+def give(model: int, given: Floats, p: Record, soc: float) -> None:
+    """What is not learned, at this sample; ``p`` is a record of ESTIMATOR_SETTINGS."""
+    if model == _CHEN_MORA:
+        chen_mora.give(given, p, soc)
+
+
+@njit(cache=True)
+def advance(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, dt_s: float) -> None:
+    """States ``x`` (2,) [V] and their derivatives ``dx`` (2, 8) after ``dt_s`` under a held current, in place."""
+    if model == _CHEN_MORA:
+        chen_mora.advance(x, dx, theta, given, current_a, dt_s)
+
+
+@njit(cache=True)
+def output(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, psi: Floats) -> float:
+    """Terminal voltage y^ [V]; psi = dy^/dtheta (8,) in place."""
+    if model == _CHEN_MORA:
+        return chen_mora.output(x, dx, theta, given, current_a, psi)
+    return math.nan
+
+
+@njit(cache=True)
+def write(model: int, theta: Floats, file: Floats, a: Floats) -> None:
+    """The parameters that are published, ``a`` (16,), from the file's and theta."""
+    if model == _CHEN_MORA:
+        chen_mora.write(theta, file, a)

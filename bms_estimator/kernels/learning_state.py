@@ -1,0 +1,45 @@
+"""The records of the learning law, parts of the whole estimator's."""
+
+import numpy as np
+
+LEARNABLE = 8
+"""So many parameters a model may have learned."""
+CONSTANTS = 16
+"""So many numbers the file of a model may give; Chen & Mora: a1..a15 at their index."""
+
+LEARNING_SETTINGS = np.dtype(
+    [
+        ("enabled", "i8"),  # 0: a printed law
+        ("model", "i8"),  # kernels.learning_model.Model
+        ("count", "i8"),  # parameters that are learned
+        ("file", "f8", CONSTANTS),  # what theta = 0 stands for
+        ("lower", "f8", LEARNABLE),  # bounds of theta
+        ("upper", "f8", LEARNABLE),
+        ("middle", "f8", LEARNABLE),  # where the leakage leads
+        ("leak_v2s", "f8", LEARNABLE),  # information that the middle counts as [V^2 s]
+        ("memory_s", "f8"),  # time constant of forgetting, under load [s]
+        ("offset_s", "f8"),  # time constant of the injection [s]
+        ("rate", "f8"),  # gamma: how fast theta goes where the data lead, at k = 1 [1/s]
+        ("told_v", "f8"),  # a sensitivity so large tells of the parameters [V]
+        ("reach", "f8"),  # a way of theta after which what is remembered counts 1/e
+        ("soc_floor", "f8"),  # below it nothing is learned (E14)
+    ],
+    align=True,
+)
+
+LEARNING_STATE = np.dtype(
+    [
+        ("theta", "f8", LEARNABLE),  # ln of each parameter over the file's
+        ("x", "f8", 2),  # states of the model [V]
+        ("dx", "f8", (2, LEARNABLE)),  # their derivatives by theta [V]
+        ("offset_v", "f8"),  # what the injection has added to the output [V]
+        ("d_offset", "f8", LEARNABLE),  # its derivative by theta [V]
+        ("psi", "f8", LEARNABLE),  # dy^/dtheta [V]
+        ("given", "f8", LEARNABLE),  # what is not learned, at the last sample
+        ("information", "f8", (LEARNABLE, LEARNABLE)),  # of psi psi', remembered [V^2 s]
+        ("pull", "f8", LEARNABLE),  # of psi (e + psi' theta), remembered [V^2 s]
+        ("step", "f8", LEARNABLE),  # the last change of theta
+        ("factor", "f8", (LEARNABLE, LEARNABLE)),  # Cholesky's, of information and leakage
+    ],
+    align=True,
+)
