@@ -13,14 +13,14 @@ from bms_estimator.model.settings import ObserverSettings
 
 MEMORY_S = 3600.0
 """Under load data are forgotten with this time constant [s]."""
-OFFSET_S = 1800.0
+OFFSET_S = 600.0
 """The injection takes up an error of the open-circuit voltage with this time constant [s]."""
 RATE_HZ = 1.0 / 60.0
 """gamma: the parameters go where the data lead with its inverse as time constant, at k = 1 [1/s]."""
-ERROR_S = 60.0
-"""Errors of the model are alike for so long [s]."""
+LEAK_S = 10.0
+"""The middle of the bounds counts as much as data of so long whose errors are ``epsilon_v`` [s]."""
 REACH = 0.5
-"""Of theta: sensitivities of parameters so far away, as a sum of ln, are no longer the present ones."""
+"""Of theta: what sensitivities do not tell of a way grows with its square, and is no longer small after this one."""
 TAU_TS, TAU_TL = NAMES.index("tau_ts"), NAMES.index("tau_tl")
 SCALED = {"r_s": (13, 15), "r_ts": (1, 3), "tau_ts": (7, 9), "r_tl": (4, 6), "tau_tl": (10, 12)}
 """Parameters that scale with each that is learned: a time constant is bounded as its capacitance is, at the file's R."""
@@ -48,9 +48,9 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
     q["middle"] = 0.5 * (q["lower"] + q["upper"])
     error_v = float(of_observer["epsilon_v"])
     half = 0.5 * (q["upper"] - q["lower"])
-    q["leak_v2s"][:n] = ERROR_S * error_v**2 / np.maximum(half[:n], 1e-3) ** 2
+    q["leak_v2s"][:n] = LEAK_S * error_v**2 / np.maximum(half[:n], 1e-3) ** 2
     q["memory_s"], q["offset_s"], q["rate"], q["reach"] = MEMORY_S, OFFSET_S, RATE_HZ, REACH
-    q["told_v"] = error_v
+    q["told_v"], q["cells"] = error_v, cell.cell.series_count
     q["soc_floor"] = max(delta(a[8], a[9], a[7]), delta(a[11], a[12], a[10])) + observer.margin_guard
     return record
 

@@ -10,8 +10,11 @@ from numba import njit
 
 from bms_estimator.kernels.charge import UNMEASURED_S, held_current
 from bms_estimator.kernels.learning_model import advance, give, output, write
-from bms_estimator.kernels.observer import LOST, change_of_lock, update_margins
+from bms_estimator.kernels.observer import change_of_lock, update_margins
 from bms_estimator.kernels.state import Record
+
+LEARN_EVERY_S = 0.999
+"""Theta moves no more often, nearly a second: more samples only add to what is remembered [s]."""
 
 
 @njit(cache=True)
@@ -19,8 +22,7 @@ def begin_learning(s: Record, p: Record, voltage_v: float) -> None:
     """The file's parameters, nothing remembered, and a cell at rest."""
     m, n = s.learning, p.learning.count
     for j in range(n):
-        m.theta[j] = min(max(0.0, p.learning.lower[j]), p.learning.upper[j])
-        m.pull[j] = 0.0
+        m.theta[j] = m.pull[j] = 0.0
         for i in range(n):
             m.information[j, i] = 0.0
     s.observer.k = max(p.observer.k0, 1.0)
@@ -54,13 +56,18 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
     o.adapting = 1 if o.soc > q.soc_floor else 0
     if o.adapting and dt_s <= UNMEASURED_S:
         remember(m, q, dt_s, e)
-        if find_step(m, q):
-            take_step(m, q, -math.expm1(-q.rate * o.k * dt_s))
-        excess = max(abs(e) - p.observer.dead_zone_v, 0.0)
+        m.waited_s += dt_s
+        if m.waited_s >= LEARN_EVERY_S:
+            if find_step(m, q):
+                take_step(m, q, -math.expm1(-q.rate * o.k * m.waited_s))
+            m.waited_s = 0.0
+        excess = max(abs(e) - p.observer.dead_zone_v, 0.0) / q.cells
         o.k += excess * excess * dt_s  # (3.13) with the dead zone of E2
     estimate = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) + m.offset_v
     show(s, p, estimate)
-    if change_of_lock(o, p.observer, dt_s, not math.isfinite(estimate)) == LOST and not math.isfinite(estimate):
+    broken = not math.isfinite(estimate)
+    change_of_lock(o, p.observer, dt_s, broken)
+    if broken:
         begin_learning(s, p, voltage_v)
 
 
@@ -76,7 +83,7 @@ def inject(m: Record, q: Record, dt_s: float, e: float) -> None:
 
 @njit(cache=True)
 def remember(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """Kreisselmeier's filters: psi psi' and psi (e + psi' theta), forgotten as the load tells anew."""
+    """Kreisselmeier's filters: psi psi' and psi (e + psi' theta). What is remembered is forgotten while a load tells anew."""
     told, known = 0.0, e
     for j in range(q.count):
         told += m.psi[j] * m.psi[j]
@@ -140,18 +147,18 @@ def factorise(m: Record, q: Record) -> bool:
 def take_step(m: Record, q: Record, share: float) -> None:
     """Move theta within its bounds, and the states with it: as though it had been so all along.
 
-    Sensitivities were of another theta: what is remembered fades with the way that theta goes.
+    Sensitivities were of another theta: what is remembered fades with the square of the way that is to be gone.
     """
     way = 0.0
     for j in range(q.count):
+        way += m.step[j] * m.step[j]
         moved = min(max(m.theta[j] + share * m.step[j], q.lower[j]), q.upper[j])
         m.step[j] = moved - m.theta[j]
         m.theta[j] = moved
         m.offset_v += m.d_offset[j] * m.step[j]
         for branch in range(2):
             m.x[branch] += m.dx[branch, j] * m.step[j]
-        way += abs(m.step[j])
-    forget(m, q, way / q.reach)
+    forget(m, q, share * way / (q.reach * q.reach))
 
 
 @njit(cache=True)

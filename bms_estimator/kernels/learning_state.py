@@ -20,8 +20,9 @@ LEARNING_SETTINGS = np.dtype(
         ("memory_s", "f8"),  # time constant of forgetting, under load [s]
         ("offset_s", "f8"),  # time constant of the injection [s]
         ("rate", "f8"),  # gamma: how fast theta goes where the data lead, at k = 1 [1/s]
+        ("cells", "f8"),  # in series: k is that of one cell, whatever the pack
         ("told_v", "f8"),  # a sensitivity so large tells of the parameters [V]
-        ("reach", "f8"),  # a way of theta after which what is remembered counts 1/e
+        ("reach", "f8"),  # of theta: sensitivities tell of ways that are short against it
         ("soc_floor", "f8"),  # below it nothing is learned (E14)
     ],
     align=True,
@@ -38,6 +39,7 @@ LEARNING_STATE = np.dtype(
         ("given", "f8", LEARNABLE),  # what is not learned, at the last sample
         ("information", "f8", (LEARNABLE, LEARNABLE)),  # of psi psi', remembered [V^2 s]
         ("pull", "f8", LEARNABLE),  # of psi (e + psi' theta), remembered [V^2 s]
+        ("waited_s", "f8"),  # since theta moved [s]
         ("step", "f8", LEARNABLE),  # the last change of theta
         ("factor", "f8", (LEARNABLE, LEARNABLE)),  # Cholesky's, of information and leakage
     ],

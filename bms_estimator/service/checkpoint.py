@@ -164,8 +164,8 @@ class CheckpointFile:
         else:
             state = {name.removeprefix("state."): file[name] for name in file if name.startswith("state.")}
         if version == NAMELESS_FORMAT or str(file["observer"]) != self._observer:
-            kept = ("observer.soc", "observer.soc_coulomb", "observer.started")
-            state = {name: v for name, v in state.items() if name in kept or not name.startswith("observer.")}
+            kept, dropped = ("observer.soc", "observer.soc_coulomb", "observer.started"), ("observer.", "learning.")
+            state = {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}
         saved = Moment(float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"]))
         return Restored(state, self._now().since(saved), int(file["restarts"]) + 1, "")
 

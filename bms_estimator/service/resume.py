@@ -42,7 +42,10 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     new = estimator.record.copy()
     estimator.step(0.0, 0.0, estimator.cell.cell.nominal_voltage_v)
     was_on = bool(saved.get("filter.started", np.zeros(1))[0])
-    _fill(estimator.record, {name: v for name, v in saved.items() if was_on or name.startswith("observer.")})
+    _fill(
+        estimator.record,
+        {name: v for name, v in saved.items() if was_on or name.startswith(("observer.", "learning."))},
+    )
     wrong = _insane(estimator)
     if wrong:
         estimator.record[...] = new
@@ -99,7 +102,7 @@ def _insane(estimator: Estimator) -> str:
     record, cell = estimator.record, estimator.cell.cell
     for name, field in fields(record):
         part, _, what = name.partition(".")
-        if part in ("observer", "filter", "checks", "map") and not np.isfinite(field).all():
+        if part in ("observer", "learning", "filter", "checks", "map") and not np.isfinite(field).all():
             return f"{what} of the {part} is not finite"
     s = record[0]["observer"]
     if not s["started"]:

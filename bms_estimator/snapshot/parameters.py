@@ -15,6 +15,7 @@ from bms_estimator.estimator.learned import (
     relative_series_resistance,
 )
 from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.element_map import ELEMENT_NAMES
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import OcvCurve, Parameter, ParameterReport
@@ -24,6 +25,7 @@ from bms_estimator.snapshot.topics import finite
 OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
 """Where the OCV is published."""
 CONFIGURED = "configured value: no data has identified it"
+LEARNED = "learned by the observer's law, which knows no error of it"
 VALID_STD = 0.3
 """An element known better than this, relative, is identified."""
 VALID_FIT_STD = 0.5
@@ -62,16 +64,17 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
     a[1:16] = state["a"][1:16]
     parameters, elements = _of_cell_file(estimator.cell, a), _elements_of(estimator, a)
     health: dict[str, Parameter] = {}
-    if estimator.identifying:
-        record = estimator.record[0]
-        led = state["target"] != estimator.settings["target"][0]  # by the fit, away from where (3.18) leads by itself
-        for i in range(1, 16):
-            held = _of_source(parameters[f"a{i}"], led[i])
+    learning, record = bool(estimator.settings_record["learning"]["enabled"][0]), estimator.record[0]
+    led = _led(estimator)
+    for i in range(1, 16):
+        held = parameters[f"a{i}"] = _of_source(parameters[f"a{i}"], led[i], learning)
+        if estimator.identifying and not learning:
             parameters[f"a{i}"] = _parameter(held, fitted_parameter(record, i), now_s)
-        present = present_elements(record)
-        for e, (name, one) in enumerate(present.items()):
-            held = _of_source(elements[name], led[3 * e + 1 : 3 * e + 4].any())
-            elements[name] = _identified(one, held, VALID_STD, now_s)
+    for e, name in enumerate(ELEMENT_NAMES):
+        elements[name] = _of_source(elements[name], led[3 * e + 1 : 3 * e + 4].any(), learning)
+    if estimator.identifying:
+        for name, one in present_elements(record).items():
+            elements[name] = _identified(one, elements[name], VALID_STD, now_s)
         health = _state_of_health(estimator, now_s)
     return ParameterReport(
         publish_time=iso_utc(now_s),
@@ -141,9 +144,19 @@ def _bias(learned: Learned, limit: float, setting: str, now_s: float) -> Paramet
     return Parameter(value=value, std=std, valid=valid, source="identified", updated=iso_utc(now_s), reason=reason)
 
 
-def _of_source(held: Parameter, led: np.bool_) -> Parameter:
-    """What the observer holds, said to be from the fit where that leads."""
-    return held.model_copy(update={"source": "identified" if led else "configured"})
+def _led(estimator: Estimator) -> np.ndarray:
+    """Which of a1..a15 data have led away from the configured: the learning law, else the fit that (3.18) follows."""
+    state, settings = estimator.state[0], estimator.settings_record[0]
+    if settings["learning"]["enabled"]:
+        return np.asarray(state["a"] != settings["learning"]["file"])
+    return np.asarray(state["target"] != settings["observer"]["target"])
+
+
+def _of_source(held: Parameter, led: np.bool_, learning: bool) -> Parameter:
+    """What the observer holds, said to be from data where those have led it."""
+    if not led:
+        return held
+    return held.model_copy(update={"source": "identified"} | ({"reason": LEARNED} if learning else {}))
 
 
 def _parameter(held: Parameter, fit: Learned | None, now_s: float) -> Parameter:

@@ -1,0 +1,77 @@
+"""The thesis's cell under steps of random height and length, and copies of its file that are wrong."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell import simulate_cell
+from bms_estimator.kernels.chen_mora import NAMES
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.settings import ObserverSettings
+
+TRUTH = load_cell("chen_mora").model_copy(update={"adaptation": {}})
+"""Bounds a quarter to four times the file's: those of Table 5 are not around a file that is wrong."""
+RATED_A = 0.275
+HEIGHTS_C = (-1.0, -0.5, 0.0, 0.0, 0.5, 1.0)
+HOLD_S = (20, 400)
+"""Steps are held between so long [s]."""
+LOW, HIGH = 0.3, 0.85
+FIRST_SOC = 0.6
+RESOLUTION_V = 5e-4
+
+
+def file_off_by(*factors: float) -> CellModel:
+    """The cell's file with R_s, R_ts, tau_ts, R_tl, tau_tl so many times as large."""
+    r_s, r_ts, tau_ts, r_tl, tau_tl = factors
+    scale = {"r_s": r_s, "r_ts": r_ts, "r_tl": r_tl, "c_ts": tau_ts / r_ts, "c_tl": tau_tl / r_tl}
+    parts = {}
+    for name, factor in scale.items():
+        part = getattr(TRUTH, name)
+        keys = [key for key in part.model_dump() if key != "exponent"]
+        parts[name] = part.model_copy(update={key: getattr(part, key) * factor for key in keys})
+    return TRUTH.model_copy(update=parts)
+
+
+def held_currents(hours: float, rng: np.random.Generator) -> np.ndarray:
+    """One current for each half second [A]; steps come midway between whole seconds."""
+    n, soc = int(hours * 7200), FIRST_SOC
+    current_a, i = np.zeros(n), 1
+    while i < n:
+        half_seconds = 2 * int(rng.integers(*HOLD_S))
+        c = rng.choice(HEIGHTS_C)
+        drop = c * half_seconds / 7200
+        if not LOW < soc - drop < HIGH:
+            c, drop = -c, -drop
+        current_a[i : i + half_seconds] = c * RATED_A
+        soc, i = soc - drop, i + half_seconds
+    return current_a
+
+
+def random_steps(hours: float, noise_v: float = 0.0, seed: int = 1, cell: CellModel = TRUTH) -> SampleBlock:
+    """A sample each second of ``cell``, its voltage with ``noise_v`` [V]."""
+    rng = np.random.default_rng(seed)
+    return measured(held_currents(hours, rng), noise_v, rng, cell)
+
+
+def measured(current_a: np.ndarray, noise_v: float, rng: np.random.Generator, cell: CellModel = TRUTH) -> SampleBlock:
+    """What a sensor sees of ``cell`` each second, under a current for each half second [A]."""
+    time_s = 0.5 * np.arange(len(current_a))
+    voltage_v, _ = simulate_cell((FIRST_SOC, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
+    block = np.zeros(len(current_a[::2]), dtype=SAMPLE)
+    block["time_s"], block["current_a"], block["temperature_c"] = time_s[::2], current_a[::2], np.nan
+    block["voltage_v"] = voltage_v[::2] + rng.normal(0.0, noise_v, block.size)
+    return block
+
+
+def learner(file: CellModel, soc: float = FIRST_SOC, **observer: float) -> Estimator:
+    """The learning law alone, told ``soc``."""
+    settings = ObserverSettings.model_validate({"law": "learning", **observer})
+    return Estimator(file, settings, identifier=None, initial_soc=soc, voltage_resolution_v=RESOLUTION_V)
+
+
+def errors(estimator: Estimator, factors: Sequence[float]) -> np.ndarray:
+    """How far what was learned from a file that is off by ``factors`` is from the truth, relative; shape (5,)."""
+    theta = estimator.record[0]["learning"]["theta"][: len(NAMES)]
+    return np.abs(np.exp(theta) * np.asarray(factors) - 1.0)
