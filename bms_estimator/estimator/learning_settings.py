@@ -15,6 +15,8 @@ MEMORY_S = 3600.0
 """Under load data are forgotten with this time constant [s]."""
 OFFSET_S = 600.0
 """The injection takes up an error of the open-circuit voltage with this time constant [s]."""
+SETTLE_S = 1200.0
+"""After a time that nobody measured: three time constants of the slow branch and more [s]."""
 RATE_HZ = 1.0 / 60.0
 """gamma: the parameters go where the data lead with its inverse as time constant, at k = 1 [1/s]."""
 LEAK_S = 10.0
@@ -49,7 +51,8 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: 
     error_v = float(of_observer["epsilon_v"])
     half = 0.5 * (q["upper"] - q["lower"])
     q["leak_v2s"][:n] = LEAK_S * error_v**2 / np.maximum(half[:n], 1e-3) ** 2
-    q["memory_s"], q["offset_s"], q["rate"], q["reach"] = MEMORY_S, OFFSET_S, RATE_HZ, REACH
+    q["memory_s"], q["offset_s"], q["settle_s"] = MEMORY_S, OFFSET_S, SETTLE_S
+    q["rate"], q["reach"] = RATE_HZ, REACH
     q["told_v"], q["cells"] = error_v, cell.cell.series_count
     q["soc_floor"] = max(delta(a[8], a[9], a[7]), delta(a[11], a[12], a[10])) + observer.margin_guard
     return record

@@ -15,27 +15,44 @@ from bms_estimator.kernels.state import Record
 
 LEARN_EVERY_S = 0.999
 """Theta moves no more often, nearly a second: more samples only add to what is remembered [s]."""
+RESTING_C = 0.02
+"""A first sample of no more is of a cell at rest [C]."""
 
 
 @njit(cache=True)
 def begin_learning(s: Record, p: Record, voltage_v: float) -> None:
     """The file's parameters, nothing remembered, and a cell at rest."""
-    m, n = s.learning, p.learning.count
-    for j in range(n):
-        m.theta[j] = m.pull[j] = 0.0
-        for i in range(n):
-            m.information[j, i] = 0.0
+    m, q = s.learning, p.learning
+    for j in range(q.count):
+        m.theta[j] = 0.0
+    empty_memory(m, q)
     s.observer.k = max(p.observer.k0, 1.0)
     take_as_rest(s, p, voltage_v)
+    if abs(s.observer.current_a) <= RESTING_C * p.observer.capacity_as / 3600.0:
+        m.settle_s = 0.0
+
+
+@njit(cache=True)
+def empty_memory(m: Record, q: Record) -> None:
+    """Nothing is remembered."""
+    m.waited_s = 0.0
+    for j in range(q.count):
+        m.pull[j] = 0.0
+        for i in range(j + 1):
+            m.information[j, i] = 0.0
 
 
 @njit(cache=True)
 def take_as_rest(s: Record, p: Record, voltage_v: float) -> None:
-    """The states of a cell at rest. What else is in the voltage is the offset's, and tells nothing of the parameters."""
+    """The states of a cell at rest. What else is in the voltage is the offset's, and tells nothing of the parameters.
+
+    Nothing is learned until the states would have forgotten that they were otherwise.
+    """
     m, q, o = s.learning, p.learning, s.observer
     for j in range(q.count):
         m.dx[0, j] = m.dx[1, j] = 0.0
     m.x[0] = m.x[1] = 0.0
+    m.settle_s = q.settle_s
     give(q.model, m.given, p, o.soc)
     m.offset_v = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi)
     for j in range(q.count):
@@ -54,13 +71,16 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
     o.innovation_v = e
     inject(m, q, dt_s, e)
     o.adapting = 1 if o.soc > q.soc_floor else 0
-    if o.adapting and dt_s <= UNMEASURED_S:
+    m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= UNMEASURED_S else q.settle_s
+    if o.adapting and m.settle_s == 0.0:
         remember(m, q, dt_s, e)
         m.waited_s += dt_s
         if m.waited_s >= LEARN_EVERY_S:
             if find_step(m, q):
                 take_step(m, q, -math.expm1(-q.rate * o.k * m.waited_s))
-            m.waited_s = 0.0
+                m.waited_s = 0.0
+            else:
+                empty_memory(m, q)
         excess = max(abs(e) - p.observer.dead_zone_v, 0.0) / q.cells
         o.k += excess * excess * dt_s  # (3.13) with the dead zone of E2
     estimate = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) + m.offset_v
@@ -128,7 +148,7 @@ def find_step(m: Record, q: Record) -> bool:
 
 @njit(cache=True)
 def factorise(m: Record, q: Record) -> bool:
-    """Cholesky's factor of information and leakage; False where rounding has left no positive matrix."""
+    """Cholesky's factor of information and leakage; False where that is no positive matrix, by rounding or a damaged state."""
     for j in range(q.count):
         rest = m.information[j, j] + q.leak_v2s[j]
         for i in range(j):

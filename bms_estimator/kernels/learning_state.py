@@ -19,6 +19,7 @@ LEARNING_SETTINGS = np.dtype(
         ("leak_v2s", "f8", LEARNABLE),  # information that the middle counts as [V^2 s]
         ("memory_s", "f8"),  # time constant of forgetting, under load [s]
         ("offset_s", "f8"),  # time constant of the injection [s]
+        ("settle_s", "f8"),  # the states forget within it what was before [s]
         ("rate", "f8"),  # gamma: how fast theta goes where the data lead, at k = 1 [1/s]
         ("cells", "f8"),  # in series: k is that of one cell, whatever the pack
         ("told_v", "f8"),  # a sensitivity so large tells of the parameters [V]
@@ -39,6 +40,7 @@ LEARNING_STATE = np.dtype(
         ("given", "f8", LEARNABLE),  # what is not learned, at the last sample
         ("information", "f8", (LEARNABLE, LEARNABLE)),  # of psi psi', remembered [V^2 s]
         ("pull", "f8", LEARNABLE),  # of psi (e + psi' theta), remembered [V^2 s]
+        ("settle_s", "f8"),  # nothing is learned for so long: the states hold what nobody measured [s]
         ("waited_s", "f8"),  # since theta moved [s]
         ("step", "f8", LEARNABLE),  # the last change of theta
         ("factor", "f8", (LEARNABLE, LEARNABLE)),  # Cholesky's, of information and leakage

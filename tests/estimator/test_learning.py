@@ -1,0 +1,233 @@
+"""The learning law's promises: it learns under a load that tells, stays bounded under any, and survives."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell import simulate_cell
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from bms_estimator.snapshot.parameters import parameter_report
+from tests.estimator.random_steps import (
+    FIRST_SOC,
+    RATED_A,
+    RESOLUTION_V,
+    TRUTH,
+    errors,
+    file_off_by,
+    held_currents,
+    learner,
+    measured,
+    random_steps,
+)
+
+NOISE_V = 1e-3
+STARTS = list(itertools.product((0.5, 2.0), repeat=5))[::5]
+OFF = (2.0, 0.5, 2.0, 0.5, 2.0)
+PRODUCTS = [2, 4]
+
+
+@pytest.fixture(scope="module")
+def ten_hours() -> SampleBlock:
+    return random_steps(10.0, NOISE_V)
+
+
+@pytest.mark.parametrize("factors", STARTS, ids=str)
+def test_a_load_of_random_steps_tells_all_elements(ten_hours: SampleBlock, factors: tuple[float, ...]) -> None:
+    estimator = learner(file_off_by(*factors))
+    estimator.run(ten_hours)
+    error = errors(estimator, factors)
+    assert error[0] < 0.005
+    assert error[PRODUCTS].max() < 0.02
+
+
+def test_a_constant_current_does_not_tell_the_elements_apart() -> None:
+    """Once both branches have settled only the sum of the resistances shows, and no time constant."""
+    factors = (2.0, 0.5, 1.0, 2.0, 0.5)
+    rng = np.random.default_rng(1)
+    constant = measured(np.full(7200 * 2, 0.1 * RATED_A), NOISE_V, rng)
+    estimator = learner(file_off_by(*factors))
+    estimator.run(constant)
+    assert errors(estimator, factors).max() > 0.4
+
+
+def test_noise_of_any_size_leaves_everything_bounded() -> None:
+    block = random_steps(3.0, 0.2)
+    estimator = learner(TRUTH)
+    q = estimator.settings_record[0]["learning"]
+    for part in np.array_split(block, 50):
+        trace = estimator.run(part)
+        theta = estimator.record[0]["learning"]["theta"]
+        assert (q["lower"] <= theta).all()
+        assert (theta <= q["upper"]).all()
+        assert np.abs(trace["voltage_estimate_v"] - 3.8).max() < 1.0
+    assert (estimator.state["a"][0, 1:] > 0.0).all()
+
+
+def test_an_element_beyond_its_bounds_is_held_there(ten_hours: SampleBlock) -> None:
+    estimator = learner(file_off_by(8.0, 1.0, 1.0, 1.0, 1.0))
+    estimator.run(ten_hours[:7200])
+    assert estimator.record[0]["learning"]["theta"][0] == pytest.approx(np.log(0.25))
+    assert estimator.state["a"][0, 15] == pytest.approx(2.0 * TRUTH.a[15])
+
+
+def test_the_dead_zone_keeps_k_still() -> None:
+    block = random_steps(2.0, 0.1 * RESOLUTION_V)
+    estimator, printed = learner(TRUTH), learner(TRUTH, dead_zone_v=0.0, epsilon_v=4 * RESOLUTION_V)
+    assert (estimator.run(block)["k"] == 1.0).all()
+    assert printed.run(block)["k"][-1] > 1.0
+
+
+def test_a_jump_of_a_resistance_is_found_again() -> None:
+    rng = np.random.default_rng(2)
+    current_a = held_currents(6.0, rng)
+    half = len(current_a) // 2
+    before, after = (
+        measured(current_a, NOISE_V, np.random.default_rng(3), cell) for cell in (TRUTH, file_off_by(1.5, 1, 1, 1, 1))
+    )
+    block = before.copy()
+    block["voltage_v"][half // 2 :] = after["voltage_v"][half // 2 :]
+    estimator = learner(TRUTH)
+    estimator.run(block[: half // 2])
+    assert errors(estimator, (1.0,) * 5)[0] < 0.01
+    estimator.run(block[half // 2 : half // 2 + 1800])
+    assert errors(estimator, (1.0 / 1.5, 1, 1, 1, 1))[0] < 0.05
+    estimator.run(block[half // 2 + 1800 :])
+    assert errors(estimator, (1.0 / 1.5, 1, 1, 1, 1))[0] < 0.01
+
+
+def test_step_and_run_leave_the_same_state_to_the_last_bit(ten_hours: SampleBlock) -> None:
+    at_once, one_by_one = learner(file_off_by(*OFF)), learner(file_off_by(*OFF))
+    block = ten_hours[:2000]
+    at_once.run(block)
+    for x in block:
+        one_by_one.step(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), 0, float(x["temperature_c"]))
+    assert at_once.record.tobytes() == one_by_one.record.tobytes()
+
+
+def test_the_rate_of_samples_does_not_matter() -> None:
+    """1, 10 and 100 Hz of one run; at 1 Hz the current of a step is known to half a second."""
+    current_a = np.repeat(held_currents(2.0, np.random.default_rng(4)), 50)
+    time_s = 0.01 * np.arange(len(current_a))
+    voltage_v, _ = simulate_cell((FIRST_SOC, 0.0, 0.0), time_s, current_a, 0.275 * 3600.0, TRUTH.a)
+    found = []
+    for every in (1, 10, 100):
+        block = np.zeros(len(time_s[::every]), dtype=random_steps(0.01).dtype)
+        block["time_s"], block["current_a"] = time_s[::every], current_a[::every]
+        block["voltage_v"], block["temperature_c"] = voltage_v[::every], np.nan
+        estimator = learner(file_off_by(*OFF))
+        estimator.run(block)
+        found.append(estimator.record[0]["learning"]["theta"][:5].copy())
+    assert found[1] == pytest.approx(found[0], abs=0.01)
+    assert found[2] == pytest.approx(found[0], abs=0.1)
+
+
+def test_a_pack_learns_as_its_cell_does(ten_hours: SampleBlock) -> None:
+    cell, pack = learner(file_off_by(*OFF)), None
+    settings = ObserverSettings(law="learning")
+    pack = Estimator(
+        file_off_by(*OFF).pack(6, 1),
+        settings,
+        identifier=None,
+        initial_soc=FIRST_SOC,
+        voltage_resolution_v=6 * RESOLUTION_V,
+    )
+    of_pack = ten_hours[:7200].copy()
+    of_pack["voltage_v"] *= 6.0
+    cell.run(ten_hours[:7200])
+    pack.run(of_pack)
+    theta, of_cell = (e.record[0]["learning"]["theta"] for e in (pack, cell))
+    assert theta == pytest.approx(of_cell, abs=1e-6)
+    assert pack.state["k"][0] == pytest.approx(cell.state["k"][0])
+
+
+def test_below_the_margins_nothing_is_learned() -> None:
+    block = measured(np.full(4 * 7200, 0.1 * RATED_A), 0.0, np.random.default_rng(1))
+    estimator = learner(file_off_by(*OFF), soc=0.02)
+    estimator.run(block[:10])
+    for part in np.array_split(block[10:], 20):
+        theta = estimator.record[0]["learning"]["theta"].copy()
+        was_below = estimator.state["adapting"][0] == 0
+        trace = estimator.run(part)
+        assert np.isfinite(trace["voltage_estimate_v"]).all()
+        if was_below:
+            assert estimator.record[0]["learning"]["theta"] == pytest.approx(theta, abs=0.0)
+    assert estimator.state["adapting"][0] == 0
+    assert estimator.state["soc"][0] < estimator.state["delta_2"][0]
+
+
+def test_a_gap_teaches_nothing_and_the_law_goes_on() -> None:
+    """Two hours at rest that nobody measured."""
+    rng = np.random.default_rng(5)
+    parts = held_currents(2.0, rng), np.zeros(2 * 7200), held_currents(3.0, rng)
+    block = measured(np.concatenate(parts), NOISE_V, rng)
+    estimator = learner(TRUTH)
+    estimator.run(block[:7200])
+    theta = estimator.record[0]["learning"]["theta"].copy()
+    estimator.run(block[14_400:14_401])
+    assert estimator.state["gaps"][0] == 1
+    assert (estimator.record[0]["learning"]["theta"] == theta).all()
+    estimator.run(block[14_401:])
+    assert errors(estimator, (1.0,) * 5)[[0, *PRODUCTS]].max() < 0.1
+
+
+def test_after_a_restart_under_load_what_was_learned_is_there_and_stays(ten_hours: SampleBlock) -> None:
+    estimator = learner(file_off_by(*OFF))
+    estimator.run(ten_hours[:28_800])
+    before = errors(estimator, OFF)
+    estimator.resume(10.0)
+    again = ten_hours[28_800:].copy()
+    again["time_s"] -= again["time_s"][0]
+    estimator.run(again[:1])
+    assert (errors(estimator, OFF) == before).all()
+    estimator.run(again)
+    assert np.abs(errors(estimator, OFF) - before)[[0, *PRODUCTS]].max() < 0.1
+
+
+@pytest.mark.parametrize("field", ["theta", "x", "information", "offset_v"])
+def test_a_state_that_is_no_number_begins_anew(ten_hours: SampleBlock, field: str) -> None:
+    estimator = learner(file_off_by(*OFF))
+    estimator.run(ten_hours[:600])
+    estimator.record[0]["learning"][field] = np.nan
+    trace = estimator.run(ten_hours[600:])
+    assert np.isfinite(trace["voltage_estimate_v"][1:]).all()
+    assert errors(estimator, OFF)[0] < 0.01
+    assert trace["lock"][-1] == 1
+
+
+def test_samples_that_are_none_are_dropped(ten_hours: SampleBlock) -> None:
+    dirty, clean = learner(TRUTH), learner(TRUTH)
+    clean.run(ten_hours[:600])
+    dirty.run(ten_hours[:300])
+    dirty.step(300.5, np.nan, 3.8)
+    dirty.step(300.5, 0.1, 60.0)
+    dirty.run(ten_hours[300:600])
+    assert dirty.record["learning"].tobytes() == clean.record["learning"].tobytes()
+
+
+def test_beside_the_filter_the_law_has_its_soc_and_keeps_its_parameters(ten_hours: SampleBlock) -> None:
+    cell = file_off_by(*OFF)
+    estimator = Estimator(
+        cell,
+        ObserverSettings(law="learning"),
+        identifier=IdentifierSettings(),
+        initial_soc=FIRST_SOC,
+        voltage_resolution_v=RESOLUTION_V,
+    )
+    estimator.run(ten_hours)
+    theta = estimator.record[0]["learning"]["theta"]
+    assert estimator.state["soc"][0] == estimator.record["filter"]["soc"][0]
+    assert estimator.state["a"][0, 13:16] == pytest.approx(cell.a[13:16] * np.exp([theta[0], 0.0, theta[0]]))
+    assert (estimator.state["target"] == estimator.settings["target"]).all()
+
+
+def test_what_was_learned_is_published_with_its_source(ten_hours: SampleBlock) -> None:
+    estimator = learner(file_off_by(*OFF))
+    estimator.run(ten_hours)
+    report = parameter_report(estimator, 0.0)
+    assert report.a["a15"].source == report.elements["r_s_ohm"].source == "identified"
+    assert report.a["a15"].value == estimator.state["a"][0, 15]
+    assert "law" in (report.a["a15"].reason or "")
+    assert report.a["a14"].source == "configured"
