@@ -1,5 +1,6 @@
 """The observer's step alone: against C, and from Python."""
 
+import functools
 import math
 import tempfile
 import time
@@ -16,7 +17,7 @@ from bms_estimator.kernels import sample_step as kernel
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 
 BLOCK = 65_536
 ROUNDS = 10
@@ -27,9 +28,12 @@ def rows() -> Iterator[Row]:
     """Kernel and C on the same block in turn, the best of all rounds for each; then calls from Python."""
     block = pulses(BLOCK)
     ours, theirs = kernel_and_c(block)
+    printed, learning = both_laws(block)
     yield Row("observer step in run", "at most 300 ns", f"{ours:.0f} ns", ours <= 300.0)
     yield Row("  the same in C, -O3 -march=native", "-", f"{theirs:.0f} ns", None)
     yield Row("  ratio", "at most 1.5", f"{ours / theirs:.2f}", ours <= 1.5 * theirs)
+    yield Row("observer step in run, the learning law", "-", f"{learning:.0f} ns", None)
+    yield Row("  the printed law in the same rounds", "-", f"{printed:.0f} ns", None)
     whole = whole_step(block)
     yield Row(
         "whole step in run at 100 Hz: filter, observer, map, margins",
@@ -61,6 +65,19 @@ def kernel_and_c(block: SampleBlock) -> tuple[float, float]:
         best = np.full(2, np.inf)
         for _ in range(ROUNDS):
             best = np.minimum(best, [elapsed_ns(run_kernel), elapsed_ns(run_c)])
+    return float(best[0]) / BLOCK, float(best[1]) / BLOCK
+
+
+def both_laws(block: SampleBlock) -> tuple[float, float]:
+    """Time per sample of ``run`` with the printed and with the learning law, in turn [ns]."""
+    laws = [Estimator(load_cell(CELL), ObserverSettings(law=law), identifier=None) for law in ("improved", "learning")]
+    best = np.full(2, np.inf)
+    for estimator in laws:
+        estimator.run(block)
+    for _ in range(ROUNDS):
+        for i, estimator in enumerate(laws):
+            estimator.state["started"] = 0
+            best[i] = min(best[i], elapsed_ns(functools.partial(estimator.run, block)))
     return float(best[0]) / BLOCK, float(best[1]) / BLOCK
 
 

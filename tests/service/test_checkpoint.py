@@ -87,6 +87,7 @@ async def test_a_restart_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
     [
         edited("observer", lock_time_s=20.0),
         edited("observer", law="scheme-1"),
+        edited("observer", law="learning"),
         edited("identifier", map_memory_h=100.0),
         edited("identifier", current_offset_std_a=0.1),
         edited("sensor", voltage_noise_v=0.01),
@@ -101,6 +102,32 @@ async def test_an_edited_setting_costs_nothing_that_was_learned(tmp_path: Path, 
     run = await ran(tmp_path, settings, samples=1)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
     assert run.estimator.record["map"].tobytes() == learned.record["map"].tobytes()
+
+
+async def test_what_the_learning_law_has_learned_outlives_a_restart_and_not_another_law(tmp_path: Path) -> None:
+    settings = edited("observer", law="learning")
+    learned = new_estimator(settings, CELL)
+    for i in range(3600):
+        learned.step(float(i), 0.3 * (i // 60 % 2), 3.8 - 0.03 * (i // 60 % 2))
+    theta = learned.record[0]["learning"]["theta"].copy()
+    assert theta.any()
+    CheckpointFile(tmp_path, settings, CELL).save(learned.record, restarts=0)
+    again = await ran(tmp_path, settings, samples=1)
+    assert (again.estimator.record[0]["learning"]["theta"] == theta).all()
+    assert again.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
+    other = await ran(tmp_path, edited("observer", law="learning", lock_time_s=20.0), samples=1)
+    assert not other.estimator.record[0]["learning"]["theta"].any()
+
+
+async def test_a_checkpoint_of_the_version_before_the_learning_law_is_taken_up(tmp_path: Path) -> None:
+    learned = a_used_pack()
+    file = CheckpointFile(tmp_path, SETTINGS, CELL)
+    file.save(learned.record, restarts=0)
+    with np.load(file.path) as saved:
+        before = {name: saved[name] for name in saved if not name.startswith("state.learning.")}
+    np.savez(file.path, **before)
+    run = await ran(tmp_path, edited("observer", law="learning"), samples=1)
+    assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
 
 async def test_an_edited_description_costs_nothing_that_was_learned(tmp_path: Path) -> None:

@@ -1,0 +1,221 @@
+"""What the learning law is worth, simulated: ``make learning``. The tables of docs/observer.md.
+
+The thesis's cell under steps of random height and length, a sample each second, bounds a quarter to four times the
+file's; the file is off by a factor 2 in R_s, R_ts, tau_ts, R_tl, tau_tl, each way: sixteen of the 32 combinations. The
+largest error of all five, and of R_s and both RC products alone, median over the starts.
+"""
+
+import itertools
+import types
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numba import njit
+from rich.console import Console
+from rich.table import Table
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels import cell as elements
+from bms_estimator.kernels import learning, sample_step
+from bms_estimator.kernels.observer import integral_of_exponential
+from bms_estimator.kernels.state import TRACE, Record
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import ObserverSettings
+from tests.estimator.random_steps import FIRST_SOC, RESOLUTION_V, TRUTH, errors, file_off_by, learner, random_steps
+
+STARTS = list(itertools.product((0.5, 2.0), repeat=5))[::2]
+HOURS = (0.5, 1.0, 3.0, 10.0)
+NOISES_V = (0.0, 1e-3, 5e-3)
+CONVERGING = [0, 2, 4]
+K_STILL_V = 9.0
+"""A dead zone that nothing gets out of [V]."""
+HIGH_OHM = 10.0
+Run = Callable[[Any, Any, Any, Any], int]
+
+
+def learned(
+    block: SampleBlock,
+    soc: float = FIRST_SOC,
+    run: Run = sample_step.run,
+    settings: Mapping[str, float] | None = None,
+    ohms: float = 1.0,
+) -> np.ndarray:
+    """Relative errors after each of ``HOURS`` from each start, of a cell of ``ohms`` times the resistances; shape (starts, hours, 5)."""
+    found = np.empty((len(STARTS), len(HOURS), 5))
+    trace = np.zeros(block.size, dtype=TRACE)
+    for n, factors in enumerate(STARTS):
+        r_s, r_ts, tau_ts, r_tl, tau_tl = factors
+        estimator = learner(file_off_by(ohms * r_s, ohms * r_ts, tau_ts, ohms * r_tl, tau_tl), soc)
+        before = 0
+        for name, value in (settings or {}).items():
+            estimator.settings_record["observer" if name == "dead_zone_v" else "learning"][name] = value
+        for h, hours in enumerate(HOURS):
+            until = int(3600 * hours)
+            run(estimator.record, estimator.settings_record, block[before:until], trace)
+            found[n, h], before = errors(estimator, factors), until
+    return found
+
+
+def percent(found: np.ndarray) -> list[str]:
+    """Median over the starts of the largest error of R_s and both products, and of all five [%], for each hour."""
+    converging = 100.0 * np.median(found[:, :, CONVERGING].max(axis=2), axis=0)
+    every = 100.0 * np.median(found.max(axis=2), axis=0)
+    return [f"{one:.1f} / {other:.1f}" for one, other in zip(converging, every, strict=True)]
+
+
+def printed(block: SampleBlock, **observer: float) -> tuple[str, str]:
+    """The printed law on the same data from a file off by 2: largest error of R_s and both products; e, RMS."""
+    found, e = [], []
+    for factors in STARTS:
+        estimator = of_printed_law(file_off_by(*factors), **observer)
+        e.append(estimator.run(block)["tracking_error_v"])
+        found.append(max(products(estimator)))
+    return f"{100.0 * np.median(found):.1f}", f"{1e3 * float(np.sqrt(np.mean(np.square(e)))):.2f}"
+
+
+def of_printed_law(file: CellModel, **observer: float) -> Estimator:
+    """Algorithm 1, N == 0 with ``gain_limit`` tiny."""
+    settings = ObserverSettings.model_validate(observer)
+    return Estimator(file, settings, identifier=None, initial_soc=FIRST_SOC, voltage_resolution_v=RESOLUTION_V)
+
+
+def products(estimator: Estimator) -> tuple[float, float, float]:
+    """Errors of R_s, R_ts C_ts and R_tl C_tl at SOC 0.5, relative."""
+    a, true = estimator.state[0]["a"], TRUTH.a
+    of = (
+        lambda p: elements.r_s(0.5, p),
+        lambda p: elements.r_ts(0.5, p) * elements.c_ts(0.5, p),
+        lambda p: elements.r_tl(0.5, p) * elements.c_tl(0.5, p),
+    )
+    r_s, short, long = (abs(f(a) / f(true) - 1.0) for f in of)
+    return r_s, short, long
+
+
+def put_in(kernel: Any, **others: Any) -> Any:
+    """A kernel with other functions under the names of those that it calls, compiled anew."""
+    plain = kernel.py_func
+    return njit(types.FunctionType(plain.__code__, plain.__globals__ | others, plain.__name__))
+
+
+def run_with(**others: Any) -> Run:
+    """The kernels' ``run`` with other parts of the learning law."""
+    law = put_in(learning.learning_step, **others)
+    run: Run = put_in(sample_step.run, step=put_in(sample_step.step, learning_step=law))
+    return run
+
+
+@njit
+def step_alone(m: Record, q: Record, share: float) -> None:
+    """Theta moves; states and offset stay as the former theta made them."""
+    way = 0.0
+    for j in range(q.count):
+        way += m.step[j] * m.step[j]
+        m.theta[j] = min(max(m.theta[j] + share * m.step[j], q.lower[j]), q.upper[j])
+    learning.forget(m, q, share * way / (q.reach * q.reach))
+
+
+@njit
+def gradient(m: Record, q: Record) -> bool:
+    """The gradient on what is remembered, over its trace, in place of Newton's step."""
+    total = 0.0
+    for j in range(q.count):
+        total += m.information[j, j] + q.leak_v2s[j]
+    for j in range(q.count):
+        m.step[j] = m.pull[j] + q.leak_v2s[j] * (q.middle[j] - m.theta[j])
+        for i in range(q.count):
+            m.step[j] -= m.information[max(i, j), min(i, j)] * m.theta[i]
+        m.step[j] /= total
+    return True
+
+
+@njit
+def inject_as_printed(m: Record, q: Record, dt_s: float, e: float) -> None:
+    """u = -N e into both branches (3.2), (3.3) with N = N(0) = 1/s; the sensitivities know."""
+    share = 2.0 * integral_of_exponential(-2.0, dt_s)
+    for branch in range(2):
+        m.x[branch] -= 0.5 * share * e
+        for j in range(q.count):
+            m.dx[branch, j] += 0.5 * share * m.psi[j]
+
+
+PARTS: dict[str, dict[str, Any]] = {
+    "all": {},
+    "no memory: sensitivity times e, normalised": {"settings": {"memory_s": 1.0}},
+    "gradient on the memory, not Newton's step": {"others": {"find_step": gradient}},
+    "the states do not move with theta": {"others": {"take_step": step_alone}},
+    "memory does not fade as theta moves": {"settings": {"reach": 1e9}},
+    "no leakage": {"settings": {"leak_v2s": 1e-14}},
+    "no injection": {"settings": {"offset_s": 1e12}},
+    "injection u = -N e into both branches, N = 1/s": {"others": {"inject": inject_as_printed}},
+    "k = 1": {"settings": {"dead_zone_v": K_STILL_V}},
+}
+
+
+def ablation(blocks: Mapping[str, tuple[SampleBlock, float]]) -> Iterator[tuple[str, ...]]:
+    """A row for each part: without it, errors at 1 h and 10 h for each of the blocks."""
+    for name, changed in PARTS.items():
+        run = run_with(**changed["others"]) if "others" in changed else sample_step.run
+        cells = []
+        for block, soc in blocks.values():
+            at = percent(learned(block, soc, run, changed.get("settings")))
+            cells += [at[1], at[3]]
+        yield name, *cells
+
+
+def gains() -> Iterator[tuple[str, ...]]:
+    """What k is worth on a cell of ten times the resistances, whose errors are ten times as large."""
+    block = random_steps(3.0, 1e-3, cell=file_off_by(HIGH_OHM, HIGH_OHM, 1.0, HIGH_OHM, 1.0))
+    for period_s, still in itertools.product((60.0, 1000.0), (False, True)):
+        settings = {"rate": 1.0 / period_s} | ({"dead_zone_v": K_STILL_V} if still else {})
+        found = 100.0 * np.median(learned(block, settings=settings, ohms=HIGH_OHM)[:, :3, 0], axis=0)
+        yield f"1/{period_s:g} s", "1" if still else "as it grows", *(f"{one:.1f}" for one in found)
+
+
+def table(title: str, columns: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> None:
+    """Print as it is done."""
+    shown = Table(title=title)
+    for column in columns:
+        shown.add_column(column)
+    for row in rows:
+        shown.add_row(*row)
+    Console(width=150).print(shown)
+
+
+def main() -> None:
+    blocks = {noise_v: random_steps(10.0, noise_v) for noise_v in NOISES_V}
+    table(
+        "errors [%]: R_s and RC products / all five",
+        ("noise", *(f"{hours:g} h" for hours in HOURS)),
+        ((f"{1e3 * noise_v:g} mV", *percent(learned(block))) for noise_v, block in blocks.items()),
+    )
+    table(
+        "the printed law, 10 h",
+        ("noise", "N(k)", "R_s and RC products [%]", "e, RMS [mV]"),
+        (
+            (f"{1e3 * noise_v:g} mV", name, *printed(blocks[noise_v], **observer))
+            for noise_v in NOISES_V
+            for name, observer in (("as printed", {}), ("== 0", {"gain_limit": 1e-12}))
+        ),
+    )
+    table(
+        "without one part: errors [%] of R_s and RC products / all five",
+        ("", "1 mV, 1 h", "10 h", "5 mV, 1 h", "10 h", "SOC 0.05 too low, 1 h", "10 h"),
+        ablation(
+            {
+                "1 mV": (blocks[1e-3], FIRST_SOC),
+                "5 mV": (blocks[5e-3], FIRST_SOC),
+                "SOC": (blocks[1e-3], FIRST_SOC - 0.05),
+            }
+        ),
+    )
+    table(
+        "what k is worth: error of R_s [%], ten times the resistances, 1 mV",
+        ("gamma", "k", *(f"{hours:g} h" for hours in HOURS[:3])),
+        gains(),
+    )
+
+
+if __name__ == "__main__":
+    main()
