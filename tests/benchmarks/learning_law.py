@@ -23,7 +23,18 @@ from bms_estimator.kernels.state import TRACE, Record
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import ObserverSettings
-from tests.estimator.random_steps import FIRST_SOC, RESOLUTION_V, TRUTH, errors, file_off_by, learner, random_steps
+from tests.estimator.random_steps import (
+    FIRST_SOC,
+    RATED_A,
+    RESOLUTION_V,
+    TRUTH,
+    errors,
+    file_off_by,
+    held_currents,
+    learner,
+    measured,
+    random_steps,
+)
 
 STARTS = list(itertools.product((0.5, 2.0), repeat=5))[::2]
 HOURS = (0.5, 1.0, 3.0, 10.0)
@@ -173,6 +184,55 @@ def gains() -> Iterator[tuple[str, ...]]:
         yield f"1/{period_s:g} s", "1" if still else "as it grows", *(f"{one:.1f}" for one in found)
 
 
+def guarantees() -> Iterator[tuple[str, str]]:
+    """A row for each promise of docs/observer.md that is not one of convergence."""
+    noisy = learner(TRUTH)
+    q, theta = noisy.settings_record[0]["learning"], noisy.record[0]["learning"]["theta"]
+    inside, estimate_v = True, []
+    for part in np.array_split(random_steps(3.0, 0.2), 100):
+        estimate_v += list(noisy.run(part)["voltage_estimate_v"])
+        inside &= bool((q["lower"] <= theta).all() and (theta <= q["upper"]).all())
+    yield (
+        "200 mV of noise, 3 h: theta within its bounds; y^ [V]",
+        f"{inside}; {min(estimate_v):.2f}..{max(estimate_v):.2f}",
+    )
+    still = learner(TRUTH)
+    still.run(random_steps(2.0, 0.1 * RESOLUTION_V))
+    yield "noise within the dead zone, 2 h: k", f"{still.state['k'][0]:g}"
+    beyond = learner(file_off_by(8.0, 1.0, 1.0, 1.0, 1.0))
+    beyond.run(random_steps(3.0, 1e-3))
+    yield "file's R_s eight times the true, bounds from a quarter: R_s over the file's", f"{ratio_of_r_s(beyond):.3f}"
+    factors = (2.0, 0.5, 1.0, 2.0, 0.5)
+    constant = learner(file_off_by(*factors))
+    constant.run(measured(np.full(4 * 7200, 0.1 * RATED_A), 1e-3, np.random.default_rng(1)))
+    yield "4 h of constant current: errors [%]", " ".join(f"{100.0 * e:.0f}" for e in errors(constant, factors))
+    for minutes, error in jump():
+        yield f"R_s jumps to 1.5 times after 3 h: its error {minutes} min later [%]", f"{100.0 * error:.1f}"
+
+
+def ratio_of_r_s(estimator: Estimator) -> float:
+    """R_s as learned over the file's."""
+    return float(np.exp(estimator.record[0]["learning"]["theta"][0]))
+
+
+def jump() -> Iterator[tuple[int, float]]:
+    """Minutes after R_s has jumped to 1.5 times, and its error then."""
+    grown = 1.5
+    current_a = held_currents(6.0, np.random.default_rng(2))
+    block, after = (
+        measured(current_a, 1e-3, np.random.default_rng(3), cell) for cell in (TRUTH, file_off_by(grown, 1, 1, 1, 1))
+    )
+    at = 3 * 3600
+    block["voltage_v"][at:] = after["voltage_v"][at:]
+    estimator = learner(TRUTH)
+    estimator.run(block[:at])
+    for minutes in (10, 30, 60):
+        until = 3 * 3600 + 60 * minutes
+        estimator.run(block[at:until])
+        at = until
+        yield minutes, abs(ratio_of_r_s(estimator) / grown - 1.0)
+
+
 def table(title: str, columns: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> None:
     """Print as it is done."""
     shown = Table(title=title)
@@ -215,6 +275,7 @@ def main() -> None:
         ("gamma", "k", *(f"{hours:g} h" for hours in HOURS[:3])),
         gains(),
     )
+    table("what holds under any load", ("", "measured"), guarantees())
 
 
 if __name__ == "__main__":
