@@ -1,8 +1,9 @@
 """What the learning law is worth, simulated: ``make learning``. The tables of docs/observer.md.
 
 The thesis's cell under steps of random height and length, a sample each second, bounds a quarter to four times the
-file's; the file is off by a factor 2 in R_s, R_ts, tau_ts, R_tl, tau_tl, each way: sixteen of the 32 combinations. The
-largest error of all five, and of R_s and both RC products alone, median over the starts.
+file's; the file is off by a factor 2 in R_s, R_ts, tau_ts, R_tl, tau_tl: sixteen of the 32 combinations, in which every
+pair is off in each of its four ways equally often. Median over the starts of the largest error, of R_s and both RC
+products and of all five.
 """
 
 import itertools
@@ -36,7 +37,7 @@ from tests.estimator.random_steps import (
     random_steps,
 )
 
-STARTS = list(itertools.product((0.5, 2.0), repeat=5))[::2]
+STARTS = [factors for factors in itertools.product((0.5, 2.0), repeat=5) if factors.count(2.0) % 2 == 0]
 HOURS = (0.5, 1.0, 3.0, 10.0)
 NOISES_V = (0.0, 1e-3, 5e-3)
 CONVERGING = [0, 2, 4]
@@ -76,19 +77,23 @@ def percent(found: np.ndarray) -> list[str]:
     return [f"{one:.1f} / {other:.1f}" for one, other in zip(converging, every, strict=True)]
 
 
-def printed(block: SampleBlock, **observer: float) -> tuple[str, str]:
-    """The printed law on the same data from a file off by 2: largest error of R_s and both products; e, RMS."""
+def printed(block: SampleBlock, *, gain: float | None) -> tuple[str, str]:
+    """The printed law on the same data: largest error of R_s and both products [%]; e, RMS [mV]."""
     found, e = [], []
     for factors in STARTS:
-        estimator = of_printed_law(file_off_by(*factors), **observer)
-        e.append(estimator.run(block)["tracking_error_v"])
+        estimator = of_printed_law(file_off_by(*factors))
+        estimator.run(block[:1])
+        if gain is not None:
+            estimator.state["gain"] = gain
+            estimator.settings["dead_zone_v"] = K_STILL_V
+        e.append(estimator.run(block[1:])["tracking_error_v"])
         found.append(max(products(estimator)))
     return f"{100.0 * np.median(found):.1f}", f"{1e3 * float(np.sqrt(np.mean(np.square(e)))):.2f}"
 
 
-def of_printed_law(file: CellModel, **observer: float) -> Estimator:
-    """Algorithm 1, N == 0 with ``gain_limit`` tiny."""
-    settings = ObserverSettings.model_validate(observer)
+def of_printed_law(file: CellModel) -> Estimator:
+    """Algorithm 1; its gain does not start again and lock is not watched, so that N stays as it is."""
+    settings = ObserverSettings(rearm_gain=None, lock_error_v=100.0)
     return Estimator(file, settings, identifier=None, initial_soc=FIRST_SOC, voltage_resolution_v=RESOLUTION_V)
 
 
@@ -254,9 +259,9 @@ def main() -> None:
         "the printed law, 10 h",
         ("noise", "N(k)", "R_s and RC products [%]", "e, RMS [mV]"),
         (
-            (f"{1e3 * noise_v:g} mV", name, *printed(blocks[noise_v], **observer))
+            (f"{1e3 * noise_v:g} mV", name, *printed(blocks[noise_v], gain=gain))
             for noise_v in NOISES_V
-            for name, observer in (("as printed", {}), ("== 0", {"gain_limit": 1e-12}))
+            for name, gain in (("as printed", None), ("== 0", 0.0))
         ),
     )
     table(
