@@ -157,12 +157,11 @@ def rls_arx(current_a: Floats, overpotential_v: Floats, forgetting: float) -> Fl
         forgetting: Factor per sample, below 1.
 
     Returns:
-        Mean coefficients over the last half, shape (5,).
+        Coefficients after each sample, shape (n, 5).
     """
     theta = np.zeros(5)
     p = np.eye(5) * 1e3
-    total = np.zeros(5)
-    half = len(current_a) // 2
+    history = np.zeros((len(current_a), 5))
     for k in range(2, len(current_a)):
         phi = np.array(
             [overpotential_v[k - 1], overpotential_v[k - 2], current_a[k], current_a[k - 1], current_a[k - 2]]
@@ -174,9 +173,8 @@ def rls_arx(current_a: Floats, overpotential_v: Floats, forgetting: float) -> Fl
         trace = np.trace(p)
         if trace > 1e6:  # wind-up while nothing excites
             p *= 1e6 / trace
-        if k >= half:
-            total += theta
-    return total / (len(current_a) - half)
+        history[k] = theta
+    return history
 
 
 def simulate_arx(coefficients: NDArray[np.float64], current_a: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,30 +11,32 @@ from bms_estimator.model.sample import SampleBlock
 
 LOWEST_SOC = 0.1
 FULL = 1.0 - 1e-6  # at 1 the simulation ends before it begins
-BOUNDS = {
-    "R0 [Ohm]": (0.01, 0.4),
-    "R1 [Ohm]": (0.002, 0.2),
-    "R2 [Ohm]": (0.002, 0.2),
-    "C1 [F]": (100.0, 20_000.0),
-    "C2 [F]": (2000.0, 200_000.0),
-}
+SPAN = 4.0
+"""Bounds are a quarter and four times the start, as those of the observer's parameters."""
 
 
-def fit(cell: CellModel, samples: SampleBlock) -> tuple[float, float, float, float, float]:
-    """R_s, R_1 [ohm], C_1 [F], R_2 [ohm], C_2 [F] of least squares on a capture that begins full and rested.
+def fit(
+    cell: CellModel, samples: SampleBlock, initial_soc: float, start: dict[str, float]
+) -> tuple[float, float, float, float, float]:
+    """R_s, R_1 [ohm], C_1 [F], R_2 [ohm], C_2 [F] of least squares on a capture that begins rested.
 
     SOC below 0.1 is left out: constant elements know nothing of it.
+
+    Args:
+        cell: Capacity, limits and OCV.
+        samples: Of the capture.
+        initial_soc: At its first sample.
+        start: Elements by their names at PyBOP.
     """
-    soc = soc_by_counting(samples, cell.cell.capacity_ah, 1.0)
+    soc = soc_by_counting(samples, cell.cell.capacity_ah, initial_soc)
     samples = samples[soc > LOWEST_SOC]
     ocv_v = ocv_grid(cell)[0]
     grid = np.linspace(0.0, 1.0, ocv_v.size)
     model = pybamm.equivalent_circuit.Thevenin(options={"number of rc elements": 2})
     values = model.default_parameter_values.copy()
-    middle = {name: float(np.sqrt(low * high)) for name, (low, high) in BOUNDS.items()}
     values.update(
         {
-            "Initial SoC": FULL,
+            "Initial SoC": min(initial_soc, FULL),
             "Cell capacity [A.h]": cell.cell.capacity_ah,
             "Nominal cell capacity [A.h]": cell.cell.capacity_ah,
             "Upper voltage cut-off [V]": cell.cell.voltage_max_v + 1.0,
@@ -46,9 +48,9 @@ def fit(cell: CellModel, samples: SampleBlock) -> tuple[float, float, float, flo
         }
         | {
             name: pybop.Parameter(
-                initial_value=middle[name], bounds=list(limits), transformation=pybop.LogTransformation()
+                initial_value=value, bounds=[value / SPAN, SPAN * value], transformation=pybop.LogTransformation()
             )
-            for name, limits in BOUNDS.items()
+            for name, value in start.items()
         },
         check_already_exists=False,
     )
@@ -64,4 +66,4 @@ def fit(cell: CellModel, samples: SampleBlock) -> tuple[float, float, float, flo
     )
     result = pybop.CMAES(problem, options=pybop.PintsOptions(max_iterations=100)).run()
     best = result.best_inputs
-    return tuple(float(best[name]) for name in ("R0 [Ohm]", "R1 [Ohm]", "C1 [F]", "R2 [Ohm]", "C2 [F]"))
+    return tuple(float(best[name]) for name in ("R0 [Ohm]", "R1 [Ohm]", "C1 [F]", "R2 [Ohm]", "C2 [F]"))  # type: ignore[return-value]

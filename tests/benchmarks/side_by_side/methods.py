@@ -1,0 +1,309 @@
+"""The methods, each behind the same few questions: learn from a capture, then say what was learned.
+
+``learn`` takes blocks of samples in turn, each told its SOC at the first sample. What comes back says a voltage open loop,
+the elements at an SOC, the SOC of a capture entered at a wrong one, and R_s over time; None is what a method does not do.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.prediction import open_circuit, predict
+from bms_estimator.calibration.relaxation import soc_by_counting
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.learned import fitted_parameter
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from tests.benchmarks.baselines import fixed_ekf, rls_arx, simulate_arx
+
+Floats = NDArray[np.float64]
+Reader = Callable[[Estimator, CellModel], Floats]
+
+LOWEST_SOC = 0.1
+MOST_MV = 1e4
+"""A model that is off by more has run away."""
+WHOLE = 0.9
+"""A prediction that ends before this part of the capture, since a learned capacitance is negative there, is none."""
+TRACED_S = 30.0
+"""How often R_s is read from the observer's parameters."""
+RLS_EVERY_S, RLS_FORGETTING = 1.0, 0.9995
+
+
+class Learned(Protocol):
+    """What a method has learned."""
+
+    def voltage_rms_mv(self, samples: SampleBlock, initial_soc: float) -> float | None:
+        """Open loop along a capture from rest, SOC above ``LOWEST_SOC`` [mV]."""
+
+    def elements(self, soc: Floats) -> Floats:
+        """R_s [ohm] and both RC products [s] at each SOC, shape (3, n)."""
+
+    def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
+        """At each sample of a capture entered with ``start_soc``."""
+
+    def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
+        """Times [s] and R_s [ohm] while it goes on learning from a capture."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method by its name in the tables.
+
+    Attributes:
+        name: Of the method.
+        learn: From the cell of the start, the samples and the SOC at the first of them.
+        run: What a step costs is measured with: a call that takes all samples; None: it does not step.
+    """
+
+    name: str
+    learn: Callable[[CellModel, SampleBlock, float], Learned]
+    run: Callable[[CellModel, SampleBlock], Callable[[], object]] | None
+
+
+class Elements:
+    """a1..a15 that stay as they are; no SOC."""
+
+    def __init__(self, cell: CellModel, a: Floats) -> None:
+        self.cell, self.a = cell, a
+
+    def voltage_rms_mv(self, samples: SampleBlock, initial_soc: float) -> float | None:
+        """As ``Learned``."""
+        counted = soc_by_counting(samples, self.cell.cell.capacity_ah, initial_soc)
+        judged = np.flatnonzero(counted < LOWEST_SOC)
+        whole = judged[0] if judged.size else counted.size
+        try:
+            error_v = predict(self.cell, samples, initial_soc, a=self.a, lowest_soc=LOWEST_SOC).error_v
+        except UserError:
+            return None
+        return 1e3 * _rms(error_v) if error_v.size >= WHOLE * whole else None
+
+    def elements(self, soc: Floats) -> Floats:
+        """As ``Learned``."""
+        return np.array([elements_at(x, self.a) for x in soc]).reshape(-1, 3).T
+
+    def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
+        """None."""
+        del samples, start_soc
+        return None
+
+    def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
+        """None."""
+        del samples, initial_soc
+        return None
+
+
+class FixedEkf(Elements):
+    """The textbook filter with these elements at mid SOC."""
+
+    def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
+        """As ``Learned``."""
+        return fixed_ekf(*_columns(samples), start_soc, textbook(self.cell), np.array(ocv_grid(self.cell)))[0]
+
+
+class Observed(Elements):
+    """The estimator after it learned, to go on from there as often as one likes."""
+
+    def __init__(self, cell: CellModel, estimator: Estimator, read: Reader, *, filtered: bool) -> None:
+        super().__init__(cell, read(estimator, cell))
+        self._estimator, self._read, self._filtered = estimator, read, filtered
+        self._saved = estimator.record.copy()
+
+    def _entered(self, soc: float) -> Estimator:
+        self._estimator.record[:] = self._saved
+        self._estimator.set_soc(soc)
+        self._estimator.resume(np.inf)
+        return self._estimator
+
+    def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
+        """As ``Learned``."""
+        trace = self._entered(start_soc).run(samples)
+        return np.interp(samples["time_s"], trace["time_s"], trace["soc"])
+
+    def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
+        """As ``Learned``; the identifier's own where it is at work and read."""
+        estimator = self._entered(initial_soc)
+        if self._filtered:
+            trace = estimator.run(samples)
+            return trace["time_s"].copy(), trace["r_s_ohm"].copy()
+        time_s = samples["time_s"]
+        cuts = np.searchsorted(time_s, np.arange(time_s[0], time_s[-1], TRACED_S)[1:])
+        said = []
+        for piece in np.split(samples, np.unique(cuts)):
+            estimator.run(piece)
+            state = estimator.state[0]
+            said.append((piece["time_s"][-1], chen_mora.r_s(float(state["soc"]), state["a"])))
+        return tuple(np.array(said).T)  # type: ignore[return-value]
+
+
+class Arx:
+    """Coefficients of a 2RC model, the mean over the last half of a capture; SOC through the inverted OCV (7.1), smoothed over a minute."""
+
+    def __init__(self, cell: CellModel, history: Floats) -> None:
+        self.cell, self.coefficients = cell, history[len(history) // 2 :].mean(axis=0)
+
+    def voltage_rms_mv(self, samples: SampleBlock, initial_soc: float) -> float | None:
+        """As ``Learned``."""
+        current_a, over_v, soc = overpotential(self.cell, samples, initial_soc)
+        predicted_v = simulate_arx(self.coefficients, current_a)
+        below = np.flatnonzero(soc < LOWEST_SOC)
+        rms_mv = 1e3 * _rms((over_v - predicted_v)[: below[0] if below.size else soc.size])
+        return rms_mv if rms_mv < MOST_MV else None
+
+    def elements(self, soc: Floats) -> Floats:
+        """As ``Learned``: the same at each SOC."""
+        c1, c2, c3 = self.coefficients[:3]
+        poles = np.sort(np.roots([1.0, -c1, -c2]))
+        real = np.isreal(poles).all() and (np.real(poles) > 0.0).all() and (np.real(poles) < 1.0).all()
+        taus = -RLS_EVERY_S / np.log(np.real(poles)) if real else np.full(2, np.nan)
+        return np.tile(np.array([c3, *taus])[:, None], soc.size)
+
+    def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
+        """As ``Learned``; it starts at rest, where none is."""
+        current_a, over_v, soc = overpotential(self.cell, samples, start_soc)
+        open_v = open_circuit(self.cell, soc) - over_v + simulate_arx(self.coefficients, current_a)
+        grid = ocv_grid(self.cell)
+        raw = np.array([chen_mora.soc_from_ocv(v, *grid) for v in open_v])
+        smooth = np.convolve(raw, np.ones(60) / 60.0, "same")
+        return np.interp(samples["time_s"], evenly(samples), smooth)
+
+    def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
+        """As ``Learned``, from the first sample anew."""
+        current_a, over_v, _ = overpotential(self.cell, samples, initial_soc)
+        return evenly(samples), rls_arx(current_a, over_v, RLS_FORGETTING)[:, 2]
+
+
+def observer(name: str, settings: ObserverSettings, identifier: IdentifierSettings | None, read: Reader) -> Method:
+    """The estimator with these settings, its parameters as ``read``."""
+
+    def learn(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
+        estimator = Estimator(cell, settings, identifier=identifier, initial_soc=initial_soc)
+        estimator.run(samples)
+        return Observed(cell, estimator, read, filtered=read is by_identifier)
+
+    def run(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:
+        estimator = Estimator(cell, settings, identifier=identifier, initial_soc=1.0)
+
+        def again() -> object:
+            estimator.state["started"] = 0
+            return estimator.run(samples)
+
+        return again
+
+    return Method(name, learn, run)
+
+
+def by_observer(estimator: Estimator, cell: CellModel) -> Floats:
+    """a1..a15 of the observer."""
+    del cell
+    return np.array(estimator.state[0]["a"])
+
+
+def by_identifier(estimator: Estimator, cell: CellModel) -> Floats:
+    """a1..a15 of the identifier's fit to its map, of the start where there is none."""
+    a = cell.a[:16].copy()
+    for i in range(1, 16):
+        learned = fitted_parameter(estimator.record[0], i)
+        a[i] = learned.value if learned else a[i]
+    return a
+
+
+def learn_nothing(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
+    """The filter that is as it was given."""
+    del samples, initial_soc
+    return FixedEkf(cell, cell.a[:16])
+
+
+def run_ekf(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:
+    """The filter over all samples."""
+    columns, model, grid = _columns(samples), textbook(cell), np.array(ocv_grid(cell))
+    return lambda: fixed_ekf(*columns, 1.0, model, grid)
+
+
+def learn_arx(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
+    """Recursive least squares; its start is 0, whatever the cell file says."""
+    current_a, over_v, _ = overpotential(cell, samples, initial_soc)
+    return Arx(cell, rls_arx(current_a, over_v, RLS_FORGETTING))
+
+
+def run_arx(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:
+    """The recursion over all samples; as many as there are, though it takes one a second."""
+    current_a = samples["current_a"].astype(np.float64)
+    over_v = open_circuit(cell, np.full(current_a.size, 0.5)) - samples["voltage_v"]
+    return lambda: rls_arx(current_a, over_v, RLS_FORGETTING)
+
+
+def fit_offline(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
+    """PyBOP's fit of constant elements."""
+    from tests.benchmarks.pybop_fit import fit  # noqa: PLC0415 - an optional, heavy package
+
+    _, r_s, r1, tau1, r2, tau2 = textbook(cell).tolist()
+    start = {"R0 [Ohm]": r_s, "R1 [Ohm]": r1, "C1 [F]": tau1 / r1, "R2 [Ohm]": r2, "C2 [F]": tau2 / r2}
+    return constant(cell, *fit(cell, samples, initial_soc, start))
+
+
+def constant(cell: CellModel, r_s: float, r1: float, c1: float, r2: float, c2: float) -> Elements:
+    """Elements that are the same at any SOC."""
+    tiny = 1e-30
+    return Elements(
+        cell, np.array([np.nan, tiny, 1.0, r1, tiny, 1.0, r2, tiny, 1.0, c1, tiny, 1.0, c2, tiny, 1.0, r_s])
+    )
+
+
+PRINTED, LEARNING, ON = ObserverSettings(), ObserverSettings(law="learning"), IdentifierSettings()
+FILE = Method("the file, EKF", learn_nothing, run_ekf)
+"""What the start was before it was made wrong, for comparison."""
+METHODS = (
+    observer("UAS printed", PRINTED, None, by_observer),
+    observer("UAS, bounds identified", PRINTED, ON, by_observer),
+    observer("UAS learning", LEARNING, None, by_observer),
+    observer("UAS learning + filter", LEARNING, ON, by_observer),
+    observer("identifier", PRINTED, ON, by_identifier),
+    Method("EKF, fixed", learn_nothing, run_ekf),
+    Method("RLS", learn_arx, run_arx),
+    *((Method("PyBOP", fit_offline, None),) if find_spec("pybop") else ()),
+)
+
+
+def elements_at(soc: float, a: Floats) -> tuple[float, float, float]:
+    """R_s [ohm] and both RC products [s]; NaN where a capacitance is negative."""
+    taus = [r(soc, a) * c(soc, a) for r, c in ((chen_mora.r_ts, chen_mora.c_ts), (chen_mora.r_tl, chen_mora.c_tl))]
+    return chen_mora.r_s(soc, a), *(tau if tau > 0.0 else np.nan for tau in taus)
+
+
+def textbook(cell: CellModel) -> Floats:
+    """Capacity [A s] and elements at SOC 0.5 as ``fixed_ekf`` takes them."""
+    r_s, tau1, tau2 = elements_at(0.5, cell.a)
+    r1, r2 = chen_mora.r_ts(0.5, cell.a), chen_mora.r_tl(0.5, cell.a)
+    return np.array([3600.0 * cell.cell.capacity_ah, r_s, r1, tau1, r2, tau2])
+
+
+def evenly(samples: SampleBlock) -> Floats:
+    """A time axis of even steps [s]."""
+    return np.arange(samples["time_s"][0], samples["time_s"][-1], RLS_EVERY_S)
+
+
+def overpotential(cell: CellModel, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats, Floats]:
+    """Current [A], E_o less terminal voltage [V] and SOC by counting, evenly in time."""
+    time_s = evenly(samples)
+    held = np.searchsorted(samples["time_s"], time_s, side="right") - 1
+    current_a = samples["current_a"][held].astype(np.float64)
+    charge_as = np.concatenate([[0.0], np.cumsum(current_a[:-1]) * RLS_EVERY_S])
+    soc = initial_soc - charge_as / (3600.0 * cell.cell.capacity_ah)
+    voltage_v = np.interp(time_s, samples["time_s"], samples["voltage_v"])
+    return current_a, open_circuit(cell, soc) - voltage_v, soc
+
+
+def _columns(samples: SampleBlock) -> list[Floats]:
+    return [np.ascontiguousarray(samples[name]) for name in ("time_s", "current_a", "voltage_v")]
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))

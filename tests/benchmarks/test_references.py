@@ -1,0 +1,83 @@
+"""What the comparison of methods is judged by, on a cell whose elements are known."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.kernels.cell import simulate_cell
+from bms_estimator.model.sample import SAMPLE
+from tests.benchmarks.side_by_side.references import (
+    pulse_resistance,
+    relaxations,
+    settled_after,
+    two_exponentials,
+    with_jump,
+)
+from tests.benchmarks.side_by_side.trials import Block
+
+CAPACITY_AH = 3.0
+R_S, R_TS, TAU_TS, R_TL, TAU_TL = 0.08, 0.02, 20.0, 0.03, 300.0
+
+
+def relaxation_test(rest_s: int = 900, resolution_v: float = 1e-3) -> Block:
+    """C/2 for six minutes, then a rest, seventeen times, at 1 Hz, as a converter of ``resolution_v`` sees it."""
+    a = np.zeros(22)
+    a[[3, 6, 9, 12, 15]] = R_TS, R_TL, TAU_TS / R_TS, TAU_TL / R_TL, R_S
+    a[[16, 17, 18, 19]] = 0.5, 20.0, 3.4, 0.7
+    current_a = np.tile(np.r_[np.full(360, 1.5), np.zeros(rest_s)], 17)
+    time_s = np.arange(float(current_a.size))
+    voltage_v, soc = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, 3600.0 * CAPACITY_AH, a)
+    samples = np.zeros(time_s.size, dtype=SAMPLE)
+    noise_v = 0.5 * resolution_v * np.random.default_rng(1).standard_normal(time_s.size)
+    samples["time_s"], samples["current_a"] = time_s, current_a
+    samples["voltage_v"] = np.round((voltage_v + noise_v) / resolution_v) * resolution_v
+    return Block(samples, soc)
+
+
+def test_rests_show_both_rc_products_within_five_percent():
+    found = relaxations(relaxation_test(), CAPACITY_AH)
+    assert found.soc.size >= 15
+    assert np.median(found.tau_ts_s) == pytest.approx(TAU_TS, rel=0.05)
+    assert np.median(found.tau_tl_s) == pytest.approx(TAU_TL, rel=0.05)
+
+
+def test_without_noise_each_rest_shows_them_within_one_percent():
+    found = relaxations(relaxation_test(resolution_v=1e-7), CAPACITY_AH)
+    assert found.soc.size == 17
+    assert found.tau_ts_s == pytest.approx(TAU_TS, rel=0.01)
+    assert found.tau_tl_s == pytest.approx(TAU_TL, rel=0.01)
+
+
+def test_a_short_rest_and_one_exponential_show_nothing():
+    assert relaxations(relaxation_test(rest_s=500), CAPACITY_AH).soc.size == 0
+    time_s = np.arange(1.0, 900.0)
+    assert two_exponentials(time_s, 3.7 - 0.02 * np.exp(-time_s / 100.0)) is None
+
+
+def test_pulses_show_the_series_resistance_within_two_percent():
+    found = pulse_resistance(relaxation_test(), CAPACITY_AH)
+    assert found.ohm.size >= 30
+    ohmic = R_S + R_TS * (1.0 - np.exp(-1.0 / TAU_TS)) + R_TL * (1.0 - np.exp(-1.0 / TAU_TL))  # at 1 Hz
+    assert np.median(found.ohm) == pytest.approx(ohmic, rel=0.02)
+
+
+def test_a_jump_shows_in_the_pulses_from_half_way_on():
+    block = relaxation_test()
+    jumped, jump_s = with_jump(block, 0.04)
+    before, after = (pulse_resistance(b, CAPACITY_AH) for b in (block, jumped))
+    late = before.time_s > jump_s + 6000.0  # a median of nine pulses is past the jump
+    assert late.sum() >= 5
+    assert (after.ohm - before.ohm)[late] == pytest.approx(0.04, rel=0.05)
+    early = before.time_s < jump_s - 6000.0
+    assert early.sum() >= 5
+    assert np.array_equal(after.ohm[early], before.ohm[early])
+
+
+def test_settled_is_what_stays():
+    time_s = np.arange(0.0, 4000.0, 10.0)
+    ratio = np.where(time_s < 1000.0, 1.0, 1.0 - 0.5 * np.exp(-(time_s - 1000.0) / 200.0))
+    settled_s = settled_after(time_s, ratio, 1000.0)
+    assert settled_s == pytest.approx(200.0 * np.log(5.0), abs=10.0)
+    ratio[250] = 2.0  # at 2500 s it leaves again, long after it settled
+    assert settled_after(time_s, ratio, 1000.0) == settled_s
+    assert settled_after(time_s, np.where(time_s < 1000.0, 1.0, 0.5), 1000.0) == np.inf
+    assert settled_after(time_s, np.where(time_s < 1000.0, 2.0, 1.0), 1000.0) is None
