@@ -41,10 +41,10 @@ demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)
 
-compare: ## methods side by side on real captures, PyBOP among them: minutes
+compare: ## methods side by side on all real captures, PyBOP among them, e.g. make compare ARGS="NCR Leaf": minutes
 	@[ -x $(COMPARE)/bin/python ] || $(PYTHON) -m venv $(COMPARE)
 	@$(COMPARE)/bin/pip install --quiet --disable-pip-version-check -e . pybop==26.3
-	@$(COMPARE)/bin/python tests/benchmarks/side_by_side.py
+	@$(COMPARE)/bin/python -m tests.benchmarks.side_by_side $(ARGS)
 	@$(COMPARE)/bin/python -m tests.benchmarks.anywhere
 
 anywhere: venv ## the SOC when switched on anywhere, on real captures, e.g. make anywhere ARGS=PF: minutes

@@ -1,7 +1,7 @@
 """R_s beside what pulses of the same captures show.
 
 A pulse is a step of the current by more than C/5 that is held before and behind it; it shows the jump of the voltage over
-that of the current, over two rows where there are more than two a second: logged current and voltage may be one row apart.
+that of the current, over two rows where there are more than two a second behind it: logged current and voltage may be one row apart.
 Nine pulses around are taken together (median), since one alone is off by up to 16 %. Judged from 15 min on.
 """
 
@@ -67,12 +67,12 @@ def pulses(samples: SampleBlock, capacity_ah: float) -> tuple[NDArray[np.intp], 
     """Row before each pulse, and what it shows [ohm]."""
     time_s, current_a, voltage_v = (samples[n] for n in ("time_s", "current_a", "voltage_v"))
     change_a, step_s = np.diff(current_a), np.diff(time_s)
-    over = 1 if np.median(step_s) > SLOW_S else 2
     inner = np.arange(1, change_a.size - 2)
     most_a = HELD_SHARE * np.abs(change_a[inner])
     held = (np.abs(change_a[inner - 1]) < most_a) & (np.abs(change_a[inner + 1]) < most_a)
     large = np.abs(change_a[inner]) > LEAST_C * capacity_ah
     soon = (step_s[inner] > 0.0) & (step_s[inner] < LONGEST_S) & (time_s[inner] > time_s[0] + AFTER_S)
     rows = inner[held & large & soon]
+    over = np.where(step_s[rows + 1] > SLOW_S, 1, 2)
     ohm = -(voltage_v[rows + over] - voltage_v[rows]) / (current_a[rows + over] - current_a[rows])
     return rows, ohm

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import IN_MID_LOAD, cell_file, charge_ah
-from tests.benchmarks.side_by_side.methods import FILE, METHODS, Learned, Method
+from tests.benchmarks.side_by_side.methods import FILE, LOWEST_SOC, METHODS, Learned, Method
 from tests.benchmarks.side_by_side.references import (
     Pulses,
     Relaxations,
@@ -65,7 +65,7 @@ class Bench:
 
     def __init__(self, trial: Trial, folder: Path) -> None:
         self.trial, self.capacity_ah = trial, trial.recipe.capacity_ah
-        self.learn = block(trial.learn, self.capacity_ah)
+        self.learn = above(block(trial.learn, self.capacity_ah))
         self.held_back = {part.name: block(part, self.capacity_ah) for part in trial.held_back}
         self.first = next(iter(self.held_back.values()))
         self.right = at_temperature(cell_file(trial.recipe, folder), trial.temperature_c)
@@ -81,6 +81,8 @@ class Bench:
             name = self.trial.name
             begin = time.thread_time()
             learned = method.learn(cell, self.learn.samples, float(self.learn.soc[0]))
+            if learned is None:
+                return
             if method.run is None:
                 yield Figure(FIT, name, method.name, factor, time.thread_time() - begin)
             for capture, held in self.held_back.items():
@@ -89,9 +91,12 @@ class Bench:
                 yield Figure(VOLTAGE, row, method.name, factor, np.nan if rms_mv is None else rms_mv)
             for table, value in chain(self._elements(learned), self._tracking(learned)):
                 yield Figure(table, name, method.name, factor, value)
-            misled = method.learn(cell, self.learn.samples, float(self.learn.soc[0]) - LEARNED_AT)
-            rms_mv = misled.voltage_rms_mv(self.first.samples, float(self.first.soc[0]))
-            yield Figure(VOLTAGE_WRONG, name, method.name, factor, np.nan if rms_mv is None else rms_mv)
+            misled = (
+                method.learn(cell, self.learn.samples, float(self.learn.soc[0]) - LEARNED_AT) if method.run else None
+            )
+            if misled is not None:
+                rms_mv = misled.voltage_rms_mv(self.first.samples, float(self.first.soc[0]))
+                yield Figure(VOLTAGE_WRONG, name, method.name, factor, np.nan if rms_mv is None else rms_mv)
 
     def _elements(self, learned: Learned) -> Iterator[tuple[str, float]]:
         """By which factor the elements are off the references, as the median over these."""
@@ -143,6 +148,13 @@ def off_by(values: Floats, reference: Floats) -> float:
     with np.errstate(invalid="ignore", divide="ignore"):
         ln = np.abs(np.log(values / reference))
     return float(np.exp(np.median(np.where(np.isfinite(ln), ln, np.inf))))
+
+
+def above(whole: Block) -> Block:
+    """The capture until its SOC falls below ``LOWEST_SOC``: nothing is judged there, nor is it learned from."""
+    below = np.flatnonzero(whole.soc < LOWEST_SOC)
+    end = int(below[0]) if below.size else whole.soc.size
+    return Block(whole.samples[:end], whole.soc[:end])
 
 
 def in_mid_load(whole: Block) -> Block:

@@ -59,12 +59,12 @@ class Method:
 
     Attributes:
         name: Of the method.
-        learn: From the cell of the start, the samples and the SOC at the first of them.
-        run: What a step costs is measured with: a call that takes all samples; None: it does not step.
+        learn: From the cell of the start, the samples and the SOC at the first of them; None: it cannot.
+        run: What a step costs is measured with: a call that takes all samples; None: it is offline.
     """
 
     name: str
-    learn: Callable[[CellModel, SampleBlock, float], Learned]
+    learn: Callable[[CellModel, SampleBlock, float], Learned | None]
     run: Callable[[CellModel, SampleBlock], Callable[[], object]] | None
 
 
@@ -240,13 +240,14 @@ def run_arx(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:
     return lambda: rls_arx(current_a, over_v, RLS_FORGETTING)
 
 
-def fit_offline(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
-    """PyBOP's fit of constant elements."""
+def fit_offline(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned | None:
+    """PyBOP's fit of constant elements, where it is not too long."""
     from tests.benchmarks.pybop_fit import fit  # noqa: PLC0415 - an optional, heavy package
 
     _, r_s, r1, tau1, r2, tau2 = textbook(cell).tolist()
     start = {"R0 [Ohm]": r_s, "R1 [Ohm]": r1, "C1 [F]": tau1 / r1, "R2 [Ohm]": r2, "C2 [F]": tau2 / r2}
-    return constant(cell, *fit(cell, samples, initial_soc, start))
+    found = fit(cell, samples, initial_soc, start)
+    return constant(cell, *found) if found else None
 
 
 def constant(cell: CellModel, r_s: float, r1: float, c1: float, r2: float, c2: float) -> Elements:
