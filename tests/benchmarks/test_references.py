@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import simulate_cell
 from bms_estimator.model.sample import SAMPLE
@@ -14,18 +15,25 @@ from tests.benchmarks.side_by_side.references import (
 )
 from tests.benchmarks.side_by_side.trials import Block
 
+Floats = NDArray[np.float64]
+
 CAPACITY_AH = 3.0
 R_S, R_TS, TAU_TS, R_TL, TAU_TL = 0.08, 0.02, 20.0, 0.03, 300.0
 
 
-def relaxation_test(rest_s: int = 900, resolution_v: float = 1e-3) -> Block:
-    """C/2 for six minutes, then a rest, seventeen times, at 1 Hz, as a converter of ``resolution_v`` sees it."""
+def elements() -> Floats:
+    """a1..a21 of two branches that do not depend on SOC."""
     a = np.zeros(22)
     a[[3, 6, 9, 12, 15]] = R_TS, R_TL, TAU_TS / R_TS, TAU_TL / R_TL, R_S
     a[[16, 17, 18, 19]] = 0.5, 20.0, 3.4, 0.7
+    return a
+
+
+def relaxation_test(rest_s: int = 900, resolution_v: float = 1e-3) -> Block:
+    """C/2 for six minutes, then a rest, seventeen times, at 1 Hz, as a converter of ``resolution_v`` sees it."""
     current_a = np.tile(np.r_[np.full(360, 1.5), np.zeros(rest_s)], 17)
     time_s = np.arange(float(current_a.size))
-    voltage_v, soc = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, 3600.0 * CAPACITY_AH, a)
+    voltage_v, soc = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, 3600.0 * CAPACITY_AH, elements())
     samples = np.zeros(time_s.size, dtype=SAMPLE)
     noise_v = 0.5 * resolution_v * np.random.default_rng(1).standard_normal(time_s.size)
     samples["time_s"], samples["current_a"] = time_s, current_a
@@ -58,6 +66,22 @@ def test_pulses_show_the_series_resistance_within_two_percent():
     assert found.ohm.size >= 30
     ohmic = R_S + R_TS * (1.0 - np.exp(-1.0 / TAU_TS)) + R_TL * (1.0 - np.exp(-1.0 / TAU_TL))  # at 1 Hz
     assert np.median(found.ohm) == pytest.approx(ohmic, rel=0.02)
+
+
+def test_pulses_of_a_capture_at_one_and_ten_hertz_whose_voltage_is_a_row_late():
+    time_s, current_a = [], []
+    for n in range(12):  # as an HPPC is logged
+        rest_s, pulse_s = np.arange(0.0, 600.0), np.arange(600.0, 610.0, 0.1)
+        time_s.append(620.0 * n + np.r_[rest_s, pulse_s, pulse_s + 10.0])
+        current_a.append(np.r_[np.zeros(600), np.full(100, 3.0), np.zeros(100)])
+    time_s, current_a = np.concatenate(time_s), np.concatenate(current_a)
+    voltage_v, soc = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, 3600.0 * CAPACITY_AH, elements())
+    samples = np.zeros(time_s.size, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"] = time_s, current_a
+    samples["voltage_v"] = np.r_[voltage_v[0], voltage_v[:-1]]
+    found = pulse_resistance(Block(samples, soc), CAPACITY_AH)
+    assert found.ohm.size >= 20
+    assert found.ohm == pytest.approx(R_S, rel=0.02)
 
 
 def test_a_jump_shows_in_the_pulses_from_half_way_on():
