@@ -170,7 +170,7 @@ def step_costs(cell: CellModel, samples: SampleBlock, row: str) -> Iterator[Figu
     calls = {m.name: m.run(cell, rows) for m in METHODS if m.run is not None}
     for call in calls.values():
         call()
-    spent = {name: [] for name in calls}
+    spent: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
         for name, call in calls.items():
             begin = time.thread_time_ns()

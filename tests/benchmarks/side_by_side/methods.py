@@ -140,7 +140,8 @@ class Observed(Elements):
             estimator.run(piece)
             state = estimator.state[0]
             said.append((piece["time_s"][-1], chen_mora.r_s(float(state["soc"]), state["a"])))
-        return tuple(np.array(said).T)  # type: ignore[return-value]
+        times_s, ohm = np.array(said).T
+        return times_s, ohm
 
 
 class Arx:
@@ -275,8 +276,8 @@ METHODS = (
 
 def elements_at(soc: float, a: Floats) -> tuple[float, float, float]:
     """R_s [ohm] and both RC products [s]; NaN where a capacitance is negative."""
-    taus = [r(soc, a) * c(soc, a) for r, c in ((chen_mora.r_ts, chen_mora.c_ts), (chen_mora.r_tl, chen_mora.c_tl))]
-    return chen_mora.r_s(soc, a), *(tau if tau > 0.0 else np.nan for tau in taus)
+    tau_ts, tau_tl = chen_mora.r_ts(soc, a) * chen_mora.c_ts(soc, a), chen_mora.r_tl(soc, a) * chen_mora.c_tl(soc, a)
+    return chen_mora.r_s(soc, a), tau_ts if tau_ts > 0.0 else np.nan, tau_tl if tau_tl > 0.0 else np.nan
 
 
 def textbook(cell: CellModel) -> Floats:
