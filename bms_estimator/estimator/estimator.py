@@ -12,8 +12,8 @@ from bms_estimator.kernels.hypotheses import seed
 from bms_estimator.kernels.input_checks import keep
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 
@@ -33,7 +33,8 @@ class Estimator:
     ``run`` on a block and ``step`` on each of its samples leave the same state to the last bit.
 
     Args:
-        cell: The pack as one two-terminal object (``CellModel.pack``).
+        cell: The pack as one two-terminal object (``CellModel.pack``). A fuel cell has no SOC (NaN), and its parameters
+            are always learned, whatever the law that is set.
         observer: The adaptive observer's settings.
         identifier: The identifier's settings; None: off, the thesis's method alone.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
@@ -49,7 +50,7 @@ class Estimator:
 
     def __init__(
         self,
-        cell: CellModel,
+        cell: PackModel,
         observer: ObserverSettings | None = None,
         *,
         identifier: IdentifierSettings | None = IDENTIFIER,
@@ -110,8 +111,10 @@ class Estimator:
         """Take ``soc`` as the state of charge from now on, known to ``SET_SOC_STD``; after the first sample.
 
         Raises:
-            ValueError: It is outside 0..1.
+            ValueError: It is outside 0..1; or this is a fuel cell, which has none.
         """
+        if isinstance(self.cell, FuelCellModel):
+            raise ValueError("a fuel cell has no SOC")  # noqa: TRY004 - of the pack, not of the argument
         if not 0.0 <= soc <= 1.0:
             raise ValueError(f"SOC {soc} is outside 0..1")
         self.state["soc"] = self.state["soc_coulomb"] = soc
@@ -130,13 +133,14 @@ class Estimator:
             unseen_s: How long nobody measured [s]; infinite when nobody knows.
         """
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
-        self.record["filter"]["soc"] = self.state["soc"]
+        if self.identifying:
+            self.record["filter"]["soc"] = self.state["soc"]
         if math.isfinite(unseen_s):
             self.record["unlearned_s"] += unseen_s
 
 
 def estimate(
-    capture: Columns, cell: CellModel, *, initial_soc: float | None = None, voltage_resolution_v: float = 1e-3
+    capture: Columns, cell: PackModel, *, initial_soc: float | None = None, voltage_resolution_v: float = 1e-3
 ) -> Columns:
     """Estimate over a whole capture; with other settings: ``Columns(Estimator(cell, ...).run(capture.rows))``.
 

@@ -2,6 +2,7 @@
 
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 
 LARGEST_AH = 2000.0
@@ -14,13 +15,15 @@ CONVERTER_STEPS = 1024
 """Of the firmware's voltage converter: its range in steps."""
 
 
-def implausible(settings: Settings, cell: CellModel) -> list[str]:
+def implausible(settings: Settings, cell: PackModel) -> list[str]:
     """One line for each setting that cannot be, with what it may have been meant to be; empty where all may be.
 
     Args:
         settings: The pack's.
-        cell: The pack as one object (``CellModel.pack``).
+        cell: The pack as one object (``CellModel.pack``); of a fuel cell nothing is checked.
     """
+    if not isinstance(cell, CellModel):
+        return []
     checks = _capacity, _counted_twice, _cell_voltage, _single_row, _range
     return [line for line in (check(settings, cell) for check in checks) if line]
 

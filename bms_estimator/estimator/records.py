@@ -4,13 +4,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.filter_settings import filter_settings
+from bms_estimator.estimator.fuel_cell_settings import fuel_cell_settings
 from bms_estimator.estimator.learning_settings import learning_settings
 from bms_estimator.kernels.cell import OCV_POINTS, emf
 from bms_estimator.kernels.estimator_state import ESTIMATOR_SETTINGS
 from bms_estimator.kernels.mittag_leffler import decay_table, series_coefficients
 from bms_estimator.kernels.nussbaum import Nussbaum
 from bms_estimator.kernels.state import OBSERVER_SETTINGS, PARAMETERS
-from bms_estimator.model.cell import CellModel, ChenMoraOcv
+from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 
 SETTLED_STEPS = 2.0
@@ -37,7 +39,7 @@ def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def estimator_settings(
-    cell: CellModel,
+    cell: PackModel,
     observer: ObserverSettings,
     identifier: IdentifierSettings,
     *,
@@ -60,6 +62,10 @@ def estimator_settings(
     """
     record = np.zeros(1, dtype=ESTIMATOR_SETTINGS)
     p = record[0]
+    if isinstance(cell, FuelCellModel):
+        gain_and_limits(p["observer"], cell.cell, observer, voltage_resolution_v)
+        p["learning"] = fuel_cell_settings(cell, p["observer"])[0]
+        return record
     p["observer"] = observer_settings(cell, observer, voltage_resolution_v, initial_soc)[0]
     p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
@@ -89,10 +95,25 @@ def observer_settings(
     """
     record = np.zeros(1, dtype=OBSERVER_SETTINGS)
     p = record[0]
+    gain_and_limits(p, cell.cell, observer, voltage_resolution_v)
     p["capacity_as"] = cell.cell.capacity_ah * 3600.0
     p["ocv_v"], p["ocv_slope_v"] = ocv_grid(cell)
     _adaptation(p, cell, observer)
     p["output_r_s"] = 0.0 if observer.law == "improved" else 1.0
+    p["margin_guard"] = observer.margin_guard
+    p["soc_initial"] = np.nan if initial_soc is None else initial_soc
+    return record
+
+
+def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage_resolution_v: float) -> None:
+    """What the observer of every pack has: the gain, its dead zone, the lock, what a sample may hold.
+
+    Args:
+        p: Of dtype ``OBSERVER_SETTINGS``; written.
+        cell: The pack's ratings.
+        observer: Its ``[observer]`` section.
+        voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
+    """
     p["nussbaum"] = Nussbaum[observer.nussbaum.replace("-", "_").upper()]
     p["alpha"] = observer.alpha
     p["gain_scale"] = observer.lambda_ ** (1.0 / observer.alpha)
@@ -104,17 +125,13 @@ def observer_settings(
     dead_zone_v = SETTLED_STEPS * voltage_resolution_v if observer.dead_zone_v is None else observer.dead_zone_v
     p["dead_zone_v"] = dead_zone_v
     p["epsilon_v"] = observer.epsilon_v or 2.0 * max(dead_zone_v, voltage_resolution_v)
-    p["lock_error_v"] = observer.lock_error_v or max(
-        LOCK_FRACTION * cell.cell.nominal_voltage_v, 10.0 * voltage_resolution_v
-    )
+    lock_error_v = max(LOCK_FRACTION * cell.nominal_voltage_v, 10.0 * voltage_resolution_v)
+    p["lock_error_v"] = observer.lock_error_v or lock_error_v
     p["lock_time_s"] = observer.lock_time_s
-    p["margin_guard"] = observer.margin_guard
-    p["soc_initial"] = np.nan if initial_soc is None else initial_soc
-    p["voltage_min_v"] = cell.cell.voltage_min_v
-    p["voltage_max_v"] = cell.cell.voltage_max_v
-    p["current_max_a"] = cell.cell.current_max_a
+    p["voltage_min_v"] = cell.voltage_min_v
+    p["voltage_max_v"] = cell.voltage_max_v
+    p["current_max_a"] = cell.current_max_a
     p["gap_s"] = GAP_S
-    return record
 
 
 def _adaptation(p: np.void, cell: CellModel, observer: ObserverSettings) -> None:

@@ -18,7 +18,7 @@ E_O = 5
 
 
 @njit(cache=True)
-def give(given: Floats, p: Record, soc: float) -> None:
+def give(given: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - a fuel cell's needs it
     """E_o and the cell file's elements at ``soc`` into ``given``; ``p`` is a record of ESTIMATOR_SETTINGS.
 
     Elements are those of ``p.learning.soc_floor`` below it: there a capacitance may be negative (E14).
@@ -30,6 +30,13 @@ def give(given: Floats, p: Record, soc: float) -> None:
     given[3] = r_tl(held, a)
     given[4] = given[3] * c_tl(held, a)
     given[E_O] = ocv(soc, p.observer.ocv_v, p.observer.ocv_slope_v)
+
+
+@njit(cache=True)
+def settle(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:  # noqa: ARG001
+    """The states of a cell at rest: its branches are empty."""
+    x[:] = 0.0
+    dx[:] = 0.0
 
 
 @njit(cache=True)

@@ -9,7 +9,7 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.charge import UNMEASURED_S, held_current
-from bms_estimator.kernels.learning_model import advance, give, output, write
+from bms_estimator.kernels.learning_model import advance, give, output, settle, write
 from bms_estimator.kernels.observer import change_of_lock, update_margins
 from bms_estimator.kernels.state import Record
 
@@ -49,14 +49,13 @@ def take_as_rest(s: Record, p: Record, voltage_v: float) -> None:
     Nothing is learned until the states would have forgotten that they were otherwise.
     """
     m, q, o = s.learning, p.learning, s.observer
+    give(q.model, m.given, p, o.soc, m.temperature_c)
+    settle(q.model, m.x, m.dx, m.theta, m.given, o.current_a)
+    injects = math.isfinite(q.offset_s)
+    m.offset_v = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) if injects else 0.0
     for j in range(q.count):
-        m.dx[0, j] = m.dx[1, j] = 0.0
-    m.x[0] = m.x[1] = 0.0
+        m.d_offset[j] = -m.psi[j] if injects else 0.0
     m.settle_s = q.settle_s
-    give(q.model, m.given, p, o.soc)
-    m.offset_v = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi)
-    for j in range(q.count):
-        m.d_offset[j] = -m.psi[j]
     o.innovation_v = 0.0
     show(s, p, voltage_v)
 
@@ -65,12 +64,12 @@ def take_as_rest(s: Record, p: Record, voltage_v: float) -> None:
 def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v: float) -> None:
     """Advance by one sample at the SOC that the observer has; the current was ``before_a`` [A] at the sample before."""
     m, q, o = s.learning, p.learning, s.observer
-    give(q.model, m.given, p, o.soc)
+    give(q.model, m.given, p, o.soc, m.temperature_c)
     advance(q.model, m.x, m.dx, m.theta, m.given, held_current(dt_s, before_a, o.current_a), dt_s)
     e = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) - m.offset_v
     o.innovation_v = e
     inject(m, q, dt_s, e)
-    o.adapting = 1 if o.soc > q.soc_floor else 0
+    o.adapting = 0 if o.soc <= q.soc_floor else 1  # without a SOC always
     m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= UNMEASURED_S else q.settle_s
     if o.adapting and m.settle_s == 0.0:
         remember(m, q, dt_s, e)
@@ -189,4 +188,5 @@ def show(s: Record, p: Record, estimate_v: float) -> None:
     o.voltage_estimate_v = estimate_v
     o.gain = q.rate * o.k
     write(q.model, m.theta, q.file, o.a)
-    update_margins(o)
+    if p.observer.capacity_as > 0.0:
+        update_margins(o)

@@ -8,7 +8,7 @@ from enum import IntEnum
 
 from numba import njit
 
-from bms_estimator.kernels import chen_mora
+from bms_estimator.kernels import chen_mora, fuel_cell
 from bms_estimator.kernels.cell import Floats
 from bms_estimator.kernels.state import Record
 
@@ -17,18 +17,31 @@ class Model(IntEnum):
     """Which model is learned."""
 
     CHEN_MORA = 0
+    FUEL_CELL = 1
 
 
 _CHEN_MORA = int(Model.CHEN_MORA)
-NAMES = {Model.CHEN_MORA: chen_mora.NAMES}
+_FUEL_CELL = int(Model.FUEL_CELL)
+NAMES = {Model.CHEN_MORA: chen_mora.NAMES, Model.FUEL_CELL: fuel_cell.NAMES}
 """What is learned of each, in the order of theta."""
 
 
 @njit(cache=True)
-def give(model: int, given: Floats, p: Record, soc: float) -> None:
+def give(model: int, given: Floats, p: Record, soc: float, temperature_c: float) -> None:
     """What is not learned, at this sample; ``p`` is a record of ESTIMATOR_SETTINGS."""
     if model == _CHEN_MORA:
-        chen_mora.give(given, p, soc)
+        chen_mora.give(given, p, soc, temperature_c)
+    elif model == _FUEL_CELL:
+        fuel_cell.give(given, p, soc, temperature_c)
+
+
+@njit(cache=True)
+def settle(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
+    """The states and their derivatives at a first sample, when nobody knows what was before; in place."""
+    if model == _CHEN_MORA:
+        chen_mora.settle(x, dx, theta, given, current_a)
+    elif model == _FUEL_CELL:
+        fuel_cell.settle(x, dx, theta, given, current_a)
 
 
 @njit(cache=True)
@@ -36,6 +49,8 @@ def advance(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, cur
     """States ``x`` (2,) [V] and their derivatives ``dx`` (2, 8) after ``dt_s`` under a held current, in place."""
     if model == _CHEN_MORA:
         chen_mora.advance(x, dx, theta, given, current_a, dt_s)
+    elif model == _FUEL_CELL:
+        fuel_cell.advance(x, dx, theta, given, current_a, dt_s)
 
 
 @njit(cache=True)
@@ -43,6 +58,8 @@ def output(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, curr
     """Terminal voltage y^ [V]; psi = dy^/dtheta (8,) in place."""
     if model == _CHEN_MORA:
         return chen_mora.output(x, dx, theta, given, current_a, psi)
+    if model == _FUEL_CELL:
+        return fuel_cell.output(x, dx, theta, given, current_a, psi)
     return math.nan
 
 
@@ -51,3 +68,5 @@ def write(model: int, theta: Floats, file: Floats, a: Floats) -> None:
     """The parameters that are published, ``a`` (16,), from the file's and theta."""
     if model == _CHEN_MORA:
         chen_mora.write(theta, file, a)
+    elif model == _FUEL_CELL:
+        fuel_cell.write(theta, file, a)

@@ -18,7 +18,7 @@ LEARNING_SETTINGS = np.dtype(
         ("middle", "f8", LEARNABLE),  # where the leakage leads
         ("leak_v2s", "f8", LEARNABLE),  # information that the middle counts as [V^2 s]
         ("memory_s", "f8"),  # time constant of forgetting, under load [s]
-        ("offset_s", "f8"),  # time constant of the injection [s]
+        ("offset_s", "f8"),  # time constant of the injection; infinite: nothing is injected [s]
         ("settle_s", "f8"),  # the states forget within it what was before [s]
         ("rate", "f8"),  # gamma: how fast theta goes where the data lead, at k = 1 [1/s]
         ("cells", "f8"),  # in series: k is that of one cell, whatever the pack
@@ -37,6 +37,7 @@ LEARNING_STATE = np.dtype(
         ("offset_v", "f8"),  # what the injection has added to the output [V]
         ("d_offset", "f8", LEARNABLE),  # its derivative by theta [V]
         ("psi", "f8", LEARNABLE),  # dy^/dtheta [V]
+        ("temperature_c", "f8"),  # the last that was told; NaN: none was [C]
         ("given", "f8", LEARNABLE),  # what is not learned, at the last sample
         ("information", "f8", (LEARNABLE, LEARNABLE)),  # of psi psi', remembered [V^2 s]
         ("pull", "f8", LEARNABLE),  # of psi (e + psi' theta), remembered [V^2 s]

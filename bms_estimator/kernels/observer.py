@@ -28,16 +28,19 @@ def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
     for i in range(1, 16):
         s.a[i] = p.a_initial[i]
         s.target[i] = p.target[i]
-    s.soc = p.soc_initial
-    if math.isnan(s.soc):
-        ohmic = current_a * r_s(1.0, s.a)
-        s.soc = soc_from_ocv(voltage_v + ohmic, p.ocv_v, p.ocv_slope_v)
-    s.soc_coulomb = s.soc
     s.k = p.k0
     s.gain = nussbaum_gain(s.k, p)
     s.lock = 1
     s.adapting = 1
     s.started = 1
+    if p.capacity_as == 0.0:
+        s.soc = s.soc_coulomb = s.delta_1 = s.delta_2 = math.nan
+        return
+    s.soc = p.soc_initial
+    if math.isnan(s.soc):
+        ohmic = current_a * r_s(1.0, s.a)
+        s.soc = soc_from_ocv(voltage_v + ohmic, p.ocv_v, p.ocv_slope_v)
+    s.soc_coulomb = s.soc
     s.voltage_estimate_v = ocv(s.soc, p.ocv_v, p.ocv_slope_v)  # (4.1), x2 = x3 = 0
     s.innovation_v = voltage_v - s.voltage_estimate_v
     update_margins(s)
@@ -45,9 +48,10 @@ def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
 
 @njit(cache=True)
 def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
-    """SOC by coulomb counting (3.1)."""
-    charge_as = held_current(dt_s, s.current_a, current_a) * min(dt_s, LONGEST_FLOW_S)
-    s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
+    """SOC by coulomb counting (3.1); none of a fuel cell."""
+    if p.capacity_as > 0.0:
+        charge_as = held_current(dt_s, s.current_a, current_a) * min(dt_s, LONGEST_FLOW_S)
+        s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
 
 

@@ -92,11 +92,9 @@ def step(
     s.samples += 1
     if not s.started:
         start(s, p, time_s, current_a, voltage_v)
-        if settings[0].identify:
-            start_filter(state[0], settings[0], current_a, voltage_v, temperature_c)
-        if settings[0].learning.enabled:
-            begin_learning(state[0], settings[0], voltage_v)
+        begin(state[0], settings[0], current_a, voltage_v, temperature_c)
         return verdict
+    sense(state[0].learning, temperature_c)
     dt_s = time_s - s.time_s
     s.time_s = time_s
     restarted = dt_s == -math.inf
@@ -126,6 +124,23 @@ def step(
     else:
         observer_step(s, p, dt_s, voltage_v)
     return verdict
+
+
+@njit(cache=True)
+def begin(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
+    """The first sample of all, of filter and learning law. Records as in ``step``."""
+    s.learning.temperature_c = temperature_c
+    if p.identify:
+        start_filter(s, p, current_a, voltage_v, temperature_c)
+    if p.learning.enabled:
+        begin_learning(s, p, voltage_v)
+
+
+@njit(cache=True)
+def sense(m: Record, temperature_c: float) -> None:
+    """Keep the last temperature that was told; ``m`` is a record of LEARNING_STATE."""
+    if math.isfinite(temperature_c):
+        m.temperature_c = temperature_c
 
 
 @njit(cache=True)

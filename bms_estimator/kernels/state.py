@@ -18,7 +18,7 @@ PARAMETERS = 16
 
 OBSERVER_SETTINGS = np.dtype(
     [
-        ("capacity_as", "f8"),  # C_c of (2.1) [A s]
+        ("capacity_as", "f8"),  # C_c of (2.1) [A s]; 0: a fuel cell, which holds no charge
         ("ocv_v", "f8", OCV_POINTS),  # E_o over SOC 0..1 [V]
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
         ("a_initial", "f8", PARAMETERS),  # a_i(t0)

@@ -6,6 +6,7 @@ scales them to packs of such objects in series and parallel.
 
 import itertools
 import math
+import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -166,15 +167,11 @@ class Bounds(Strict):
         return (self.weight_upper * self.upper + self.weight_lower * self.lower) / self.rate
 
 
-class Cell(Strict):
-    """What the cell is."""
+class Rated(Strict):
+    """What every pack has, whatever it is made of."""
 
     name: str
     description: str = ""
-    capacity_ah: Positive = Field(description="rated capacity in ampere-hours")
-    capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
-        default=None, description="how wrong capacity_ah may be, relative; as for most cells when left out"
-    )
     series_count: Annotated[int, Field(ge=1)] = Field(default=1, description="cells in series that the values describe")
     nominal_voltage_v: Positive
     voltage_min_v: Positive = Field(description="a sample below is a glitch")
@@ -189,6 +186,15 @@ class Cell(Strict):
                 f"voltage_max_v = {self.voltage_max_v}: must increase in this order"
             )
         return self
+
+
+class Cell(Rated):
+    """What the cell is."""
+
+    capacity_ah: Positive = Field(description="rated capacity in ampere-hours")
+    capacity_std: Annotated[float, Field(ge=0, le=0.3)] | None = Field(
+        default=None, description="how wrong capacity_ah may be, relative; as for most cells when left out"
+    )
 
 
 class CellModel(Strict):
@@ -278,6 +284,21 @@ def generic_cells() -> list[str]:
     return _names("cells/generic")
 
 
+def shipped_fuel_cells() -> list[str]:
+    """Names of the fuel cells whose files come with the package."""
+    return _names("cells/fuel_cell")
+
+
+def is_fuel_cell(name_or_path: str | Path) -> bool:
+    """Whether a fuel cell is called so, or a readable file is that of one: it has a section ``[fuel_cell]``."""
+    if str(name_or_path) in shipped_fuel_cells():
+        return True
+    try:
+        return "fuel_cell" in tomllib.loads(Path(name_or_path).read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return False  # whoever reads it as a cell says what is wrong
+
+
 def _names(folder: str) -> list[str]:
     entries = (resources.files("bms_estimator.model") / folder).iterdir()
     return sorted(Path(entry.name).stem for entry in entries if entry.name.endswith(".toml"))
@@ -293,16 +314,21 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
             with age or measured better, and its resistances were measured on it.
 
     Raises:
-        UserError: No such cell or file, or a value in it that is not allowed; a capacity that is missing or cannot be.
+        UserError: No such cell or file, or a value in it that is not allowed; a capacity that is missing or cannot be;
+            a fuel cell, which has neither SOC nor capacity.
     """
     text = str(name_or_path)
+    if is_fuel_cell(text):
+        raise UserError(
+            f"{text} is a fuel cell, which has no state of charge, capacity or OCV: this needs a battery cell"
+        )
     if capacity_ah is not None and not 0.0 < capacity_ah < math.inf:
         raise UserError(f"capacity_ah = {capacity_ah}: must be above 0 (what the cell holds, in ampere-hours)")
     if text in generic_cells():
         if capacity_ah is None:
             raise UserError(f"{text} is a generic cell: give its capacity, capacity_ah of [pack] or --capacity-ah")
         return _scaled(_packaged(f"cells/generic/{text}.toml"), 1, capacity_ah)
-    cell = _packaged(f"cells/{text}.toml") if text in shipped_cells() else _from_file(text)
+    cell = _packaged(f"cells/{text}.toml") if text in shipped_cells() else read_toml(existing(text), CellModel)
     if capacity_ah is None:
         return cell
     return cell.model_copy(
@@ -315,11 +341,16 @@ def _packaged(name: str) -> CellModel:
         return read_toml(path, CellModel)
 
 
-def _from_file(text: str) -> CellModel:
+def existing(text: str) -> Path:
+    """The path of a cell file.
+
+    Raises:
+        UserError: There is none.
+    """
     path = Path(text)
     if not text or not path.exists():
         raise UserError(
             f"{text or 'a cell of no name'}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())}), "
-            f"nor a generic one ({', '.join(generic_cells())})"
+            f"nor a generic one ({', '.join(generic_cells())}), nor a fuel cell ({', '.join(shipped_fuel_cells())})"
         )
-    return read_toml(path, CellModel)
+    return path

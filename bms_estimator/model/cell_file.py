@@ -5,8 +5,9 @@ from pathlib import Path
 
 import tomlkit
 
-from bms_estimator.model.cell import ELEMENTS, CellModel
+from bms_estimator.model.cell import ELEMENTS
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
 
 SOURCES = {"r_ts": "(2.5)", "r_tl": "(2.6)", "c_ts": "(2.7)", "c_tl": "(2.8)", "r_s": "(2.9)"}
 """Section -> its equation."""
@@ -14,8 +15,8 @@ DIGITS = 8
 """Significant digits: a hundredth of a microvolt of a cell's voltage."""
 
 
-def write_cell(path: Path, cell: CellModel, remarks: Sequence[str] = ()) -> None:
-    """Write a cell file that ``load_cell`` reads.
+def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None:
+    """Write a cell file that ``load_any`` reads.
 
     Args:
         path: Written anew, whatever is there.
@@ -31,7 +32,7 @@ def write_cell(path: Path, cell: CellModel, remarks: Sequence[str] = ()) -> None
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def cell_text(cell: CellModel, remarks: Sequence[str] = ()) -> str:
+def cell_text(cell: PackModel, remarks: Sequence[str] = ()) -> str:
     """The text of a cell file."""
     document = tomlkit.document()
     for remark in remarks:

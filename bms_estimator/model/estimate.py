@@ -27,7 +27,7 @@ class Estimate(Report):
     temperature_c: float | None = Field(description="temperature [C], mean; null without a sensor")
     cell_lowest_v: float | None = Field(description="lowest voltage of a single cell [V], last; null without any")
     cell_highest_v: float | None = Field(description="highest voltage of a single cell [V], last; null without any")
-    soc: float | None = Field(description="state of charge, 0..1")
+    soc: float | None = Field(description="state of charge, 0..1; null of a fuel cell, as all that follows from it")
     soc_percent: float | None = Field(description="state of charge [%]")
     soc_std: float | None = Field(description="standard deviation of soc; null without the identifier")
     soc_coulomb: float | None = Field(description="state of charge by coulomb counting alone, 0..1")
@@ -76,9 +76,11 @@ class ParameterReport(Report):
 
     publish_time: str = Field(description="when this message was made, ISO 8601, UTC")
     soc: float | None = Field(description="state of charge the elements belong to, 0..1")
-    a: dict[str, Parameter] = Field(description="a1..a21 of (2.5)-(2.10)")
+    a: dict[str, Parameter] = Field(description="a1..a21 of (2.5)-(2.10); empty of a fuel cell")
     ocv: OcvCurve | None = Field(description="null before the first sample, and without the identifier")
-    elements: dict[str, Parameter] = Field(description="r_s_ohm, r_ts_ohm, c_ts_farad, r_tl_ohm, c_tl_farad, e_o_v")
+    elements: dict[str, Parameter] = Field(
+        description="r_s_ohm, r_ts_ohm, c_ts_farad, r_tl_ohm, c_tl_farad, e_o_v; of a fuel cell the values of its file"
+    )
     state_of_health: dict[str, Parameter] = Field(
         description="capacity and r_s over those of the cell file: 1 is as new; r_s at the same SOC and temperature; "
         "current_offset_a: what the current sensor shows at no current [A]"
@@ -121,7 +123,7 @@ class Info(Report):
     version: str = Field(description="of bms_estimator")
     started: str = Field(description="ISO 8601, UTC")
     cell: str
-    capacity_ah: float
+    capacity_ah: float | None = Field(description="null of a fuel cell")
     series_count: int
     nominal_voltage_v: float
     observer: str = Field(description="adaptation law and gain")

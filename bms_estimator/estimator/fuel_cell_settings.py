@@ -1,0 +1,53 @@
+"""From a fuel cell's file to the record of the law that learns it."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.estimator.learning_settings import LEAK_S, RATE_HZ, REACH
+from bms_estimator.kernels.fuel_cell import NAMES
+from bms_estimator.kernels.learning_model import Model
+from bms_estimator.kernels.learning_state import LEARNING_SETTINGS
+from bms_estimator.model.fuel_cell import FuelCellModel
+
+MEMORY_S = 60.0
+"""Water and gas of a stack change within a minute: what was before is of another one [s]."""
+SETTLE_S = 5.0
+"""Double layer and oxygen have forgotten by then what nobody measured [s]."""
+FACTORS = {
+    "r_ohm": 4.0,
+    "tafel_slope_v": 1.5,
+    "activation_v": 1.3,
+    "c_dl_farad": 4.0,
+    "concentration_v": 4.0,
+    "limiting_current_a": 2.0,
+    "internal_current_a": 4.0,
+}
+"""How many times larger or smaller than in the file a parameter may be. Of the activation loss at 1 A it is three decades of
+the exchange current."""
+
+
+def fuel_cell_settings(cell: FuelCellModel, of_observer: np.void) -> NDArray[np.void]:
+    """The learning law's settings record.
+
+    Nothing is injected: a voltage that is wrong as a whole is the exchange current's, not an offset's.
+
+    Args:
+        cell: The stack as one object.
+        of_observer: Of dtype ``OBSERVER_SETTINGS``.
+
+    Returns:
+        Shape (1,), dtype ``LEARNING_SETTINGS``.
+    """
+    record = np.zeros(1, dtype=LEARNING_SETTINGS)
+    q, n = record[0], len(NAMES)
+    q["enabled"], q["model"], q["count"], q["file"] = 1, Model.FUEL_CELL, n, cell.a
+    q["upper"][:n] = [math.log(FACTORS[name]) for name in NAMES]
+    q["lower"] = -q["upper"]
+    q["told_v"], q["cells"] = of_observer["epsilon_v"], cell.cell.series_count
+    q["leak_v2s"][:n] = LEAK_S * float(q["told_v"]) ** 2 / q["upper"][:n] ** 2
+    q["memory_s"], q["offset_s"], q["settle_s"] = MEMORY_S, math.inf, SETTLE_S
+    q["rate"], q["reach"] = RATE_HZ, REACH
+    q["soc_floor"] = -math.inf
+    return record

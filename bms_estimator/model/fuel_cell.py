@@ -1,0 +1,153 @@
+"""The fuel cell: what its file holds, in the place of a cell file.
+
+The values describe ``series_count`` cells in series as one two-terminal object; ``FuelCellModel.pack`` scales them to
+several such stacks. There is no capacity and no SOC: a stack delivers as long as it is fed.
+"""
+
+import math
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from bms_estimator.model.cell import (
+    CellModel,
+    NotNegative,
+    Positive,
+    Rated,
+    existing,
+    is_fuel_cell,
+    load_cell,
+    shipped_fuel_cells,
+)
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.toml_file import Strict, read_toml
+
+Parameter = Literal[
+    "r_ohm",
+    "tafel_slope_v",
+    "exchange_current_a",
+    "c_dl_farad",
+    "concentration_v",
+    "limiting_current_a",
+    "internal_current_a",
+]
+"""What is identified of a stack."""
+
+
+class FuelCell(Strict):
+    """Losses of a stack, of all its cells in series, and what it is fed with."""
+
+    r_ohm: Positive = Field(description="membrane and contacts")
+    tafel_slope_v: Positive = Field(description="growth of the activation loss when the current grows e times")
+    exchange_current_a: Annotated[float, Field(gt=0, lt=1)] = Field(description="where Tafel's line meets 0 V")
+    c_dl_farad: Positive = Field(description="double layer")
+    concentration_v: Positive = Field(description="B of the loss -B ln(1 - i / limiting_current_a)")
+    limiting_current_a: Positive = Field(description="what the gas that reaches the electrodes allows at most")
+    internal_current_a: Positive = Field(description="of gas that crosses the membrane: flows at no load, too")
+    temperature_c: Annotated[float, Field(gt=-40, lt=200)] = Field(
+        description="of the values; taken where none is measured"
+    )
+    hydrogen_atm: Positive = Field(description="partial pressure at the anode")
+    oxygen_atm: Positive = Field(description="partial pressure at the cathode; 0.21 in air at 1 atm")
+
+
+class FuelCellModel(Strict):
+    """A fuel cell's file."""
+
+    cell: Rated
+    fuel_cell: FuelCell
+    std: dict[Parameter, NotNegative] = Field(
+        default_factory=dict, description="relative standard deviations of values that were identified"
+    )
+
+    @property
+    def a(self) -> NDArray[np.float64]:
+        """What the kernels take, shape (16,).
+
+        From 1 on the parameters of ``kernels.fuel_cell.NAMES``, then cells in series, temperature [C], hydrogen and
+        oxygen [atm].
+        """
+        f = self.fuel_cell
+        learned = (f.r_ohm, f.tafel_slope_v, self.activation_v, f.c_dl_farad, f.concentration_v)
+        currents = (f.limiting_current_a, f.internal_current_a)
+        conditions = (self.cell.series_count, f.temperature_c, f.hydrogen_atm, f.oxygen_atm)
+        values = np.zeros(16)
+        values[1:12] = *learned, *currents, *conditions
+        return values
+
+    @property
+    def activation_v(self) -> float:
+        """Activation loss at 1 A [V]: the a of Tafel's line a + A ln i."""
+        return -self.fuel_cell.tafel_slope_v * math.log(self.fuel_cell.exchange_current_a)
+
+    def identified(self, a: NDArray[np.float64], std: dict[Parameter, float]) -> "FuelCellModel":
+        """The same stack with other parameters.
+
+        Args:
+            a: As the property ``a``; what stands for conditions is not looked at.
+            std: Relative standard deviations of those that were identified.
+        """
+        r_ohm, tafel_v, activation_v, c_dl, b, limit, internal = (float(f"{value:.6g}") for value in a[1:8])
+        values = {
+            "r_ohm": r_ohm,
+            "tafel_slope_v": tafel_v,
+            "exchange_current_a": float(f"{math.exp(-activation_v / tafel_v):.6g}"),
+            "c_dl_farad": c_dl,
+            "concentration_v": b,
+            "limiting_current_a": limit,
+            "internal_current_a": internal,
+        }
+        losses = FuelCell.model_validate(self.fuel_cell.model_dump() | values)
+        rounded = {name: float(f"{value:.2g}") for name, value in std.items()}
+        return self.model_copy(update={"fuel_cell": losses, "std": rounded})
+
+    def pack(self, series: int, parallel: int) -> "FuelCellModel":
+        """The model of ``series`` x ``parallel`` of these: voltages, resistance, capacitance and currents scaled."""
+        if series == parallel == 1:
+            return self
+        factor = {"ohm": series / parallel, "farad": parallel / series, "v": series, "a": parallel}
+
+        def scaled(part: Strict) -> dict[str, object]:
+            return {
+                key: value * factor[unit] if (unit := key.rpartition("_")[2]) in factor else value
+                for key, value in part.model_dump().items()
+            }
+
+        count = {"series_count": self.cell.series_count * series}
+        return FuelCellModel.model_validate(
+            {"cell": scaled(self.cell) | count, "fuel_cell": scaled(self.fuel_cell), "std": self.std}
+        )
+
+
+PackModel = CellModel | FuelCellModel
+"""Whatever a pack may be made of."""
+
+
+def load_fuel_cell(name_or_path: str | Path) -> FuelCellModel:
+    """A shipped fuel cell by name, or a fuel cell's file by path.
+
+    Raises:
+        UserError: No such name or file, or a value in it that is not allowed.
+    """
+    text = str(name_or_path)
+    if text not in shipped_fuel_cells():
+        return read_toml(existing(text), FuelCellModel)
+    with resources.as_file(resources.files("bms_estimator.model") / f"cells/fuel_cell/{text}.toml") as path:
+        return read_toml(path, FuelCellModel)
+
+
+def load_any(name_or_path: str | Path, capacity_ah: float | None = None) -> PackModel:
+    """A cell as ``load_cell`` finds it, or a fuel cell.
+
+    Raises:
+        UserError: As ``load_cell``; a fuel cell is given a capacity.
+    """
+    if not is_fuel_cell(name_or_path):
+        return load_cell(name_or_path, capacity_ah)
+    if capacity_ah is not None:
+        raise UserError(f"{name_or_path} is a fuel cell, which has no capacity: leave out capacity_ah")
+    return load_fuel_cell(name_or_path)
