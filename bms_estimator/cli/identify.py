@@ -23,8 +23,10 @@ from bms_estimator.cli.captures import (
     check_out,
     name_of,
 )
-from bms_estimator.model.cell import load_cell
+from bms_estimator.cli.identify_fuel_cell import identify_fuel_cell
+from bms_estimator.model.cell import is_fuel_cell, load_cell
 from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture
 
 
@@ -51,8 +53,15 @@ def identify_command(
 
     Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole range of SOC tell most;
     the OCV is better found by `ocv` before. Written is only what makes replays cut in mid-load no worse.
+
+    Of a fuel cell: polarisation curves (columns current_a, voltage_v) and records, docs/fuel-cell.md.
     """
     check_out(out, captures, force=force)
+    if is_fuel_cell(cell):
+        if capacity_ah is not None or soc is not None or keep_ocv:
+            raise UserError(f"{cell} is a fuel cell: --capacity-ah, --soc and --keep-ocv are of batteries")
+        identify_fuel_cell(captures, cell, out, temperature_c=temperature_c, current_sign=current_sign, as_json=as_json)
+        return
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     started_s = time.perf_counter()

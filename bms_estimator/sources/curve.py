@@ -1,4 +1,4 @@
-"""A curve of open-circuit voltage that somebody else found, as a CSV file."""
+"""Curves as CSV files: an open-circuit voltage that somebody else found, a polarisation curve of a fuel cell."""
 
 import csv
 import gzip
@@ -13,6 +13,9 @@ from bms_estimator.model.errors import UserError
 Floats = NDArray[np.float64]
 
 COLUMNS = ("soc", "ocv_v", "hysteresis_v")
+
+
+POLARISATION = ("current_a", "voltage_v", "temperature_c")
 
 
 class CurveColumns(NamedTuple):
@@ -32,17 +35,41 @@ def read_curve(path: Path) -> CurveColumns | None:
     Raises:
         UserError: It has, but what is in them is no curve.
     """
+    rows = _rows(path, COLUMNS)
+    return None if rows is None else _checked(path, rows, has_hysteresis=not np.isnan(rows[:, 2]).all())
+
+
+def read_polarisation(path: Path) -> Floats | None:
+    """The polarisation curve in a CSV file (.gz) with columns current_a [A], voltage_v [V] and perhaps temperature_c [C].
+
+    Returns:
+        Those columns, shape (n, 3), a missing temperature as NaN. None when the file is no CSV, has no such columns, or has
+        a column time_s: then it is a record.
+
+    Raises:
+        UserError: It has, but not a number in every row.
+    """
+    rows = _rows(path, POLARISATION, without="time_s")
+    if rows is not None and (rows.shape[0] == 0 or not np.isfinite(rows[:, :2]).all()):
+        raise UserError(
+            f"{path}: {'no rows' if rows.shape[0] == 0 else 'a value is missing'}: give current_a and voltage_v"
+        )
+    return rows
+
+
+def _rows(path: Path, columns: tuple[str, str, str], without: str = "") -> Floats | None:
+    """Columns of a CSV file, shape (n, 3); NaN where the last, which may be missing, is. None when it is no such file."""
     if not path.is_file() or not path.name.lower().endswith((".csv", ".csv.gz")):
         return None
     try:
         with gzip.open(path, "rt") if path.name.lower().endswith(".gz") else path.open() as text:
             rows = csv.DictReader(line for line in text if line.strip() and not line.startswith("#"))
-            if not {"soc", "ocv_v"} <= set(rows.fieldnames or ()):
+            if not set(columns[:2]) <= set(rows.fieldnames or ()) or without in (rows.fieldnames or ()):
                 return None
-            found = [[_number(path, rows.line_num, name, row.get(name)) for name in COLUMNS] for row in rows]
+            found = [[_number(path, rows.line_num, name, row.get(name)) for name in columns] for row in rows]
     except (OSError, EOFError, UnicodeDecodeError):
         return None  # whoever reads captures says what is wrong
-    return _checked(path, np.array(found).reshape(-1, 3), "hysteresis_v" in (rows.fieldnames or ()))
+    return np.array(found).reshape(-1, 3)
 
 
 def _number(path: Path, line: int, name: str, cell: str | None) -> float:

@@ -1,0 +1,118 @@
+"""``bms-estimator identify`` of a fuel cell: its parameters from polarisation curves and records, into a file."""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from rich import box
+from rich.console import Console, Group
+from rich.table import Table
+
+from bms_estimator.calibration.fuel_cell import KEYS, FuelCellFit, Source, fit_fuel_cell
+from bms_estimator.cli.captures import name_of
+from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
+from bms_estimator.sources.curve import read_polarisation
+from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.replay import load_capture
+
+DIGITS = 4
+FEWEST = 3
+"""Points that a curve or record needs."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter as it is printed."""
+
+    value: float
+    std: float | None
+    """Of the value, in its unit; None where the data did not tell of it."""
+    of_start: float
+    """What the file of --cell has."""
+    reason: str | None
+    """Why the data did not tell of it."""
+
+
+def identify_fuel_cell(
+    paths: Sequence[Path],
+    cell: str,
+    out: Path,
+    *,
+    temperature_c: float | None,
+    current_sign: CurrentSign | None,
+    as_json: bool,
+) -> None:
+    """Identify, write the file and print the outcome; arguments as of ``identify_command``."""
+    start = load_fuel_cell(cell)
+    sources = [_source(path, start, temperature_c, current_sign) for path in paths]
+    started_s = time.perf_counter()
+    fit = fit_fuel_cell(sources, start)
+    seconds = time.perf_counter() - started_s
+    values: dict[str, Value] = {
+        key: Value(
+            value=getattr(fit.model.fuel_cell, key),
+            std=fit.model.std[key] * getattr(fit.model.fuel_cell, key) if key in fit.model.std else None,
+            of_start=getattr(start.fuel_cell, key),
+            reason=fit.not_told.get(key),
+        )
+        for key in KEYS
+    }
+    renamed = fit.model.model_copy(update={"cell": fit.model.cell.model_copy(update={"name": name_of(out)})})
+    write_cell(out, renamed, _remarks(cell, fit))
+    if as_json:
+        outcome = {"out": str(out), "parameters": {k: asdict(v) for k, v in values.items()}}
+        rms = {f"{name}_rms_mv": 1e3 * rms_v for name, rms_v in fit.rms_v.items()}
+        sys.stdout.write(json.dumps(outcome | rms | {"seconds": seconds}) + "\n")
+    else:
+        Console().print(_tables(out, values, fit, seconds))
+
+
+def _source(path: Path, model: FuelCellModel, temperature_c: float | None, sign: CurrentSign | None) -> Source:
+    """A polarisation curve where the file has no times, else a record, without what no such stack can give."""
+    points = read_polarisation(path)
+    if points is not None:
+        time_s, (current_a, voltage_v, sensed_c) = None, points.T
+        good = np.full(current_a.shape, fill_value=True)
+    else:
+        record = load_capture(path, current_sign=sign)
+        time_s, current_a, voltage_v, sensed_c = (
+            record[name] for name in ("time_s", "current_a", "voltage_v", "temperature_c")
+        )
+        limits = model.cell
+        good = (voltage_v >= limits.voltage_min_v) & (voltage_v <= limits.voltage_max_v)
+        good &= (np.abs(current_a) <= limits.current_max_a) & (np.diff(time_s, prepend=-np.inf) > 0.0)
+    if good.sum() < FEWEST:
+        raise UserError(f"{path}: {good.sum()} usable points: give at least {FEWEST}")
+    celsius = np.where(np.isnan(sensed_c), math.nan if temperature_c is None else temperature_c, sensed_c)
+    return Source(
+        name=name_of(path),
+        time_s=None if time_s is None else time_s[good],
+        current_a=np.ascontiguousarray(current_a[good]),
+        voltage_v=voltage_v[good],
+        temperature_c=celsius[good],
+    )
+
+
+def _remarks(cell: str, fit: FuelCellFit) -> list[str]:
+    fits = ", ".join(f"{name} ({1e3 * rms_v:.1f} mV RMS)" for name, rms_v in fit.rms_v.items())
+    kept = f"As in the file, because the data do not tell: {', '.join(fit.not_told)}." if fit.not_told else ""
+    return [line for line in (f"Identified from {fits}, begun at {Path(cell).name}.", kept) if line]
+
+
+def _tables(out: Path, values: dict[str, Value], fit: FuelCellFit, seconds: float) -> Group:
+    """The outcome for people."""
+    table = Table(title=f"{out}: written", title_justify="left", box=box.SIMPLE_HEAD)
+    for column in ("", "identified", "±", "before"):
+        table.add_column(column, justify="right" if column else "left")
+    for key, v in values.items():
+        std = "as before" if v.std is None else f"{v.std:.2g}"
+        table.add_row(key, f"{v.value:.{DIGITS}g}", std, f"{v.of_start:.{DIGITS}g}")
+    left = [f"{name}: {1e3 * rms_v:.1f} mV RMS" for name, rms_v in fit.rms_v.items()]
+    return Group(table, *left, *(f"{key}: {reason}" for key, reason in fit.not_told.items()), f"{seconds:.1f} s")
