@@ -57,6 +57,7 @@ def export(
     A service that starts from it, here or on a replacement, begins with what this one has learned.
     """
     settings, model = load_pack(pack)
+    cell, series = unpacked_cell(pack, settings), settings.pack.series
     file = CheckpointFile(checkpoint.parent if checkpoint else state_folder(settings), settings, model)
     if checkpoint:
         file.path = checkpoint
@@ -73,7 +74,6 @@ def export(
     wrong = resume(estimator, found.state, 0.0)
     if wrong or not estimator.record[0]["filter"]["started"]:
         raise UserError(f"{file.path}: nothing to export: {wrong or 'the identifier was off, it has learned nothing'}")
-    cell, series = unpacked_cell(pack, settings), settings.pack.series
     learned = learned_cell(estimator, cell, series)
     renamed = learned.model_copy(update={"cell": learned.cell.model_copy(update={"name": name_of(out)})})
     correction_v, std_v = learned_ocv(estimator.record[0], estimator.settings_record[0], TENTHS)

@@ -10,10 +10,11 @@ from bms_estimator.cli.pack import load_pack
 from bms_estimator.cli.settings_file import settings_file
 from bms_estimator.estimator.lemma import Condition, failed
 from bms_estimator.estimator.plausible import implausible
-from bms_estimator.estimator.records import observer_settings
+from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.sinks.credential import is_for_the_service
 from bms_estimator.sinks.mqtt import broker_arguments
@@ -42,7 +43,7 @@ def init(file: PackFile = Path("pack.toml")) -> None:
 def check(file: PackFile = Path("pack.toml")) -> None:
     """Check a settings file and its cell file; name what is wrong, warn of what will not work well."""
     settings, cell = load_pack(file)
-    warnings = [*implausible(settings, cell), *(f"{cell.cell.name}: {_unmet(c)}" for c in failed(cell))]
+    warnings = [*implausible(settings, cell), *_lemma(cell)]
     if settings.mqtt is not None:
         mqtt = settings.mqtt
         if mqtt.password_file is not None and is_for_the_service(mqtt.password_file):
@@ -66,23 +67,35 @@ def show(file: Annotated[Path | None, typer.Argument(help="settings of the pack;
         typer.echo(f"# {name} = {value:.6g}")
 
 
-def derived(settings: Settings, cell: CellModel) -> dict[str, float]:
+def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
     """What is not set but follows: of the pack, of the observer, at the limits of Lemma 4.1.3."""
-    record = observer_settings(
-        cell, settings.observer, settings.sensor.voltage_resolution_v, settings.pack.initial_soc
-    )[0]
-    a = {i: cell.bounds(i).limit for i in range(7, 13)}
-    return {
-        "pack.capacity_ah": cell.cell.capacity_ah,
+    record = estimator_settings(
+        cell,
+        settings.observer,
+        settings.identifier,
+        voltage_resolution_v=settings.sensor.voltage_resolution_v,
+        voltage_noise_v=settings.sensor.voltage_noise_v,
+        initial_soc=settings.pack.initial_soc,
+    )[0]["observer"]
+    follows = {
         "pack.nominal_voltage_v": cell.cell.nominal_voltage_v,
         "pack.series_count": cell.cell.series_count,
         "observer.dead_zone_v": record["dead_zone_v"],
         "observer.epsilon_v": record["epsilon_v"],
         "observer.lock_error_v": record["lock_error_v"],
-        "observer.delta_1": delta(a[8], a[9], a[7]),  # (2.11)
-        "observer.delta_2": delta(a[11], a[12], a[10]),  # (2.12)
         "publish_period_s": 1.0 / settings.publish.rate_hz,
     }
+    if isinstance(cell, CellModel):
+        a = {i: cell.bounds(i).limit for i in range(7, 13)}
+        follows["pack.capacity_ah"] = cell.cell.capacity_ah
+        follows["observer.delta_1"] = delta(a[8], a[9], a[7])  # (2.11)
+        follows["observer.delta_2"] = delta(a[11], a[12], a[10])  # (2.12)
+    return follows
+
+
+def _lemma(cell: PackModel) -> list[str]:
+    """What Lemma 4.1.1 asks of the bounds and does not get; of a fuel cell it asks nothing."""
+    return [f"{cell.cell.name}: {_unmet(c)}" for c in failed(cell)] if isinstance(cell, CellModel) else []
 
 
 def _unmet(condition: Condition) -> str:
@@ -92,10 +105,11 @@ def _unmet(condition: Condition) -> str:
     )
 
 
-def _in_short(settings: Settings, cell: CellModel) -> str:
+def _in_short(settings: Settings, cell: PackModel) -> str:
     c = cell.cell
     broker = settings.mqtt.url if settings.mqtt else "no broker"
+    holds = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
     return (
-        f"{settings.pack.name}: {c.name}, {c.series_count} in series, {c.nominal_voltage_v:g} V, {c.capacity_ah:g} Ah; "
+        f"{settings.pack.name}: {c.name}, {c.series_count} in series, {c.nominal_voltage_v:g} V, {holds}; "
         f"{settings.sensor.protocol} board on {settings.sensor.port}; {broker}"
     )

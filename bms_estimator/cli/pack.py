@@ -6,13 +6,14 @@ from pydantic import ValidationError
 
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
 from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings, load_settings
 
 TABLE_RESOLUTION_V = 1e-3
 """What a capture resolves when no pack file says otherwise: laboratory equipment's millivolt [V]."""
 
 
-def load_pack(path: Path) -> tuple[Settings, CellModel]:
+def load_pack(path: Path) -> tuple[Settings, PackModel]:
     """A pack's settings and the pack as one object.
 
     A cell file is looked for beside the pack file first, then in the working directory.
@@ -29,7 +30,7 @@ def unpacked_cell(path: Path, settings: Settings) -> CellModel:
     return load_cell(_found(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
-def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None) -> tuple[Settings, CellModel]:
+def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None) -> tuple[Settings, PackModel]:
     """The settings of ``pack``; ``cell`` and ``capacity_ah`` [Ah] in place of its own where they are given.
 
     Raises:
@@ -52,9 +53,26 @@ def _found(pack: Path, cell: str) -> str:
     return str(beside) if beside.is_file() else cell
 
 
-def _model(settings: Settings, cell: str, capacity_ah: float | None) -> CellModel:
+def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
     """The pack as one object, made of ``cell``."""
-    return load_cell(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
+    model = load_any(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
+    if settings.pack.initial_soc is not None:
+        refuse_soc(model, "pack.initial_soc")
+    return model
+
+
+def refuse_soc(model: PackModel, told: str) -> None:
+    """Say that a fuel cell has no SOC.
+
+    Args:
+        model: The pack as one object.
+        told: The setting or option that has told one.
+
+    Raises:
+        UserError: It is a fuel cell.
+    """
+    if isinstance(model, FuelCellModel):
+        raise UserError(f"{told}: {model.cell.name} is a fuel cell, which has no state of charge: leave it out")
 
 
 def with_pack(settings: Settings, **changes: object) -> Settings:

@@ -18,12 +18,12 @@ from rich.table import Table
 
 from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, Force, SignOfCurrent, check_out
 from bms_estimator.cli.compiling import compiling_shown
-from bms_estimator.cli.pack import pack_or_cell, with_broker, with_pack
+from bms_estimator.cli.pack import pack_or_cell, refuse_soc, with_broker, with_pack
 from bms_estimator.cli.summary import Result, Summary
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.live import new_estimator
 from bms_estimator.sinks import Delivery
@@ -63,6 +63,7 @@ def replay(
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:
+        refuse_soc(model, "--soc")
         settings = with_pack(settings, initial_soc=soc)
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
     if out is not None:
@@ -90,7 +91,7 @@ def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
         yield f"its last {source.unread_bytes:,} bytes are no whole record: cut off there, or a length is damaged"
 
 
-async def _replay(settings: Settings, cell: CellModel, source: Replay, table: TableSink | None) -> Result:
+async def _replay(settings: Settings, cell: PackModel, source: Replay, table: TableSink | None) -> Result:
     """Source -> estimator -> table, summary, broker."""
     with compiling_shown():
         estimator, summary = new_estimator(settings, cell), Summary()
@@ -111,11 +112,11 @@ async def _replay(settings: Settings, cell: CellModel, source: Replay, table: Ta
         wall_s = time.perf_counter() - started_s
         if publisher:
             publisher.publish_last()
-    return summary.result(estimator.record[0], estimator.settings_record[0], source.samples, wall_s)
+    return summary.result(estimator, source.samples, wall_s)
 
 
 async def _publisher(
-    stack: AsyncExitStack, settings: Settings, cell: CellModel, estimator: Estimator, source: Replay
+    stack: AsyncExitStack, settings: Settings, cell: PackModel, estimator: Estimator, source: Replay
 ) -> Publisher | None:
     """Who publishes, when there is a broker."""
     if settings.mqtt is None:
@@ -148,19 +149,28 @@ def result_table(title: str, result: Result) -> Table:
         **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
         **({"clock set back": f"{result.time_steps_back:,} times"} if result.time_steps_back else {}),
         "duration": _text(result.duration_s, ",.1f", "s"),
-        "SOC": f"{_text(result.soc_initial, '.2%')} to {_text(result.soc_final, '.2%')}",
-        "SOC, std at the end": _text(result.soc_std_final, ".2%"),
+        **({} if result.parameters else _soc(result)),
         "innovation, RMS": _text(result.innovation_rms_v, ".3f", "mV", 1e3),
         "voltage error, RMS": _text(result.voltage_rms_error_v, ".3f", "mV", 1e3),
         "lock": lock,
         "k at the end": _text(result.k_final, ".4g", "V²s"),
         "speed": f"{_text(result.samples_per_s, ',.0f')} samples/s, {result.wall_s:.2f} s",
     }
-    for name, value in rows.items():
+    learned = {
+        name: f"{'' if p.valid else 'not valid: '}{p.value:.4g} ± {p.std:.2g}" for name, p in result.parameters.items()
+    }
+    for name, value in (rows | learned).items():
         table.add_row(name, value)
     for suspicion in result.suspects:
         table.add_row("suspected", f"[yellow]{suspicion}[/]")
     return table
+
+
+def _soc(result: Result) -> dict[str, str]:
+    return {
+        "SOC": f"{_text(result.soc_initial, '.2%')} to {_text(result.soc_final, '.2%')}",
+        "SOC, std at the end": _text(result.soc_std_final, ".2%"),
+    }
 
 
 def _text(value: float | None, form: str, unit: str = "", scale: float = 1.0) -> str:

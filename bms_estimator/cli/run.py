@@ -12,8 +12,8 @@ import typer
 
 from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.logs import configure_logs
 from bms_estimator.service.serve import serve, state_folder
@@ -57,7 +57,7 @@ def run(
     asyncio.run(serve_several(loaded))
 
 
-def _run_one(settings: Settings, cell: CellModel, port: str | None, record: Path | None, *, view: bool) -> None:
+def _run_one(settings: Settings, cell: PackModel, port: str | None, record: Path | None, *, view: bool) -> None:
     settings = with_sensor(settings, port=port)
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if view and sys.stdout.isatty() else None)

@@ -6,8 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters
 from bms_estimator.snapshot.health import sample_counters, suspicions
 from bms_estimator.snapshot.topics import finite
+
+
+@dataclass(frozen=True)
+class LearnedParameter:
+    """What was learned, at the end."""
+
+    value: float
+    std: float
+    valid: bool
 
 
 @dataclass(frozen=True)
@@ -32,6 +44,8 @@ class Result:
     """Kind of fault -> samples that were not used."""
     gaps: int
     time_steps_back: int
+    parameters: dict[str, LearnedParameter]
+    """Of a fuel cell, by the keys of its file; of a battery none: they are over SOC."""
     samples_per_s: float | None  # read, whether used or not
     wall_s: float
 
@@ -62,15 +76,15 @@ class Summary:
         difference = trace["soc"] - trace["soc_coulomb"]
         self._soc_difference += float(difference @ difference)
 
-    def result(self, record: np.void, settings: np.void, read: int, wall_s: float) -> Result:
+    def result(self, estimator: Estimator, read: int, wall_s: float) -> Result:
         """The outcome.
 
         Args:
-            record: Of dtype ESTIMATOR_STATE, after the last sample.
-            settings: Of dtype ESTIMATOR_SETTINGS.
+            estimator: After the last sample.
             read: How many samples the capture had.
             wall_s: How long it took [s].
         """
+        record, settings = estimator.record[0], estimator.settings_record[0]
         state = record["observer"]
         counters = sample_counters(state)
         return Result(
@@ -92,12 +106,20 @@ class Summary:
             },
             gaps=counters["gaps"],
             time_steps_back=counters["time_steps_back"],
+            parameters=_learned(estimator),
             samples_per_s=read / wall_s if wall_s > 0.0 else None,
             wall_s=wall_s,
         )
 
     def _rms(self, squares: float) -> float | None:
         return finite(math.sqrt(squares / self._rows)) if self._rows else None
+
+
+def _learned(estimator: Estimator) -> dict[str, LearnedParameter]:
+    if not isinstance(estimator.cell, FuelCellModel) or not estimator.state[0]["started"]:
+        return {}
+    found = fuel_cell_parameters(estimator, 0.0)
+    return {name: LearnedParameter(p.value or math.nan, p.std or math.nan, p.valid) for name, p in found.items()}
 
 
 def _field(row: np.void | None, name: str) -> float | None:

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.cell import CellModel, ChenMoraOcv
+from bms_estimator.model.cell import ChenMoraOcv
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.moment import Moment, moment
 
@@ -34,19 +35,23 @@ REFUSED = "refused: "
 """A reason that begins so tells why a file that was found is not taken up."""
 
 
-def pack_identity(settings: Settings, cell: CellModel) -> str:
+def pack_identity(settings: Settings, cell: PackModel) -> str:
     """Hash of what gives the state its meaning: cells in series, capacity, open-circuit voltage, sign of the current.
+
+    Of a fuel cell: all its parameters and the sign.
 
     Plain numbers and not the sections of the settings: a description, a tuning value or a setting that a later version
     adds leave the meaning as it is.
     """
+    if isinstance(cell, FuelCellModel):  # theta is over the file's values
+        return hashlib.sha256(repr((*cell.a, settings.sensor.current_sign)).encode()).hexdigest()
     ocv = cell.ocv
     curve = ocv.a if isinstance(ocv, ChenMoraOcv) else (*ocv.soc, *ocv.ocv_v)
     meaning = (cell.cell.series_count, cell.cell.capacity_ah, settings.sensor.current_sign, *curve)
     return hashlib.sha256(repr(meaning).encode()).hexdigest()
 
 
-def _observer_identity(settings: Settings, cell: CellModel) -> str:
+def _observer_identity(settings: Settings, cell: PackModel) -> str:
     """Hash of what the observer's parameters and gain rest on; under other settings it begins anew, within seconds."""
     parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
     return hashlib.sha256(repr(parts).encode()).hexdigest()
@@ -85,7 +90,7 @@ class CheckpointFile:
         now: The present moment.
     """
 
-    def __init__(self, folder: Path, settings: Settings, cell: CellModel, now: Callable[[], Moment] = moment) -> None:
+    def __init__(self, folder: Path, settings: Settings, cell: PackModel, now: Callable[[], Moment] = moment) -> None:
         self._name, self._now = settings.pack.name, now
         self._identity, self._observer = pack_identity(settings, cell), _observer_identity(settings, cell)
         self._range_v = cell.cell.voltage_min_v, cell.cell.voltage_max_v

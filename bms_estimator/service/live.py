@@ -10,9 +10,9 @@ import numpy as np
 import structlog
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile
@@ -36,7 +36,7 @@ log = structlog.get_logger(__name__)
 
 async def run_live(
     settings: Settings,
-    cell: CellModel,
+    cell: PackModel,
     *,
     source: Source,
     sinks: Sequence[Sink],
@@ -106,7 +106,7 @@ async def run_live(
     return estimator
 
 
-def new_estimator(settings: Settings, cell: CellModel) -> Estimator:
+def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
     """The estimator of a pack, its kernels loaded: nothing compiles once samples come."""
 
     def make() -> Estimator:
@@ -159,11 +159,16 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None) -> tuple[i
     outcome = found.reason
     if not outcome:
         wrong = resume(estimator, found.state, found.unseen_s)
-        outcome = f"{REFUSED}{wrong}" if wrong else f"restored: SOC {estimator.state['soc'][0]:.4f}"
+        outcome = f"{REFUSED}{wrong}" if wrong else f"restored{_soc_text(estimator)}"
     if outcome.startswith(REFUSED):
         outcome = f"{outcome}; {checkpoint.set_aside()}"
     log.info("checkpoint", file=str(checkpoint.path), outcome=outcome)
     return found.restarts, outcome
+
+
+def _soc_text(estimator: Estimator) -> str:
+    soc = float(estimator.state["soc"][0])
+    return "" if math.isnan(soc) else f": SOC {soc:.4f}"
 
 
 async def _save_often(
@@ -186,7 +191,8 @@ async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Pub
     What is saved already is not saved again: it would seem to be of now, and not of before nobody measured.
     """
     state = estimator.record.copy()
-    taught = int(state["observer"]["samples"][0]), float(state["observer"]["soc"][0])
+    soc = float(np.nan_to_num(state["observer"]["soc"][0]))  # a fuel cell has none, and NaN would equal nothing
+    taught = int(state["observer"]["samples"][0]), soc
     if not taught[0] or taught == checkpoint.saved:
         return
     try:
@@ -195,6 +201,20 @@ async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Pub
     except OSError as error:
         publisher.checkpoint = f"cannot be saved: {error}"
         log.warning("checkpoint cannot be saved", file=str(checkpoint.path), error=str(error))
+
+
+def _present_soc(estimator: Estimator) -> float:
+    """The SOC that a request may change.
+
+    Raises:
+        UserError: There is none.
+    """
+    if not estimator.state["started"][0]:
+        raise UserError("no sample has been taken yet")
+    soc = float(estimator.state["soc"][0])
+    if math.isnan(soc):
+        raise UserError("a fuel cell has no state of charge")
+    return soc
 
 
 def _offer(
@@ -216,9 +236,7 @@ def _offer(
 
     async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         soc = number(arguments, "soc", 0.0, 1.0)
-        if not estimator.state["started"][0]:
-            raise UserError("no sample has been taken yet")
-        before = float(estimator.state["soc"][0])
+        before = _present_soc(estimator)
         estimator.set_soc(soc)
         log.info("SOC set on request", before=before, soc=soc)
         return {"soc": soc, "before": before}

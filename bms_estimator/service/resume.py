@@ -41,12 +41,13 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     """
     new = estimator.record.copy()
     estimator.step(0.0, 0.0, estimator.cell.cell.nominal_voltage_v)
+    begun = estimator.record.copy()
     was_on = bool(saved.get("filter.started", np.zeros(1))[0])
     _fill(
         estimator.record,
         {name: v for name, v in saved.items() if was_on or name.startswith(("observer.", "learning."))},
     )
-    wrong = _insane(estimator)
+    wrong = _insane(estimator, begun)
     if wrong:
         estimator.record[...] = new
         return wrong
@@ -97,12 +98,13 @@ def _open_new_states(estimator: Estimator) -> None:
             f["covariance"][best, j, j] = variance
 
 
-def _insane(estimator: Estimator) -> str:
-    """Why a state cannot be used; empty when it can."""
+def _insane(estimator: Estimator, begun: NDArray[np.void]) -> str:
+    """Why a state cannot be used; empty when it can. What a first sample leaves without a value, ``begun``, needs none."""
     record, cell = estimator.record, estimator.cell.cell
-    for name, field in fields(record):
+    for (name, field), (_, first) in zip(fields(record), fields(begun), strict=True):
         part, _, what = name.partition(".")
-        if part in ("observer", "learning", "filter", "checks", "map") and not np.isfinite(field).all():
+        known = np.isfinite(first)
+        if part in ("observer", "learning", "filter", "checks", "map") and not np.isfinite(field[known]).all():
             return f"{what} of the {part} is not finite"
     s = record[0]["observer"]
     if not s["started"]:
@@ -114,14 +116,17 @@ def _insane(estimator: Estimator) -> str:
         "k": (0.0, np.inf),
     }
     for name, (low, high) in ranges.items():
-        if not low <= s[name] <= high:
+        if not low <= s[name] <= high and np.isfinite(begun[0]["observer"][name]):
             return f"{name} = {s[name]} is outside {low}..{high}"
-    f = record[0]["filter"]
+    if not (s["a"][begun[0]["observer"]["a"] > 0.0] > 0.0).all():
+        return "a parameter a1..a15 is not positive"
+    return _insane_filter(record[0]["filter"]) if estimator.identifying else ""
+
+
+def _insane_filter(f: np.void) -> str:
+    """The same of the filter's part."""
     count, best = int(f["count"]), int(f["best"])
     if not 0 <= best < count <= HYPOTHESES:
         return f"{count} hypotheses, the best of them {best}"
     variances = np.diagonal(f["covariance"][:count], axis1=1, axis2=2)
-    for name, good in (("a parameter a1..a15", s["a"][1:16] > 0.0), ("a variance", variances >= 0.0)):
-        if not good.all():
-            return f"{name} is not positive"
-    return ""
+    return "" if (variances >= 0.0).all() else "a variance is not positive"

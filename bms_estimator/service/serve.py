@@ -10,8 +10,8 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
@@ -28,7 +28,7 @@ log = structlog.get_logger(__name__)
 
 async def serve(
     settings: Settings,
-    cell: CellModel,
+    cell: PackModel,
     *,
     sinks: Sequence[Sink] = (),
     tap: Tap | None = None,

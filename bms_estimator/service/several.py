@@ -5,15 +5,15 @@ from collections.abc import Sequence
 
 from structlog.contextvars import bind_contextvars
 
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.serve import serve, state_folder
 
 
-async def serve_several(packs: Sequence[tuple[Settings, CellModel]]) -> None:
+async def serve_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
     """Serve packs until SIGINT or SIGTERM. When one ends, all end in good order: who starts us starts all again.
 
     Args:
@@ -27,7 +27,7 @@ async def serve_several(packs: Sequence[tuple[Settings, CellModel]]) -> None:
     _differ("sensor.port", [settings.sensor.port for settings, _ in packs])
     stop, notifier = stop_on_signal(), Notifier(names)
 
-    async def serve_one(settings: Settings, cell: CellModel) -> None:
+    async def serve_one(settings: Settings, cell: PackModel) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
             await serve(settings, cell, stop=stop, folder=state_folder(settings), notifier=notifier)

@@ -135,8 +135,9 @@ def _header(snapshot: Snapshot, *, wide: bool) -> RenderableType:
     info, health = snapshot.info, snapshot.health
     left = Text.assemble((f" {info.device} ", "bold reverse"), overflow="ellipsis")
     if wide:
+        holds = "" if info.capacity_ah is None else f", {info.capacity_ah:.4g} Ah"
         cells = f"{info.series_count} cell{'s' if info.series_count > 1 else ''}"
-        left += Text(f"  {info.cell}, {cells} in series, {info.nominal_voltage_v:.4g} V, {info.capacity_ah:.4g} Ah")
+        left += Text(f"  {info.cell}, {cells} in series, {info.nominal_voltage_v:.4g} V{holds}")
     state = Text("● live", style="bold green") if health.sensor_online else Text("● stale", style="bold red")
     row = Table.grid(expand=True)
     row.add_column(no_wrap=True)

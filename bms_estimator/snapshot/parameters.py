@@ -19,6 +19,8 @@ from bms_estimator.kernels.element_map import ELEMENT_NAMES
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import OcvCurve, Parameter, ParameterReport
+from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters
 from bms_estimator.snapshot.ocv_formula import formula
 from bms_estimator.snapshot.topics import finite
 
@@ -51,6 +53,8 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
         estimator: Read only.
         now_s: Wall clock [s since 1970].
     """
+    if isinstance(estimator.cell, FuelCellModel):
+        return _of_fuel_cell(estimator, now_s)
     a, state = estimator.cell.a.copy(), estimator.state[0]
     if not state["started"]:
         return ParameterReport(
@@ -84,6 +88,12 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
         elements=elements,
         state_of_health=health,
     )
+
+
+def _of_fuel_cell(estimator: Estimator, now_s: float) -> ParameterReport:
+    """No SOC, no a1..a21; what is learned stands among the elements."""
+    elements = fuel_cell_parameters(estimator, now_s) if estimator.state[0]["started"] else {}
+    return ParameterReport(publish_time=iso_utc(now_s), soc=None, a={}, ocv=None, elements=elements, state_of_health={})
 
 
 def _of_cell_file(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:

@@ -7,9 +7,9 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.estimate import Estimate, Health, Info, Snapshot
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
 from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
@@ -51,7 +51,7 @@ class Publisher:
     def __init__(
         self,
         settings: Settings,
-        cell: CellModel,
+        cell: PackModel,
         estimator: Estimator,
         *,
         source: Source,

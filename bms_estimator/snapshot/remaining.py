@@ -32,7 +32,7 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
         current_a: The load [A], positive on discharge; charging counts as none.
     """
     state, settings = estimator.state[0], estimator.settings[0]
-    if not state["started"]:
+    if not state["started"] or math.isnan(state["soc"]):
         return RemainingCharge()
     soc, load_a = float(state["soc"]), max(current_a, 0.0)
     capacity_ah = float(settings["capacity_as"]) / 3600.0

@@ -9,6 +9,7 @@ from bms_estimator import __version__
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Estimate, Info
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.snapshot.remaining import RemainingCharge
 from bms_estimator.snapshot.window import WindowSummary
@@ -71,7 +72,7 @@ def estimate_report(
 
 
 def info_report(
-    settings: Settings, cell: CellModel, board: Mapping[str, str], started_s: float, *, temperature_sensor: bool
+    settings: Settings, cell: PackModel, board: Mapping[str, str], started_s: float, *, temperature_sensor: bool
 ) -> Info:
     """Topic ``info``.
 
@@ -87,10 +88,12 @@ def info_report(
         version=__version__,
         started=iso_utc(started_s),
         cell=cell.cell.name,
-        capacity_ah=cell.cell.capacity_ah,
+        capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
         series_count=cell.cell.series_count,
         nominal_voltage_v=cell.cell.nominal_voltage_v,
-        observer=f"{settings.observer.law}, {settings.observer.nussbaum}",
+        observer=f"{settings.observer.law}, {settings.observer.nussbaum}"
+        if isinstance(cell, CellModel)
+        else "learning",
         temperature_sensor=temperature_sensor,
         publish_rate_hz=settings.publish.rate_hz,
         board=dict(board),
