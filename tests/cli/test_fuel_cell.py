@@ -1,0 +1,137 @@
+"""A fuel cell on the command line: identified, replayed, checked; what makes no sense for it says so in one line."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.fuel_cell import KEYS
+from bms_estimator.kernels.fuel_cell_open_loop import open_loop, polarisation
+from bms_estimator.model.fuel_cell import load_fuel_cell
+from tests import mann_stack
+from tests.command_line import run
+
+PEM = load_fuel_cell("pem_30w")
+GROWN = np.array([1.0, 1.3, *[1.0] * 14])
+"""A stack whose resistance is 30 % above the file's."""
+
+
+def table(path: Path, **columns: np.ndarray) -> Path:
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.6g")
+    return path
+
+
+@pytest.fixture(scope="module")
+def curve(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    current_a = np.array([0, 0.05, 0.2, 0.5, 1, 2, 3, 4, 5, 6, 7, 8, 8.5])
+    voltage_v, _ = polarisation(PEM.a * GROWN, np.zeros(8), current_a, np.full(current_a.size, np.nan))
+    return table(tmp_path_factory.mktemp("fuel") / "curve.csv", current_a=current_a, voltage_v=voltage_v)
+
+
+@pytest.fixture(scope="module")
+def steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    time_s, current_a = mann_stack.random_steps(60.0, 200.0, seed=1)
+    voltage_v, _ = open_loop(PEM.a * GROWN, np.zeros(8), time_s, current_a, np.full(time_s.size, np.nan))
+    voltage_v += np.random.default_rng(0).normal(0.0, 0.003, time_s.size)
+    folder = tmp_path_factory.mktemp("fuel")
+    return table(folder / "steps.csv", time_s=time_s, current_a=current_a, voltage_v=voltage_v)
+
+
+def test_identify_writes_a_file_that_replays_use(capsys, curve: Path, steps: Path, tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    code, printed, _ = run(capsys, "identify", curve, steps, "--cell", "pem_30w", "--out", out, "--json")
+    assert code == 0
+    found = json.loads(printed)
+    assert set(found["parameters"]) == set(KEYS)
+    r_ohm = found["parameters"]["r_ohm"]
+    assert abs(r_ohm["value"] - 1.3 * r_ohm["of_start"]) < 3.0 * r_ohm["std"] < 0.05 * r_ohm["of_start"]
+    assert found["steps_rms_mv"] == pytest.approx(3.0, rel=0.05)
+    mine = load_fuel_cell(out)
+    assert mine.cell.name == "mine"
+    assert mine.std["r_ohm"] == pytest.approx(r_ohm["std"] / r_ohm["value"], rel=0.1)
+    assert "Identified from curve" in out.read_text()
+    before, after = (
+        json.loads(run(capsys, "replay", steps, "--cell", cell, "--json")[1])["innovation_rms_v"]
+        for cell in ("pem_30w", out)
+    )
+    assert after < 0.2 * before
+
+
+def test_identify_says_what_the_data_do_not_tell(capsys, curve: Path, tmp_path: Path) -> None:
+    code, printed, _ = run(capsys, "identify", curve, "--cell", "pem_30w", "--out", tmp_path / "mine.toml")
+    assert code == 0
+    assert "c_dl_farad: not known at all from these data; it needs steps of the current" in " ".join(printed.split())
+
+
+def test_replay_learns_and_has_no_soc(capsys, steps: Path, tmp_path: Path) -> None:
+    code, printed, _ = run(capsys, "replay", steps, "--cell", "pem_30w", "--json", "--out", tmp_path / "out.csv")
+    assert code == 0
+    result = json.loads(printed)
+    assert (result["soc_initial"], result["soc_final"], result["lock_lost"]) == (None, None, False)
+    assert result["samples"] == 12_000
+    assert result["parameters"]["r_ohm"]["value"] > 1.1 * PEM.fuel_cell.r_ohm
+    assert not result["parameters"]["concentration_v"]["valid"]
+    with (tmp_path / "out.csv").open() as rows:
+        last = list(csv.DictReader(rows))[-1]
+    assert last["soc"] == "nan"
+    assert abs(float(last["voltage_estimate_v"]) - float(last["voltage_v"])) < 0.1
+    code, printed, _ = run(capsys, "replay", steps, "--cell", "pem_30w")
+    assert "r_ohm" in printed
+    assert "SOC" not in printed
+
+
+def test_a_pack_file_names_it(capsys, tmp_path: Path) -> None:
+    pack = tmp_path / "pack.toml"
+    pack.write_text('[pack]\ncell = "pem_30w"\nseries = 2\n')
+    code, printed, err = run(capsys, "config", "check", pack)
+    assert (code, err) == (0, "")
+    assert "pem_30w, 28 in series, 18.6 V, fuel cell" in printed
+    code, printed, _ = run(capsys, "config", "show", pack)
+    assert code == 0
+    assert "delta_1" not in printed
+    assert "observer.lock_error_v" in printed
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("capacity", "{steps}", "--cell", "pem_30w"),
+        ("validate", "{steps}", "--cell", "pem_30w"),
+        ("cell", "export", "{pack}", "--out", "{out}"),
+        ("simulate", "--cell", "pem_30w"),
+        ("replay", "{steps}", "--cell", "pem_30w", "--soc", "0.5"),
+        ("replay", "{steps}", "--cell", "pem_30w", "--capacity-ah", "3"),
+        ("replay", "{steps}", "--pack", "{soc}"),
+        ("identify", "{steps}", "--cell", "pem_30w", "--out", "{out}", "--keep-ocv"),
+    ],
+    ids=" ".join,
+)
+def test_what_makes_no_sense_for_a_fuel_cell_says_so_in_one_line(
+    capsys, arguments, steps: Path, tmp_path: Path
+) -> None:
+    pack, soc = tmp_path / "pack.toml", tmp_path / "soc.toml"
+    pack.write_text('[pack]\ncell = "pem_30w"\n')
+    soc.write_text('[pack]\ncell = "pem_30w"\ninitial_soc = 0.5\n')
+    places = {"steps": steps, "pack": pack, "soc": soc, "out": tmp_path / "out.toml"}
+    code, out, err = run(capsys, *(argument.format(**places) for argument in arguments))
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "is a fuel cell" in err
+
+
+def test_files_that_cannot_be_used_are_named(capsys, steps: Path, tmp_path: Path) -> None:
+    short = tmp_path / "short.csv"
+    short.write_text("current_a,voltage_v\n1.0,10.0\n2.0,9.0\n")
+    hole = tmp_path / "hole.csv"
+    hole.write_text("current_a,voltage_v\n1.0,10.0\n2.0\n3.0,8.0\n")
+    for path, message in (
+        (short, "2 usable points"),
+        (hole, "a value is missing"),
+        (tmp_path / "none.csv", "none.csv"),
+    ):
+        code, _, err = run(capsys, "identify", path, "--cell", "pem_30w", "--out", tmp_path / "out.toml")
+        assert code == 2
+        assert message in err

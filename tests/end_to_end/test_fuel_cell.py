@@ -1,0 +1,82 @@
+"""The whole way with a fuel cell: simulated stack -> board -> serial line -> the real program -> the real broker."""
+
+import asyncio
+import contextlib
+import json
+from pathlib import Path
+
+import numpy as np
+
+from bms_estimator.calibration.fuel_cell import KEYS
+from bms_estimator.cli.pack import load_pack
+from bms_estimator.service.checkpoint import CheckpointFile
+from bms_estimator.service.live import new_estimator
+from bms_estimator.service.resume import resume
+from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.simulation.virtual_converter import Reading
+from bms_estimator.sources.replay import RawCapture
+from tests import mann_stack
+from tests.end_to_end.test_whole_way import program
+from tests.mosquitto import Broker, Listener
+
+SAMPLES = 500
+LSB_V = 25.0 / 1024.0
+
+
+def stack() -> list[Reading]:
+    """A minute at 100 Hz; the board asks for no more."""
+    time_s, current_a = mann_stack.random_steps(60.0, 100.0, seed=2, highest_a=4.0)
+    record = mann_stack.measured(time_s, current_a, noise_v=0.0)
+    columns = (record.current_a, record.voltage_v, record.temperature_c)
+    return [Reading(*map(float, row)) for row in zip(*columns, strict=True)]
+
+
+async def test_a_fuel_cell_is_served_as_a_battery_is_and_goes_on_after_a_restart(
+    tmp_path: Path, broker: Broker
+) -> None:
+    readings, pack, capture = stack(), tmp_path / "pack.toml", tmp_path / "line.bms"
+    with VirtualBoard(lambda at_s: readings[min(int(100.0 * at_s), len(readings) - 1)]) as board:
+        pack.write_text(f"""
+[pack]
+cell = "pem_30w"
+[sensor]
+port = "{board.path}"
+[publish]
+rate_hz = 10
+[mqtt]
+url = "{broker.url}"
+[state]
+folder = "{tmp_path / "state"}"
+""")
+        running = asyncio.create_task(board.run())
+        async with Listener(broker, "bms/#") as listener, program(pack, "--record", str(capture)):
+            await listener.wait_json("bms/pack/health", lambda h: h["samples"]["samples"] > SAMPLES)
+            parameters = await listener.wait_json("bms/pack/parameters", lambda p: p["elements"])
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+    state = json.loads(listener.all("bms/pack/state")[-1])
+    assert [state[name] for name in ("soc", "soc_percent", "remaining_capacity_ah", "delta_1", "time_to_empty_s")] == [
+        None
+    ] * 5
+    assert 8.0 < state["voltage_v"] < 13.0
+    assert state["lock"]
+    assert state["frames_lost"] == 0
+    errors_v = [json.loads(s)["innovation_v"] for s in listener.all("bms/pack/state")]
+    assert np.sqrt(np.mean(np.square(errors_v))) < 4.0 * LSB_V
+    assert tuple(parameters["elements"]) == KEYS
+    assert (parameters["a"], parameters["soc"]) == ({}, None)
+    info = json.loads(listener.all("bms/pack/info")[-1])
+    assert (info["cell"], info["capacity_ah"], info["observer"]) == ("pem_30w", None, "learning")
+
+    settings, cell = load_pack(pack)
+    saved = CheckpointFile(tmp_path / "state", settings, cell).load()
+    assert saved.reason == ""
+    replayed, resumed = new_estimator(settings, cell), new_estimator(settings, cell)
+    for block in RawCapture(capture):
+        replayed.run(block)
+    assert saved.state["learning.theta"].tobytes() == replayed.record["learning"]["theta"].tobytes(), "to the last bit"
+    assert resume(resumed, saved.state, 10.0) == ""
+    np.testing.assert_array_equal(resumed.record["learning"]["theta"], replayed.record["learning"]["theta"])
+    insane = {**saved.state, "learning.theta": np.full_like(saved.state["learning.theta"], np.nan)}
+    assert resume(new_estimator(settings, cell), insane, 10.0) == "theta of the learning is not finite"

@@ -1,0 +1,153 @@
+"""The very step that takes a battery's samples takes a fuel cell's."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.fuel_cell import KEYS
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.fuel_cell import NAMES
+from bms_estimator.kernels.fuel_cell_open_loop import open_loop
+from bms_estimator.kernels.sample_step import Verdict
+from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters
+from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.snapshot.remaining import remaining_charge
+from tests import mann_stack
+
+PEM = load_fuel_cell("pem_30w")
+
+
+def block(record: mann_stack.Record) -> SampleBlock:
+    samples = np.zeros(record.time_s.size, SAMPLE)
+    for name in ("time_s", "current_a", "voltage_v", "temperature_c"):
+        samples[name] = getattr(record, name)
+    return samples
+
+
+def own_block(truth: np.ndarray, duration_s: float, *, seed: int = 0, noise_v: float = 0.003) -> SampleBlock:
+    """100 Hz of the model itself whose parameters are ``truth`` times the file's; steps of the current lie between samples."""
+    time_s, current_a = mann_stack.random_steps(duration_s, 500.0, seed=seed)
+    voltage_v, _ = open_loop(PEM.a * truth, np.zeros(8), time_s, current_a, np.full(time_s.size, np.nan))
+    voltage_v += np.random.default_rng(seed).normal(0.0, noise_v, time_s.size)
+    nobody = np.full(time_s.size, np.nan)
+    return block(mann_stack.Record(time_s, current_a, voltage_v, nobody, nobody).every(5))
+
+
+def learned(estimator: Estimator) -> dict[str, float]:
+    return dict(zip(NAMES, estimator.state["a"][0][1:8], strict=True))
+
+
+@pytest.fixture(scope="module")
+def ten_minutes() -> mann_stack.Record:
+    """The stack of the tests at 100 Hz: its contacts grow by 60 mohm in the middle."""
+    time_s, current_a = mann_stack.random_steps(600.0, 500.0, seed=4)
+    more_ohm = np.where(time_s < 300.0, 0.0, 0.06)
+    return mann_stack.measured(time_s, current_a, seed=4, more_ohm=more_ohm).every(5)
+
+
+def test_run_and_step_leave_the_same_state_to_the_last_bit(ten_minutes: mann_stack.Record) -> None:
+    samples = block(ten_minutes)[:3000]
+    samples["voltage_v"][100] = np.nan
+    samples["voltage_v"][200] = 25.0
+    samples["temperature_c"][300:500] = np.nan
+    stepped, ran, in_parts = Estimator(PEM), Estimator(PEM), Estimator(PEM)
+    verdicts = [
+        stepped.step(*(float(s[n]) for n in ("time_s", "current_a", "voltage_v")), 0, float(s["temperature_c"]))
+        for s in samples
+    ]
+    ran.run(samples)
+    for part in np.array_split(samples, 7):
+        in_parts.run(part)
+    assert stepped.record.tobytes() == ran.record.tobytes() == in_parts.record.tobytes()
+    assert [verdicts.count(v) for v in (Verdict.ACCEPTED, Verdict.NOT_FINITE, Verdict.OUT_OF_RANGE)] == [2998, 1, 1]
+    assert ran.state["samples"][0] == 2998
+
+
+def test_what_a_stack_has_not_is_nan_inside_and_null_outside(ten_minutes: mann_stack.Record) -> None:
+    estimator = Estimator(PEM)
+    trace = estimator.run(block(ten_minutes)[:500])
+    for name in ("soc", "soc_coulomb", "soc_std", "soc_ocv", "delta_1", "delta_2", "stability_margin"):
+        assert np.isnan(trace[name]).all(), name
+    assert np.isfinite(trace["voltage_estimate_v"]).all()
+    assert (trace["lock"] == 1).all()
+    assert all(math.isnan(value) for value in vars(remaining_charge(estimator, 3.0)).values())
+    report = parameter_report(estimator, 0.0)
+    assert (report.soc, report.a, report.ocv, report.state_of_health) == (None, {}, None, {})
+    assert tuple(report.elements) == KEYS
+    assert parameter_report(Estimator(PEM), 0.0).elements == {}
+    with pytest.raises(ValueError, match="has no SOC"):
+        estimator.set_soc(0.5)
+
+
+def test_a_resistance_that_grows_is_learned() -> None:
+    """Ten minutes as in the file, then 35 % more of one parameter alone: in ten minutes it is found, and the others again."""
+    estimator, grown = Estimator(PEM), np.ones(16)
+    grown[1 + NAMES.index("r_ohm")] = 1.35
+    first, then = own_block(np.ones(16), 600.0), own_block(grown, 600.0, seed=1)
+    then["time_s"] += 600.0
+    estimator.run(first)
+    assert learned(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.05)
+    trace = estimator.run(then)
+    assert learned(estimator)["r_ohm"] == pytest.approx(1.35 * PEM.fuel_cell.r_ohm, rel=0.05)
+    assert learned(estimator)["tafel_slope_v"] == pytest.approx(PEM.fuel_cell.tafel_slope_v, rel=0.03)
+    first_v, last_v = (np.sqrt(np.mean(trace["innovation_v"][part] ** 2)) for part in (slice(500), slice(-6000, None)))
+    assert first_v > 0.1
+    assert last_v < 0.01
+
+
+def test_a_stack_that_is_more_than_the_model_is_followed_in_its_voltage(ten_minutes: mann_stack.Record) -> None:
+    """Its contacts grow by 60 mohm at 300 s: 180 mV off at once, 20 mV after four minutes; the resistance within 10 %."""
+    estimator, late = Estimator(PEM), slice(-6000, None)
+    trace = estimator.run(block(ten_minutes))
+    grown_v = trace["innovation_v"][(ten_minutes.time_s > 300.0) & (ten_minutes.time_s < 310.0)]
+    assert np.sqrt(np.mean(grown_v**2)) > 0.1
+    assert np.sqrt(np.mean(trace["innovation_v"][late] ** 2)) < 0.025
+    assert learned(estimator)["r_ohm"] == pytest.approx(ten_minutes.r_ohm[late].mean(), rel=0.1)
+    assert (trace["lock"][late] == 1).all()
+
+
+def test_wrong_parameters_are_learned_and_said_to_be_known() -> None:
+    """The model itself from a wrong start, 5 to 50 % off: right to 3 % in ten minutes."""
+    truth = np.array([1.0, 1.5, 0.9, 1.05, 1.3, *[1.0] * 11])
+    estimator = Estimator(PEM, voltage_resolution_v=1e-3)
+    trace = estimator.run(own_block(truth, 600.0))
+    assert np.sqrt(np.mean(trace["innovation_v"][-6000:] ** 2)) < 0.008
+    found = learned(estimator)
+    for name, factor, within in (
+        ("r_ohm", 1.5, 0.03),
+        ("tafel_slope_v", 0.9, 0.01),
+        ("activation_v", 1.05, 0.005),
+        ("c_dl_farad", 1.3, 0.03),
+    ):
+        assert found[name] == pytest.approx(factor * PEM.a[1 + NAMES.index(name)], rel=within), name
+    published = fuel_cell_parameters(estimator, 0.0)
+    assert published["r_ohm"].valid
+    assert published["r_ohm"].std is not None
+    assert not published["concentration_v"].valid
+    assert "known to" in str(published["concentration_v"].reason)
+
+
+def test_without_a_load_nothing_is_learned_but_the_voltage() -> None:
+    samples = own_block(np.ones(16), 60.0)
+    samples["current_a"], samples["voltage_v"] = 0.0, 13.1
+    estimator = Estimator(PEM)
+    estimator.run(samples)
+    found = learned(estimator)
+    for name in ("r_ohm", "c_dl_farad"):
+        assert found[name] == pytest.approx(PEM.a[1 + NAMES.index(name)], rel=0.02), name
+    assert not fuel_cell_parameters(estimator, 0.0)["r_ohm"].valid
+
+
+def test_parameters_stay_within_their_bounds_whatever_is_measured() -> None:
+    samples = own_block(np.ones(16), 120.0)
+    samples["voltage_v"] = np.random.default_rng(1).uniform(2.0, 18.0, samples.size)
+    estimator = Estimator(PEM)
+    estimator.run(samples)
+    q = estimator.settings_record[0]["learning"]
+    theta = estimator.record[0]["learning"]["theta"][:7]
+    assert np.isfinite(theta).all()
+    assert (q["lower"][:7] <= theta).all()
+    assert (theta <= q["upper"][:7]).all()

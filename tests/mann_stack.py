@@ -1,0 +1,139 @@
+"""A PEM stack that does more than the model knows: what the fuel cell's tests and benchmark take for the truth.
+
+Losses after Mann et al. (2000) with the coefficients of Correa et al. (2004), from which ``pem_30w`` is made, and beyond
+the model: a membrane whose resistance follows current, temperature and a water content that lags by a minute, oxygen that
+lags by 0.3 s, a stack that warms by some K, a reaction that also runs backwards (Butler-Volmer).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+CELLS, AREA_CM2, THICK_CM = 14, 20.0, 0.0178
+XI_1, XI_3, XI_4 = -0.948, 7.6e-5, -1.93e-4
+B_V, LIMIT_A, INTERNAL_A = 0.016, 0.469 * AREA_CM2, 0.003 * AREA_CM2
+C_FARAD, CONTACT_OHM = 3.0 / 64.0 * AREA_CM2, 0.0003 * 64.0 / AREA_CM2
+HYDROGEN_ATM, OXYGEN_ATM = 1.0, 0.21
+WATER_S, OXYGEN_S, WARM_S = 60.0, 0.3, 300.0
+DRY, PER_AMPERE = 12.0, 0.5
+"""Water content of the membrane at no load, and what an ampere adds."""
+COLD_C, WARM_K = 35.0, 6.0
+FULL_W = 30.0
+"""At this power the stack warms by ``WARM_K``."""
+SUBSTEP_S = 5e-4
+NOISE_V = 0.003
+RESOLUTION_V = 0.001
+
+
+class Record(NamedTuple):
+    """Columns, shape (n,) each; the last is no measurement but the truth."""
+
+    time_s: Floats
+    current_a: Floats
+    voltage_v: Floats
+    temperature_c: Floats
+    r_ohm: Floats
+
+    def every(self, n: int) -> "Record":
+        """Each n-th sample alone, as a slower board has them: steps of the current lie anywhere between two."""
+        return Record(*(column[::n] for column in self))
+
+
+def measured(
+    time_s: Floats, current_a: Floats, *, seed: int = 0, noise_v: float = NOISE_V, more_ohm: Floats | float = 0.0
+) -> Record:
+    """Voltage and temperature of the stack under a current that holds from each sample on; it starts settled.
+
+    Args:
+        time_s: Shape (n,), increasing [s].
+        current_a: Shape (n,), not negative [A].
+        seed: Of the noise.
+        noise_v: Standard deviation of a voltage [V].
+        more_ohm: What the contacts have grown by, of the stack, a number or shape (n,) [ohm].
+    """
+    growth = np.broadcast_to(np.asarray(more_ohm, dtype=float), time_s.shape).copy()
+    voltage_v, temperature_c, r_ohm = _run(np.asarray(time_s, dtype=float), np.asarray(current_a, dtype=float), growth)
+    noisy = voltage_v + np.random.default_rng(seed).normal(0.0, noise_v, time_s.size)
+    rounded = np.round(noisy / RESOLUTION_V) * RESOLUTION_V
+    return Record(time_s, current_a, rounded, np.round(temperature_c, 1), r_ohm)
+
+
+def curve(currents_a: Floats, *, seed: int = 0, noise_v: float = NOISE_V) -> Record:
+    """A polarisation curve: under each current the stack has settled and is as warm as it gets."""
+    time_s = np.arange(3.0)
+    last = [measured(time_s, np.full(time_s.size, i), seed=seed + k, noise_v=noise_v) for k, i in enumerate(currents_a)]
+    columns = (np.array([getattr(record, name)[-1] for record in last]) for name in Record._fields)
+    return Record(*columns)
+
+
+def random_steps(duration_s: float, rate_hz: float, *, seed: int, highest_a: float = 5.0) -> tuple[Floats, Floats]:
+    """Time [s] and a current of random steps of 0.5 to 5 s between 0.2 A and ``highest_a``."""
+    dice = np.random.default_rng(seed)
+    time_s = np.arange(round(duration_s * rate_hz)) / rate_hz
+    starts = np.cumsum(dice.uniform(0.5, 5.0, math.ceil(duration_s / 0.5)))
+    heights = dice.uniform(0.2, highest_a, starts.size + 1)
+    return time_s, heights[np.searchsorted(starts, time_s)]
+
+
+def settled_r_ohm(current_a: float, temperature_c: float) -> float:
+    """Resistance of the stack once the water has settled [ohm]."""
+    return CELLS * _cell_ohm(current_a, temperature_c + 273.15, DRY + PER_AMPERE * current_a)
+
+
+@njit
+def _cell_ohm(current_a: float, kelvin: float, water: float) -> float:
+    density = current_a / AREA_CM2
+    dry = 181.6 * (1.0 + 0.03 * density + 0.062 * (kelvin / 303.0) ** 2 * density**2.5)
+    wet = (water - 0.634 - 3.0 * density) * math.exp(4.18 * (kelvin - 303.0) / kelvin)
+    return dry / wet * THICK_CM / AREA_CM2 + CONTACT_OHM
+
+
+@njit
+def _activation_v(kelvin: float) -> float:
+    hydrogen = HYDROGEN_ATM / (1.09e6 * math.exp(77.0 / kelvin))
+    oxygen = OXYGEN_ATM / (5.08e6 * math.exp(-498.0 / kelvin))
+    xi_2 = 0.00286 + 0.0002 * math.log(AREA_CM2) + 4.3e-5 * math.log(hydrogen)
+    return -(XI_1 + xi_2 * kelvin + XI_3 * kelvin * math.log(oxygen))
+
+
+@njit
+def _nernst_v(kelvin: float) -> float:
+    gases = math.log(HYDROGEN_ATM) + 0.5 * math.log(OXYGEN_ATM)
+    return 1.229 - 8.5e-4 * (kelvin - 298.15) + 4.3085e-5 * kelvin * gases
+
+
+@njit
+def _run(time_s: Floats, current_a: Floats, more_ohm: Floats) -> tuple[Floats, Floats, Floats]:
+    n = time_s.size
+    voltage_v, temperature_c, r_ohm = np.empty(n), np.empty(n), np.empty(n)
+    kelvin, water = COLD_C + 273.15, DRY + PER_AMPERE * current_a[0]
+    oxygen = 1.0 - (current_a[0] + INTERNAL_A) / LIMIT_A
+    loss_v = 0.0
+    for _ in range(20):  # as warm as the first current makes it
+        loss_v = _activation_v(kelvin) - XI_4 * kelvin * math.log(current_a[0] + INTERNAL_A) - B_V * math.log(oxygen)
+        start_v = CELLS * (_nernst_v(kelvin) - loss_v - current_a[0] * _cell_ohm(current_a[0], kelvin, water))
+        kelvin = 273.15 + COLD_C + WARM_K * current_a[0] * start_v / FULL_W
+    for j in range(n):
+        if j > 0:
+            left_s, i = time_s[j] - time_s[j - 1], current_a[j - 1]
+            while left_s > 1e-9:
+                dt_s = min(SUBSTEP_S, left_s)
+                left_s -= dt_s
+                tafel_v = -XI_4 * kelvin
+                exchange_a = math.exp(-_activation_v(kelvin) / tafel_v)
+                forth = math.exp((loss_v + B_V * math.log(oxygen)) / tafel_v)
+                reaction_a = exchange_a * (forth - math.exp(-loss_v / tafel_v))
+                loss_v += dt_s * (i + INTERNAL_A - reaction_a) / C_FARAD
+                oxygen += dt_s / OXYGEN_S * (max(1.0 - (i + INTERNAL_A) / LIMIT_A, 0.01) - oxygen)
+                water += dt_s / WATER_S * (DRY + PER_AMPERE * i - water)
+                warm_k = WARM_K * i * voltage_v[j - 1] / FULL_W
+                kelvin += dt_s / WARM_S * (273.15 + COLD_C + warm_k - kelvin)
+        r_ohm[j] = CELLS * _cell_ohm(current_a[j], kelvin, water) + more_ohm[j]
+        voltage_v[j] = CELLS * (_nernst_v(kelvin) - loss_v) - current_a[j] * r_ohm[j]
+        temperature_c[j] = kelvin - 273.15
+    return voltage_v, temperature_c, r_ohm

@@ -1,0 +1,85 @@
+"""A fuel cell's file: the shipped one, scaling, what is refused, and that a written one is read again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.kernels.fuel_cell import NAMES
+from bms_estimator.kernels.fuel_cell_open_loop import polarisation
+from bms_estimator.model.cell import is_fuel_cell, load_cell, shipped_fuel_cells
+from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import FuelCellModel, load_any, load_fuel_cell
+from tests import mann_stack
+
+PEM = load_fuel_cell("pem_30w")
+
+
+def voltage_v(model: FuelCellModel, current_a: float) -> float:
+    return float(polarisation(model.a, np.zeros(8), np.array([current_a]), np.array([np.nan]))[0][0])
+
+
+def test_the_shipped_stack_gives_30_w() -> None:
+    assert shipped_fuel_cells() == ["pem_30w"]
+    assert 3.25 * voltage_v(PEM, 3.25) == pytest.approx(30.3, abs=0.1)
+    assert voltage_v(PEM, 3.25) == pytest.approx(PEM.cell.nominal_voltage_v, abs=0.05)
+
+
+def test_the_shipped_stack_is_that_of_the_coefficients_that_it_names() -> None:
+    kelvin = 273.15 + PEM.fuel_cell.temperature_c
+    f, n = PEM.fuel_cell, mann_stack.CELLS
+    assert f.tafel_slope_v == pytest.approx(-mann_stack.XI_4 * kelvin * n, rel=1e-3)
+    assert PEM.activation_v == pytest.approx(n * mann_stack._activation_v(kelvin), rel=1e-3)
+    assert f.c_dl_farad == pytest.approx(mann_stack.C_FARAD / n, rel=1e-3)
+    assert f.r_ohm == pytest.approx(n * mann_stack._cell_ohm(3.25, kelvin, 14.0), rel=1e-3)
+    assert f.concentration_v == pytest.approx(n * mann_stack.B_V)
+    assert (f.limiting_current_a, f.internal_current_a) == pytest.approx((mann_stack.LIMIT_A, mann_stack.INTERNAL_A))
+
+
+def test_stacks_in_series_and_parallel_share_voltage_and_current() -> None:
+    assert voltage_v(PEM.pack(3, 1), 2.0) == pytest.approx(3.0 * voltage_v(PEM, 2.0))
+    assert voltage_v(PEM.pack(1, 4), 8.0) == pytest.approx(voltage_v(PEM, 2.0))
+    assert PEM.pack(1, 1) is PEM
+
+
+def test_a_written_file_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    a = PEM.a
+    a[1 : 1 + len(NAMES)] *= 1.25
+    found = PEM.identified(a, {"r_ohm": 0.0123456})
+    write_cell(path, found, ["a remark"])
+    again = load_any(path)
+    assert again == found
+    assert again.a == pytest.approx(a, rel=1e-4)
+    assert again.std == {"r_ohm": 0.012}
+    assert is_fuel_cell(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "edit", "message"),
+    [
+        ("r_ohm = 0.1677", "r_ohm = -1", r"fuel_cell\.r_ohm = -1.*greater than 0.*membrane"),
+        ("r_ohm = 0.1677", "", r"fuel_cell\.r_ohm: missing \(membrane"),
+        ("oxygen_atm = 0.21", "oxygen_atm = 0.21\nhumidity = 1", r"fuel_cell\.humidity.*unknown key"),
+        ("exchange_current_a = 0.000927", "exchange_current_a = 2.0", r"exchange_current_a = 2\.0.*less than 1"),
+        ("[fuel_cell]", "[std]\nocv = 1.0\n[fuel_cell]", r"std\.ocv"),
+        ("voltage_min_v = 2.0", "voltage_min_v = 20.0", r"must increase in this order"),
+    ],
+)
+def test_a_wrong_value_is_named(tmp_path: Path, text: str, edit: str, message: str) -> None:
+    shipped = Path(mann_stack.__file__).parents[1] / "bms_estimator/model/cells/fuel_cell/pem_30w.toml"
+    path = tmp_path / "mine.toml"
+    path.write_text(shipped.read_text().replace(text, edit, 1))
+    with pytest.raises(UserError, match=message):
+        load_fuel_cell(path)
+
+
+def test_what_needs_a_battery_refuses_a_fuel_cell(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"^pem_30w is a fuel cell, which has no state of charge"):
+        load_cell("pem_30w")
+    with pytest.raises(UserError, match=r"no capacity"):
+        load_any("pem_30w", 3.0)
+    with pytest.raises(UserError, match=r"no such cell file.*pem_30w"):
+        load_fuel_cell("pem_31w")
+    assert load_any("chen_mora") == load_cell("chen_mora")
