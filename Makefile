@@ -11,7 +11,7 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare anywhere chapter5 ablation learning firmware kernels lock
+.PHONY: help venv apt check test demo benchmark compare anywhere chapter5 ablation learning fuelcell firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -55,6 +55,9 @@ chapter5: venv ## the experiments of the thesis's chapter 5 on real captures, be
 
 ablation: venv ## what each part of the filter is worth, on real captures, e.g. make ablation ARGS=LFP: minutes
 	@$(BIN)/python -m tests.benchmarks.ablation $(ARGS)
+
+fuelcell: venv ## figures of the fuel cell, docs/fuel-cell.md: seconds
+	@$(BIN)/python -m tests.benchmarks.fuel_cell
 
 learning: venv ## what the learning law and each of its parts are worth, simulated
 	@$(BIN)/python -m tests.benchmarks.learning_law
