@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,15 +32,7 @@ LEAST_V = 1e-4
 """No source is better than this [V]: what leaves less has as many points as parameters."""
 BLOCKS = 20
 """Parts of a record whose means tell how long its errors are alike."""
-KEYS: tuple[Parameter, ...] = (
-    "r_ohm",
-    "tafel_slope_v",
-    "exchange_current_a",
-    "c_dl_farad",
-    "concentration_v",
-    "limiting_current_a",
-    "internal_current_a",
-)
+KEYS: tuple[Parameter, ...] = get_args(Parameter)
 """Of ``[fuel_cell]``, in the order of ``NAMES``."""
 NEEDS = {
     "r_ohm": "steps of the current, or a curve over more of its range",

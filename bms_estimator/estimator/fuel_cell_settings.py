@@ -24,8 +24,8 @@ FACTORS = {
     "limiting_current_a": 2.0,
     "internal_current_a": 4.0,
 }
-"""How many times larger or smaller than in the file a parameter may be. Of the activation loss at 1 A it is three decades of
-the exchange current."""
+"""How many times larger or smaller than in the file a parameter may be; 1.3 of the activation loss at 1 A is about 8 of the
+exchange current."""
 
 
 def fuel_cell_settings(cell: FuelCellModel, of_observer: np.void) -> NDArray[np.void]:

@@ -7,9 +7,9 @@ A stack of n cells as one two-terminal object under the current i, positive when
     C dv/dt = I - I e^((v - v_inf(I)) / A),   I = i + i_n                        double layer, Tafel's kinetics
     v_inf(I) = a + A ln I - B ln(1 - I / i_L)                                    Larminie and Dicks (2003), 3.4 to 3.7
 
-r, A and a are of the file's temperature and follow the stack's (``give_file``). T in K, pressures in atm, I in A (a is the loss at 1 A: the exchange current is e^(-a / A) A), v the activation and
-concentration overpotential of the whole stack. Over a sample whose current is held, e^(-v / A) is a first-order lag of
-time constant A C / I: the step is exact for every length.
+T in K, pressures in atm, I in A: a is the loss at 1 A, and e^(-a / A) A the exchange current. v is the activation and
+concentration overpotential of the whole stack. r, A and a are of the file's temperature and follow the stack's (``give_file``).
+Over a sample whose current is held, e^(-v / A) is a first-order lag of time constant A C / I: the step is exact for every length.
 
 Correa et al. take v / v_inf(I) in place of the exponential. Both end at v_inf; theirs does so v_inf / A (6 to 9) times more
 slowly from the same C, because it takes the chord of Tafel's curve for its slope. A / I is what impedance measures.

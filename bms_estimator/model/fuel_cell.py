@@ -35,7 +35,7 @@ Parameter = Literal[
     "limiting_current_a",
     "internal_current_a",
 ]
-"""What is identified of a stack."""
+"""What is identified of a stack, in the order of ``kernels.fuel_cell.NAMES``."""
 
 
 class FuelCell(Strict):
