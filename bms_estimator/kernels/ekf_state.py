@@ -112,7 +112,8 @@ WINDOW = np.dtype(
         ("time_s", "f8"),  # since the update before [s]
         ("charge_as", "f8"),  # moved since then [A s]
         ("throughput_as", "f8"),  # its magnitude
-        ("unknown_as", "f8"),  # std of charge in gaps, where nobody measured [A s]
+        ("unknown_as", "f8"),  # std of the charge where nobody measured [A s]
+        ("gap", "i8"),  # 1: samples are missing
         ("sum_v", "f8"),
         ("sum_a", "f8"),
         ("sum_as", "f8"),  # of the charge moved until each sample

@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.charge import LONGEST_FLOW_S, held_current
+from bms_estimator.kernels.charge import LONGEST_FLOW_S, UNMEASURED_S, held_current
 from bms_estimator.kernels.ekf import HIGHEST, LOWEST, decay, inflate, predict, update
 from bms_estimator.kernels.ekf_noise import (
     bias_variance,
@@ -39,7 +39,7 @@ from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, 
 from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
-from bms_estimator.kernels.unseen import first_load, unseen_charge, unseen_current, watch_load
+from bms_estimator.kernels.unseen import first_load, goes_on, unseen_charge, watch_load
 
 WINDOW_S = 0.99
 """Samples of about a second make one update [s]."""
@@ -158,7 +158,7 @@ def copy(s: Record, source: int, to: int) -> None:
 def clear(s: Record) -> None:
     """Begin a new window."""
     w = s.window
-    w.samples = 0
+    w.samples = w.gap = 0
     w.time_s = w.charge_as = w.throughput_as = w.unknown_as = 0.0
     w.sum_v = w.sum_a = w.sum_as = 0.0
     for k in range(BRANCHES):
@@ -166,16 +166,18 @@ def clear(s: Record) -> None:
 
 
 @njit(cache=True)
-def count_on(s: Record, p: Record, dt_s: float, seen: bool, current_a: float, temperature_c: float) -> None:
-    """Charge and branches from the sample before to this one; not ``seen``: nobody measured between them."""
+def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, temperature_c: float) -> None:
+    """Charge and branches from the sample before to this one; ``gap``: samples are missing between them."""
     if is_temperature(temperature_c):
         share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
         s.temperature_c += share * (temperature_c - s.temperature_c)
         s.sensed = 1
     w = s.window
-    held_a, flow_s = held_current(dt_s, s.current_a, current_a), min(dt_s, LONGEST_FLOW_S)
-    if not seen:
-        held_a = unseen_current(s, held_a, dt_s)
+    held_a = held_current(dt_s, s.current_a, current_a)
+    charge_as = held_a * min(dt_s, LONGEST_FLOW_S)
+    if gap and dt_s > UNMEASURED_S:
+        charge_as += goes_on(s, held_a, dt_s)
+        held_a = charge_as / dt_s
     if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
         s.decay_s = dt_s
         for k in range(BRANCHES):
@@ -183,11 +185,13 @@ def count_on(s: Record, p: Record, dt_s: float, seen: bool, current_a: float, te
     for k in range(BRANCHES):
         s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
     w.time_s += dt_s
-    w.charge_as += held_a * flow_s
-    w.throughput_as += abs(held_a) * flow_s
-    if not seen:
+    w.charge_as += charge_as
+    w.throughput_as += abs(charge_as)
+    if gap:
+        w.gap = 1
+    if gap or dt_s > UNMEASURED_S:
         w.unknown_as += unseen_charge(s, p, held_a, dt_s)
-    s.soc = min(max(s.soc - held_a * flow_s / p.capacity_as, 0.0), 1.0)
+    s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
 
 
@@ -209,7 +213,7 @@ def update_all(s: Record, p: Record) -> None:
     w = s.window
     dt_s = w.time_s
     if dt_s > 0.0:
-        if w.unknown_as == 0.0:
+        if not w.gap:
             watch_load(s, w.charge_as / dt_s, dt_s)
         decay(s, p)
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)

@@ -71,14 +71,14 @@ def take_first(s: Record, p: Record, current_a: float, voltage_v: float) -> None
 
 @njit(cache=True)
 def identify(
-    s: Record, p: Record, dt_s: float, seen: bool, current_a: float, voltage_v: float, temperature_c: float
+    s: Record, p: Record, dt_s: float, gap: bool, current_a: float, voltage_v: float, temperature_c: float
 ) -> None:
-    """Take one sample: SOC for the observer, elements for the map, every now and then a fit for (3.18)."""
+    """Take one sample, after a ``gap`` or not: SOC for the observer, elements for the map, now and then a fit for (3.18)."""
     f, c = s.filter, s.checks
     change_a = current_a - f.current_a
-    count_on(f, p.filter, dt_s, seen, current_a, temperature_c)
+    count_on(f, p.filter, dt_s, gap, current_a, temperature_c)
     unknown = f.window.unknown_as / p.filter.capacity_as
-    if unknown > ONE_STD:
+    if gap and unknown > ONE_STD and not c.suspects & SIGN_OF_CURRENT:
         decay(f, p.filter)
         predict(f, p.filter, f.best)
         restart_filter(s, p, math.hypot(f.soc_std, unknown), current_a, voltage_v)

@@ -8,7 +8,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import soc_from_ocv
-from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
 from bms_estimator.kernels.hypotheses import pack_std
 from bms_estimator.kernels.identification import UNSEEN_MOST, identify, restart_filter, start_filter
@@ -97,26 +96,23 @@ def step(
     sense(state[0].learning, temperature_c)
     dt_s = time_s - s.time_s
     s.time_s = time_s
-    restarted = dt_s == -math.inf
-    if restarted:  # a new clock
+    new_clock = dt_s == -math.inf
+    if new_clock:
         dt_s = state[0].unseen_s
+        state[0].learning.settle_s = settings[0].learning.settle_s  # the load meanwhile is not known
     if not 0.0 <= dt_s < math.inf:  # the clock was set back, or nobody knows how long nobody measured: go on from here
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
-        if not restarted:
-            s.time_steps_back += 1
-        else:
+        if new_clock:
             after_restart(state[0], settings[0], current_a, voltage_v)
+        else:
+            s.time_steps_back += 1
         return verdict
-    gap = restarted or dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
-    if gap:
-        s.gaps += 1
-    s.step_s = dt_s
+    gap = new_clock or is_gap(s, p, dt_s)
     before_a = s.current_a
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
-        seen = dt_s <= UNMEASURED_S and not gap
-        identify(state[0], settings[0], dt_s, seen, current_a, voltage_v, temperature_c)
+        identify(state[0], settings[0], dt_s, gap, current_a, voltage_v, temperature_c)
     else:
         s.soc = s.soc_coulomb
     if settings[0].learning.enabled:
@@ -124,6 +120,16 @@ def step(
     else:
         observer_step(s, p, dt_s, voltage_v)
     return verdict
+
+
+@njit(cache=True)
+def is_gap(s: Record, p: Record, dt_s: float) -> bool:
+    """Whether samples are missing in a step of ``dt_s``; counts them. Records as in ``judge``."""
+    gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
+    s.step_s = dt_s
+    if gap:
+        s.gaps += 1
+    return gap
 
 
 @njit(cache=True)

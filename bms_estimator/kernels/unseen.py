@@ -7,7 +7,6 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.state import Record
 
 LOAD_S = 600.0
@@ -39,12 +38,9 @@ def watch_load(s: Record, current_a: float, dt_s: float) -> None:
 
 
 @njit(cache=True)
-def unseen_current(s: Record, held_a: float, dt_s: float) -> float:
-    """Mean of a current that nobody measured [A]: ``held_a`` by both ends, and where those say little the present load."""
-    if dt_s <= UNMEASURED_S:
-        return held_a
-    goes_on = LOAD_S / dt_s * (1.0 - math.exp(-dt_s / LOAD_S))
-    return held_a + goes_on * (s.mean_a - held_a)
+def goes_on(s: Record, held_a: float, dt_s: float) -> float:
+    """Charge that the present load moves in a gap of ``dt_s`` beyond ``held_a``, which both ends agree on, until it changes [A s]."""
+    return (s.mean_a - held_a) * LOAD_S * (1.0 - math.exp(-dt_s / LOAD_S))
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ import numpy as np
 import structlog
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.clock import Clock
+from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SAMPLE
@@ -70,7 +70,7 @@ async def run_live(
     notifier = notifier or Notifier([name])
     estimator = new_estimator(settings, cell)
     restarts, restored = _restore(estimator, checkpoint)
-    restored_s = clock.monotonic()
+    restored_s = since_boot()
     publisher = Publisher(
         settings,
         cell,
@@ -90,7 +90,7 @@ async def run_live(
         await stack.enter_async_context(source)
         notifier.ready(name)
         tasks = [
-            _estimate(source, estimator, publisher, lambda: clock.monotonic() - restored_s),
+            _estimate(source, estimator, publisher, lambda: since_boot() - restored_s),
             _keep_alive(publisher, notifier, name),
             _measure_lag(publisher),
         ]
@@ -125,9 +125,10 @@ def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
 
 async def _estimate(source: Source, estimator: Estimator, publisher: Publisher, waited_s: Callable[[], float]) -> None:
     """Take what the source gives; ``waited_s`` is how long it has given nothing since the state was restored [s]."""
+    unseen_s = estimator.record["unseen_s"].copy()
     async for block in source:
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
-            estimator.record["unseen_s"] += waited_s()
+            estimator.record["unseen_s"] = unseen_s + waited_s()
         publisher.add(block, estimator.run(block))
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
@@ -176,17 +177,18 @@ async def _save_often(
 ) -> None:
     """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC`` or there is a first sample."""
     loop = asyncio.get_running_loop()
-    due_s = 0.0
+    due_s, failed = 0.0, False
     while True:
         await asyncio.sleep(min(LOOK_S, every_s))
         saved_soc = checkpoint.saved[1] if checkpoint.saved else math.inf
-        if loop.time() >= due_s or abs(estimator.state["soc"][0] - saved_soc) >= SAVED_SOC:
-            await _save(checkpoint, estimator, publisher, restarts)
+        moved = abs(estimator.state["soc"][0] - saved_soc) >= SAVED_SOC
+        if loop.time() >= due_s or (moved and not failed):
+            failed = not await _save(checkpoint, estimator, publisher, restarts)
             due_s = loop.time() + every_s
 
 
-async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, restarts: int) -> None:
-    """Save what samples have taught; writing waits for the disk in a thread.
+async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, restarts: int) -> bool:
+    """Save what samples have taught; writing waits for the disk in a thread. False: it cannot be written.
 
     What is saved already is not saved again: it would seem to be of now, and not of before nobody measured.
     """
@@ -194,13 +196,15 @@ async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Pub
     soc = float(np.nan_to_num(state["observer"]["soc"][0]))  # a fuel cell has none, and NaN would equal nothing
     taught = int(state["observer"]["samples"][0]), soc
     if not taught[0] or taught == checkpoint.saved:
-        return
+        return True
     try:
         await asyncio.get_running_loop().run_in_executor(checkpoint.thread, checkpoint.save, state, restarts)
         publisher.checkpoint, checkpoint.saved = "saved", taught
     except OSError as error:
         publisher.checkpoint = f"cannot be saved: {error}"
         log.warning("checkpoint cannot be saved", file=str(checkpoint.path), error=str(error))
+        return False
+    return True
 
 
 def _present_soc(estimator: Estimator) -> float:

@@ -51,8 +51,11 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     if wrong:
         estimator.record[...] = new
         return wrong
-    if not was_on or abs(estimator.record["filter"]["soc"][0] - estimator.state["soc"][0]) > SAME_SOC:
+    f = estimator.record["filter"]
+    if estimator.identifying and (not was_on or abs(f["soc"][0] - estimator.state["soc"][0]) > SAME_SOC):
         unseen_s = math.inf
+    if "filter.mean_a" not in saved:  # a version that did not know the load
+        f["mean_a"] = f["current_a"]
     if was_on and saved.get("filter.mean", np.zeros(0)).shape[-1] < STATES:
         _open_curve(estimator)
     _open_new_states(estimator)

@@ -5,6 +5,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.suspect import Suspect
 from tests.estimator.simulated_cell import TRUTH, measured, pulses
 
 FULL_LOAD_A = 1.5 * TRUTH.cell.capacity_ah
@@ -71,6 +72,38 @@ def test_a_load_in_a_gap_is_inside_the_band(unseen_s: int, restart: bool) -> Non
     error = np.abs(after["soc"] - true_soc[3600 + unseen_s :])
     assert (error < 2.0 * after["soc_std"]).all()
     assert error[-1] < 0.02
+
+
+@pytest.mark.parametrize("period_s", [60, 120, 600, 1800])
+def test_slow_sampling_is_no_gap(period_s: int) -> None:
+    """Both ends of a step are measured: what is between them is not the load of long ago."""
+    block, true_soc = measured(np.repeat([0.0, 0.3], [3600, 7 * 3600]), 0.95, np.random.default_rng(6))
+    estimator = Estimator(TRUTH, initial_soc=0.95)
+    trace = estimator.run(block[::period_s])
+    error = np.abs(trace["soc"] - true_soc[::period_s])[trace["time_s"] >= 7200.0]
+    assert error.max() < 0.01
+    assert (error < 2.0 * trace["soc_std"][trace["time_s"] >= 7200.0]).all()
+    assert estimator.state["gaps"][0] == 1  # the first step: nothing is known of the pace
+
+
+def test_a_hole_after_a_restart_is_a_gap() -> None:
+    block = measured(np.zeros(2000), 0.6, np.random.default_rng(7))[0]
+    estimator = Estimator(TRUTH, initial_soc=0.6)
+    estimator.run(block[:300])
+    estimator.resume(600.0)
+    estimator.run(np.concatenate([block[900:1200], block[1250:]]))
+    assert estimator.state["gaps"][0] == 1
+
+
+def test_while_the_sign_of_the_current_is_wrong_a_gap_narrows_nothing() -> None:
+    block = pulses()[0][:6000].copy()
+    block["current_a"] *= -1.0
+    estimator = Estimator(TRUTH, initial_soc=1.0)
+    estimator.run(block[:3600])
+    assert estimator.record["checks"]["suspects"][0] == Suspect.SIGN_OF_CURRENT
+    before = estimator.record["filter"]["soc_std"][0]
+    estimator.run(block[5100:5101])
+    assert estimator.record["filter"]["soc_std"][0] >= before
 
 
 def test_without_the_filter_the_load_is_counted_through_a_restart() -> None:

@@ -40,7 +40,7 @@ def somewhere(p, seed=1, time_s=1.0):
     s["covariance"][0] = (mixed @ mixed.T / STATES) * std[:, None] * std
     s["x_a"] = rng.normal(1.0, 0.5, BRANCHES)
     for current_a, voltage_v in zip(rng.normal(1.5, 0.5, 5), rng.normal(3.6, 0.01, 5), strict=True):
-        hypotheses.count_on(s, p, time_s / 5, True, current_a, 12.0)
+        hypotheses.count_on(s, p, time_s / 5, False, current_a, 12.0)
         hypotheses.gather(s, current_a, voltage_v)
     return s
 

@@ -1,6 +1,7 @@
 """What outlives a restart: taken up when it is of the same pack, whatever else was edited or has come with a version."""
 
 import asyncio
+import itertools
 import os
 import stat
 import threading
@@ -80,6 +81,31 @@ async def test_a_restart_goes_on_from_the_checkpoint(tmp_path: Path) -> None:
     assert second.estimator.state["samples"][0] == 2
     assert second.health.restarts == 1
     assert second.health.checkpoint == f"restored: SOC {first.estimator.state['soc'][0]:.4f}"
+
+
+async def test_without_the_identifier_a_restart_goes_on_too(tmp_path: Path) -> None:
+    counting = edited("identifier", enabled=False)
+    await ran(tmp_path, counting)
+    second = await ran(tmp_path, counting, samples=2)
+    assert second.health.restarts == 1
+    unseen_s = second.estimator.record["unseen_s"][0]
+    assert second.estimator.state["soc"][0] == pytest.approx(0.4 - (unseen_s + 1.0) / 3600.0, abs=1e-9)
+
+
+async def test_samples_that_cannot_be_used_do_not_prolong_what_nobody_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await ran(tmp_path)
+    monkeypatch.setattr(live, "since_boot", itertools.count().__next__)  # a second passes with each look
+    source = ScriptedSource()
+    for i in range(40):
+        source.give((0.1 * i, 0.0, 9.9))
+    source.give((5.0, 0.275, 3.8))
+    source.finish()
+    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
+    running = run_live(SETTINGS, CELL, source=source, sinks=[Collector()], stop=asyncio.Event(), checkpoint=checkpoint)
+    estimator = await asyncio.wait_for(running, LONG_S)
+    assert 41.0 < estimator.record["unseen_s"][0] < 41.0 + LONG_S
 
 
 @pytest.mark.parametrize(
@@ -386,6 +412,33 @@ async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes
         await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved: "))
         source.give((1.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.samples["samples"] == 2)
+
+
+async def test_a_disk_that_is_full_is_not_tried_again_and_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "LOOK_S", 0.01)
+    attempts = []
+
+    class Full(CheckpointFile):
+        def save(self, state: Any, restarts: int) -> None:
+            attempts.append((state, restarts))
+            raise OSError(28, "No space left on device")
+
+    settings = Settings.model_validate(
+        SETTINGS.model_dump(by_alias=True, exclude_none=True) | {"state": {"checkpoint_s": 1e6}}
+    )
+    source, sink = ScriptedSource(), Collector()
+    checkpoint = Full(tmp_path, settings, CELL)
+    task = asyncio.create_task(
+        run_live(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    for second in range(5):
+        source.give((30.0 * second, 0.275, 3.8))
+        await sink.until(lambda s, n=second + 1: s.health.samples["samples"] == n)
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+    assert len(attempts) <= 2  # once, and at the end
 
 
 async def test_a_checkpoint_is_of_the_last_sample_and_not_of_a_later_time_without_any(tmp_path: Path) -> None:

@@ -99,23 +99,23 @@ def stamped(board_us: Callable[[int, int], int], seconds: int = 60) -> FrameDeco
 
 
 @pytest.mark.parametrize(
-    ("board_us", "jumps"),
+    ("board_us", "least", "most"),
     [
-        (lambda i, us: us + (3_000_000_000 if i == 300 else 0), 2),
-        (lambda i, us: us + (3_000_000_000 if i >= 300 else 0), 1),
-        (lambda i, us: us - (20_000_000 if i >= 300 else 0), 1),
-        (lambda i, us: us if not 300 <= i < 330 else 2_654_435_761 * (i + 1), None),
+        (lambda i, us: us + (3_000_000_000 if i == 300 else 0), 2, 2),
+        (lambda i, us: us + (3_000_000_000 if i >= 300 else 0), 1, 1),
+        (lambda i, us: us - (20_000_000 if i >= 300 else 0), 1, 1),
+        (lambda i, us: us if not 300 <= i < 330 else 2_654_435_761 * (i + 1), 3, 40),
     ],
     ids=["one ahead", "ahead from now on", "back", "at random for 3 s"],
 )
-def test_a_clock_that_jumps_is_not_believed(board_us: Callable[[int, int], int], jumps: int | None) -> None:
+def test_a_clock_that_jumps_is_not_believed(board_us: Callable[[int, int], int], least: int, most: int) -> None:
     """Time goes on by arrival: no charge is counted for time that was none."""
     decoder = stamped(board_us)
     last = decoder.feed(
         START_S + 60.1, SampleMessage(600, board_us(600, 60_100_000) % 2**32, 34_571, 21_405, 38, 225, 1, 16).encode()
     )
     assert last["time_s"][0] == pytest.approx(60.0, abs=1e-3)
-    assert decoder.counters.clock_jumps == jumps if jumps else 3 <= decoder.counters.clock_jumps <= 40
+    assert least <= decoder.counters.clock_jumps <= most
 
 
 def test_a_host_that_was_held_up_for_a_minute_believes_the_board() -> None:

@@ -217,7 +217,8 @@ def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
     """Go on by the board's clock. Whole turns of its 32 bits, which only an outage can hide, are told by arrival.
 
     Returns:
-        Whether the clock can be right: a sample may come late, but not before it was taken.
+        Whether the step can be right: a sample may come late, but not before it was taken. A clock that runs steadily too
+        fast, as a simulated one does, is told by its rate, not here.
     """
     step_us = (board_us - d.board_us) & _MASK
     if lost > 0:
