@@ -1,0 +1,95 @@
+"""The SOC through kills, restarts and gaps, on real captures: RMSE [%] / inside 2 soc_std [%] / interval score [%].
+
+Cut in mid-load, 0.2 too low and 0.2 too high, judged from 15 min later on, above SOC 0.05, as in `make anywhere`.
+"""
+
+import sys
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.sample import SampleBlock
+from tests.benchmarks.recipes import GROUPS, chosen, runs
+from tests.estimator.anywhere.score import score
+
+NAMES = ("PF 25 C", "PF 0 C", "NCR", "NCR, constant current", "LFP 25 C (its own file)")
+SEED = 1
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What happens every ``every_s``, a third more or less: samples are missing for ``missing_s``, a third more or less.
+
+    When it is a kill the estimator goes on from what it was up to ``age_s`` before.
+    """
+
+    name: str
+    every_s: float
+    missing_s: float
+    age_s: float | None = None
+
+
+DISTURBANCES = (
+    Disturbance("undisturbed", np.inf, 0.0),
+    Disturbance("killed every 100 s, checkpoint up to 60 s old", 100.0, 12.0, 60.0),
+    Disturbance("killed every 10 min, checkpoint up to 60 s old", 600.0, 12.0, 60.0),
+    Disturbance("off for half an hour every 2 h", 7200.0, 1800.0, 1.0),
+    Disturbance("400 s without samples each hour", 3600.0, 400.0),
+    Disturbance("30 s without samples every 5 min", 300.0, 30.0),
+)
+
+
+def disturbed(estimator: Estimator, seen: SampleBlock, what: Disturbance) -> NDArray[np.void]:
+    """The trace through it."""
+    random, time_s, traces, i = np.random.default_rng(SEED), seen["time_s"], [], 0
+    while i < seen.size:
+        end_s = time_s[i] + what.every_s * random.uniform(0.67, 1.33)
+        missing_s, age_s = what.missing_s * random.uniform(0.67, 1.33), (what.age_s or 0.0) * random.uniform()
+        kept, end = np.searchsorted(time_s, [end_s - age_s, end_s])
+        traces.append(estimator.run(seen[i:kept]).copy())
+        state = estimator.record.copy()
+        traces.append(estimator.run(seen[kept:end]).copy())
+        if what.age_s is not None and state["observer"]["started"][0]:
+            estimator.record[...] = state
+            estimator.resume(age_s + missing_s)
+        i = int(np.searchsorted(time_s, end_s + missing_s))
+    return np.concatenate(traces)
+
+
+def row(tried: Iterable[tuple[CellModel, SampleBlock, Floats, float]], what: Disturbance) -> str:
+    """Means over the runs of a group."""
+    found = []
+    for cell, seen, truth, told in tried:
+        trace = disturbed(Estimator(cell, initial_soc=told), seen, what)
+        true_soc = np.interp(trace["time_s"], seen["time_s"], truth)
+        one = score(trace["time_s"], trace["soc"], trace["soc_std"], true_soc)
+        found += [] if one is None else [(one.rmse, one.cover, one.score)]
+    rmse, cover, points = np.mean(found, axis=0)
+    return f"{rmse:.1f}/{cover:.0f}/{points:.1f}"
+
+
+def main() -> None:
+    """Print the table of the groups whose name contains an argument, or of ``NAMES``."""
+    groups = [g for g in chosen(GROUPS, sys.argv[1:]) if sys.argv[1:] or g.name in NAMES]
+    table = Table(title="through kills, restarts and gaps: RMSE / inside / score in %")
+    table.add_column("")
+    for group in groups:
+        table.add_column(group.name, justify="right")
+    with tempfile.TemporaryDirectory() as folder:
+        for what in DISTURBANCES:
+            table.add_row(what.name, *(row(runs(group, Path(folder)), what) for group in groups))
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+
+
+if __name__ == "__main__":
+    main()
