@@ -171,8 +171,11 @@ class Protocol:
 
     @cached_property
     def lowest_soc(self) -> float:
-        """Where validation ends: ``LOWEST_SOC``, or above it the last point of step 1. Below that (2.10) is a guess."""
-        return max(LOWEST_SOC, *(float(test.soc.min()) for test in self.tests))
+        """Where validation ends: ``LOWEST_SOC``, or above it the last point of step 1, of all tests together.
+
+        Below that (2.10) is a guess.
+        """
+        return max(LOWEST_SOC, min(float(test.soc.min()) for test in self.tests))
 
     @cached_property
     def with_ocv(self) -> CellModel:

@@ -111,6 +111,17 @@ def test_a_load_beyond_the_thesis_s_c_rates_only_validates(samples):
     assert [c.name for c in fast.validating] == ["constant", "steps"]
 
 
+def test_validation_ends_where_the_lowest_point_of_all_relaxation_tests_lies(samples, protocol):
+    """A second test that ends half full takes nothing from what the first one gives."""
+    half = samples["relaxation"][: samples["relaxation"].size // 2]
+    both, alone = on(samples | {"half": half}), on(samples | {"relaxation": half})
+    assert [test.name for test in both.tests] == ["relaxation", "half"]
+    assert both.lowest_soc == protocol.lowest_soc < 0.1
+    assert alone.lowest_soc == both.tests[1].soc.min() > 0.4
+    assert both.dynamic["constant"].soc[-1] == pytest.approx(protocol.lowest_soc, abs=1e-3)
+    assert both.r_s_mean.soc.min() == pytest.approx(protocol.lowest_soc, abs=0.02)
+
+
 def test_bounds_are_the_printed_ones_scaled_by_cells_and_capacity():
     pack = load_cell("thunder_power_6s")
     assert printed_bounds(pack) == {name: pack.adaptation[name] for name in pack.adaptation}
