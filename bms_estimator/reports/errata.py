@@ -1,4 +1,4 @@
-"""The errata of the thesis, E1 to E26, each number in them computed."""
+"""The errata of the thesis, E1 to E26: what follows from numbers is computed, printed numbers are those of ``printed``."""
 
 from dataclasses import dataclass
 
@@ -58,7 +58,7 @@ def table(s: Simulation) -> Table:
 def _first(s: Simulation) -> list[Erratum]:
     """E1 to E14."""
     true, estimated = s.cell.a, s.printed_a
-    a8 = printed.BOUNDS[8]
+    a8, inferred_a8 = printed.BOUNDS[8], _weights(printed.A8_WEIGHTS)
     e6 = next(c for c in lemma_conditions(load_cell("chen_mora")) if not c.holds)
     relative = {i: 100.0 * abs(row[1] / row[2] - 1.0) for i, row in printed.TABLE_5.items()}
     r_s = [f"{100.0 * abs(row[1] / row[0] - 1.0):.1f}" for row in printed.TABLE_6.values()]
@@ -79,9 +79,10 @@ def _first(s: Simulation) -> list[Erratum]:
         ),
         Erratum(
             "Tables 5, 10, a8",
-            f"weights {a8[2]:g}, {a8[3]:g}",
-            f"10, 20: the limit of the printed ones is {(a8[2] * a8[0] + a8[3] * a8[1]) / (a8[2] + a8[3]):.2f}, printed are "
-            f"{printed.TABLE_5[8][1]:.2f} and {printed.TABLE_10[8][1]:.2f}, that of 10, 20 is {printed.bounds('5', 8).limit:.2f}",
+            f"weights {_weights(a8[2:])}",
+            f"{inferred_a8}: the limit of the printed ones is {(a8[2] * a8[0] + a8[3] * a8[1]) / (a8[2] + a8[3]):.2f}, printed "
+            f"are {printed.TABLE_5[8][1]:.2f} and {printed.TABLE_10[8][1]:.2f}, that of {inferred_a8} is "
+            f"{printed.bounds('5', 8).limit:.2f}",
         ),
         Erratum("Table 10, a5", f"{printed.TABLE_10[5][1]:g}", f"{printed.bounds('10', 5).limit:g}"),
         Erratum(
@@ -102,7 +103,7 @@ def _first(s: Simulation) -> list[Erratum]:
         ),
         Erratum("Algorithm 1", "a1, a2, a3 at t0; e < eps2", "x1, x2, x3; abs(e) < eps2"),
         Erratum("(3.1), (3.18)", "no dot", "time derivatives"),
-        Erratum("4.1.1", "0.275 mA battery", "275 mAh"),
+        Erratum("4.1.1", "0.275 mA battery", f"{1e3 * s.cell.cell.capacity_ah:g} mAh"),
         Erratum(
             "(2.11), (2.12)",
             "-",
@@ -162,10 +163,12 @@ def _theory(s: Simulation) -> list[Erratum]:
 def _experiments(s: Simulation) -> list[Erratum]:
     """E20 to E26."""
     currents = printed_pack.current_errors_percent()
-    ohm = " / ".join(f"{load.split()[0]}" for load in ("50 ohm", "25 ohm", "12.5 ohm"))
-    off = " / ".join(f"{currents[load]:.1f}" for load in ("50 ohm", "25 ohm", "12.5 ohm"))
+    loads = ("50 ohm", "25 ohm", "12.5 ohm")
+    ohm = " / ".join(f"{printed.RESISTORS_OHM[load]:g}" for load in loads)
+    off = " / ".join(f"{currents[load]:.1f}" for load in loads)
     six, small = load_cell("thunder_power_6s").cell, s.cell.cell
     parallel = six.capacity_ah / small.capacity_ah
+    inferred = printed.INFERRED_WEIGHTS["10"]
     return [
         Erratum(
             "5.1",
@@ -191,9 +194,9 @@ def _experiments(s: Simulation) -> list[Erratum]:
         ),
         Erratum(
             "Tables 5, 10, weights",
-            "a7 60, 55; Table 10 a4 50, 50",
-            f"a7 70, 65 in both: {printed.mean_from_start('5', 7):.4f} ({printed.TABLE_5[7][1]:.4f}) and "
-            f"{printed.mean_from_start('10', 7):.2f} ({printed.TABLE_10[7][1]:.2f}); a4 70, 50: "
+            f"a7 {_weights(printed.BOUNDS[7][2:])}; Table 10 a4 {_weights(printed.BOUNDS[4][2:])}",
+            f"a7 {_weights(inferred[7])} in both: {printed.mean_from_start('5', 7):.4f} ({printed.TABLE_5[7][1]:.4f}) and "
+            f"{printed.mean_from_start('10', 7):.2f} ({printed.TABLE_10[7][1]:.2f}); a4 {_weights(inferred[4])}: "
             f"{printed.mean_from_start('10', 4):.4f} ({printed.TABLE_10[4][1]:.4f}); inferred, as E4",
         ),
         Erratum(
@@ -210,6 +213,10 @@ def _experiments(s: Simulation) -> list[Erratum]:
             "Figure 16; Table 5; Tables 5 and 6; Lemma 4.1.3",
         ),
     ]
+
+
+def _weights(pair: tuple[float, ...]) -> str:
+    return ", ".join(f"{weight:g}" for weight in pair)
 
 
 def _sides(condition: Condition) -> str:

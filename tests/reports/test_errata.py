@@ -135,6 +135,11 @@ def test_derivative_of_the_overpotential_needs_the_rate_of_soc():
     assert abs(y_rate - slope + current_a * r_s_rate) > 1e3 * abs(y1_rate)
 
 
+def test_inferred_weights_of_a7_are_the_same_in_both_tables():
+    """E24 says so."""
+    assert printed.INFERRED_WEIGHTS["5"][7] == printed.INFERRED_WEIGHTS["10"][7]
+
+
 def test_bounds_of_table_5_and_10_differ_in_a4_only():
     differing = [
         i for i in printed.BOUNDS if printed.bounds("5", i).limit != pytest.approx(printed.bounds("10", i).limit)
