@@ -34,7 +34,9 @@ DIAGRAMS = {
 }
 """Figures with nothing to compute."""
 FUEL_CELL = dict.fromkeys(
-    ("45", "46"), "A measurement on a fuel cell whose recording and model the thesis does not give; no battery."
+    ("45", "46"),
+    "The recording is not published, nor are the equations of its model. The project's own model of a fuel cell, after section "
+    "7.3, is in docs/fuel-cell.md.",
 )
 
 CHAPTERS: dict[str, tuple[str, ...]] = {
