@@ -136,9 +136,8 @@ def build(
     """
     experiment = Experiment(recorded)
     if recorded is not None:
-        _ = (
-            experiment.protocol.r_s_fit
-        )  # captures that cannot serve are refused here, not after half a minute of simulations
+        # captures that cannot serve are refused here, not after half a minute of simulations
+        _ = experiment.protocol.r_s_fit
     builders = _builders(Simulation(), experiment)
     wanted = _wanted(builders, table, figure)
     total, done = sum(len(marks) for _, marks in wanted), 0
