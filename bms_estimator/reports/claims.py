@@ -106,7 +106,7 @@ def _max(p: Protocol, name: str) -> float:
 
 
 def _dynamic(p: Protocol) -> list[Result]:
-    return [Result(c.name, p.dynamic[c.name].mean_percent, p.static[c.name].mean_percent) for c in p.validating]
+    return [Result(c.name, p.dynamic[c.name].mean_percent / p.static[c.name].mean_percent, 1.0) for c in p.validating]
 
 
 def _soc(p: Protocol) -> list[Result]:
@@ -164,7 +164,7 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Protocol], list[Result]]]] = {
     ),
     "dynamic against static": (
         "Table 13",
-        "mean error [%] of the dynamic model no larger than the static one's",
+        "mean error of the dynamic model over the static one's at most 1",
         _dynamic,
     ),
     "SOC by interpolation": (
@@ -182,7 +182,6 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Protocol], list[Result]]]] = {
 
 
 def claim(key: str, protocols: Sequence[Protocol]) -> Claim:
-    """One claim on the captures of one or more cells."""
+    """One claim on the captures of one or more cells. A relaxation test that serves two cells counts for each."""
     where, criterion, test = CLAIMS[key]
-    results = {result.capture: result for p in protocols for result in test(p)}  # a relaxation test may serve two cells
-    return Claim(key, where, criterion, tuple(results.values()))
+    return Claim(key, where, criterion, tuple(result for p in protocols for result in test(p)))

@@ -176,6 +176,19 @@ def test_leaf_verdicts(leaf):
     assert list(found.values()) == [fails, fails, none, none, fails, Verdict.CLAIM_HOLDS, fails]
 
 
+def test_a_relaxation_test_that_serves_two_cells_counts_for_each(leaf):
+    """By the name of a capture the second result would stand in the first one's place."""
+    one, two = claim("RC products", [leaf]), claim("RC products", [leaf, leaf])
+    assert two.results == 2 * one.results
+    assert len(one.results) == 2
+
+
+def test_dynamic_against_static_is_their_ratio(leaf):
+    (result,) = claim("dynamic against static", [leaf]).results
+    assert (result.found, result.limit) == (pytest.approx(0.543 / 0.517, abs=0.01), 1.0)
+    assert not result.met
+
+
 @pytest.mark.parametrize(
     ("met", "verdict"), [(0, Verdict.CLAIM_FAILS), (2, Verdict.CLAIM_FAILS), (3, Verdict.CLAIM_HOLDS)]
 )
