@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.calibration.ocv_points import pooled
 from bms_estimator.calibration.series_resistance import SeriesResistance, SeriesResistanceFit
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
@@ -92,8 +93,10 @@ EXPERIMENTS = (
 CONSTANT_C = 0.01
 """Above this C-rate a capture charges or discharges [1/h]."""
 VOLTAGE_STEP_V = 1e-3
-R_S_SOC = (0.98, 0.9, 0.7, 0.5, 0.3, 0.1)
+R_S_SOC = (0.98, 0.9, 0.7, 0.5, 0.3, 0.1, 0.05)
 """Where R_s is looked at."""
+MIDDLE_SOC = 0.5
+"""Where the fit of (2.10) is looked at."""
 
 
 def protocol(experiment: Experiment) -> Protocol:
@@ -139,18 +142,25 @@ def lines(name: str, p: Protocol) -> Iterator[tuple[str, ...]]:
 
 
 def main() -> None:
-    """Print errors by load, the steps' outcomes by cell, and the verdicts."""
+    """Print errors by load, the steps' outcomes by cell, the verdicts, and what else would have come out."""
     if not DATA.is_dir():
         sys.exit(f"{DATA}: the captures are not there")
     console = Console(width=WIDTH)
     protocols = {experiment.name: protocol(experiment) for experiment in EXPERIMENTS}
     console.print(errors(protocols))
     console.print(parameters(protocols))
-    console.print(resistances(EXPERIMENTS[0]))
-    console.print(ablation(EXPERIMENTS[0]))
-    console.print(verdicts("all captures", list(protocols.values())))
-    room = [protocols[experiment.name] for experiment in EXPERIMENTS if experiment.room]
-    console.print(verdicts("captures at room temperature", room))
+    first = EXPERIMENTS[0].name
+    otherwise = variants(EXPERIMENTS[0], protocols[first])
+    console.print(resistances(first, otherwise))
+    console.print(worst(first, protocols[first]))
+    console.print(ablation(first, otherwise))
+    with_fast = protocols | {first: otherwise[FAST]}
+    for on, names in (
+        ("all captures", list(protocols)),
+        ("captures at room temperature", [experiment.name for experiment in EXPERIMENTS if experiment.room]),
+    ):
+        console.print(verdicts(on, [protocols[name] for name in names]))
+        console.print(f"with {FAST}: {claim('steps, mean', [with_fast[name] for name in names]).words}")
 
 
 def errors(protocols: dict[str, Protocol]) -> Table:
@@ -182,15 +192,17 @@ def errors(protocols: dict[str, Protocol]) -> Table:
 def parameters(protocols: dict[str, Protocol]) -> Table:
     """What the three steps gave."""
     table = Table(title="steps 1 to 3")
-    heads = ("cell", "step 1: points", "residual [mV]", "step 2 on", "outcome", "a13..a15 [ohm, -, ohm]")
-    for column in (*heads, "RC products [s]", "of the rests [s]"):
-        table.add_column(column)
+    residual = f"residual in mV, nearest SOC {MIDDLE_SOC}"
+    heads = ("cell", "step 1: points", residual, "step 2 on", "outcome", "a13..a15 in ohm, -, ohm")
+    for column in (*heads, "RC products in s", "of the rests in s"):
+        table.add_column(column, overflow="fold")
     for name, p in protocols.items():
         residual_v, found = p.joint_fit.residual_v, list(products(p))
+        middle_v = residual_v[np.argmin(np.abs(pooled(p.tests).soc - MIDDLE_SOC))]
         table.add_row(
             name,
             str(residual_v.size),
-            f"{1e3 * np.sqrt(np.mean(residual_v**2)):.1f}",
+            f"{1e3 * np.sqrt(np.mean(residual_v**2)):.1f} / {1e3 * middle_v:.1f}",
             p.smallest.name,
             p.adaptive.outcome,
             ", ".join(f"{value:.4g}" for value in p.r_s_fit.a),
@@ -244,49 +256,60 @@ class Unweighted(Protocol):
         return {name: replace(curve, weight=np.ones_like(curve.weight)) for name, curve in super().r_s_curves.items()}
 
 
-VARIANTS = {
-    "as it is": Protocol,
-    "(4.2) not weighted by the current": Unweighted,
-    "1.5C in step 3 of the other loads": FastInStep3,
-    "each load in its own step 3 as well": OwnInStep3,
-}
+AS_IT_IS, UNWEIGHTED, FAST = "as it is", "(4.2) not weighted by the current", "1.5C in step 3 of the other loads"
+VARIANTS = {UNWEIGHTED: Unweighted, FAST: FastInStep3, "each load in its own step 3 as well": OwnInStep3}
 
 
-def variants(experiment: Experiment) -> Iterator[tuple[str, ...]]:
-    """Mean and largest error on each load of one cell, by how step 3 is done; last with other bounds."""
-    made = protocol(experiment)
+def variants(experiment: Experiment, made: Protocol) -> dict[str, Protocol]:
+    """The protocol as ``made``, with step 3 done otherwise, and with other bounds."""
     model = load_cell(experiment.cell, experiment.capacity_ah)
-    found = {name: make(model, made.captures, VOLTAGE_STEP_V) for name, make in VARIANTS.items()}
     bounds = {f"a{i}": model.bounds(i) for i in range(1, 13)}
     own_bounds = model.model_copy(update={"adaptation": bounds})
-    found["bounds around the cell file's elements"] = Protocol(own_bounds, made.captures, VOLTAGE_STEP_V)
-    for name, p in found.items():
-        yield (
-            name,
-            *(f"{p.dynamic[c.name].mean_percent:.2f} / {p.dynamic[c.name].max_percent:.1f}" for c in made.validating),
-        )
+    return {
+        AS_IT_IS: made,
+        **{name: variant(model, made.captures, VOLTAGE_STEP_V) for name, variant in VARIANTS.items()},
+        "bounds around the cell file's elements": Protocol(own_bounds, made.captures, VOLTAGE_STEP_V),
+    }
 
 
-def ablation(experiment: Experiment) -> Table:
+def ablation(name: str, otherwise: dict[str, Protocol]) -> Table:
     """What the parts of step 3 and the bounds are worth on one cell."""
-    table = Table(title=f"{experiment.name}: mean / largest error in % when one thing is done otherwise")
-    table.add_column("")
-    for capture in protocol(experiment).validating:
-        table.add_column(capture.name, justify="right")
-    for row in variants(experiment):
-        table.add_row(*row)
+    table = Table(title=f"{name}: mean / largest error in % when one thing is done otherwise")
+    loads = [capture.name for capture in otherwise[AS_IT_IS].validating]
+    for column in ("", *loads):
+        table.add_column(column, justify="right")
+    for what, p in otherwise.items():
+        found = (p.dynamic[load] for load in loads)
+        table.add_row(what, *(f"{run.mean_percent:.2f} / {run.max_percent:.1f}" for run in found))
     return table
 
 
-def resistances(experiment: Experiment) -> Table:
-    """R_s by (4.2) of each load of one cell, over SOC."""
-    table = Table(title=f"{experiment.name}: R_s by (4.2) in mohm, by SOC")
-    for column in ("load", *map(str, R_S_SOC)):
+def resistances(name: str, otherwise: dict[str, Protocol]) -> Table:
+    """R_s by (4.2) of each load of one cell, and by the fit to their mean, over SOC."""
+    table = Table(title=f"{name}: R_s by (4.2) in mohm, by SOC; its fit (2.9)")
+    for column in ("load", "its current in A", *map(str, R_S_SOC)):
         table.add_column(column, justify="right")
-    made = protocol(experiment)
-    for load, curve in FastInStep3(made.cell, made.captures, VOLTAGE_STEP_V).r_s_curves.items():
+    least_a = CONSTANT_C * otherwise[FAST].cell.cell.capacity_ah
+    loaded = {c.name: c.samples["current_a"][c.samples["current_a"] > least_a] for c in otherwise[FAST].step_3}
+    for load, curve in otherwise[FAST].r_s_curves.items():
         at = np.interp(R_S_SOC, curve.soc, curve.r_s_ohm)
-        table.add_row(load, *(f"{1e3 * ohm:.0f}" for ohm in at))
+        table.add_row(load, f"{np.median(loaded[load]):.3f}", *(f"{1e3 * ohm:.0f}" for ohm in at))
+    for what in (AS_IT_IS, UNWEIGHTED):
+        fitted = otherwise[what].r_s_fit(np.array(R_S_SOC))
+        table.add_row(f"fit, {what}", "", *(f"{1e3 * ohm:.0f}" for ohm in fitted))
+    return table
+
+
+def worst(name: str, p: Protocol) -> Table:
+    """Where each load of one cell has its largest error."""
+    table = Table(title=f"{name}: where the largest error is")
+    for column in ("load", "at SOC", "measured in V", "less predicted in V", "current in A"):
+        table.add_column(column, justify="right")
+    for load, run in p.dynamic.items():
+        at = np.flatnonzero(run.aligned)[np.argmax(run.error_percent[run.aligned])]
+        table.add_row(
+            load, f"{run.soc[at]:.2f}", f"{run.voltage_v[at]:.2f}", f"{run.error_v[at]:.2f}", f"{run.current_a[at]:.2f}"
+        )
     return table
 
 
