@@ -64,7 +64,7 @@ class ObserverSettings(Strict):
     law: Literal["improved", "scheme-1", "scheme-2", "scheme-3", "learning"] = Field(
         default="improved",
         description="improved: (3.18) with output (4.1); scheme-1..3: (3.16)..(3.18) with (3.14); "
-        "learning: sensitivity times e, docs/observer.md",
+        "learning: sensitivity times e, docs/observer.md, the default where identifier.enabled = false",
     )
     nussbaum: Literal["mittag-leffler", "k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"] = "mittag-leffler"
     alpha: Annotated[float, Field(gt=2, le=3)] = Field(default=2.5, description="a of (3.10), in (2, 3]")
@@ -103,7 +103,7 @@ class IdentifierSettings(Strict):
     """The identifier: SOC with its error, the cell's own parameters."""
 
     enabled: bool = Field(
-        default=True, description="false: SOC by coulomb counting, parameters as the observer's bounds have them"
+        default=True, description="false: SOC by coulomb counting, parameters as the observer's law has them"
     )
     map_memory_h: Annotated[float, Field(ge=1)] = Field(
         default=336.0, description="time constant with which learned elements are forgotten"
@@ -182,6 +182,17 @@ class Settings(Strict):
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
     state: StateSettings = StateSettings()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _law_that_learns(cls, tables: object) -> object:
+        """Without the identifier the printed law has its bounds alone: there the one that learns is the default (docs/comparison.md)."""
+        if not isinstance(tables, dict):
+            return tables
+        identifier, observer = tables.get("identifier"), tables.get("observer", {})
+        if not isinstance(identifier, dict) or not isinstance(observer, dict) or identifier.get("enabled") is not False:
+            return tables
+        return tables | {"observer": {"law": "learning"} | observer}
 
 
 def load_settings(path: Path) -> Settings:

@@ -103,6 +103,20 @@ def test_printed_gain_law_can_be_asked_for(tmp_path: Path) -> None:
     assert observer.lambda_ == 2.0
 
 
+@pytest.mark.parametrize(
+    ("text", "law"),
+    [
+        ("", "improved"),
+        ("[identifier]\nenabled = false", "learning"),
+        ('[identifier]\nenabled = false\n[observer]\nlaw = "improved"', "improved"),
+    ],
+)
+def test_without_the_identifier_the_law_learns_unless_another_is_named(tmp_path: Path, text: str, law: str) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text(text)
+    assert load_settings(path).observer.law == law
+
+
 def test_pack_scales_the_cell() -> None:
     cell = load_cell("chen_mora")
     pack = cell.pack(series=3, parallel=2)
