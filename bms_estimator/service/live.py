@@ -180,8 +180,7 @@ async def _save_often(
     due_s, failed = 0.0, False
     while True:
         await asyncio.sleep(min(LOOK_S, every_s))
-        saved_soc = checkpoint.saved[1] if checkpoint.saved else math.inf
-        moved = abs(estimator.state["soc"][0] - saved_soc) >= SAVED_SOC
+        moved = checkpoint.saved is None or abs(estimator.state["soc"][0] - checkpoint.saved[1]) >= SAVED_SOC
         if loop.time() >= due_s or (moved and not failed):
             failed = not await _save(checkpoint, estimator, publisher, restarts)
             due_s = loop.time() + every_s
