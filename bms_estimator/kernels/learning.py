@@ -15,6 +15,8 @@ from bms_estimator.kernels.state import Record
 
 LEARN_EVERY_S = 0.999
 """Theta moves no more often, nearly a second: more samples only add to what is remembered [s]."""
+FASTEST_HZ = 1.0
+"""Greatest gamma k: theta is never to go faster than it may move. So k, which only grows, is bounded [1/s]."""
 RESTING_C = 0.02
 """A first sample of no more is of a cell at rest [C]."""
 
@@ -81,7 +83,7 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
             else:
                 empty_memory(m, q)
         excess = max(abs(e) - p.observer.dead_zone_v, 0.0) / q.cells
-        o.k += excess * excess * dt_s  # (3.13) with the dead zone of E2
+        o.k = min(o.k + excess * excess * dt_s, FASTEST_HZ / q.rate)  # (3.13) with the dead zone of E2
     estimate = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) + m.offset_v
     show(s, p, estimate)
     broken = not math.isfinite(estimate)

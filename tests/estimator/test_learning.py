@@ -75,9 +75,22 @@ def test_an_element_beyond_its_bounds_is_held_there(ten_hours: SampleBlock) -> N
 
 def test_the_dead_zone_keeps_k_still() -> None:
     block = random_steps(2.0, 0.1 * RESOLUTION_V)
-    estimator, printed = learner(TRUTH), learner(TRUTH, dead_zone_v=0.0, epsilon_v=4 * RESOLUTION_V)
-    assert (estimator.run(block)["k"] == 1.0).all()
-    assert printed.run(block)["k"][-1] > 1.0
+    still, without = learner(TRUTH), learner(TRUTH, dead_zone_v=0.0, epsilon_v=4 * RESOLUTION_V)
+    assert (still.run(block)["k"] == 1.0).all()
+    assert without.run(block)["k"][-1] > 1.0
+
+
+def test_k_is_bounded_under_noise_that_goes_on(ten_hours: SampleBlock) -> None:
+    """At its bound theta goes where the data lead within a second; a checkpoint may hold a k from beyond."""
+    estimator = learner(file_off_by(*OFF))
+    k = estimator.run(random_steps(6.0, 0.05))["k"]
+    assert k[1800] < 60.0
+    assert k[-1] == pytest.approx(60.0)
+    estimator = learner(file_off_by(*OFF))
+    estimator.run(ten_hours[:1])
+    estimator.state["k"] = 113.0
+    assert estimator.run(ten_hours[1:])["k"][-1] == pytest.approx(60.0)
+    assert errors(estimator, OFF)[[0, *PRODUCTS]].max() < 0.02
 
 
 def test_a_jump_of_a_resistance_is_found_again() -> None:
@@ -125,8 +138,7 @@ def test_the_rate_of_samples_does_not_matter() -> None:
 
 
 def test_a_pack_learns_as_its_cell_does(ten_hours: SampleBlock) -> None:
-    cell, pack = learner(file_off_by(*OFF)), None
-    settings = ObserverSettings(law="learning")
+    cell, settings = learner(file_off_by(*OFF)), ObserverSettings(law="learning")
     pack = Estimator(
         file_off_by(*OFF).pack(6, 1),
         settings,
