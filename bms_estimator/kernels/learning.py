@@ -15,8 +15,8 @@ from bms_estimator.kernels.state import Record
 
 LEARN_EVERY_S = 0.999
 """Theta moves no more often, nearly a second: more samples only add to what is remembered [s]."""
-FASTEST_HZ = 1.0
-"""Greatest gamma k: theta is never to go faster than it may move. So k, which only grows, is bounded [1/s]."""
+FASTEST_HZ = 0.1
+"""Greatest gamma k, since k only grows: theta that follows noise faster than in some 10 s is led astray by it [1/s]."""
 RESTING_C = 0.02
 """A first sample of no more is of a cell at rest [C]."""
 
