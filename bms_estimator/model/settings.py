@@ -86,7 +86,10 @@ class ObserverSettings(Strict):
         default=None, description="an error beyond it for lock_time_s is a loss of lock"
     )
     lock_time_s: Positive = 10.0
-    margin_guard: Fraction = Field(default=0.005, description="adaptation stops this far above max(delta1, delta2)")
+    margin_guard: Annotated[float, Field(ge=1e-6, le=1)] = Field(
+        default=0.005,
+        description="adaptation stops this far above max(delta1, delta2); at these a capacitance is 0",
+    )
     scheme_2_lambda: Positive = Field(default=100.0, description="lambda_i of (3.17)")
     scheme_2_epsilon: Positive = Field(default=0.35, description="parameters up to this value are penalised, (3.17)")
 
