@@ -43,7 +43,7 @@ class Estimate(Report):
     delta_2: float | None = Field(description="SOC below which C_tl is negative (2.12)")
     stability_margin: float | None = Field(description="soc - max(delta_1, delta_2)")
     adaptive_gain_k: float | None = Field(description="k of (3.13) [V^2 s]")
-    nussbaum_gain: float | None = Field(description="N(k) of (3.12)")
+    nussbaum_gain: float | None = Field(description="N(k) of (3.12); gamma k [1/s] of the law that learns")
     converged: bool = Field(description="|tracking_error_v| is below eps2 of Algorithm 1")
     lock: bool = Field(description="the observer tracks the measured voltage")
     frames_received: int = Field(description="valid frames since start")
@@ -126,7 +126,7 @@ class Info(Report):
     capacity_ah: float | None = Field(description="null of a fuel cell")
     series_count: int
     nominal_voltage_v: float
-    observer: str = Field(description="adaptation law and gain")
+    observer: str = Field(description="adaptation law, and which N(k) is the gain of a printed one")
     temperature_sensor: bool = Field(
         description="a cell temperature came; without any 25 C is taken, and the resistances are less sure"
     )

@@ -83,6 +83,7 @@ def info_report(
         started_s: Wall clock at start [s since 1970].
         temperature_sensor: Whether the cell's temperature is measured.
     """
+    learns = settings.observer.law == "learning" or not isinstance(cell, CellModel)
     return Info(
         device=settings.pack.name,
         version=__version__,
@@ -91,9 +92,7 @@ def info_report(
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
         series_count=cell.cell.series_count,
         nominal_voltage_v=cell.cell.nominal_voltage_v,
-        observer=f"{settings.observer.law}, {settings.observer.nussbaum}"
-        if isinstance(cell, CellModel)
-        else "learning",
+        observer="learning" if learns else f"{settings.observer.law}, {settings.observer.nussbaum}",
         temperature_sensor=temperature_sensor,
         publish_rate_hz=settings.publish.rate_hz,
         board=dict(board),
