@@ -27,6 +27,8 @@ NOISE_V = 1e-3
 STARTS = list(itertools.product((0.5, 2.0), repeat=5))[::5]
 OFF = (2.0, 0.5, 2.0, 0.5, 2.0)
 PRODUCTS = [2, 4]
+K_BOUND = 6.0
+"""gamma k is 0.1/s then."""
 
 
 @pytest.fixture(scope="module")
@@ -53,17 +55,14 @@ def test_a_constant_current_does_not_tell_the_elements_apart() -> None:
     assert errors(estimator, factors).max() > 0.4
 
 
-def test_noise_of_any_size_leaves_everything_bounded() -> None:
-    block = random_steps(3.0, 0.2)
-    estimator = learner(TRUTH)
-    q = estimator.settings_record[0]["learning"]
-    for part in np.array_split(block, 50):
-        trace = estimator.run(part)
-        theta = estimator.record[0]["learning"]["theta"]
-        assert (q["lower"] <= theta).all()
-        assert (theta <= q["upper"]).all()
-        assert np.abs(trace["voltage_estimate_v"] - 3.8).max() < 1.0
-    assert (estimator.state["a"][0, 1:] > 0.0).all()
+def test_noise_of_200_mv_leaves_the_voltage_near_the_cells() -> None:
+    """To a fifth of the noise."""
+    noise_v = 0.2
+    noisy, clean = random_steps(3.0, noise_v), random_steps(3.0)
+    trace = learner(TRUTH).run(noisy)
+    true_v = np.interp(trace["time_s"], clean["time_s"], clean["voltage_v"])
+    error_v = trace["voltage_estimate_v"] - true_v
+    assert np.sqrt(np.mean(np.square(error_v))) < 0.2 * noise_v
 
 
 def test_an_element_beyond_its_bounds_is_held_there(ten_hours: SampleBlock) -> None:
@@ -73,6 +72,18 @@ def test_an_element_beyond_its_bounds_is_held_there(ten_hours: SampleBlock) -> N
     assert estimator.state["a"][0, 15] == pytest.approx(2.0 * TRUTH.a[15])
 
 
+@pytest.mark.parametrize("tau_factors", [(8.0, 0.1), (100.0, 1e-3)], ids=str)
+def test_a_file_whose_branches_are_in_the_other_order_is_allowed(tau_factors: tuple[float, float]) -> None:
+    short, long = tau_factors
+    estimator = learner(file_off_by(1.0, 1.0, short, 1.0, long))
+    q = estimator.settings_record[0]["learning"]
+    assert (q["lower"] <= 0.0).all()
+    assert (q["upper"] >= 0.0).all()
+    estimator.run(random_steps(0.5, NOISE_V))
+    theta = estimator.record[0]["learning"]["theta"]
+    assert theta[2] < 0.0 < theta[4]
+
+
 def test_the_dead_zone_keeps_k_still() -> None:
     block = random_steps(2.0, 0.1 * RESOLUTION_V)
     still, without = learner(TRUTH), learner(TRUTH, dead_zone_v=0.0, epsilon_v=4 * RESOLUTION_V)
@@ -80,17 +91,20 @@ def test_the_dead_zone_keeps_k_still() -> None:
     assert without.run(block)["k"][-1] > 1.0
 
 
-def test_k_is_bounded_under_noise_that_goes_on(ten_hours: SampleBlock) -> None:
-    """At its bound theta goes where the data lead within a second; a checkpoint may hold a k from beyond."""
-    estimator = learner(file_off_by(*OFF))
-    k = estimator.run(random_steps(6.0, 0.05))["k"]
-    assert k[1800] < 60.0
-    assert k[-1] == pytest.approx(60.0)
-    estimator = learner(file_off_by(*OFF))
-    estimator.run(ten_hours[:1])
+def test_k_is_bounded_under_noise_that_goes_on() -> None:
+    k = learner(TRUTH).run(random_steps(3.0, 0.05))["k"]
+    assert 1.0 < k[600] < K_BOUND
+    assert k[-1] == pytest.approx(K_BOUND)
+
+
+def test_a_k_beyond_its_bound_does_not_lead_what_is_learned_astray() -> None:
+    """As a checkpoint may hold it after hours of noise."""
+    estimator, block = learner(file_off_by(*OFF)), random_steps(10.0, 5e-3)
+    estimator.run(block[:1])
     estimator.state["k"] = 113.0
-    assert estimator.run(ten_hours[1:])["k"][-1] == pytest.approx(60.0)
-    assert errors(estimator, OFF)[[0, *PRODUCTS]].max() < 0.02
+    estimator.run(block[1:])
+    assert estimator.state["k"][0] == pytest.approx(K_BOUND)
+    assert errors(estimator, OFF)[[0, *PRODUCTS]].max() < 0.03
 
 
 def test_a_jump_of_a_resistance_is_found_again() -> None:
@@ -168,6 +182,17 @@ def test_below_the_margins_nothing_is_learned() -> None:
             assert estimator.record[0]["learning"]["theta"] == pytest.approx(theta, abs=0.0)
     assert estimator.state["adapting"][0] == 0
     assert estimator.state["soc"][0] < estimator.state["delta_2"][0]
+
+
+@pytest.mark.parametrize("law", ["improved", "learning"])
+def test_the_smallest_guard_keeps_capacitances_above_zero(law: str) -> None:
+    with pytest.raises(ValueError, match="margin_guard"):
+        ObserverSettings.model_validate({"law": law, "margin_guard": 0.0})
+    settings = ObserverSettings.model_validate({"law": law, "margin_guard": 1e-6})
+    estimator = Estimator(TRUTH, settings, identifier=None, initial_soc=0.01, voltage_resolution_v=RESOLUTION_V)
+    block = measured(np.full(7200, 0.1 * RATED_A), 0.0, np.random.default_rng(1))
+    assert np.isfinite(estimator.run(block)["voltage_estimate_v"]).all()
+    assert estimator.state["adapting"][0] == 0
 
 
 def test_a_gap_teaches_nothing_and_the_law_goes_on() -> None:
