@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import soc_from_ocv
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
-from bms_estimator.kernels.hypotheses import pack_std
+from bms_estimator.kernels.hypotheses import is_temperature, pack_std
 from bms_estimator.kernels.identification import UNSEEN_MOST, identify, restart_filter, start_filter
 from bms_estimator.kernels.learning import begin_learning, learning_step, take_as_rest
 from bms_estimator.kernels.observer import count_charge, observer_step, start
@@ -135,7 +135,8 @@ def is_gap(s: Record, p: Record, dt_s: float) -> bool:
 @njit(cache=True)
 def begin(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """The first sample of all, of filter and learning law. Records as in ``step``."""
-    s.learning.temperature_c = temperature_c
+    s.learning.temperature_c = math.nan
+    sense(s.learning, temperature_c)
     if p.identify:
         start_filter(s, p, current_a, voltage_v, temperature_c)
     if p.learning.enabled:
@@ -144,8 +145,8 @@ def begin(s: Record, p: Record, current_a: float, voltage_v: float, temperature_
 
 @njit(cache=True)
 def sense(m: Record, temperature_c: float) -> None:
-    """Keep the last temperature that was told; ``m`` is a record of LEARNING_STATE."""
-    if math.isfinite(temperature_c):
+    """Keep the last temperature that a cell can have; ``m`` is a record of LEARNING_STATE."""
+    if is_temperature(temperature_c):
         m.temperature_c = temperature_c
 
 
