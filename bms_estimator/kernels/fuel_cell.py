@@ -44,10 +44,6 @@ BARRIER_V = 0.948
 with i_0 after Arrhenius has it: xi_1 of Mann et al. (2000) [V]."""
 MEMBRANE_K = 1268.0
 """Of the membrane's conductivity, e^(-1268 / T): Springer et al. (1991) [K]."""
-LEAST_CURRENT_A = 1e-6
-"""A stack takes no charge: its reaction is never slower than this [A]."""
-SETTLED_S = 1e6
-"""No double layer is still on its way after so long [s]."""
 LEAST_REST = 0.02
 """1 - I / i_L is no less: beyond 98 % of the limiting current the loss stays, for there is no steady state [1]."""
 
@@ -87,8 +83,8 @@ def give_file(given: Floats, file: Floats, temperature_c: float) -> None:
 
 @njit(cache=True)
 def reaction_current(current_a: float, internal_a: float) -> float:
-    """I = i + i_n, what the electrodes turn over [A]."""
-    return max(current_a + internal_a, LEAST_CURRENT_A)
+    """I = i + i_n, what the electrodes turn over [A]; a stack takes no charge, so a negative i counts as none."""
+    return max(current_a, 0.0) + internal_a
 
 
 @njit(cache=True)
@@ -107,8 +103,7 @@ def settled(theta: Floats, given: Floats, current_a: float, slope: Floats) -> fl
     slope[ACTIVATION] = activation_v
     slope[B] = -b_v * math.log(rest)
     slope[LIMIT] = -gain
-    if current_a + internal_a > LEAST_CURRENT_A:
-        slope[INTERNAL] = (tafel_v + gain) * internal_a / reaction_a
+    slope[INTERNAL] = (tafel_v + gain) * internal_a / reaction_a
     return activation_v + slope[TAFEL] + slope[B]
 
 
@@ -141,26 +136,31 @@ def advance(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: floa
         dx[0, j] = along * dx[0, j] + ahead * slope[j]
     dx[0, TAFEL] += tafel_v * (along * z - log_behind) - fade
     dx[0, C_DL] -= fade
-    if current_a + internal_a > LEAST_CURRENT_A:
-        dx[0, INTERNAL] += fade * internal_a / reaction_a
+    dx[0, INTERNAL] += fade * internal_a / reaction_a
     x[0] = v_inf - tafel_v * log_behind
     slope[:] = 0.0
 
 
 @njit(cache=True)
 def output(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, psi: Floats) -> float:
-    """Terminal voltage y [V] at ``current_a``, and in ``psi`` its derivatives by theta, shape (8,); rest as ``advance``."""
+    """Terminal voltage y [V] at ``current_a``, and in ``psi`` its derivatives by theta, shape (8,); rest as ``advance``.
+
+    Where more than i_n flows in ``psi`` is 0: that current is wrong, and tells of no parameter.
+    """
     drop_v = given[R] * math.exp(theta[R]) * current_a
     for j in range(psi.shape[0]):
         psi[j] = -dx[0, j]
     psi[R] -= drop_v
+    if current_a + given[INTERNAL] * math.exp(theta[INTERNAL]) < 0.0:
+        psi[:] = 0.0
     return given[E] - x[0] - drop_v
 
 
 @njit(cache=True)
 def settle(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
-    """The state that ``current_a`` leads to, and its sensitivities; arguments as of ``advance``."""
-    advance(x, dx, theta, given, current_a, SETTLED_S)
+    """The state that ``current_a`` leads to, and its sensitivities, whatever they were; arguments as of ``advance``."""
+    dx[1] = 0.0
+    x[0], x[1] = settled(theta, given, current_a, dx[0]), 0.0
 
 
 @njit(cache=True)

@@ -141,13 +141,47 @@ def test_without_a_load_nothing_is_learned_but_the_voltage() -> None:
     assert not fuel_cell_parameters(estimator, 0.0)["r_ohm"].valid
 
 
-def test_parameters_stay_within_their_bounds_whatever_is_measured() -> None:
-    samples = own_block(np.ones(16), 120.0)
-    samples["voltage_v"] = np.random.default_rng(1).uniform(2.0, 18.0, samples.size)
+def test_a_stack_is_learned_again_after_a_sensor_that_told_anything() -> None:
+    samples = own_block(np.ones(16), 720.0)
+    broken = slice(6000, 12000)
+    samples["voltage_v"][broken] = np.random.default_rng(1).uniform(2.0, 18.0, 6000)
     estimator = Estimator(PEM)
-    estimator.run(samples)
-    q = estimator.settings_record[0]["learning"]
-    theta = estimator.record[0]["learning"]["theta"][:7]
-    assert np.isfinite(theta).all()
-    assert (q["lower"][:7] <= theta).all()
-    assert (theta <= q["upper"][:7]).all()
+    trace = estimator.run(samples)
+    assert np.sqrt(np.mean(trace["innovation_v"][broken] ** 2)) > 1.0
+    assert np.sqrt(np.mean(trace["innovation_v"][-6000:] ** 2)) < 0.01
+    assert learned(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.1)
+
+
+@pytest.mark.parametrize("field", ["theta", "x", "dx", "information", "pull", "temperature_c"])
+def test_a_state_that_is_no_number_begins_anew(field: str) -> None:
+    samples = own_block(np.ones(16), 90.0)
+    estimator = Estimator(PEM)
+    estimator.run(samples[:1000])
+    estimator.record[0]["learning"][field] = np.nan
+    trace = estimator.run(samples[1000:])
+    assert np.isfinite(trace["voltage_estimate_v"][300:]).all()
+    assert estimator.state["lock_losses"][0] <= 1
+    assert np.sqrt(np.mean(trace["innovation_v"][300:] ** 2)) < 0.01
+
+
+@pytest.mark.parametrize("celsius", [-273.15, -300.0, -127.0, 1e6, np.inf])
+@pytest.mark.parametrize("first", [0, 500])
+def test_a_temperature_that_no_cell_has_counts_as_none(first: int, celsius: float) -> None:
+    samples = own_block(np.ones(16), 10.0)
+    without, told = Estimator(PEM), Estimator(PEM)
+    expected_v = without.run(samples)["voltage_estimate_v"].copy()
+    samples["temperature_c"][first : first + 2] = celsius
+    np.testing.assert_array_equal(told.run(samples)["voltage_estimate_v"], expected_v)
+    assert np.isfinite(expected_v).all()
+
+
+def test_a_current_of_the_wrong_sign_teaches_nothing() -> None:
+    samples = own_block(np.ones(16), 60.0)
+    estimator = Estimator(PEM)
+    estimator.run(samples[:2000])
+    samples["current_a"][2000:5000] *= -1.0
+    estimator.run(samples[2000:5000])
+    assert learned(estimator)["tafel_slope_v"] == pytest.approx(PEM.fuel_cell.tafel_slope_v, rel=0.02)
+    assert learned(estimator)["r_ohm"] == pytest.approx(PEM.fuel_cell.r_ohm, rel=0.05)
+    trace = estimator.run(samples[5000:])
+    assert np.sqrt(np.mean(trace["innovation_v"][100:] ** 2)) < 0.02
