@@ -106,10 +106,19 @@ class FuelCellModel(Strict):
         return self.model_copy(update={"fuel_cell": losses, "std": rounded})
 
     def pack(self, series: int, parallel: int) -> "FuelCellModel":
-        """The model of ``series`` x ``parallel`` of these: voltages, resistance, capacitance and currents scaled."""
+        """The model of ``series`` x ``parallel`` of these: voltages, resistance, capacitance and currents scaled.
+
+        Raises:
+            UserError: Their exchange current is 1 A and more: no activation loss at 1 A is left to be learned.
+        """
         if series == parallel == 1:
             return self
         factor = {"ohm": series / parallel, "farad": parallel / series, "v": series, "a": parallel}
+        exchange_a = parallel * self.fuel_cell.exchange_current_a
+        if exchange_a >= 1.0:
+            raise UserError(
+                f"{self.cell.name}: exchange_current_a of {parallel} in parallel is {exchange_a:g}: must be less than 1"
+            )
 
         def scaled(part: Strict) -> dict[str, object]:
             return {

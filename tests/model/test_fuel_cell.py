@@ -43,6 +43,13 @@ def test_stacks_in_series_and_parallel_share_voltage_and_current() -> None:
     assert PEM.pack(1, 1) is PEM
 
 
+def test_stacks_in_parallel_whose_exchange_current_is_too_large_are_refused() -> None:
+    large = PEM.model_copy(update={"fuel_cell": PEM.fuel_cell.model_copy(update={"exchange_current_a": 0.4})})
+    assert large.pack(1, 2).activation_v > 0.0
+    with pytest.raises(UserError, match=r"^pem_30w: exchange_current_a of 3 in parallel is 1\.2: must be less than 1$"):
+        large.pack(1, 3)
+
+
 def test_a_written_file_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     a = PEM.a
