@@ -10,7 +10,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.frames import CurrentSign
 
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
-CELL_HELP = "lfp, nmc, nca, lco, lmo, lto: generic; else a shipped cell's name or a cell file (pem_30w: a fuel cell)"
+CELL_HELP = "lfp, nmc, nca, lco, lmo, lto: generic; else a shipped cell's name or a cell file"
+OR_FUEL_CELL_HELP = f"{CELL_HELP}; pem_30w or a fuel cell's file"
 CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
 CapacityAh = Annotated[
     float | None,

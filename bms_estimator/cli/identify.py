@@ -14,7 +14,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.identify import CaptureFit, Identification, identify
 from bms_estimator.cli.captures import (
-    CELL_HELP,
+    OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
     Force,
@@ -34,7 +34,7 @@ def identify_command(
     captures: Annotated[
         list[Path], typer.Argument(help="recorded captures, CSV (.gz) or Parquet, each from rest", show_default=False)
     ],
-    cell: Annotated[str, typer.Option(help=f"{CELL_HELP}; its capacity and OCV", show_default=False)],
+    cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; its capacity and OCV", show_default=False)],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
     soc: Annotated[

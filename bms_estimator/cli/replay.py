@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, Force, SignOfCurrent, check_out
+from bms_estimator.cli.captures import OR_FUEL_CELL_HELP, AsJson, CapacityAh, Force, SignOfCurrent, check_out
 from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import pack_or_cell, refuse_soc, with_broker, with_pack
 from bms_estimator.cli.summary import Result, Summary
@@ -40,7 +40,7 @@ def replay(
     capture: Annotated[
         Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet; -: from stdin", show_default=False)
     ],
-    cell: Annotated[str | None, typer.Option(help=CELL_HELP, show_default=False)] = None,
+    cell: Annotated[str | None, typer.Option(help=OR_FUEL_CELL_HELP, show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[Path | None, typer.Option(help="settings of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
