@@ -9,12 +9,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 
-from bms_estimator.calibration.fuel_cell import KEYS, FuelCellFit, Source, fit_fuel_cell
+from bms_estimator.calibration.fuel_cell import KEYS, Floats, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.cli.captures import name_of
+from bms_estimator.kernels.hypotheses import COLDEST_C, HOTTEST_C
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
@@ -50,6 +52,8 @@ def identify_fuel_cell(
     as_json: bool,
 ) -> None:
     """Identify, write the file and print the outcome; arguments as of ``identify_command``."""
+    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
+        raise UserError(f"--temperature-c {temperature_c:g}: must lie within {COLDEST_C:g} and {HOTTEST_C:g} C")
     start = load_fuel_cell(cell)
     sources = [_source(path, start, temperature_c, current_sign) for path in paths]
     started_s = time.perf_counter()
@@ -79,18 +83,17 @@ def _source(path: Path, model: FuelCellModel, temperature_c: float | None, sign:
     points = read_polarisation(path)
     if points is not None:
         time_s, (current_a, voltage_v, sensed_c) = None, points.T
-        good = np.full(current_a.shape, fill_value=True)
+        current_a = -current_a if sign == "charge_positive" else current_a
     else:
         record = load_capture(path, current_sign=sign)
         time_s, current_a, voltage_v, sensed_c = (
             record[name] for name in ("time_s", "current_a", "voltage_v", "temperature_c")
         )
-        limits = model.cell
-        good = (voltage_v >= limits.voltage_min_v) & (voltage_v <= limits.voltage_max_v)
-        good &= (np.abs(current_a) <= limits.current_max_a) & (np.diff(time_s, prepend=-np.inf) > 0.0)
-    if good.sum() < FEWEST:
-        raise UserError(f"{path}: {good.sum()} usable points: give at least {FEWEST}")
-    celsius = np.where(np.isnan(sensed_c), math.nan if temperature_c is None else temperature_c, sensed_c)
+    good = _usable(path, model, current_a, voltage_v)
+    if time_s is not None:
+        good &= np.diff(time_s, prepend=-np.inf) > 0.0
+    sensed = (sensed_c >= COLDEST_C) & (sensed_c <= HOTTEST_C)
+    celsius = np.where(sensed, sensed_c, math.nan if temperature_c is None else temperature_c)
     return Source(
         name=name_of(path),
         time_s=None if time_s is None else time_s[good],
@@ -98,6 +101,24 @@ def _source(path: Path, model: FuelCellModel, temperature_c: float | None, sign:
         voltage_v=voltage_v[good],
         temperature_c=celsius[good],
     )
+
+
+def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floats) -> NDArray[np.bool_]:
+    """Which points such a stack can give, shape (n,).
+
+    Raises:
+        UserError: Most have another sign, or too few are left.
+    """
+    c = model.cell
+    charging = current_a < -model.fuel_cell.internal_current_a
+    if 2 * charging.sum() > charging.size:
+        raise UserError(f"{path}: the current is negative, but a fuel cell takes no charge: is --current-sign right?")
+    good: NDArray[np.bool_] = (voltage_v >= c.voltage_min_v) & (voltage_v <= c.voltage_max_v)
+    good &= (current_a <= c.current_max_a) & ~charging
+    if good.sum() < FEWEST:
+        limits = f"{c.voltage_min_v:g} to {c.voltage_max_v:g} V and up to {c.current_max_a:g} A"
+        raise UserError(f"{path}: {good.sum()} usable points: give at least {FEWEST} of {limits}, as {c.name} has them")
+    return good
 
 
 def _remarks(cell: str, fit: FuelCellFit) -> list[str]:

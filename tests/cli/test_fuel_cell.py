@@ -9,6 +9,7 @@ import pytest
 
 from bms_estimator.calibration.fuel_cell import KEYS
 from bms_estimator.kernels.fuel_cell_open_loop import open_loop, polarisation
+from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from tests import mann_stack
 from tests.command_line import run
@@ -22,6 +23,13 @@ def table(path: Path, **columns: np.ndarray) -> Path:
     rows = np.column_stack(list(columns.values()))
     np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.6g")
     return path
+
+
+def negated(path: Path, folder: Path) -> Path:
+    """The file with its current as one that is positive on charge."""
+    rows = np.genfromtxt(path, delimiter=",", names=True)
+    rows["current_a"] *= -1.0
+    return table(folder / f"negated_{path.name}", **{name: rows[name] for name in rows.dtype.names})
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +74,50 @@ def test_identify_says_what_the_data_do_not_tell(capsys, curve: Path, tmp_path: 
     assert "c_dl_farad: not known at all from these data; it needs steps of the current" in " ".join(printed.split())
 
 
+@pytest.mark.parametrize("as_curve", [True, False])
+def test_a_current_that_is_positive_on_charge_is_turned(
+    capsys, curve: Path, steps: Path, tmp_path: Path, *, as_curve: bool
+) -> None:
+    turned = negated(curve if as_curve else steps, tmp_path)
+    command = "identify", turned, "--cell", "pem_30w", "--current-sign", "charge_positive"
+    code, printed, _ = run(capsys, *command, "--out", tmp_path / "mine.toml", "--json")
+    assert code == 0
+    assert json.loads(printed)["parameters"]["r_ohm"]["value"] == pytest.approx(
+        GROWN[1] * PEM.fuel_cell.r_ohm, rel=0.05
+    )
+
+
+@pytest.mark.parametrize("celsius", ["inf", "-273.15", "-127"])
+def test_a_temperature_that_no_cell_has_counts_as_none(capsys, curve: Path, tmp_path: Path, celsius: str) -> None:
+    lines = curve.read_text().splitlines()
+    told = tmp_path / curve.name
+    told.write_text("\n".join([f"{lines[0]},temperature_c", *(f"{line},{celsius}" for line in lines[1:])]))
+    found = []
+    for path in (curve, told):
+        out = tmp_path / "mine.toml"
+        code, _, _ = run(capsys, "identify", path, "--cell", "pem_30w", "--out", out, "--force")
+        assert code == 0
+        found.append(load_fuel_cell(out))
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("celsius", ["-300", "nan", "121"])
+def test_an_option_with_such_a_temperature_is_refused(capsys, curve: Path, tmp_path: Path, celsius: str) -> None:
+    command = "identify", curve, "--cell", "pem_30w", "--out", tmp_path / "mine.toml"
+    code, _, err = run(capsys, *command, "--temperature-c", celsius)
+    assert code == 2
+    assert f"--temperature-c {celsius}: must lie within -60 and 120 C" in err
+
+
+def test_replay_survives_a_temperature_that_no_cell_has(capsys, tmp_path: Path) -> None:
+    celsius = np.array([40.0, -273.15, 40.0, 40.0])
+    columns = {"time_s": np.arange(4.0), "current_a": np.full(4, 3.0), "voltage_v": np.full(4, 9.4)}
+    path = table(tmp_path / "cold.csv", **columns, temperature_c=celsius)
+    code, printed, _ = run(capsys, "replay", path, "--cell", "pem_30w", "--json")
+    assert code == 0
+    assert json.loads(printed)["innovation_rms_v"] < 0.2
+
+
 def test_replay_learns_and_has_no_soc(capsys, steps: Path, tmp_path: Path) -> None:
     code, printed, _ = run(capsys, "replay", steps, "--cell", "pem_30w", "--json", "--out", tmp_path / "out.csv")
     assert code == 0
@@ -95,6 +147,27 @@ def test_a_pack_file_names_it(capsys, tmp_path: Path) -> None:
     assert "observer.lock_error_v" in printed
 
 
+def test_stacks_in_parallel_beyond_tafel_s_line_are_refused_in_one_line(capsys, tmp_path: Path) -> None:
+    pack, cell = tmp_path / "pack.toml", tmp_path / "mine.toml"
+    losses = PEM.fuel_cell.model_copy(update={"exchange_current_a": 0.4})
+    write_cell(cell, PEM.model_copy(update={"fuel_cell": losses}))
+    pack.write_text('[pack]\ncell = "mine.toml"\nparallel = 3\n')
+    code, out, err = run(capsys, "config", "check", pack)
+    assert (code, out) == (2, "")
+    assert err == "error: pem_30w: exchange_current_a of 3 in parallel is 1.2: must be less than 1\n"
+
+
+def test_help_offers_a_fuel_cell_where_one_is_taken(capsys) -> None:
+    offered = {c for c in ("capacity", "identify", "replay", "simulate", "thesis", "validate") if _offers(capsys, c)}
+    assert offered == {"identify", "replay"}
+
+
+def _offers(capsys, command: str) -> bool:
+    code, printed, _ = run(capsys, command, "--help")
+    assert code == 0
+    return "pem_30w" in printed
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -102,6 +175,7 @@ def test_a_pack_file_names_it(capsys, tmp_path: Path) -> None:
         ("validate", "{steps}", "--cell", "pem_30w"),
         ("cell", "export", "{pack}", "--out", "{out}"),
         ("simulate", "--cell", "pem_30w"),
+        ("thesis", "{steps}", "--cell", "pem_30w"),
         ("replay", "{steps}", "--cell", "pem_30w", "--soc", "0.5"),
         ("replay", "{steps}", "--cell", "pem_30w", "--capacity-ah", "3"),
         ("replay", "{steps}", "--pack", "{soc}"),
@@ -122,15 +196,20 @@ def test_what_makes_no_sense_for_a_fuel_cell_says_so_in_one_line(
     assert "is a fuel cell" in err
 
 
-def test_files_that_cannot_be_used_are_named(capsys, steps: Path, tmp_path: Path) -> None:
+def test_files_that_cannot_be_used_are_named(capsys, curve: Path, steps: Path, tmp_path: Path) -> None:
     short = tmp_path / "short.csv"
     short.write_text("current_a,voltage_v\n1.0,10.0\n2.0,9.0\n")
     hole = tmp_path / "hole.csv"
     hole.write_text("current_a,voltage_v\n1.0,10.0\n2.0\n3.0,8.0\n")
+    one_cell = table(tmp_path / "one_cell.csv", current_a=np.arange(4.0), voltage_v=np.array([0.86, 0.7, 0.64, 0.57]))
+    reversed_curve, reversed_steps = (negated(path, tmp_path) for path in (curve, steps))
     for path, message in (
         (short, "2 usable points"),
         (hole, "a value is missing"),
         (tmp_path / "none.csv", "none.csv"),
+        (one_cell, "0 usable points: give at least 3 of 2 to 18 V and up to 15 A, as pem_30w has them"),
+        (reversed_curve, "the current is negative, but a fuel cell takes no charge: is --current-sign right?"),
+        (reversed_steps, "the current is negative, but a fuel cell takes no charge: is --current-sign right?"),
     ):
         code, _, err = run(capsys, "identify", path, "--cell", "pem_30w", "--out", tmp_path / "out.toml")
         assert code == 2
