@@ -1,8 +1,14 @@
 """Settings that are allowed, but cannot be: a slip of the unit, a count given twice or not at all."""
 
+from collections.abc import Iterator
+
+import numpy as np
+
 from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels.fuel_cell_open_loop import polarisation
+from bms_estimator.kernels.learning_state import LEARNABLE
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.settings import Settings
 
 LARGEST_AH = 2000.0
@@ -20,12 +26,29 @@ def implausible(settings: Settings, cell: PackModel) -> list[str]:
 
     Args:
         settings: The pack's.
-        cell: The pack as one object (``CellModel.pack``); of a fuel cell nothing is checked.
+        cell: The pack as one object (``CellModel.pack``).
     """
-    if not isinstance(cell, CellModel):
-        return []
-    checks = _capacity, _counted_twice, _cell_voltage, _single_row, _range
-    return [line for line in (check(settings, cell) for check in checks) if line]
+    if isinstance(cell, FuelCellModel):
+        found = [_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
+    else:
+        checks = _capacity, _counted_twice, _cell_voltage, _single_row
+        full_v = float(ocv_grid(cell)[0][-1])
+        found = [*(check(settings, cell) for check in checks), _range(settings, full_v, "when full")]
+    return [line for line in found if line]
+
+
+def _no_load_v(cell: FuelCellModel) -> float:
+    """The highest voltage of a stack, at the file's temperature [V]."""
+    voltage_v, _ = polarisation(cell.a, np.zeros(LEARNABLE), np.zeros(1), np.full(1, np.nan))
+    return float(voltage_v[0])
+
+
+def _ignored(settings: Settings, cell: FuelCellModel) -> Iterator[str]:
+    """What the file sets, but a fuel cell has not."""
+    if "law" in settings.observer.model_fields_set and settings.observer.law != "learning":
+        yield f"observer.law = {settings.observer.law!r}: ignored: a fuel cell ({cell.cell.name}) always has 'learning'"
+    if "enabled" in settings.identifier.model_fields_set and settings.identifier.enabled:
+        yield f"identifier.enabled = true: ignored: the identifier is of batteries, {cell.cell.name} is a fuel cell"
 
 
 def _capacity(settings: Settings, cell: CellModel) -> str | None:
@@ -64,12 +87,12 @@ def _single_row(settings: Settings, cell: CellModel) -> str | None:
     return f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
 
 
-def _range(settings: Settings, cell: CellModel) -> str | None:
+def _range(settings: Settings, highest_v: float, when: str) -> str | None:
     sensor = settings.sensor
-    range_v, full_v = CONVERTER_STEPS * sensor.voltage_resolution_v, float(ocv_grid(cell)[0][-1])
-    if sensor.protocol == "text" or full_v <= range_v:
+    range_v = CONVERTER_STEPS * sensor.voltage_resolution_v
+    if sensor.protocol == "text" or highest_v <= range_v:
         return None
     return (
         f"sensor.voltage_resolution_v = {sensor.voltage_resolution_v:.4g}: the board's range ends at {range_v:.1f} V, "
-        f"but this pack has {full_v:.1f} V when full; it needs another divider, and its resolution here"
+        f"but this pack has {highest_v:.1f} V {when}; it needs another divider, and its resolution here"
     )

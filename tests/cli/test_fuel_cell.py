@@ -137,7 +137,7 @@ def test_replay_learns_and_has_no_soc(capsys, steps: Path, tmp_path: Path) -> No
 
 def test_a_pack_file_names_it(capsys, tmp_path: Path) -> None:
     pack = tmp_path / "pack.toml"
-    pack.write_text('[pack]\ncell = "pem_30w"\nseries = 2\n')
+    pack.write_text('[pack]\ncell = "pem_30w"\nseries = 2\n[sensor]\nvoltage_resolution_v = 0.03\n')
     code, printed, err = run(capsys, "config", "check", pack)
     assert (code, err) == (0, "")
     assert "pem_30w, 28 in series, 18.6 V, fuel cell" in printed
@@ -145,6 +145,34 @@ def test_a_pack_file_names_it(capsys, tmp_path: Path) -> None:
     assert code == 0
     assert "delta_1" not in printed
     assert "observer.lock_error_v" in printed
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("series = 3", "the board's range ends at 25.0 V, but this pack has 40.1 V at no load"),
+        (
+            '[observer]\nlaw = "scheme-2"',
+            "observer.law = 'scheme-2': ignored: a fuel cell (pem_30w) always has 'learning'",
+        ),
+        ("[identifier]\nenabled = true", "identifier.enabled = true: ignored: the identifier is of batteries"),
+    ],
+)
+def test_check_warns_of_what_is_ignored_or_out_of_range(capsys, tmp_path: Path, settings: str, said: str) -> None:
+    pack = tmp_path / "pack.toml"
+    pack.write_text(f'[pack]\ncell = "pem_30w"\n{settings}\n')
+    code, _, err = run(capsys, "config", "check", pack)
+    assert code == 0
+    assert err.startswith(f"warning: {pack}: ")
+    assert err.count("\n") == 1
+    assert said in err
+
+
+@pytest.mark.parametrize("settings", ["", '[observer]\nlaw = "learning"', "[identifier]\nenabled = false"])
+def test_check_has_nothing_to_say_of_a_stack_that_may_be(capsys, tmp_path: Path, settings: str) -> None:
+    pack = tmp_path / "pack.toml"
+    pack.write_text(f'[pack]\ncell = "pem_30w"\n{settings}\n')
+    assert run(capsys, "config", "check", pack)[::2] == (0, "")
 
 
 def test_stacks_in_parallel_beyond_tafel_s_line_are_refused_in_one_line(capsys, tmp_path: Path) -> None:
