@@ -77,8 +77,36 @@ ELEMENTS = {
     "c_ts_farad": _raw("C_ts", "F", 0),
     "c_tl_farad": _raw("C_tl", "F", 0),
 }
-ENTITIES = ESTIMATE | ELEMENTS
+STACK = {
+    # by element of the parameters of a fuel cell
+    "r_ohm": Entity("Resistance", "Ω", 4, 0.0005),
+    "tafel_slope_v": _raw("Tafel slope", "V", 4),
+    "exchange_current_a": _raw("Exchange current", "A", 9),
+    "c_dl_farad": _raw("Double layer capacitance", "F", 4),
+    "concentration_v": _raw("Concentration loss B", "V", 4),
+    "limiting_current_a": _raw("Limiting current", "A", 2),
+    "internal_current_a": _raw("Internal current", "A", 4),
+}
+OF_CHARGE = (
+    "soc_percent",
+    "remaining_capacity_ah",
+    "remaining_energy_wh",
+    "time_to_empty_s",
+    "soc_std",
+    "usable_capacity_ah",
+    "stability_margin",
+    "delta_1",
+    "delta_2",
+)
+"""What a fuel cell has not."""
+BATTERY = ESTIMATE | ELEMENTS
+FUEL_CELL = {key: entity for key, entity in ESTIMATE.items() if key not in OF_CHARGE} | STACK
 PROBLEM_NAMES = {"sensor_silent": "Sensor silent", "suspicion": "Input suspected", "lock_lost": "Lock lost"}
+
+
+def entities(info: Info) -> dict[str, Entity]:
+    """The numbers of a pack by their keys."""
+    return FUEL_CELL if info.capacity_ah is None else BATTERY
 
 
 def device_id(device: str) -> str:
@@ -110,7 +138,7 @@ def discovery(info: Info, root: str, sample_period_s: float) -> dict[str, Any]:
         device["serial_number"] = info.board["serial"]
     fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
     expiry_s = max(LEAST_EXPIRY_S, math.ceil(fresh_s))
-    numbers = {key: _number(key, entity, root, expiry_s) for key, entity in ENTITIES.items()}
+    numbers = {key: _number(key, entity, root, expiry_s) for key, entity in entities(info).items()}
     problems = {key: _problem(key, name, root) for key, name in PROBLEM_NAMES.items()}
     return {
         "device": device,

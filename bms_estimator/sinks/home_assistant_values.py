@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from bms_estimator.model.estimate import Snapshot
-from bms_estimator.sinks.home_assistant import ELEMENTS, ENTITIES, ESTIMATE, SLOW_S
+from bms_estimator.sinks.home_assistant import SLOW_S, Entity, entities
 
 PAUSE_S = 5.0
 """Between two messages with values [s]."""
@@ -32,7 +32,8 @@ def next_values(shown: Shown, snapshot: Snapshot, now_s: float) -> Shown:
     waited_s = now_s - shown.told_s
     if snapshot.estimate is None or waited_s < PAUSE_S:
         return shown
-    moved = {key: value for key, value in _rounded(snapshot).items() if _moved(shown, key, value, now_s)}
+    shows = entities(snapshot.info)
+    moved = {k: value for k, value in _rounded(snapshot, shows).items() if _moved(shown, k, value, shows[k], now_s)}
     if not moved and waited_s < HEARTBEAT_S:
         return shown
     return shown._replace(
@@ -53,23 +54,25 @@ def next_problems(shown: Shown, snapshot: Snapshot, now_s: float) -> Shown:
     return shown._replace(problems=problems, problems_s=now_s)
 
 
-def _rounded(snapshot: Snapshot) -> dict[str, float | None]:
-    elements = snapshot.parameters.elements
-    raw = {key: getattr(snapshot.estimate, key) for key in ESTIMATE}
-    raw |= {key: elements[key].value for key in ELEMENTS if key in elements}
-    return {key: None if value is None else round(value, ENTITIES[key].decimals) for key, value in raw.items()}
+def _rounded(snapshot: Snapshot, shows: Mapping[str, Entity]) -> dict[str, float | None]:
+    """The value of each entity; None where there is none."""
+    elements, rounded = snapshot.parameters.elements, dict[str, float | None]()
+    for key, entity in shows.items():
+        value = elements[key].value if key in elements else getattr(snapshot.estimate, key, None)
+        rounded[key] = None if value is None else round(value, entity.decimals)
+    return rounded
 
 
-def _moved(shown: Shown, key: str, value: float | None, now_s: float) -> bool:
+def _moved(shown: Shown, key: str, value: float | None, entity: Entity, now_s: float) -> bool:
     """Whether a value is to be shown anew."""
     if key not in shown.values:
         return True
-    if now_s - shown.changed_s[key] < ENTITIES[key].pace_s:
+    if now_s - shown.changed_s[key] < entity.pace_s:
         return False
     before = shown.values[key]
     if value is None or before is None:
         return value is not before
-    return round(abs(value - before), ENTITIES[key].decimals) >= ENTITIES[key].step
+    return round(abs(value - before), entity.decimals) >= entity.step
 
 
 def _problems(shown: Shown, snapshot: Snapshot) -> dict[str, str | None]:

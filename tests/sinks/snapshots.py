@@ -5,6 +5,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
 from bms_estimator.sinks import Delivery
@@ -19,10 +20,25 @@ NOW = 1_700_000_000.0
 
 def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None) -> Snapshot:
     cell = load_cell("chen_mora")
-    estimator = Estimator(cell, identifier=None, initial_soc=0.5)
+    return _of(cell, Estimator(cell, identifier=None, initial_soc=0.5), 3.8, sensor_message, delivery)
+
+
+def of_fuel_cell() -> Snapshot:
+    stack = load_fuel_cell("pem_30w")
+    return _of(stack, Estimator(stack), 13.0)
+
+
+def _of(
+    cell: PackModel,
+    estimator: Estimator,
+    voltage_v: float,
+    sensor_message: str | None = None,
+    delivery: Delivery | None = None,
+) -> Snapshot:
+    """After two samples without a load."""
     window = Window()
     block = np.zeros(2, dtype=SAMPLE)
-    block["time_s"], block["voltage_v"], block["temperature_c"] = [0.0, 0.1], 3.8, np.nan
+    block["time_s"], block["voltage_v"], block["temperature_c"] = [0.0, 0.1], voltage_v, np.nan
     window.add(estimator.run(block), NOW)
     summary = window.take()
     assert summary
@@ -47,6 +63,7 @@ def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None
 
 
 ONE = snapshot()
+STACK = of_fuel_cell()
 NOTHING_YET = ONE._replace(
     estimate=None, parameters=parameter_report(Estimator(load_cell("chen_mora"), identifier=None), NOW)
 )

@@ -6,15 +6,19 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from bms_estimator.calibration.fuel_cell import KEYS
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.sinks.home_assistant import discovery
 from bms_estimator.sinks.messages import Messages, Sent
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import ONE, STACK
 
 ROOT = "bms/pack"
 COMPONENTS = discovery(ONE.info, ROOT, 0.0)["components"]
 SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
 MOST_ROWS_PER_MIN = 20
+
+
+OF_STACK = discovery(STACK.info, ROOT, 0.0)["components"]
 
 
 def with_values(**values: float | None) -> Snapshot:
@@ -49,13 +53,15 @@ def noisy(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, Snapsh
         )
 
 
-def restless(seconds: float, period_s: float = 0.1) -> Iterator[tuple[float, Snapshot]]:
+def restless(seconds: float, period_s: float = 0.1, one: Snapshot = ONE) -> Iterator[tuple[float, Snapshot]]:
     """Every value is another one each time."""
-    names = [key for key in SHOWN if hasattr(ONE.estimate, key)]
+    assert one.estimate
+    names = [key for key in SHOWN if hasattr(one.estimate, key)]
     for i in range(round(seconds / period_s)):
-        elements = {key: e.model_copy(update={"value": float(i)}) for key, e in ONE.parameters.elements.items()}
-        parameters = ONE.parameters.model_copy(update={"elements": elements})
-        yield i * period_s, with_values(**dict.fromkeys(names, i))._replace(parameters=parameters)
+        elements = {key: e.model_copy(update={"value": float(i)}) for key, e in one.parameters.elements.items()}
+        parameters = one.parameters.model_copy(update={"elements": elements})
+        estimate = one.estimate.model_copy(update=dict.fromkeys(names, i))
+        yield i * period_s, one._replace(estimate=estimate, parameters=parameters)
 
 
 def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str, dict[str, object]]]:
@@ -68,17 +74,20 @@ def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str,
                 yield now_s, message.topic, json.loads(message.payload)
 
 
-def rows(stream: Iterator[tuple[float, Snapshot]]) -> list[float]:
+def rows(
+    stream: Iterator[tuple[float, Snapshot]], components: dict[str, dict[str, object]] = COMPONENTS
+) -> list[float]:
     """When the recorder of Home Assistant writes a row: for each change of state or attribute of an entity it shows."""
     last: dict[str, object] = {}
     written = []
+    shown = {key for key, component in components.items() if component.get("enabled_by_default", True)}
     for now_s, topic, payload in told(stream):
-        for key in SHOWN & set(payload):
-            assert COMPONENTS[key]["state_topic"] == topic
+        for key in shown & set(payload):
+            assert components[key]["state_topic"] == topic
             if key in last and last[key] != payload[key]:
                 written.append(now_s)
             last[key] = payload[key]
-    assert set(last) == SHOWN
+    assert set(last) == shown
     return written
 
 
@@ -89,6 +98,22 @@ def test_home_assistant_records_at_most_20_rows_in_any_minute(
     written = np.array(rows(stream(900.0)))
     assert written.size > 100
     assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
+
+
+def test_a_fuel_cell_makes_no_more() -> None:
+    written = np.array(rows(restless(900.0, one=STACK), OF_STACK))
+    assert written.size > 100
+    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
+
+
+def test_of_a_fuel_cell_home_assistant_shows_what_it_has_and_what_is_learned() -> None:
+    values = next(payload for _, topic, payload in told(iter([(0.0, STACK)])) if not topic.endswith("problems"))
+    numbers = {key for key, component in OF_STACK.items() if component["platform"] == "sensor"}
+    assert numbers == set(values)
+    assert {key for key, value in values.items() if value is None} == {"temperature_c"}
+    assert set(KEYS) <= numbers
+    assert values["r_ohm"] == pytest.approx(0.1677, abs=1e-3)
+    assert OF_STACK["r_ohm"]["unit_of_measurement"] == "Ω"
 
 
 def test_noise_alone_makes_no_rows() -> None:
