@@ -38,6 +38,13 @@ ELEMENT_UNITS = {
     "r_tl_ohm": ("R_tl", 1e3, "mΩ"),
     "c_tl_farad": ("C_tl", 1.0, "F"),
     "e_o_v": ("E_o", 1.0, "V"),
+    "r_ohm": ("r", 1e3, "mΩ"),
+    "tafel_slope_v": ("A", 1.0, "V"),
+    "exchange_current_a": ("i_0", 1e3, "mA"),
+    "c_dl_farad": ("C", 1.0, "F"),
+    "concentration_v": ("B", 1.0, "V"),
+    "limiting_current_a": ("i_L", 1.0, "A"),
+    "internal_current_a": ("i_n", 1e3, "mA"),
 }
 """Element -> name, factor and unit on the screen."""
 WORN = {"capacity": "capacity", "r_s": "R_s"}
@@ -96,11 +103,7 @@ class View:
 def _blocks(scene: Scene, width: int, *, wide: bool) -> list[Block]:
     """The parts of the screen from top to bottom, each with its rank."""
     snapshot, e = scene.snapshot, scene.latest
-    charge = [
-        Block(0, _soc(e, scene.true_soc)),
-        Block(4, _bar(e, scene.true_soc, width - PANEL_CELLS if wide else width)),
-        Block(3, _left(e)),
-    ]
+    charge = _charge(scene, width - PANEL_CELLS if wide else width) if snapshot.info.capacity_ah is not None else []
     health = Block(0, _health(snapshot.health, snapshot.parameters))
     below = [
         Block(5, _observer(e)),
@@ -116,9 +119,15 @@ def _blocks(scene: Scene, width: int, *, wide: bool) -> list[Block]:
     columns.add_column(ratio=1)
     columns.add_column(ratio=1)
     left = Group(*_measured(e, VALUE_CELLS), _sparks(scene, width // 2 - PANEL_CELLS))
-    columns.add_row(_panel(left, "Measured"), _panel(elements, "Elements at this SOC"))
-    soc = _panel(Group(*(block.content for block in charge)), "State of charge")
-    return [header, Block(0, soc), health, Block(0, columns), *below]
+    columns.add_row(_panel(left, "Measured"), _panel(elements, "Elements at this SOC" if charge else "Learned"))
+    soc = [Block(0, _panel(Group(*(block.content for block in charge)), "State of charge"))] if charge else []
+    return [header, *soc, health, Block(0, columns), *below]
+
+
+def _charge(scene: Scene, cells: int) -> list[Block]:
+    """What a battery holds."""
+    e = scene.latest
+    return [Block(0, _soc(e, scene.true_soc)), Block(4, _bar(e, scene.true_soc, cells)), Block(3, _left(e))]
 
 
 def sparkline(values: Sequence[float], cells: int) -> str:
@@ -211,13 +220,11 @@ def _elements(elements: dict[str, Parameter]) -> Table:
     table.add_column(justify="right", no_wrap=True, min_width=VALUE_CELLS)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(style="dim", no_wrap=True)
-    for key, (name, factor, unit) in ELEMENT_UNITS.items():
-        parameter = elements.get(key)
-        value = parameter.value if parameter else None
-        std = f"± {_short(parameter.std * factor)} " if parameter and parameter.std is not None else ""
-        style = "bold" if parameter and parameter.valid else ""
-        source = parameter.source if parameter else ""
-        table.add_row(name, Text(_number(value, ".4g", factor), style=style), f"{std}{unit}", source)
+    for key, parameter in elements.items():
+        name, factor, unit = ELEMENT_UNITS[key]
+        std = "" if parameter.std is None else f"± {_short(parameter.std * factor)} "
+        value = Text(_number(parameter.value, ".4g", factor), style="bold" if parameter.valid else "")
+        table.add_row(name, value, f"{std}{unit}", parameter.source)
     return table
 
 

@@ -18,6 +18,7 @@ from bms_estimator.sinks.console_view import Scene, View
 from bms_estimator.snapshot.publisher import Publisher
 from tests.collector import Collector
 from tests.scripted_source import ScriptedSource
+from tests.sinks.snapshots import STACK
 
 SILENT = (
     "/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0 at 500000 baud: bytes come, but no valid frame among them"
@@ -72,6 +73,15 @@ def test_no_line_is_longer_than_the_screen_and_what_matters_is_whole(
     assert "+12.500 A" in text
     for message in [SILENT, *SUSPECTS] if wrong else ["health good"]:
         assert "".join(message.split()) in "".join(lines).replace(" ", "")  # a path may be longer than a line
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(60, 30), (80, 24), (120, 40)])
+def test_of_a_fuel_cell_what_is_learned_is_shown_and_no_charge(columns: int, rows: int) -> None:
+    text = " ".join(" ".join(drawn(Scene(STACK, STACK.estimate), columns, rows)).split())
+    for shown in ("r 167.7 ±", "i_0 0.92", "i_n 6", "C 0.067 ±", "13.000 V"):
+        assert shown in text, text
+    for absent in ("SOC", "State of charge", "░", "empty in", "R_ts"):
+        assert absent not in text
 
 
 def test_before_the_first_sample_there_is_a_screen_too(snapshot: Snapshot) -> None:
