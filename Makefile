@@ -59,7 +59,7 @@ unseen: venv ## the SOC through kills, restarts and gaps, on real captures: minu
 ablation: venv ## what each part of the filter is worth, on real captures, e.g. make ablation ARGS=LFP: minutes
 	@$(BIN)/python -m tests.benchmarks.ablation $(ARGS)
 
-fuelcell: venv ## figures of the fuel cell, docs/fuel-cell.md: seconds
+fuelcell: venv ## figures of the fuel cell, docs/fuel-cell.md: half a minute
 	@$(BIN)/python -m tests.benchmarks.fuel_cell
 
 learning: venv ## what the learning law and each of its parts are worth, simulated

@@ -25,6 +25,8 @@ DRY, PER_AMPERE = 12.0, 0.5
 COLD_C, WARM_K = 35.0, 6.0
 FULL_W = 30.0
 """At this power the stack warms by ``WARM_K``."""
+CURVE_A = np.array([0, 0.05, 0.1, 0.2, 0.4, 0.7, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 5.5, 6, 6.5, 7, 7.5, 8, 8.5])
+"""Points of a polarisation curve [A]."""
 SUBSTEP_S = 5e-4
 NOISE_V = 0.003
 RESOLUTION_V = 0.001

@@ -20,7 +20,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import OcvCurve, Parameter, ParameterReport
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters
+from bms_estimator.snapshot.fuel_cell import VALID_STD, fuel_cell_parameters
 from bms_estimator.snapshot.ocv_formula import formula
 from bms_estimator.snapshot.topics import finite
 
@@ -28,8 +28,6 @@ OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
 """Where the OCV is published."""
 CONFIGURED = "configured value: no data has identified it"
 LEARNED = "learned by the observer's law, which knows no error of it"
-VALID_STD = 0.3
-"""An element known better than this, relative, is identified."""
 VALID_FIT_STD = 0.5
 """The same for a1..a15: amplitudes and exponents show only where the SOC was swept."""
 VALID_CAPACITY_STD = 0.02

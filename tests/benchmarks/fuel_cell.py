@@ -1,4 +1,4 @@
-"""Figures of the fuel cell (docs/fuel-cell.md): ``make fuelcell``, seconds.
+"""Figures of the fuel cell (docs/fuel-cell.md): ``make fuelcell``, half a minute.
 
 Truth is the stack of ``tests.mann_stack``, which does more than the model, and two measured curves in tests/data/fuel_cell.
 """
@@ -19,11 +19,10 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters
 from bms_estimator.sources.curve import read_polarisation
 from tests import mann_stack
-from tests.mann_stack import Record
+from tests.mann_stack import CURVE_A, Record
 
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
-CURVE_A = np.array([0, 0.05, 0.1, 0.2, 0.4, 0.7, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 5.5, 6, 6.5, 7, 7.5, 8, 8.5])
 LEAST_A = 0.1
 """Of the measured curves: see docs/fuel-cell.md [A/cm2]."""
 WRONG = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])

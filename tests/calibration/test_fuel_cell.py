@@ -11,10 +11,10 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.sources.curve import read_polarisation
 from tests import mann_stack
+from tests.mann_stack import CURVE_A
 
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
-CURVE_A = np.array([0, 0.05, 0.1, 0.2, 0.4, 0.7, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 5.5, 6, 6.5, 7, 7.5, 8, 8.5])
 TRUTH = np.array([1.0, 1.3, 0.9, 1.05, 1.6, 0.8, 1.1, 1.4, *[1.0] * 8])
 """Parameters of a stack over those of the file."""
 IMPEDANCE_OHM = 0.061
