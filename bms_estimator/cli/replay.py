@@ -157,7 +157,8 @@ def result_table(title: str, result: Result) -> Table:
         "speed": f"{_text(result.samples_per_s, ',.0f')} samples/s, {result.wall_s:.2f} s",
     }
     learned = {
-        name: f"{'' if p.valid else 'not valid: '}{p.value:.4g} ± {p.std:.2g}" for name, p in result.parameters.items()
+        name: f"{'' if p.valid else 'not valid: '}{_text(p.value, '.4g')} ± {_text(p.std, '.2g')}"
+        for name, p in result.parameters.items()
     }
     for name, value in (rows | learned).items():
         table.add_row(name, value)

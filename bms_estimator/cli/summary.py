@@ -15,10 +15,10 @@ from bms_estimator.snapshot.topics import finite
 
 @dataclass(frozen=True)
 class LearnedParameter:
-    """What was learned, at the end."""
+    """What was learned, at the end; a number that there is none of is None."""
 
-    value: float
-    std: float
+    value: float | None
+    std: float | None
     valid: bool
 
 
@@ -119,7 +119,7 @@ def _learned(estimator: Estimator) -> dict[str, LearnedParameter]:
     if not isinstance(estimator.cell, FuelCellModel) or not estimator.state[0]["started"]:
         return {}
     found = fuel_cell_parameters(estimator, 0.0)
-    return {name: LearnedParameter(p.value or math.nan, p.std or math.nan, p.valid) for name, p in found.items()}
+    return {name: LearnedParameter(p.value, p.std, p.valid) for name, p in found.items()}
 
 
 def _field(row: np.void | None, name: str) -> float | None:

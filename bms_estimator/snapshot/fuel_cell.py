@@ -8,9 +8,10 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.fuel_cell import ACTIVATION, NAMES, TAFEL
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Parameter
+from bms_estimator.snapshot.topics import finite
 
 VALID_STD = 0.3
-"""A parameter known better than this, relative, is identified."""
+"""An element or parameter known better than this, relative, is identified."""
 
 
 def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parameter]:
@@ -55,8 +56,8 @@ def _exchange_current(a: np.ndarray, covariance: np.ndarray, now_s: float) -> Pa
 def _learned(value: float, ln_std: float, now_s: float) -> Parameter:
     valid = ln_std < VALID_STD
     return Parameter(
-        value=value,
-        std=value * ln_std,
+        value=finite(value),
+        std=finite(value * ln_std),
         valid=valid,
         source="identified",
         updated=iso_utc(now_s),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.fuel_cell import KEYS
+from bms_estimator.cli.summary import Summary
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.fuel_cell import NAMES
 from bms_estimator.kernels.fuel_cell_open_loop import open_loop
@@ -128,6 +129,15 @@ def test_wrong_parameters_are_learned_and_said_to_be_known() -> None:
     assert published["r_ohm"].std is not None
     assert not published["concentration_v"].valid
     assert "known to" in str(published["concentration_v"].reason)
+
+
+@pytest.mark.parametrize(("held", "printed"), [(0.0, 0.0), (math.nan, None), (math.inf, None)])
+def test_what_a_replay_prints_is_a_number_or_none(held: float, printed: float | None) -> None:
+    estimator = Estimator(PEM)
+    estimator.run(own_block(np.ones(16), 2.0))
+    estimator.state["a"][0, 1] = held
+    r_ohm = Summary().result(estimator, 1, 1.0).parameters["r_ohm"]
+    assert (r_ohm.value, r_ohm.std) == (printed, printed)
 
 
 def test_without_a_load_nothing_is_learned_but_the_voltage() -> None:
