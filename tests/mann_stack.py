@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.fuel_cell_open_loop import open_loop
+
 Floats = NDArray[np.float64]
 
 CELLS, AREA_CM2, THICK_CM = 14, 20.0, 0.0178
@@ -80,6 +82,15 @@ def random_steps(duration_s: float, rate_hz: float, *, seed: int, highest_a: flo
     starts = np.cumsum(dice.uniform(0.5, 5.0, math.ceil(duration_s / 0.5)))
     heights = dice.uniform(0.2, highest_a, starts.size + 1)
     return time_s, heights[np.searchsorted(starts, time_s)]
+
+
+def model_itself(a: Floats, duration_s: float, *, seed: int = 0, noise_v: float = NOISE_V) -> Record:
+    """100 Hz of the model with the parameters ``a``, shape (16,), for comparison; steps of the current lie between samples."""
+    time_s, current_a = random_steps(duration_s, 500.0, seed=seed)
+    nobody = np.full(time_s.size, np.nan)
+    voltage_v, _ = open_loop(a, np.zeros(8), time_s, current_a, nobody)
+    voltage_v += np.random.default_rng(seed).normal(0.0, noise_v, time_s.size)
+    return Record(time_s, current_a, voltage_v, nobody, nobody).every(5)
 
 
 def settled_r_ohm(current_a: float, temperature_c: float) -> float:

@@ -206,18 +206,23 @@ async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Pub
     return True
 
 
-def _present_soc(estimator: Estimator) -> float:
-    """The SOC that a request may change.
+def _set_soc(estimator: Estimator, soc: float) -> float:
+    """Set the SOC on request.
+
+    Returns:
+        What it was.
 
     Raises:
         UserError: There is none.
     """
     if not estimator.state["started"][0]:
         raise UserError("no sample has been taken yet")
-    soc = float(estimator.state["soc"][0])
-    if math.isnan(soc):
-        raise UserError("a fuel cell has no state of charge")
-    return soc
+    before = float(estimator.state["soc"][0])
+    try:
+        estimator.set_soc(soc)
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    return before
 
 
 def _offer(
@@ -239,8 +244,7 @@ def _offer(
 
     async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         soc = number(arguments, "soc", 0.0, 1.0)
-        before = _present_soc(estimator)
-        estimator.set_soc(soc)
+        before = _set_soc(estimator, soc)
         log.info("SOC set on request", before=before, soc=soc)
         return {"soc": soc, "before": before}
 

@@ -122,11 +122,7 @@ def learning() -> None:
 def wrong_start() -> None:
     say("## The model itself: r +50 %, A -10 %, a +5 %, C +30 % of the file's, 3 mV of noise, 100 Hz")
     factors = np.array([1.0, 1.5, 0.9, 1.05, 1.3, *[1.0] * 11])
-    time_s, current_a = mann_stack.random_steps(600.0, 500.0, seed=0)
-    nobody = np.full(time_s.size, np.nan)
-    voltage_v, _ = open_loop(PEM.a * factors, np.zeros(8), time_s, current_a, nobody)
-    voltage_v += np.random.default_rng(0).normal(0.0, 0.003, time_s.size)
-    block = samples(Record(time_s, current_a, voltage_v, nobody, nobody).every(5))
+    block = samples(mann_stack.model_itself(PEM.a * factors, 600.0))
     for memory_s in (MEMORY_S, 600.0):
         say(f"memory {memory_s:.0f} s")
         estimator = Estimator(PEM)

@@ -9,7 +9,6 @@ from bms_estimator.calibration.fuel_cell import KEYS
 from bms_estimator.cli.summary import Summary
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.fuel_cell import NAMES
-from bms_estimator.kernels.fuel_cell_open_loop import open_loop
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
@@ -28,13 +27,9 @@ def block(record: mann_stack.Record) -> SampleBlock:
     return samples
 
 
-def own_block(truth: np.ndarray, duration_s: float, *, seed: int = 0, noise_v: float = 0.003) -> SampleBlock:
-    """100 Hz of the model itself whose parameters are ``truth`` times the file's; steps of the current lie between samples."""
-    time_s, current_a = mann_stack.random_steps(duration_s, 500.0, seed=seed)
-    voltage_v, _ = open_loop(PEM.a * truth, np.zeros(8), time_s, current_a, np.full(time_s.size, np.nan))
-    voltage_v += np.random.default_rng(seed).normal(0.0, noise_v, time_s.size)
-    nobody = np.full(time_s.size, np.nan)
-    return block(mann_stack.Record(time_s, current_a, voltage_v, nobody, nobody).every(5))
+def own_block(truth: np.ndarray, duration_s: float, *, seed: int = 0) -> SampleBlock:
+    """The model itself whose parameters are ``truth`` times the file's."""
+    return block(mann_stack.model_itself(PEM.a * truth, duration_s, seed=seed))
 
 
 def learned(estimator: Estimator) -> dict[str, float]:
