@@ -22,6 +22,7 @@ from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources.serial_board import SerialBoard, Tap
+from bms_estimator.store.outbox import MEMORY_MOST, Outbox
 
 log = structlog.get_logger(__name__)
 
@@ -61,7 +62,8 @@ async def serve(
     board = SerialBoard(settings.sensor, tap=tap)
     if settings.mqtt is not None:
         sample_period_s = settings.sensor.sample_period_s
-        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, sample_period_s=sample_period_s)
+        outbox = Outbox(None, most=MEMORY_MOST)
+        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=sample_period_s)
         all_sinks.append(mqtt)
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     with alone(folder / f"{settings.pack.name}.lock") if folder else contextlib.nullcontext():

@@ -18,7 +18,9 @@ class Delivery:
     """What became of what one pack sends and of what is asked of it, since start; topic ``health`` shows it."""
 
     drops: int = 0
-    """Snapshots with an estimate that were replaced before the broker could take them."""
+    """States and events that found no room while the broker was away."""
+    waiting: int = 0
+    """States and events that the broker has not acknowledged yet."""
     refused_topics: list[str] = field(default_factory=list)
     """What the broker denies, as far as it can be told."""
     corrections: int = 0

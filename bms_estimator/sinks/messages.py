@@ -54,8 +54,19 @@ class Messages:
         sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
         return [self._retained(AVAILABILITY, b"online"), *sensor]
 
+    def kept(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:  # noqa: ARG002 - of use to events
+        """What a snapshot brings that must reach the broker, late if need be: each has its own time.
+
+        Args:
+            before: The snapshot before this one; None of the first.
+            snapshot: The snapshot.
+        """
+        if snapshot.estimate is None:
+            return []
+        return [Message(f"{self.root}/state", _report(snapshot.estimate), 1, retain=False)]
+
     def due(self, sent: Sent, snapshot: Snapshot, now_s: float) -> tuple[list[Message], Sent]:
-        """What a snapshot brings that the broker has not got yet.
+        """What a snapshot brings that the broker has not got yet, beside what is ``kept``.
 
         Args:
             sent: What it got.
@@ -63,12 +74,10 @@ class Messages:
             now_s: Monotonic clock [s].
 
         Returns:
-            The messages, the state first, for it is in a hurry; and what the broker has got after them.
+            The messages, and what the broker has got after them.
         """
-        estimate, parameters, health, info = snapshot
+        _, parameters, health, info = snapshot
         before, messages = sent.snapshot, []
-        if estimate is not None:
-            messages.append(self._live("state", _report(estimate)))
         known = bool(parameters.elements)  # not before the first sample
         if known and (before is None or before.parameters is not parameters):
             messages.append(self._live("parameters", _report(parameters)))

@@ -1,8 +1,7 @@
 """The MQTT sink: a connection to a broker that may come and go.
 
-``publish`` puts a snapshot in a slot for one; a task takes it from there when the broker does. The loop
-never waits, and what the broker could not take in time is counted. What is said stands in ``messages``, what may
-be asked in ``requests``.
+``publish`` puts what must reach the broker in the outbox, and the snapshot in a slot for one; a task takes them from
+there when the broker does. The loop never waits. What is said stands in ``messages``, what may be asked in ``requests``.
 """
 
 import asyncio
@@ -33,6 +32,7 @@ from bms_estimator.sinks.credential import credential
 from bms_estimator.sinks.home_assistant import BIRTH_TOPIC
 from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY, Message, Messages, Sent
 from bms_estimator.sinks.requests import MOST_SHOWN, Requests
+from bms_estimator.store.outbox import Outbox
 
 FIRST_DELAY_S = 5.0
 """Before the first attempt to reach a lost broker again; doubles with each [s]."""
@@ -50,6 +50,8 @@ KEEPALIVE_S = 20
 """A broker that lost us without a word publishes the will after one and a half times this [s]."""
 CLOSING_S = 3.0
 """How long the last messages may take [s]."""
+BATCH = 20
+"""States and events sent between two looks at what else there is to say."""
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 """Small messages go at once."""
@@ -71,6 +73,7 @@ class MqttSink:
         device: Name of the pack in the topics.
         requests: Answers requests.
         delivery: Where it is counted what became of what was sent.
+        outbox: What must reach the broker.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
         first_delay_s: Before the first attempt to reach a lost broker again [s].
         birth_delay_s: From Home Assistant's birth message to the retained messages [s].
@@ -86,6 +89,7 @@ class MqttSink:
         device: str,
         requests: Requests,
         delivery: Delivery,
+        outbox: Outbox,
         *,
         sample_period_s: float = 0.0,
         first_delay_s: float = FIRST_DELAY_S,
@@ -93,12 +97,13 @@ class MqttSink:
         echo_s: float = ECHO_S,
     ) -> None:
         self._url, self._connection = settings.url, broker_arguments(settings)
-        self._requests, self._delivery = requests, delivery
+        self._requests, self._delivery, self._outbox = requests, delivery, outbox
         self._first_delay_s, self._birth_delay_s, self._echo_s = first_delay_s, birth_delay_s, echo_s
         self._messages = Messages(settings.base_topic, device, sample_period_s)
         # The same at each connection: the broker ends an older one that it still holds, and its will comes first.
         self._identifier = f"bms-{device}-{secrets.token_hex(4)}"
         self._slot: Snapshot | None = None
+        self._before: Snapshot | None = None  # the last one that was taken
         self._sent = Sent()  # only the sending task sets it
         self._again = True  # the broker may hold nothing: send all of it
         self._forged = False  # somebody else wrote an availability of ours
@@ -113,10 +118,14 @@ class MqttSink:
         """Take a snapshot; returns at once."""
         if self._task is not None and self._task.done():
             self._task.result()  # only a fault of ours ends it: let it be seen
-        if self._slot is not None and self._slot.estimate is not None:
-            self._delivery.drops += 1
-        self._slot = snapshot
+        for message in self._messages.kept(self._before, snapshot):
+            self._outbox.put(message)
+        self._count()
+        self._slot = self._before = snapshot
         self._wake.set()
+
+    def _count(self) -> None:
+        self._delivery.drops, self._delivery.waiting = self._outbox.dropped, self._outbox.waiting
 
     async def __aenter__(self) -> Self:
         """Start reaching for the broker."""
@@ -191,6 +200,7 @@ class MqttSink:
             self._delay_s = self._first_delay_s
             await self._subscribe(client, protocol)
             self._wake.set()
+            self._outbox.connected = True
             try:
                 async with asyncio.TaskGroup() as tasks:
                     others = [tasks.create_task(self._receive(client)), tasks.create_task(self._expect_echo())]
@@ -203,6 +213,9 @@ class MqttSink:
                 with contextlib.suppress(aiomqtt.MqttError):
                     await self._publish(client, self._messages.farewell())
                 raise
+            finally:
+                self._outbox.connected = False
+                self._outbox.rewind()
 
     async def _subscribe(self, client: aiomqtt.Client, protocol: ProtocolVersion) -> None:
         """Subscribe, and say what the broker refuses.
@@ -260,9 +273,20 @@ class MqttSink:
                 now_s = asyncio.get_running_loop().time()
                 messages, self._sent = self._messages.due(self._sent, snapshot, now_s)
                 await self._publish(client, messages)
+            await self._send_kept(client)
             if self._closing:
                 await self._publish(client, self._messages.farewell())
                 return
+            if self._outbox.waiting:
+                self._wake.set()
+
+    async def _send_kept(self, client: "_Client") -> None:
+        """Send some of what waits in the outbox."""
+        if self._outbox.waiting:
+            for number, message in await self._outbox.take(BATCH):
+                await self._publish(client, [message])
+                self._outbox.sent(number)
+        self._count()
 
     async def _correct(self, client: "_Client") -> None:
         """Put the availabilities right, if it is time.

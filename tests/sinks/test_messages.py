@@ -18,10 +18,9 @@ def topics(messages: list[Message]) -> list[str]:
     return [message.topic.removeprefix("bms/pack/") for message in messages]
 
 
-def test_a_broker_that_got_nothing_gets_everything_and_the_state_first():
+def test_a_broker_that_got_nothing_gets_everything_that_is_not_kept():
     messages, sent = MESSAGES.due(Sent(), ONE, NOW)
     assert topics(messages) == [
-        "state",
         "parameters",
         "sensor/availability",
         "health",
@@ -35,39 +34,46 @@ def test_a_broker_that_got_nothing_gets_everything_and_the_state_first():
 
 def test_what_is_retained_has_qos_1_and_what_is_live_is_neither():
     messages, _ = MESSAGES.due(Sent(), ONE, NOW)
-    live = {"state", "parameters", "home_assistant"}
+    live = {"parameters", "home_assistant"}
     for message, topic in zip(messages, topics(messages), strict=True):
         assert (message.qos, message.retain) == ((0, False) if topic in live else (1, True))
     assert all((m.qos, m.retain) == (1, True) for m in (*MESSAGES.greeting(), *MESSAGES.farewell()))
 
 
+def test_a_state_is_kept_until_the_broker_has_it_and_there_is_none_without_samples():
+    [state] = MESSAGES.kept(None, ONE)
+    assert (state.topic, state.qos, state.retain) == ("bms/pack/state", 1, False)
+    assert topics(MESSAGES.kept(ONE, ONE)) == ["state"]
+    assert MESSAGES.kept(ONE, NOTHING_YET) == []
+
+
 def test_what_has_not_changed_is_not_said_again():
     _, sent = MESSAGES.due(Sent(), ONE, NOW)
     messages, _ = MESSAGES.due(sent, ONE, NOW + 1.0)
-    assert topics(messages) == ["state"]
+    assert topics(messages) == []
 
 
 def test_health_is_said_whenever_it_was_made_anew():
     _, sent = MESSAGES.due(Sent(), ONE, NOW)
     messages, _ = MESSAGES.due(sent, snapshot(), NOW + 1.0)
-    assert topics(messages) == ["state", "parameters", "health"]
+    assert topics(messages) == ["parameters", "health"]
 
 
 def test_another_setting_of_the_board_changes_info_and_only_another_board_the_discovery():
     _, sent = MESSAGES.due(Sent(), ONE, NOW)
     faster = ONE.info.model_copy(update={"board": {**ONE.info.board, "sample_rate_hz": "50"}})
     messages, sent = MESSAGES.due(sent, ONE._replace(info=faster), NOW + 1.0)
-    assert topics(messages) == ["state", "info"]
+    assert topics(messages) == ["info"]
     swapped = ONE.info.model_copy(update={"board": {**ONE.info.board, "serial": "B2"}})
     messages, _ = MESSAGES.due(sent, ONE._replace(info=swapped), NOW + 2.0)
-    assert topics(messages) == ["state", "info", DISCOVERY]
+    assert topics(messages) == ["info", DISCOVERY]
 
 
 def test_parameters_come_not_before_the_first_sample():
     messages, sent = MESSAGES.due(Sent(), NOTHING_YET, NOW)
-    assert not {"state", "parameters", "home_assistant"} & set(topics(messages))
+    assert not {"parameters", "home_assistant"} & set(topics(messages))
     messages, _ = MESSAGES.due(sent, ONE, NOW + 1.0)
-    assert topics(messages)[:2] == ["state", "parameters"]
+    assert topics(messages)[0] == "parameters"
 
 
 def test_the_availabilities_that_are_right_are_those_last_said():
@@ -78,8 +84,7 @@ def test_the_availabilities_that_are_right_are_those_last_said():
 
 
 def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missing():
-    messages, _ = MESSAGES.due(Sent(), ONE, NOW)
-    state = json.loads(messages[0].payload)
+    state = json.loads(MESSAGES.kept(None, ONE)[0].payload)
     described = schema()["state"]["properties"]
     assert set(state) == set(described) == set(schema()["state"]["required"])
     assert all("description" in field for field in described.values())
@@ -90,7 +95,7 @@ def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missi
 
 def test_every_payload_is_json_without_nan():
     messages, _ = MESSAGES.due(Sent(), ONE, NOW)
-    for message in messages:
+    for message in (*messages, *MESSAGES.kept(None, ONE)):
         if message.topic != "bms/pack/sensor/availability":
             json.loads(message.payload, parse_constant=pytest.fail)
 
@@ -99,4 +104,6 @@ def test_no_message_comes_near_the_limit_of_the_broker_s_example():
     limit = re.search(r"^message_size_limit (\d+)$", BROKER.read_text(), re.MULTILINE)
     assert limit
     messages, _ = MESSAGES.due(Sent(), ONE, NOW)
-    assert max(len(m.payload) for m in (*messages, *MESSAGES.greeting())) < int(limit[1]) / 10
+    assert (
+        max(len(m.payload) for m in (*messages, *MESSAGES.kept(None, ONE), *MESSAGES.greeting())) < int(limit[1]) / 10
+    )
