@@ -15,9 +15,9 @@ from bms_estimator.kernels.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.settings import MqttSettings, Settings
+from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
-from bms_estimator.sinks.mqtt import broker_arguments
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 
@@ -45,11 +45,8 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     settings, cell = load_pack(file)
     warnings = [*implausible(settings, cell), *_lemma(cell)]
     if settings.mqtt is not None:
-        mqtt = settings.mqtt
-        if mqtt.password_file is not None and is_for_the_service(mqtt.password_file):
-            warnings.append(f"mqtt.password_file = {mqtt.password_file}: {ONLY_IN_SERVICE}")
-            mqtt = mqtt.model_copy(update={"password_file": None})
-        broker_arguments(mqtt)  # reads password and certificates
+        mqtt, unseen = _here(settings.mqtt)
+        warnings += unseen + check_brokers(mqtt)
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
@@ -93,6 +90,17 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
     return follows
 
 
+def _here(mqtt: MqttSettings) -> tuple[MqttSettings, list[str]]:
+    """The settings without what only the running service can read, and a warning for each such file."""
+    files = {"password_file": mqtt.password_file, "cert_file": mqtt.cert_file, "key_file": mqtt.key_file}
+    unseen = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
+    without = set(unseen)
+    if without & {"cert_file", "key_file"}:  # one is of no use without the other
+        without |= {"cert_file", "key_file"}
+    warnings = [f"mqtt.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unseen.items()]
+    return mqtt.model_copy(update=dict.fromkeys(without)), warnings
+
+
 def _lemma(cell: PackModel) -> list[str]:
     """What Lemma 4.1.1 asks of the bounds and does not get; of a fuel cell it asks nothing."""
     return [f"{cell.cell.name}: {_unmet(c)}" for c in failed(cell)] if isinstance(cell, CellModel) else []
@@ -107,7 +115,7 @@ def _unmet(condition: Condition) -> str:
 
 def _in_short(settings: Settings, cell: PackModel) -> str:
     c = cell.cell
-    broker = settings.mqtt.url if settings.mqtt else "no broker"
+    broker = ", ".join(settings.mqtt.urls) if settings.mqtt else "no broker"
     holds = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
     return (
         f"{settings.pack.name}: {c.name}, {c.series_count} in series, {c.nominal_voltage_v:g} V, {holds}; "

@@ -7,6 +7,7 @@ from pydantic import ValidationError
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
+from bms_estimator.model.secret import without_secrets
 from bms_estimator.model.settings import MqttSettings, PackSettings, SensorSettings, Settings, load_settings
 
 TABLE_RESOLUTION_V = 1e-3
@@ -98,5 +99,6 @@ def with_broker(settings: Settings, url: str) -> Settings:
     try:
         mqtt = MqttSettings.model_validate(others | {"url": url})
     except ValidationError:
-        raise UserError(f"--mqtt {url}: must be {MqttSettings.model_fields['url'].description}") from None
+        meant = MqttSettings.model_fields["url"].description
+        raise UserError(f"--mqtt {without_secrets(url)}: must be {meant}") from None
     return settings.model_copy(update={"mqtt": mqtt})

@@ -1,9 +1,10 @@
 """The settings of one pack: what ``pack.toml`` holds. Values are SI, the unit stands in the key."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from bms_estimator.model.toml_file import Strict, read_toml
 
@@ -135,13 +136,27 @@ class PublishSettings(Strict):
     rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="snapshots per second")
 
 
+def _of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
+    """Addresses as they must be."""
+    urls = (value,) if isinstance(value, str) else value
+    if not urls:
+        raise ValueError("must name a broker")
+    for url in urls:
+        if "@" in url:
+            raise ValueError("a name goes to mqtt.username, a password to a file that mqtt.password_file names")
+        if not re.fullmatch(r"mqtts?://[^/\s]+", url):
+            raise ValueError("must be mqtt://host:port")
+    return value
+
+
 class MqttSettings(Strict):
     """The broker, and what others may have done over it."""
 
-    url: str = Field(
+    model_config = ConfigDict(hide_input_in_errors=True)
+
+    url: Annotated[str | tuple[str, ...], AfterValidator(_of_brokers)] = Field(
         default="mqtt://localhost:1883",
-        pattern=r"^mqtts?://[^/]+$",
-        description="mqtt://host:port or mqtts://host:port for TLS",
+        description="mqtt://host:port or mqtts://host:port for TLS; or a list of them, tried in turn",
     )
     username: str | None = None
     password_file: Path | None = Field(
@@ -149,12 +164,23 @@ class MqttSettings(Strict):
         description="file that holds the password, read at start; a name alone: systemd's credential of this name",
     )
     ca_file: Path | None = Field(default=None, description="certificate authority for mqtts, else the system's")
+    cert_file: Path | None = Field(
+        default=None, description="our own certificate for mqtts, PEM, where the broker asks for one; as password_file"
+    )
+    key_file: Path | None = Field(
+        default=None, description="its key, PEM, not encrypted; in cert_file when left out; as password_file"
+    )
     base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
         default="bms", description="first part of all topics: no +, # or spaces, no / at either end"
     )
     commands: tuple[Command, ...] = Field(
         default=(), description="requests that change something and may be made by whoever may publish; none by default"
     )
+
+    @property
+    def urls(self) -> tuple[str, ...]:
+        """The addresses of all brokers."""
+        return (self.url,) if isinstance(self.url, str) else self.url
 
     @model_validator(mode="before")
     @classmethod

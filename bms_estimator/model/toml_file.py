@@ -7,6 +7,7 @@ from typing import Any, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.secret import without_secrets
 
 
 class Strict(BaseModel):
@@ -49,7 +50,7 @@ def _line(path: Path, model: type[BaseModel], detail: Any) -> str:
     message = detail["msg"].removeprefix("Value error, ")
     if isinstance(detail["input"], dict):
         return f"{path}: {where}: {message}"
-    return f"{path}: {where} = {detail['input']!r}: {message}{hint}"
+    return f"{path}: {where} = {without_secrets(repr(detail['input']))}: {message}{hint}"
 
 
 def _description(model: type[BaseModel], keys: list[str]) -> str:

@@ -13,15 +13,14 @@ from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
-from bms_estimator.sinks.mqtt import (
-    CORRECTION_S,
-    LONGEST_DELAY_S,
-    MOST_BYTES,
-    MOST_WAITING,
-    MqttSink,
-    _Inbox,
-    broker_arguments,
-)
+from bms_estimator.sinks.availability import CORRECTION_S
+from bms_estimator.sinks.brokers import brokers, check
+from bms_estimator.sinks.client import MOST_BYTES, MOST_WAITING, Inbox
+from bms_estimator.sinks.connection import Connection, Hello
+from bms_estimator.sinks.dial import Dial
+from bms_estimator.sinks.link import LONGEST_DELAY_S, Link
+from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import NAMES, Requests
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
@@ -32,6 +31,7 @@ from tests.sinks.snapshots import ONE, snapshot
 MOST_KEPT = 4
 RETAINED = ("info", "availability", "sensor/availability", "schema", "health", "home_assistant/problems")
 DISCOVERY = "homeassistant/device/bms_pack/config"
+HELLO = Hello("test", Message("bms/pack/availability", b"offline", 1, retain=True), lambda *_: None)
 DYNAMIC_SECURITY = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
 
 
@@ -61,6 +61,10 @@ class Sink:
 
     async def __aexit__(self, *_: object) -> None:
         await self.mqtt.__aexit__(None, None, None)
+
+
+async def never(_: Connection) -> None:
+    raise AssertionError("there is no broker")
 
 
 async def until(condition: Any) -> None:
@@ -139,14 +143,14 @@ async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_
 async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path: Path) -> None:
     pauses: list[float] = []
 
-    class Impatient(MqttSink):
+    class Impatient(Link):
         async def _pause(self, delay_s: float) -> None:
             pauses.append(delay_s)
-            self._closing = len(pauses) == 12
+            if len(pauses) == 12:
+                self.closing.set()
 
-    delivery = Delivery()
-    settings, outbox = MqttSettings(url=Broker(tmp_path).url), Outbox(None, most=MOST_KEPT)
-    await Impatient(settings, "pack", Requests(delivery), delivery, outbox)._stay_connected()
+    settings = MqttSettings(url=Broker(tmp_path).url)
+    await Impatient(brokers(settings), HELLO, Dial(settings), serve=never).run()
     assert max(pauses) <= LONGEST_DELAY_S == 30.0
     assert pauses[0] <= 5.0 < pauses[3]
     assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"
@@ -288,7 +292,7 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
 
 def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
     delivery = Delivery()
-    inbox = _Inbox(Requests(delivery), MOST_WAITING)
+    inbox = Inbox(Requests(delivery).refuse, MOST_WAITING)
     for length in (MOST_BYTES - 1, 200_000_000) * (2 * MOST_WAITING):
         payload = bytes(1) * min(length, 2 * MOST_BYTES)
         inbox.put_nowait(aiomqtt.Message("t", payload, 1, retain=False, mid=1, properties=None))
@@ -437,7 +441,6 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"url": "mqtt://me:secret@host:1883"}, "mqtt.username"),
         ({"url": "mqtt://host:99999"}, "mqtt.url"),
         ({"url": f"mqtt://{'a' * 64}.local"}, "mqtt.url = mqtt://a+.local: .*too long"),
         ({"url": "mqtt://broker..local"}, r"mqtt.url = mqtt://broker\.\.local: .*empty"),
@@ -448,4 +451,4 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
 )
 def test_settings_that_cannot_reach_a_broker_are_named(changes: dict[str, Any], named: str) -> None:
     with pytest.raises(UserError, match=named):
-        broker_arguments(MqttSettings(**changes))
+        check(MqttSettings(**changes))

@@ -1,0 +1,134 @@
+"""Where the brokers are, and what opens their doors: addresses, password, certificates."""
+
+import ssl
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import MqttSettings
+from bms_estimator.sinks.credential import credential
+
+PORTS = {"mqtt": 1883, "mqtts": 8883}
+
+
+class Broker(NamedTuple):
+    """One broker's address."""
+
+    url: str
+    host: str
+    port: int
+    tls: bool
+
+
+def brokers(settings: MqttSettings) -> list[Broker]:
+    """The brokers in the order in which they are tried.
+
+    Raises:
+        UserError: A URL cannot be used, or a certificate is given where it cannot be shown.
+    """
+    found = [_broker(url) for url in settings.urls]
+    if settings.cert_file and not any(broker.tls for broker in found):
+        raise UserError(f"mqtt.cert_file = {settings.cert_file}: of no use without TLS: mqtt.url must be mqtts://...")
+    if settings.key_file and not settings.cert_file:
+        raise UserError(f"mqtt.key_file = {settings.key_file}: of no use without mqtt.cert_file")
+    return found
+
+
+def password(settings: MqttSettings) -> str | None:
+    """The broker's password, read anew.
+
+    Raises:
+        UserError: The file cannot be read.
+    """
+    if settings.password_file is None:
+        return None
+    try:
+        return credential(settings.password_file).read_text(encoding="utf-8").rstrip("\r\n")
+    except OSError as error:
+        raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:  # whose text holds the bytes
+        raise UserError(f"mqtt.password_file = {settings.password_file}: cannot be read: not UTF-8 text") from None
+
+
+def tls_context(settings: MqttSettings) -> ssl.SSLContext:
+    """Whom to trust and what to show, read anew: certificates end, and are replaced while the service runs.
+
+    Raises:
+        UserError: A file cannot be read, or is not what it should be.
+    """
+    try:
+        context = ssl.create_default_context(cafile=settings.ca_file)
+    except OSError as error:  # ssl.SSLError is one
+        raise UserError(f"mqtt.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    if settings.cert_file is not None:
+        _show(context, settings, settings.cert_file)
+    return context
+
+
+def check(settings: MqttSettings) -> list[str]:
+    """Whether addresses, password and certificates can be used.
+
+    Returns:
+        A sentence for each secret that every user of this machine may read.
+
+    Raises:
+        UserError: One cannot be used.
+    """
+    password(settings)
+    if any(broker.tls for broker in brokers(settings)):
+        tls_context(settings)
+    files = {
+        "password_file": settings.password_file,
+        "key_file": settings.key_file or settings.cert_file,
+    }
+    return [
+        f"mqtt.{key} = {name}: every user of this machine may read it; take that away with chmod o-r"
+        for key, name in files.items()
+        if name is not None and credential(name).exists() and credential(name).stat().st_mode & 0o004
+    ]
+
+
+def _broker(address: str) -> Broker:
+    try:
+        url = urlsplit(address)
+        host, port = url.hostname, url.port or PORTS[url.scheme]
+        (host or "").encode("idna")  # as the resolver will
+    except ValueError as error:  # UnicodeError is one
+        raise UserError(f"mqtt.url = {address}: {error}") from None
+    if not host:
+        raise UserError(f"mqtt.url = {address}: must be mqtt://host:port")
+    return Broker(address, host, port, url.scheme == "mqtts")
+
+
+def _show(context: ssl.SSLContext, settings: MqttSettings, cert_file: Path) -> None:
+    """Show a certificate of our own; without a key file its key stands in the same file.
+
+    Raises:
+        UserError: A file cannot be read, or the two do not belong together.
+    """
+    key_file = settings.key_file or cert_file
+    for name, path in (("cert_file", cert_file), ("key_file", key_file)):  # the error of both does not say which
+        try:
+            credential(path).read_bytes()
+        except OSError as error:
+            raise UserError(f"mqtt.{name} = {path}: cannot be read: {error.strerror}") from None
+    try:
+        # a password, or OpenSSL would ask the terminal for one
+        context.load_cert_chain(credential(cert_file), credential(key_file), password=_refuse_password)
+    except ssl.SSLError as error:
+        if error.reason == "KEY_VALUES_MISMATCH":
+            raise UserError(f"mqtt.key_file = {key_file}: is not the key of mqtt.cert_file = {cert_file}") from None
+        raise UserError(
+            f"mqtt.cert_file = {cert_file}, mqtt.key_file = {key_file}: no certificate in PEM with its key: {error}"
+        ) from None
+
+
+def _refuse_password() -> str:
+    """Asked for when a key is encrypted.
+
+    Raises:
+        UserError: Always.
+    """
+    raise UserError("mqtt.key_file: is encrypted, and nobody is there to type its password; give a key without one")

@@ -1,0 +1,236 @@
+"""The real connection: aiomqtt and paho, and what they say in words of ours."""
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import AsyncIterator, Callable, Sequence
+from functools import partial
+from typing import Any
+
+import aiomqtt
+import structlog
+from aiomqtt import ProtocolVersion
+from paho.mqtt.client import DisconnectFlags, error_string
+from paho.mqtt.enums import MQTTErrorCode
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from bms_estimator.sinks.connection import Hello, LinkError, Received
+from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.reasons import UNSUPPORTED_VERSION, words
+
+KEEPALIVE_S = 10
+"""After so long a silence the broker is asked for a sign of life, for which it has as long again. One that lost us
+without a word publishes the will after one and a half times this [s]."""
+ACKNOWLEDGED_S = 15.0
+"""A broker that lives but takes longer to acknowledge is lost; NATS takes 10 s to find a new leader [s]."""
+PARTING_S = 1.0
+"""A connection that broke cannot be ended in good order [s]."""
+NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+"""Small messages go at once."""
+MOST_WAITING = 100
+"""Messages that wait to be read; more are lost."""
+MOST_BYTES = 16_384
+"""Nothing that comes is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
+HEAD_BYTES = 16
+"""What a published message has beside topic and payload, at most."""
+
+log = structlog.get_logger(__name__)
+
+
+class _ToLog(logging.Handler):
+    """What paho and aiomqtt have to say goes where all lines go."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        log.warning("mqtt client", said=record.getMessage())
+
+
+_logger = logging.getLogger(__name__)
+_logger.setLevel(logging.WARNING)
+_logger.propagate = False
+_logger.addHandler(_ToLog())
+
+
+class ClosedError(aiomqtt.MqttError):
+    """The broker has closed the connection in place of an answer to CONNECT."""
+
+
+class Client(aiomqtt.Client):
+    """A connection of one version of MQTT.
+
+    Args:
+        arguments: Address, name, password and TLS for aiomqtt.
+        protocol: Which MQTT.
+        hello: How it begins.
+    """
+
+    def __init__(self, arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello) -> None:
+        limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
+        limit.MaximumPacketSize = MOST_BYTES
+        self._is_5 = protocol is ProtocolVersion.V5
+        super().__init__(
+            **arguments,
+            protocol=protocol,
+            properties=limit if self._is_5 else None,
+            identifier=hello.identifier,
+            will=aiomqtt.Will(*hello.will),
+            keepalive=KEEPALIVE_S,
+            max_queued_incoming_messages=MOST_WAITING,
+            queue_type=partial(Inbox, hello.lose),  # type: ignore[arg-type]  # it is only called
+            socket_options=[NO_DELAY],
+            logger=_logger,
+        )
+        self.protocol = "MQTT 5" if self._is_5 else "MQTT 3.1.1"
+        self._answers: dict[int, asyncio.Future[str | None]] = {}
+        self._in_flight = asyncio.Semaphore(self._client.max_inflight_messages)
+        self._most_bytes: int | None = None
+        self._abandoned = False
+        self._why = "the connection broke"
+
+    async def publish(self, message: Message) -> str | None:  # type: ignore[override]
+        """As ``Connection`` has it."""
+        if self._most_bytes is not None and HEAD_BYTES + len(message.topic) + len(message.payload) > self._most_bytes:
+            return f"longer than the {self._most_bytes} bytes that the broker takes"  # it would end the connection
+        async with self._in_flight:
+            info = self._client.publish(*message)
+            if info.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
+                raise LinkError(f"a message cannot be sent: {error_string(info.rc)}")
+            answer: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
+            self._answers[info.mid] = answer
+            try:
+                async with asyncio.timeout(ACKNOWLEDGED_S):
+                    return await answer
+            except TimeoutError:
+                raise LinkError(f"the broker has not acknowledged a message for {ACKNOWLEDGED_S:g} s") from None
+            finally:
+                self._answers.pop(info.mid, None)
+
+    async def subscribe(self, requests: str, others: Sequence[str]) -> dict[str, str]:  # type: ignore[override]
+        """As ``Connection`` has it."""
+        topics = [requests, *others]
+        if self._is_5:
+            wanted: Any = [(topic, SubscribeOptions(qos=0, retainAsPublished=topic == requests)) for topic in topics]
+        else:
+            wanted = [(topic, 0) for topic in topics]
+        try:
+            answers = await super().subscribe(wanted)
+        except aiomqtt.MqttError as error:
+            raise LinkError(f"no subscription: {error}") from None
+        return {
+            topic: words(answer)
+            for topic, answer in zip(topics, answers, strict=False)
+            if isinstance(answer, ReasonCode) and answer.is_failure
+        }
+
+    async def receive(self) -> Received:
+        """As ``Connection`` has it."""
+        try:
+            message = await anext(self.messages)
+        except aiomqtt.MqttError:
+            raise LinkError(self._why) from None
+        return Received(message.topic.value, bytes(message.payload), bool(message.retain))
+
+    def abandon(self) -> None:
+        """Give up an attempt to connect, though the broker may still answer."""
+        self._abandoned = True
+        self._client.disconnect()
+
+    async def part(self) -> None:
+        """End the connection, in good order where that is possible."""
+        with contextlib.suppress(TimeoutError, aiomqtt.MqttError):
+            async with asyncio.timeout(PARTING_S):
+                await self.__aexit__(None, None, None)
+        if self._disconnected.done() and not self._disconnected.cancelled():
+            self._disconnected.exception()  # else asyncio prints that nobody has looked at it
+
+    def _on_connect(
+        self, client: Any, userdata: Any, flags: Any, reason_code: ReasonCode, properties: Properties | None = None
+    ) -> None:
+        if self._abandoned:
+            client.disconnect()
+            return
+        most = getattr(properties, "ReceiveMaximum", None)
+        if most is not None and most < client.max_inflight_messages:
+            self._in_flight = asyncio.Semaphore(most)
+        self._most_bytes = getattr(properties, "MaximumPacketSize", None)
+        super()._on_connect(client, userdata, flags, reason_code, properties)
+
+    def _on_disconnect(
+        self,
+        client: Any,
+        userdata: Any,
+        flags: DisconnectFlags,
+        reason_code: ReasonCode,
+        properties: Properties | None = None,
+    ) -> None:
+        if flags.is_disconnect_packet_from_server:
+            self._why = words(reason_code)
+        elif reason_code == "Keep alive timeout":
+            self._why = "the broker gave no sign of life"
+        if not self._connected.done() and not self._abandoned:
+            self._connected.set_exception(ClosedError(self._why))
+        super()._on_disconnect(client, userdata, flags, reason_code, properties)
+
+    def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Any) -> None:  # noqa: ARG002
+        answer = self._answers.get(mid)
+        if answer is not None and not answer.done():
+            answer.set_result(words(reason_code) if reason_code.is_failure else None)
+
+
+@contextlib.asynccontextmanager
+async def connected(arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello) -> AsyncIterator[Client]:
+    """A connection while the context lasts.
+
+    Raises:
+        aiomqtt.MqttError: The broker cannot be reached, or refuses.
+    """
+    client = Client(arguments, protocol, hello)
+    try:
+        await client.__aenter__()
+    except BaseException:
+        client.abandon()
+        raise
+    try:
+        yield client
+    finally:
+        await client.part()
+
+
+def refusal(error: aiomqtt.MqttError) -> str:
+    """Why there is no connection."""
+    if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
+        return words(error.rc)
+    return str(error)
+
+
+def may_know_3_1_1(error: aiomqtt.MqttError) -> bool:
+    """Whether what refused MQTT 5 so may be a broker of the older one."""
+    if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
+        return error.rc.value == UNSUPPORTED_VERSION
+    return isinstance(error, ClosedError)
+
+
+class Inbox(asyncio.Queue[aiomqtt.Message]):
+    """What waits to be read; bounded in bytes, too, and without a log line for each message that is lost.
+
+    Args:
+        lose: Hears why and on which topic a message is lost.
+        maxsize: Messages.
+    """
+
+    def __init__(self, lose: Callable[[str, str], None], maxsize: int) -> None:
+        super().__init__(maxsize)
+        self._lose = lose
+
+    def put_nowait(self, item: aiomqtt.Message) -> None:
+        """Take a message, or say that it is lost."""
+        topic = item.topic.value
+        if len(topic) + len(item.payload) > MOST_BYTES:
+            self._lose("too_long", topic)
+        elif self.full():
+            self._lose("overflow", topic)
+        else:
+            super().put_nowait(item)

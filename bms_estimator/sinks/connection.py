@@ -1,0 +1,64 @@
+"""What a connection to a broker must be able to do. ``client`` has the real one."""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractAsyncContextManager
+from typing import NamedTuple, Protocol
+
+from bms_estimator.sinks.brokers import Broker
+from bms_estimator.sinks.messages import Message
+
+
+class LinkError(Exception):
+    """The broker cannot be reached, refuses the connection, or the connection is lost; the message says why."""
+
+
+class Received(NamedTuple):
+    """A message that came."""
+
+    topic: str
+    payload: bytes
+    retain: bool
+
+
+class Hello(NamedTuple):
+    """How each connection of a client begins."""
+
+    identifier: str
+    """The same at each: the broker ends an older one that it still holds, and its will comes first."""
+    will: Message
+    lose: Callable[[str, str], None]
+    """Hears kind (``too_long``, ``overflow``) and topic of each message that came and was thrown away."""
+
+
+class Connection(Protocol):
+    """A connection while it lasts; every method raises LinkError when it is lost."""
+
+    protocol: str
+    """For people: which MQTT is spoken."""
+
+    async def subscribe(self, requests: str, others: Sequence[str]) -> dict[str, str]:
+        """Ask for messages at QoS 0.
+
+        Args:
+            requests: What is retained there must say so though it comes live, as far as the protocol can.
+            others: Further topics.
+
+        Returns:
+            The topics that the broker refuses, and why.
+        """
+
+    async def publish(self, message: Message) -> str | None:
+        """Hand over a message and wait until the broker has acknowledged it.
+
+        What is published by several tasks goes out in the order in which they called.
+
+        Returns:
+            Why the broker refuses it, where it does and says so.
+        """
+
+    async def receive(self) -> Received:
+        """Wait for the next message."""
+
+
+Connect = Callable[[Broker, Hello], AbstractAsyncContextManager[Connection]]
+"""Connects to a broker; entering raises LinkError, and within a bounded time."""

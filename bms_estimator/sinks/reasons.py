@@ -1,0 +1,29 @@
+"""What a broker means by a reason code, for people. MQTT 5 has them; what 3.1.1 has is a part of them."""
+
+from paho.mqtt.reasoncodes import ReasonCode
+
+UNSUPPORTED_VERSION = 132
+"""Of a broker that does not know MQTT 5."""
+
+_NOT_ALLOWED = (
+    "name or password wrong, or not allowed; see mqtt.username, mqtt.password_file and the broker's access list"
+)
+HINTS = {
+    133: "another mqtt.base_topic or pack.name may help",
+    134: _NOT_ALLOWED,
+    135: _NOT_ALLOWED,
+    136: "the broker is not ready",
+    138: "the broker does not want this client",
+    141: "it heard nothing from here for too long",
+    142: "another client has the same name",
+    149: "a message is longer than the broker takes",
+    151: "the broker allows no more",
+    159: "too many connections in a short time",
+}
+"""By code: what it comes from, or what to do."""
+
+
+def words(reason: ReasonCode) -> str:
+    """A reason code as text: name, number, hint."""
+    hint = HINTS.get(reason.value)
+    return f"{reason.getName()} ({reason.value})" + (f": {hint}" if hint else "")
