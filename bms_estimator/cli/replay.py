@@ -34,7 +34,7 @@ from bms_estimator.snapshot.health import dropped_text
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources.replay import RawCapture, Replay, open_capture
 from bms_estimator.sources.standard_input import standard_input
-from bms_estimator.store.outbox import MEMORY_MOST, Outbox
+from bms_estimator.store.outbox import Outbox
 
 
 def replay(
@@ -123,7 +123,7 @@ async def _publisher(
     if settings.mqtt is None:
         return None
     delivery = Delivery()
-    outbox = Outbox(None, most=MEMORY_MOST)
+    outbox = Outbox(None, most=settings.store.outbox_messages)
     mqtt = MqttSink(settings.mqtt, settings.pack.name, Requests(delivery), delivery, outbox)
     sinks = [await stack.enter_async_context(mqtt)]
     return Publisher(settings, cell, estimator, source=source, sinks=sinks, clock=Clock(), delivery=delivery)

@@ -201,6 +201,18 @@ class StateSettings(Strict):
     checkpoint_s: Annotated[float, Field(ge=1)] = 60.0
 
 
+class StoreSettings(Strict):
+    """What is kept in the state folder: messages for a broker that is away, and the pack's history."""
+
+    outbox_messages: Annotated[int, Field(ge=1, le=10_000_000)] = Field(
+        default=90_000,
+        description="states and events that wait for a broker, a day of states at one a second; then the oldest goes",
+    )
+    history_days: Annotated[int, Field(ge=0, le=36_600)] = Field(
+        default=366, description="how long minutes and events are kept; 0: none are"
+    )
+
+
 class Settings(Strict):
     """One pack's settings file."""
 
@@ -211,6 +223,7 @@ class Settings(Strict):
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
     state: StateSettings = StateSettings()
+    store: StoreSettings = StoreSettings()
 
     @model_validator(mode="before")
     @classmethod

@@ -22,7 +22,8 @@ from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources.serial_board import SerialBoard, Tap
-from bms_estimator.store.outbox import MEMORY_MOST, Outbox
+from bms_estimator.store.database import Database
+from bms_estimator.store.outbox import Outbox
 
 log = structlog.get_logger(__name__)
 
@@ -60,13 +61,19 @@ async def serve(
     delivery, all_sinks = Delivery(), list(sinks)
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     board = SerialBoard(settings.sensor, tap=tap)
+    database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
+    outbox = Outbox(database, most=settings.store.outbox_messages)
     if settings.mqtt is not None:
         sample_period_s = settings.sensor.sample_period_s
-        outbox = Outbox(None, most=MEMORY_MOST)
         mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=sample_period_s)
         all_sinks.append(mqtt)
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
-    with alone(folder / f"{settings.pack.name}.lock") if folder else contextlib.nullcontext():
+    async with contextlib.AsyncExitStack() as stack:
+        if folder:
+            stack.enter_context(alone(folder / f"{settings.pack.name}.lock"))
+        if database:
+            await stack.enter_async_context(database)
+        await stack.enter_async_context(outbox)
         return await run_live(
             settings,
             cell,

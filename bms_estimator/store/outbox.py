@@ -1,82 +1,160 @@
-"""Messages that must reach the broker: they wait here, oldest first, until it has acknowledged them."""
+"""Messages that must reach the broker: they wait here, oldest first, until it has acknowledged them.
+
+While the broker takes what comes nothing is written. While it is away, or behind, what waits goes to disk each
+``FLUSH_S``, and only a page of it stays in memory. ``kill -9`` costs at most what came since, a clean end nothing.
+"""
 
 import asyncio
+import contextlib
 from collections import deque
-from typing import NamedTuple, Self
+from typing import Self
 
 from bms_estimator.sinks.messages import Message
+from bms_estimator.store.backlog import Outcome, Work, look
+from bms_estimator.store.database import Database, StoreError
+from bms_estimator.store.queue import PAGE, Queue, Waiting
 
-MEMORY_MOST = 4096
-"""Messages that are kept in memory: some megabytes."""
+FLUSH_S = 1.0
+"""How often what waits is written while the broker is away [s]."""
+BEHIND = 3
+"""A connected broker that has not acknowledged a message after so many of these times is behind."""
 
-
-class Waiting(NamedTuple):
-    """A message on its way to the broker."""
-
-    number: int
-    """Rises by one with each message."""
-    message: Message
+__all__ = ["Outbox", "Waiting"]
 
 
 class Outbox:
     """Keeps messages in order until the broker has them.
 
     Args:
-        database: None: in memory only.
+        database: Where they wait for a broker that is away; None: in memory only.
         most: So many are kept; of more the oldest that is not on its way is dropped.
 
     Attributes:
         connected: Whether there is a broker; whoever sends says so.
-        dropped: Messages that found no room, since start.
     """
 
-    def __init__(self, database: None, *, most: int) -> None:  # noqa: ARG002 - the database comes next
-        self._most = most
-        self._next = 0
-        self._handed: dict[int, Waiting] = {}  # on their way: not yet acknowledged
-        self._ready: deque[Waiting] = deque()
-        self._filled = asyncio.Event()
+    def __init__(self, database: Database | None, *, most: int) -> None:
+        self._database, self._queue = database, Queue(most)
+        self._opened = database is None
+        self._offset: int | None = None  # of numbers on disk; known once it was looked at
+        self._seen: deque[int] = deque(maxlen=BEHIND)  # the next number at the last looks
+        self._filled, self._wanted = asyncio.Event(), asyncio.Event()
+        self._closing = False
+        self._task: asyncio.Task[None] | None = None
         self.connected = False
-        self.dropped = 0
 
     @property
     def waiting(self) -> int:
         """Messages that the broker has not acknowledged."""
-        return len(self._handed) + len(self._ready)
+        return self._queue.waiting
+
+    @property
+    def dropped(self) -> int:
+        """Messages that found no room, since start."""
+        return self._queue.dropped
 
     async def __aenter__(self) -> Self:
-        """Start."""
+        """Start to look after what is on disk."""
+        if self._database is not None:
+            self._task = asyncio.create_task(self._stay_saved(), name="outbox")
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """End."""
+        """Write what is left."""
+        if self._task is None:
+            return
+        self._closing = True
+        self._wanted.set()
+        await self._task
 
     def put(self, message: Message) -> None:
         """Keep a message; returns at once and never fails."""
-        self._ready.append(Waiting(self._next, message))
-        self._next += 1
-        if self.waiting > self._most:
-            self._ready.popleft()
-            self.dropped += 1
-        if self._ready:
-            self._filled.set()
+        self._queue.put(message)
+        self._tell()
 
     async def take(self, most: int) -> list[Waiting]:
         """Wait until there is a message, and hand out up to ``most`` of the oldest that were not since ``rewind``."""
-        while not self._ready:
+        while not (self._opened and self._queue.can_hand_out):
             self._filled.clear()
             await self._filled.wait()
-        taken = [self._ready.popleft() for _ in range(min(most, len(self._ready)))]
-        self._handed |= {waiting.number: waiting for waiting in taken}
+        taken = self._queue.hand_out(most)
+        if self._queue.hungry:
+            self._wanted.set()
         return taken
 
     def sent(self, number: int) -> None:
         """The broker has acknowledged a message."""
-        self._handed.pop(number, None)
+        self._queue.sent(number)
 
     def rewind(self) -> None:
         """A connection is lost: hand out again, in order, what was not acknowledged."""
-        self._ready.extendleft(reversed(self._handed.values()))
-        self._handed.clear()
-        if self._ready:
+        self._queue.rewind()
+        self._tell()
+
+    def _tell(self) -> None:
+        if self._opened and self._queue.can_hand_out:
             self._filled.set()
+
+    async def _stay_saved(self) -> None:
+        """Each second, and when the next page is wanted."""
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        while not self._closing:
+            self._wanted.clear()
+            due = loop.time() >= due_s
+            if due:
+                due_s = loop.time() + FLUSH_S
+            await self._settle(write=due and self._behind())
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout_at(due_s):
+                    await self._wanted.wait()
+        self._queue.rewind()
+        await self._settle(write=True)
+
+    def _behind(self) -> bool:
+        """Whether what waits must be written."""
+        self._seen.append(self._queue.next)
+        oldest = self._queue.oldest
+        return oldest is not None and (not self.connected or (len(self._seen) == BEHIND and oldest < self._seen[0]))
+
+    async def _settle(self, *, write: bool) -> None:
+        """Bring disk and memory together; without the disk memory goes on alone."""
+        assert self._database is not None  # noqa: S101
+        queue = self._queue
+        try:
+            if self._offset is None:
+                found = await self._database.call(look)
+                self._offset = found.first - queue.found(found.messages, found.span)
+            work = self._due(self._offset, write=write)
+            if work:
+                queue.writing(work.rows)
+                self._done(work, await self._database.call(work))
+            queue.sure, queue.passing = True, False
+        except StoreError:
+            queue.sure, queue.passing = False, True
+        self._opened = True
+        self._tell()
+
+    def _due(self, offset: int, *, write: bool) -> Work:
+        queue, stored = self._queue, self._queue.stored
+        return Work(
+            offset=offset,
+            first=stored.first,
+            end=stored.end,
+            drops=stored.drops,
+            gone=list(queue.gone),
+            rows=queue.unwritten() if write or not queue.sure else [],
+            page=PAGE if queue.hungry else 0,
+            recount=not queue.sure,
+        )
+
+    def _done(self, work: Work, outcome: Outcome) -> None:
+        """A transaction is on disk."""
+        queue = self._queue
+        if outcome.stored is not None:
+            queue.left(outcome.stored)
+        queue.stored.drops -= work.drops
+        del queue.gone[: len(work.gone)]
+        if work.page:
+            queue.loaded(outcome.page, work.page)
+        queue.wrote()

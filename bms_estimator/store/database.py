@@ -1,0 +1,200 @@
+"""A pack's SQLite file, in a thread of its own: the event loop never waits for the disk, nor fails with it."""
+
+import asyncio
+import os
+import sqlite3
+import stat
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import structlog
+
+from bms_estimator.store.tables import NewerVersionError, migrate
+
+HANG_S = 10.0
+"""A disk that has not answered by then is taken to hang [s]."""
+RETRY_S = 10.0
+"""A disk that failed is tried again no more often than this [s]."""
+SYNC_S = 30.0
+"""So much at most is lost with the power: transactions between reach the system at once, and the disk when it likes [s]."""
+LOCKED_S = 5.0
+"""How long somebody else may hold the file [s]."""
+LOG_BYTES = 4 << 20
+"""To so much the write-ahead log is cut back."""
+FREE_PAGES = 256
+"""Of 4 KiB; more that are free go back to the file system."""
+UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+Result = TypeVar("Result")
+
+log = structlog.get_logger(__name__)
+
+
+class StoreError(Exception):
+    """The database cannot be used now; the text says why."""
+
+
+class Database:
+    """Runs transactions one after the other. What fails is tried again with a later one, in a new file if need be.
+
+    Args:
+        path: The file, made where it is not there.
+        hang_s: How long a transaction may take [s].
+        retry_s: After a failure, before the disk is tried again [s].
+
+    Attributes:
+        reason: Why it cannot be used now; empty when it can.
+    """
+
+    def __init__(self, path: Path, *, hang_s: float = HANG_S, retry_s: float = RETRY_S) -> None:
+        self.path, self.reason = path, ""
+        self._hang_s, self._retry_s = hang_s, retry_s
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="database")
+        self._stuck: Future[Any] | None = None
+        self._failed_s = -retry_s
+        self._file = _File(path)
+
+    async def __aenter__(self) -> Self:
+        """Nothing to open yet: the first transaction does."""
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        """Close the file, unless the disk hangs."""
+        closing = self._thread.submit(self._file.close)
+        await asyncio.wait([asyncio.wrap_future(closing)], timeout=self._hang_s)
+        self._thread.shutdown(wait=False)
+
+    async def call(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
+        """Run ``work`` in a transaction.
+
+        Raises:
+            StoreError: It was not committed, or nobody knows.
+        """
+        now_s = asyncio.get_running_loop().time()
+        if (self._stuck and not self._stuck.done()) or now_s - self._failed_s < self._retry_s:
+            raise StoreError(self.reason)
+        running = self._thread.submit(self._file.run, work)
+        waiter = asyncio.wrap_future(running)
+        done, _ = await asyncio.wait([waiter], timeout=self._hang_s)
+        if not done:
+            waiter.add_done_callback(lambda late: late.cancelled() or late.exception())
+            if not running.cancel():
+                self._stuck = running
+            raise self._failure(f"the disk has not answered for {self._hang_s:g} s")
+        try:
+            result = waiter.result()
+        except (sqlite3.Error, OSError) as error:
+            self._failed_s = asyncio.get_running_loop().time()
+            raise self._failure(str(error)) from error
+        if self.reason:
+            log.info("database is back", file=str(self.path))
+            self.reason = ""
+        return result
+
+    def _failure(self, reason: str) -> StoreError:
+        if not self.reason:
+            log.warning("database cannot be used: going on in memory", file=str(self.path), reason=reason)
+        self.reason = reason
+        return StoreError(reason)
+
+
+class _File:
+    """The connection; all of it runs in the thread."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._connection: sqlite3.Connection | None = None
+        self._inode = (0, 0)
+        self._synced_s = 0.0
+
+    def run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
+        """One transaction; in a new file where the one that is there cannot be used."""
+        try:
+            return self._run(work)
+        except NewerVersionError as error:
+            self._set_aside(str(error))
+        except sqlite3.DatabaseError as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF not in UNUSABLE:
+                raise
+            self._set_aside(str(error))
+        return self._run(work)
+
+    def _run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
+        """Open what is not open, close what has failed."""
+        try:
+            connection = self._opened()
+            due = time.monotonic() - self._synced_s >= SYNC_S
+            connection.execute(f"PRAGMA synchronous = {'FULL' if due else 'NORMAL'}")
+            connection.execute("BEGIN IMMEDIATE")
+            result = work(connection)
+            connection.execute("COMMIT")
+        except BaseException:
+            self.close()
+            raise
+        if due:
+            self._synced_s = time.monotonic()
+        return result
+
+    def close(self) -> None:
+        """Close; what was not committed is undone."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
+
+    def _opened(self) -> sqlite3.Connection:
+        """The connection to the file that is there: one that was deleted would take everything and keep nothing."""
+        if self._connection is not None and _inode(self._path) == self._inode:
+            return self._connection
+        self.close()
+        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for suffix in ("", "-wal", "-shm"):
+            self._refuse_planted(self._path.with_name(self._path.name + suffix))
+        os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600))
+        self._inode = _inode(self._path)
+        self._connection = sqlite3.connect(self._path, timeout=LOCKED_S, isolation_level=None)
+        self._prepare(self._connection)
+        return self._connection
+
+    def _prepare(self, connection: sqlite3.Connection) -> None:
+        connection.execute("PRAGMA auto_vacuum = INCREMENTAL")  # of a new file
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute(f"PRAGMA journal_size_limit = {LOG_BYTES}")
+        migrate(connection)
+
+    def _refuse_planted(self, path: Path) -> None:
+        """Put a link, or what is no file, out of the way: SQLite would write where it leads."""
+        try:
+            found = path.lstat()
+        except FileNotFoundError:
+            return
+        if not stat.S_ISREG(found.st_mode):
+            path.replace(path.with_name(f"{path.name}.refused"))
+            log.warning("no file stands where the database must: set aside", file=str(path))
+
+    def _set_aside(self, reason: str) -> None:
+        """Keep a file that cannot be used, and its log, out of the way of a new one."""
+        aside = self._path.with_name(f"{self._path.stem}.refused{self._path.suffix}")
+        for suffix in ("", "-wal", "-shm"):
+            source, target = (path.with_name(path.name + suffix) for path in (self._path, aside))
+            target.unlink(missing_ok=True)
+            if source.exists():
+                source.replace(target)
+        log.warning("database set aside, a new one is begun", file=str(self._path), reason=reason, aside=aside.name)
+
+
+def trim(connection: sqlite3.Connection) -> None:
+    """Give back free pages, some of them at a time."""
+    (free,) = connection.execute("PRAGMA freelist_count").fetchone()
+    if free > FREE_PAGES:
+        connection.execute(f"PRAGMA incremental_vacuum({FREE_PAGES})").fetchall()
+
+
+def _inode(path: Path) -> tuple[int, int]:
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0
+    return found.st_dev, found.st_ino

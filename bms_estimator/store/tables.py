@@ -1,0 +1,50 @@
+"""The tables of a pack's database, and how older ones become them."""
+
+import sqlite3
+
+MIGRATIONS = (
+    """
+    CREATE TABLE outbox (
+        number INTEGER PRIMARY KEY,
+        topic TEXT NOT NULL,
+        payload BLOB NOT NULL,
+        qos INTEGER NOT NULL,
+        retain INTEGER NOT NULL
+    );
+    CREATE TABLE minute (
+        time_s INTEGER PRIMARY KEY,
+        voltage_v REAL, voltage_min_v REAL, voltage_max_v REAL,
+        current_a REAL, current_min_a REAL, current_max_a REAL,
+        temperature_c REAL, temperature_min_c REAL, temperature_max_c REAL,
+        soc REAL, soc_std REAL,
+        charge_out_ah REAL, charge_in_ah REAL, energy_out_wh REAL, energy_in_wh REAL,
+        seen_s REAL
+    );
+    CREATE TABLE event (
+        number INTEGER PRIMARY KEY,
+        time_s REAL NOT NULL,
+        name TEXT NOT NULL,
+        text TEXT NOT NULL
+    );
+    CREATE INDEX event_time ON event (time_s);
+    """,
+)
+"""What makes version n + 1 of version n; never changed once released, only added to."""
+
+
+class NewerVersionError(Exception):
+    """A later version wrote this database."""
+
+
+def migrate(connection: sqlite3.Connection) -> None:
+    """Bring a database to this version; a new one is empty.
+
+    Raises:
+        NewerVersionError: It is beyond this version.
+        sqlite3.Error: It cannot be read or written.
+    """
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    if version > len(MIGRATIONS):
+        raise NewerVersionError(f"version {version}, this program knows {len(MIGRATIONS)}")
+    for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
+        connection.executescript(f"BEGIN IMMEDIATE; {script} PRAGMA user_version = {number}; COMMIT;")
