@@ -87,6 +87,15 @@ class ParameterReport(Report):
     )
 
 
+class Totals(Report):
+    """What is counted over restarts; what came after the last checkpoint before a kill is missing."""
+
+    since: str = Field(description="when counting began, ISO 8601, UTC")
+    crashes: int = Field(description="starts after a run that had not ended cleanly: a fault, a kill, a power cut")
+    samples: dict[str, int] = Field(description="samples accepted and dropped by kind")
+    unseen_s: float = Field(description="in gaps and between runs, as far as its length was known [s]")
+
+
 class Health(Report):
     """Topic ``health``, retained: how the service and the line are."""
 
@@ -114,6 +123,11 @@ class Health(Report):
     availability_corrections: int = Field(description="times somebody else wrote an availability and was put right")
     requests: dict[str, int] = Field(description="by what became of them, since start")
     checkpoint: str = Field(description="what became of the last checkpoint")
+    unseen_s: float | None = Field(
+        description="how long nobody measured in the last gap of the samples or before the start [s]; "
+        "null: never since the start, or nobody knows"
+    )
+    total: Totals = Field(description="what is counted since the checkpoint began, over restarts")
 
 
 class Info(Report):

@@ -199,6 +199,11 @@ class StateSettings(Strict):
         description="where checkpoints go; systemd's StateDirectory when left out, else the user's XDG state folder",
     )
     checkpoint_s: Annotated[float, Field(ge=1)] = 60.0
+    longest_days: Positive | None = Field(
+        default=None,
+        description="a checkpoint that is known to be older is not taken up, as where packs are exchanged; "
+        "without: any age, only the SOC is less sure",
+    )
 
 
 class StoreSettings(Strict):

@@ -6,11 +6,11 @@ edited, and versions that know other fields may come, without what was learned b
 
 import hashlib
 import io
+import math
 import os
 import re
 import stat
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.cell import ChenMoraOcv
+from bms_estimator.model.estimate import Totals
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.service.disk_thread import DiskThread
 from bms_estimator.service.moment import Moment, moment
+from bms_estimator.snapshot.totals import new_totals
 
-FORMAT = 5
-"""Raise it when a field of an old name gets another meaning."""
-NAMELESS_FORMAT = 4
-"""The format before: one record with the layout of its version, one file for each pack. Read for a while."""
+FORMAT = 6
+"""Raise it when a field of an old name gets another meaning, and tell ``_MIGRATIONS`` how to read those before."""
+DAY_S = 86400.0
 LONGEST_FILE = 1 << 20
 """A checkpoint has some kilobytes; a longer file is none [bytes]."""
 KEPT = 8
@@ -67,6 +69,21 @@ def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDAr
 
 
 @dataclass(frozen=True)
+class Ledger:
+    """What a checkpoint tells of the runs that wrote it.
+
+    Attributes:
+        restarts: Starts that found a checkpoint.
+        total: What is counted over restarts.
+        clean: The last of them has ended by itself; False while it runs.
+    """
+
+    restarts: int
+    total: Totals
+    clean: bool = False
+
+
+@dataclass(frozen=True)
 class Restored:
     """What a checkpoint file held."""
 
@@ -74,8 +91,8 @@ class Restored:
     """Fields of ESTIMATOR_STATE by their names, as ``fields`` gives them; empty when it was refused."""
     unseen_s: float
     """Since it was saved [s]; infinite when nobody knows."""
-    restarts: int
-    """Starts that found a checkpoint, this one included."""
+    ledger: Ledger
+    """With this start counted; of nothing when it was refused."""
     reason: str
     """Why it is not taken up; empty when it may be."""
 
@@ -94,29 +111,46 @@ class CheckpointFile:
         self._name, self._now = settings.pack.name, now
         self._identity, self._observer = pack_identity(settings, cell), _observer_identity(settings, cell)
         self._range_v = cell.cell.voltage_min_v, cell.cell.voltage_max_v
+        self._longest_days = settings.state.longest_days
+        self._content: dict[str, Any] = {}  # of the file, as far as it is no ledger
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
-        self.thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
-        """Where to call ``save``: a call that nobody waits for any more still ends before the next one begins."""
+        self.thread = DiskThread("checkpoint")
+        """Where to call ``save`` and ``mark``: a call that nobody waits for any more still ends before the next one begins."""
         self.saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 
-    def save(self, state: NDArray[np.void], restarts: int) -> None:
-        """Write atomically: after a power cut there is the old file or the new one.
+    def save(self, state: NDArray[np.void], ledger: Ledger) -> None:
+        """Write atomically: after a power cut there is the old file or the new one. A folder that is gone is made anew.
 
         Args:
             state: Shape (1,), dtype ESTIMATOR_STATE.
-            restarts: Starts that found a checkpoint.
+            ledger: Of this run and those before.
 
         Raises:
             OSError: The file cannot be written.
         """
-        content = io.BytesIO()
-        named: dict[str, Any] = {f"state.{name}": field for name, field in fields(state)} | asdict(self._now())
-        np.savez(content, format=FORMAT, identity=self._identity, observer=self._observer, restarts=restarts, **named)
+        named = {f"state.{name}": field for name, field in fields(state)} | asdict(self._now())
+        content = {"identity": self._identity, "observer": self._observer, **named}
+        self._write(content, ledger)
+
+    def mark(self, ledger: Ledger) -> None:
+        """Change what the file tells of the runs, and nothing else: its state is as old as before. Without a file: nothing.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        if self._content:
+            self._write(self._content, ledger)
+
+    def _write(self, content: dict[str, Any], ledger: Ledger) -> None:
+        packed = io.BytesIO()
+        total = ledger.total.model_dump_json()
+        np.savez(packed, format=FORMAT, restarts=ledger.restarts, total=total, clean=ledger.clean, **content)
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         new = self.path.with_suffix(".new")
         new.unlink(missing_ok=True)
         with open(new, "xb", opener=_private) as file:
-            file.write(content.getbuffer())
+            file.write(packed.getbuffer())
             file.flush()
             os.fsync(file.fileno())
         new.replace(self.path)
@@ -125,30 +159,33 @@ class CheckpointFile:
             os.fsync(folder)
         finally:
             os.close(folder)
+        self._content = content
         self._remove_oldest()
 
     def load(self) -> Restored:
         """Read; what is wrong is a reason, not an exception.
 
-        The file of the format before is taken over by its name: it is of the settings that were used last. What it
+        The file of a format before names is taken over by its name: it is of the settings that were used last. What it
         hashed, whole sections of the settings, cannot be made again by a version that knows others.
         """
         before = self.path.with_name(f"{self._name}.npz")
+        new = Ledger(0, new_totals(self._now().wall_s))
         try:
             if not self.path.exists() and before.exists():
                 before.replace(self.path)
             with np.load(io.BytesIO(_read(self.path)), allow_pickle=False) as file:
-                return self._checked(file)
+                return self._checked(_migrated(dict(file)))
         except FileNotFoundError:
-            return Restored({}, 0.0, 0, "none found")
+            return Restored({}, 0.0, new, "none found")
         except _RefusedError as error:
-            return Restored({}, 0.0, 0, f"{REFUSED}{error}")
+            return Restored({}, 0.0, new, f"{REFUSED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return Restored({}, 0.0, 0, f"{REFUSED}unreadable ({type(error).__name__}: {error})")
+            return Restored({}, 0.0, new, f"{REFUSED}unreadable ({type(error).__name__}: {error})")
 
     def set_aside(self) -> str:
         """Keep a file that was refused out of the way of the next save. Returns what was done, for people."""
         aside = self.path.with_name(f"{self._name}.refused.npz")
+        self._content = {}
         try:
             self.path.replace(aside)
         except OSError as error:
@@ -156,23 +193,26 @@ class CheckpointFile:
         return f"set aside as {aside.name}"
 
     def _checked(self, file: Mapping[str, NDArray[Any]]) -> Restored:
-        version = int(file["format"])
-        if version not in (NAMELESS_FORMAT, FORMAT):
-            raise _RefusedError(f"format {version}, this version reads {FORMAT}")
-        if version == NAMELESS_FORMAT:
-            state = dict(fields(file["state"]))
+        state = {name.removeprefix("state."): file[name] for name in file if name.startswith("state.")}
+        if not str(file["identity"]):  # a format that had another one: what its voltage tells
             low, high = self._range_v
             if not low <= state["observer.voltage_estimate_v"][0] <= high:
                 raise _RefusedError("its voltage is none of this pack")
         elif str(file["identity"]) != self._identity:
             raise _RefusedError("it belongs to another pack or cell")
-        else:
-            state = {name.removeprefix("state."): file[name] for name in file if name.startswith("state.")}
-        if version == NAMELESS_FORMAT or str(file["observer"]) != self._observer:
+        saved = Moment(float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"]))
+        unseen_s = self._now().since(saved)
+        if self._longest_days is not None and self._longest_days * DAY_S < unseen_s < math.inf:
+            days = f"{unseen_s / DAY_S:.1f} days old"
+            raise _RefusedError(f"it is {days}, state.longest_days is {self._longest_days:g}")
+        total = Totals.model_validate_json(str(file["total"]))
+        crashed = total.model_copy(update={"crashes": total.crashes + (not file["clean"])})
+        self._content = {name: v for name, v in file.items() if name not in ("format", "restarts", "total", "clean")}
+        self._content |= {"identity": self._identity}
+        if str(file["observer"]) != self._observer:
             kept, dropped = ("observer.soc", "observer.soc_coulomb", "observer.started"), ("observer.", "learning.")
             state = {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}
-        saved = Moment(float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"]))
-        return Restored(state, self._now().since(saved), int(file["restarts"]) + 1, "")
+        return Restored(state, unseen_s, Ledger(int(file["restarts"]) + 1, crashed), "")
 
     def _remove_oldest(self) -> None:
         """Of the pack's files leave those saved last: whoever tries settings leaves one for each."""
@@ -185,6 +225,40 @@ class CheckpointFile:
 
 class _RefusedError(Exception):
     """Why a checkpoint is not taken up."""
+
+
+File = dict[str, Any]
+"""Arrays by their names."""
+
+
+def _named(file: File) -> File:
+    """From format 4, that of 0.1.0: one record with the layout of its version, one file for each pack, hashed settings."""
+    state = {f"state.{name}": field for name, field in fields(file.pop("state"))}
+    return file | state | {"identity": "", "observer": ""}
+
+
+def _counted(file: File) -> File:
+    """From format 5: nothing was counted over restarts, and nobody knows how its run ended."""
+    total = new_totals(float(file["wall_s"]))
+    return file | {"total": total.model_dump_json(), "clean": True}
+
+
+_MIGRATIONS = {4: _named, 5: _counted}
+"""By format: how to make a file of it one of the next format."""
+
+
+def _migrated(file: File) -> File:
+    """A file of any format that is known, as one of ``FORMAT``.
+
+    Raises:
+        _RefusedError: Its format is not known.
+    """
+    version = int(file["format"])
+    if version != FORMAT and version not in _MIGRATIONS:
+        raise _RefusedError(f"format {version}, this version reads {min(_MIGRATIONS)} to {FORMAT}")
+    for step in range(version, FORMAT):
+        file = _MIGRATIONS[step](file)
+    return file
 
 
 def _private(path: str, flags: int) -> int:

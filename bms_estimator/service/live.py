@@ -15,19 +15,17 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.checkpoint import REFUSED, CheckpointFile
+from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.resume import resume
+from bms_estimator.service.saving import Saving
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.snapshot.publisher import Publisher
+from bms_estimator.snapshot.totals import Tally, new_totals
 from bms_estimator.sources import Source
 
-SAVED_SOC = 0.002
-"""How far the SOC may go from that of the checkpoint: a kill costs no more, beside what moves until the next start."""
-LOOK_S = 1.0
-"""How often it is seen how far it has gone [s]."""
 LAG_STEP_S = 0.1
 """How often the loop's lag is measured [s]: what blocks it for longer is always seen."""
 
@@ -69,8 +67,9 @@ async def run_live(
     name, clock = settings.pack.name, clock or Clock()
     notifier = notifier or Notifier([name])
     estimator = new_estimator(settings, cell)
-    restarts, restored = _restore(estimator, checkpoint)
+    ledger, restored = _restore(estimator, checkpoint, clock)
     restored_s = since_boot()
+    tally = Tally(estimator, ledger.total)
     publisher = Publisher(
         settings,
         cell,
@@ -78,7 +77,8 @@ async def run_live(
         source=source,
         sinks=sinks,
         clock=clock,
-        restarts=restarts,
+        restarts=ledger.restarts,
+        tally=tally,
         checkpoint=restored,
         delivery=delivery,
     )
@@ -90,18 +90,19 @@ async def run_live(
         await stack.enter_async_context(source)
         notifier.ready(name)
         tasks = [
-            _estimate(source, estimator, publisher, lambda: since_boot() - restored_s),
+            _estimate(source, tally, publisher, lambda: since_boot() - restored_s),
             _keep_alive(publisher, notifier, name),
             _measure_lag(publisher),
         ]
-        if checkpoint:
-            tasks.append(_save_often(checkpoint, estimator, publisher, settings.state.checkpoint_s, restarts))
+        saving = Saving(checkpoint, estimator, publisher, tally, ledger.restarts) if checkpoint else None
+        if saving:
+            tasks.append(saving.save_often(settings.state.checkpoint_s))
         try:
             await until_first_ends(*tasks, stop.wait())
         finally:  # a fault ends the loop, too
             notifier.stopping(name)
-            if checkpoint:  # before the sinks part, which may take seconds: who stops us may not wait for them
-                await _save(checkpoint, estimator, publisher, restarts)
+            if saving:  # before the sinks part, which may take seconds: who stops us may not wait for them
+                await saving.save_last()
         publisher.publish_last()
     return estimator
 
@@ -123,13 +124,14 @@ def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
     return make()
 
 
-async def _estimate(source: Source, estimator: Estimator, publisher: Publisher, waited_s: Callable[[], float]) -> None:
+async def _estimate(source: Source, tally: Tally, publisher: Publisher, waited_s: Callable[[], float]) -> None:
     """Take what the source gives; ``waited_s`` is how long it has given nothing since the state was restored [s]."""
+    estimator = tally.estimator
     unseen_s = estimator.record["unseen_s"].copy()
     async for block in source:
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
             estimator.record["unseen_s"] = unseen_s + waited_s()
-        publisher.add(block, estimator.run(block))
+        publisher.add(block, tally.run(block))
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
 
@@ -152,10 +154,10 @@ async def _measure_lag(publisher: Publisher) -> None:
         publisher.add_lag(loop.time() - due_s)
 
 
-def _restore(estimator: Estimator, checkpoint: CheckpointFile | None) -> tuple[int, str]:
-    """Go on from the checkpoint where there is a good one. Returns how many starts found one, and what was done."""
+def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clock) -> tuple[Ledger, str]:
+    """Go on from the checkpoint where there is a good one. Returns what the runs before have counted, and what was done."""
     if checkpoint is None:
-        return 0, "off"
+        return Ledger(0, new_totals(clock.wall())), "off"
     found = checkpoint.load()
     outcome = found.reason
     if not outcome:
@@ -164,46 +166,12 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None) -> tuple[i
     if outcome.startswith(REFUSED):
         outcome = f"{outcome}; {checkpoint.set_aside()}"
     log.info("checkpoint", file=str(checkpoint.path), outcome=outcome)
-    return found.restarts, outcome
+    return found.ledger, outcome
 
 
 def _soc_text(estimator: Estimator) -> str:
     soc = float(estimator.state["soc"][0])
     return "" if math.isnan(soc) else f": SOC {soc:.4f}"
-
-
-async def _save_often(
-    checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, every_s: float, restarts: int
-) -> None:
-    """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC`` or there is a first sample."""
-    loop = asyncio.get_running_loop()
-    due_s, failed = 0.0, False
-    while True:
-        await asyncio.sleep(min(LOOK_S, every_s))
-        moved = checkpoint.saved is None or abs(estimator.state["soc"][0] - checkpoint.saved[1]) >= SAVED_SOC
-        if loop.time() >= due_s or (moved and not failed):
-            failed = not await _save(checkpoint, estimator, publisher, restarts)
-            due_s = loop.time() + every_s
-
-
-async def _save(checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, restarts: int) -> bool:
-    """Save what samples have taught; writing waits for the disk in a thread. False: it cannot be written.
-
-    What is saved already is not saved again: it would seem to be of now, and not of before nobody measured.
-    """
-    state = estimator.record.copy()
-    soc = float(np.nan_to_num(state["observer"]["soc"][0]))  # a fuel cell has none, and NaN would equal nothing
-    taught = int(state["observer"]["samples"][0]), soc
-    if not taught[0] or taught == checkpoint.saved:
-        return True
-    try:
-        await asyncio.get_running_loop().run_in_executor(checkpoint.thread, checkpoint.save, state, restarts)
-        publisher.checkpoint, checkpoint.saved = "saved", taught
-    except OSError as error:
-        publisher.checkpoint = f"cannot be saved: {error}"
-        log.warning("checkpoint cannot be saved", file=str(checkpoint.path), error=str(error))
-        return False
-    return True
 
 
 def _set_soc(estimator: Estimator, soc: float) -> float:

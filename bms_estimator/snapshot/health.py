@@ -8,7 +8,7 @@ import numpy as np
 
 from bms_estimator.kernels.input_checks import COUNTERS
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Health
+from bms_estimator.model.estimate import Health, Totals
 from bms_estimator.model.suspect import Suspect
 from bms_estimator.sinks import Delivery
 
@@ -72,6 +72,8 @@ def health_report(
     sensor_message: str | None,
     delivery: Delivery,
     clock_ppm: float | None,
+    total: Totals,
+    unseen_s: float | None,
 ) -> Health:
     """Topic ``health``.
 
@@ -87,6 +89,8 @@ def health_report(
         sensor_message: Why values are not fresh; None when they are.
         delivery: What became of what was sent and asked.
         clock_ppm: The source's.
+        total: Counted over restarts.
+        unseen_s: How long nobody measured last [s]; None: never, or nobody knows.
     """
     state = record["observer"]
     return Health(
@@ -110,4 +114,6 @@ def health_report(
         availability_corrections=delivery.corrections,
         requests=dict(delivery.requests),
         checkpoint=checkpoint,
+        unseen_s=unseen_s,
+        total=total,
     )

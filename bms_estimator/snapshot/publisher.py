@@ -19,6 +19,7 @@ from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.rest import Rest
 from bms_estimator.snapshot.topics import estimate_report, info_report
+from bms_estimator.snapshot.totals import Tally, new_totals
 from bms_estimator.snapshot.window import Window, WindowSummary
 from bms_estimator.sources import Source
 
@@ -38,6 +39,7 @@ class Publisher:
         source: Its counters, message and board are read.
         sinks: Where snapshots go.
         clock: The clocks.
+        tally: What is counted over restarts; else begins with this run.
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the checkpoint at start.
         delivery: What became of what was sent and asked.
@@ -57,12 +59,14 @@ class Publisher:
         source: Source,
         sinks: Sequence[Sink],
         clock: Clock,
+        tally: Tally | None = None,
         restarts: int = 0,
         checkpoint: str = "off",
         delivery: Delivery | None = None,
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
         self._source, self._sinks, self._clock = source, sinks, clock
+        self._tally = tally or Tally(estimator, new_totals(clock.wall()))
         self._restarts, self._delivery = restarts, delivery or Delivery()
         self._rest = Rest(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
@@ -162,6 +166,8 @@ class Publisher:
             sensor_message=message,
             delivery=self._delivery,
             clock_ppm=self._source.clock_ppm,
+            total=self._tally.total,
+            unseen_s=self._tally.unseen_s,
         )
 
     def _info(self) -> Info:

@@ -9,8 +9,9 @@ import pytest
 from bms_estimator.cli.pack import load_pack
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import TableOcv, load_cell
-from bms_estimator.service.checkpoint import CheckpointFile
+from bms_estimator.service.checkpoint import CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator
+from bms_estimator.snapshot.totals import new_totals
 from tests.command_line import run
 from tests.estimator.anywhere.cases import OXIDE, Case, capture
 
@@ -39,7 +40,7 @@ def pack(tmp_path_factory) -> Path:
     estimator = new_estimator(settings, cell)
     estimator.run(drive(1).samples)
     (folder / "state").mkdir()
-    CheckpointFile(folder / "state", settings, cell).save(estimator.record, 0)
+    CheckpointFile(folder / "state", settings, cell).save(estimator.record, Ledger(0, new_totals(0.0)))
     return file
 
 

@@ -20,17 +20,19 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Health
 from bms_estimator.model.settings import Settings
-from bms_estimator.service import live
+from bms_estimator.service import live, saving
 from bms_estimator.service.alone import alone
-from bms_estimator.service.checkpoint import FORMAT, KEPT, CheckpointFile, fields, pack_identity
+from bms_estimator.service.checkpoint import FORMAT, KEPT, CheckpointFile, Ledger, fields, pack_identity
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.resume import resume
+from bms_estimator.snapshot.totals import new_totals
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
 SETTINGS = Settings.model_validate({"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}})
+NEW = Ledger(0, new_totals(0.0))
 OLD_FILE = Path(__file__).with_name("checkpoint_format_4.npz")
 """Of the version before: half an hour of a simulated chen_mora under random steps, SOC 0.576."""
 
@@ -124,7 +126,7 @@ async def test_samples_that_cannot_be_used_do_not_prolong_what_nobody_measured(
 )
 async def test_an_edited_setting_costs_nothing_that_was_learned(tmp_path: Path, settings: Settings) -> None:
     learned = a_used_pack()
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, restarts=0)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW)
     run = await ran(tmp_path, settings, samples=1)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
     assert run.estimator.record["map"].tobytes() == learned.record["map"].tobytes()
@@ -137,7 +139,7 @@ async def test_what_the_learning_law_has_learned_outlives_a_restart_and_not_anot
         learned.step(float(i), 0.3 * (i // 60 % 2), 3.8 - 0.03 * (i // 60 % 2))
     theta = learned.record[0]["learning"]["theta"].copy()
     assert theta.any()
-    CheckpointFile(tmp_path, settings, CELL).save(learned.record, restarts=0)
+    CheckpointFile(tmp_path, settings, CELL).save(learned.record, NEW)
     again = await ran(tmp_path, settings, samples=1)
     assert (again.estimator.record[0]["learning"]["theta"] == theta).all()
     assert again.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
@@ -148,7 +150,7 @@ async def test_what_the_learning_law_has_learned_outlives_a_restart_and_not_anot
 async def test_a_checkpoint_of_the_version_before_the_learning_law_is_taken_up(tmp_path: Path) -> None:
     learned = a_used_pack()
     file = CheckpointFile(tmp_path, SETTINGS, CELL)
-    file.save(learned.record, restarts=0)
+    file.save(learned.record, NEW)
     with np.load(file.path) as saved:
         before = {name: saved[name] for name in saved if not name.startswith("state.learning.")}
     np.savez(file.path, **before)
@@ -158,7 +160,7 @@ async def test_a_checkpoint_of_the_version_before_the_learning_law_is_taken_up(t
 
 async def test_an_edited_description_costs_nothing_that_was_learned(tmp_path: Path) -> None:
     learned = a_used_pack()
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, restarts=0)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW)
     described = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"name": "mine", "description": "new"})})
     run = await ran(tmp_path, cell=described, samples=2)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
@@ -238,19 +240,19 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
         estimator.state["a"][0][3], reason = np.nan, "refused: a of the observer is not finite"
     if damage == "range":
         estimator.state["soc"], reason = 1.7, r"refused: soc = 1.7 is outside 0.0..1.0"
-    file.save(estimator.record, restarts=0)
+    file.save(estimator.record, NEW)
     if damage == "other cell":
         other = CheckpointFile(tmp_path, SETTINGS, CELL.pack(2, 1))
-        other.save(estimator.record, restarts=0)
+        other.save(estimator.record, NEW)
         other.path.replace(file.path)
         reason = "refused: it belongs to another pack or cell"
     if damage in ("truncated", "garbage"):
         file.path.write_bytes(file.path.read_bytes()[:500] if damage == "truncated" else bytes(range(256)) * 8)
     if damage == "format":
         monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", FORMAT + 1)
-        file.save(estimator.record, restarts=0)
+        file.save(estimator.record, NEW)
         monkeypatch.undo()
-        reason = f"refused: format {FORMAT + 1}, this version reads {FORMAT}"
+        reason = f"refused: format {FORMAT + 1}, this version reads 4 to {FORMAT}"
     if damage == "pipe":  # whoever opens it for reading waits for a writer
         file.path.unlink()
         os.mkfifo(file.path)
@@ -276,7 +278,7 @@ def test_the_checkpoints_of_a_pack_are_bounded_in_number(tmp_path: Path) -> None
     (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
     for series in range(1, KEPT + 4):
         file = CheckpointFile(tmp_path, SETTINGS, CELL.pack(series, 1))
-        file.save(estimator.record, restarts=0)
+        file.save(estimator.record, NEW)
         os.utime(file.path, (series, series))
     names = {path.name for path in tmp_path.iterdir()}
     assert len(names) == KEPT + 1
@@ -289,7 +291,7 @@ def test_what_is_written_is_private_and_goes_through_no_planted_link(tmp_path: P
     victim.write_text("precious")
     file.path.with_suffix(".new").symlink_to(victim)
     (tmp_path / "pack.lock").symlink_to(victim)
-    file.save(new_estimator(SETTINGS, CELL).record, restarts=0)
+    file.save(new_estimator(SETTINGS, CELL).record, NEW)
     with alone(tmp_path / "pack.lock"):
         pass
     assert victim.read_text() == "precious"
@@ -348,11 +350,11 @@ async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_
     slow, began, release, saves = threading.Lock(), threading.Event(), threading.Event(), []
 
     class SlowDisk(CheckpointFile):
-        def save(self, state: Any, restarts: int) -> None:
+        def save(self, state: Any, ledger: Ledger) -> None:
             assert slow.acquire(blocking=False), "two saves at once"
             began.set()
             assert release.wait(LONG_S)
-            super().save(state, restarts)
+            super().save(state, ledger)
             saves.append(int(state["observer"]["samples"][0]))
             slow.release()
 
@@ -375,13 +377,13 @@ async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_
 
 async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first sample is saved, and the state whenever the SOC has gone by so much."""
-    monkeypatch.setattr(live, "LOOK_S", 0.01)
+    monkeypatch.setattr(saving, "LOOK_S", 0.01)
     saved: asyncio.Queue[float] = asyncio.Queue()
     loop = asyncio.get_running_loop()
 
     class Noting(CheckpointFile):
-        def save(self, state: Any, restarts: int) -> None:
-            super().save(state, restarts)
+        def save(self, state: Any, ledger: Ledger) -> None:
+            super().save(state, ledger)
             loop.call_soon_threadsafe(saved.put_nowait, float(state["observer"]["soc"][0]))
 
     tables = {"state": {"checkpoint_s": 1e6}, "identifier": {"enabled": False}}
@@ -406,7 +408,8 @@ async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monke
 
 
 async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes_on(tmp_path: Path) -> None:
-    file = CheckpointFile(tmp_path / "absent", SETTINGS, CELL)
+    (tmp_path / "state").write_text("no folder")
+    file = CheckpointFile(tmp_path / "state", SETTINGS, CELL)
     async with often(file) as (source, sink, _):
         source.give((0.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved: "))
@@ -417,12 +420,12 @@ async def test_a_checkpoint_that_cannot_be_written_is_reported_and_the_loop_goes
 async def test_a_disk_that_is_full_is_not_tried_again_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "LOOK_S", 0.01)
+    monkeypatch.setattr(saving, "LOOK_S", 0.01)
     attempts = []
 
     class Full(CheckpointFile):
-        def save(self, state: Any, restarts: int) -> None:
-            attempts.append((state, restarts))
+        def save(self, state: Any, ledger: Ledger) -> None:
+            attempts.append((state, ledger))
             raise OSError(28, "No space left on device")
 
     settings = Settings.model_validate(
@@ -445,8 +448,8 @@ async def test_a_checkpoint_is_of_the_last_sample_and_not_of_a_later_time_withou
     states = []
 
     class Counting(CheckpointFile):
-        def save(self, state: Any, restarts: int) -> None:
-            super().save(state, restarts)
+        def save(self, state: Any, ledger: Ledger) -> None:
+            super().save(state, ledger)
             states.append(state["observer"]["samples"][0])
 
     async with often(Counting(tmp_path, SETTINGS, CELL)) as (source, sink, _):

@@ -13,6 +13,7 @@ from bms_estimator.snapshot.health import health_report
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.topics import estimate_report, info_report
+from bms_estimator.snapshot.totals import new_totals
 from bms_estimator.snapshot.window import Window
 
 NOW = 1_700_000_000.0
@@ -57,6 +58,8 @@ def _of(
             sensor_message=sensor_message,
             clock_ppm=None,
             delivery=delivery or Delivery(),
+            total=new_totals(NOW),
+            unseen_s=None,
         ),
         info_report(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW, temperature_sensor=False),
     )

@@ -1,0 +1,106 @@
+"""When the state is saved: with the first sample, as the SOC moves, once in a while, and at the end."""
+
+import asyncio
+from collections.abc import Callable
+
+import numpy as np
+import structlog
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.service.checkpoint import CheckpointFile, Ledger
+from bms_estimator.snapshot.publisher import Publisher
+from bms_estimator.snapshot.totals import Tally
+
+SAVED_SOC = 0.002
+"""How far the SOC may go from that of the checkpoint: a kill costs no more, beside what moves until the next start."""
+LOOK_S = 1.0
+"""How often it is seen how far it has gone [s]."""
+HUNG_S = 10.0
+"""A disk that has not taken the state for so long is said to hang [s]."""
+LAST_S = 5.0
+"""So long the end waits for the disk: who stops us waits for no more than a minute or so [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+class Saving:
+    """Saves what samples have taught; the disk is waited for in a thread, and nothing else waits for it.
+
+    Args:
+        checkpoint: Where to.
+        estimator: Read only.
+        publisher: Is told what becomes of it.
+        tally: What is counted over restarts.
+        restarts: Starts that found a checkpoint.
+    """
+
+    def __init__(
+        self, checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, tally: Tally, restarts: int
+    ) -> None:
+        self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
+        self._tally, self._restarts = tally, restarts
+        self._saved: tuple[int, float] | None = None
+        """Samples and SOC of the state that was saved last; None: none was by this run."""
+
+    async def save_often(self, every_s: float) -> None:
+        """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC`` or there is a first sample."""
+        await self._write(self._mark(clean=False))  # from now on a run that leaves no word has crashed
+        loop = asyncio.get_running_loop()
+        due_s, failed = 0.0, False
+        while True:
+            await asyncio.sleep(min(LOOK_S, every_s))
+            moved = self._saved is None or abs(self._estimator.state["soc"][0] - self._saved[1]) >= SAVED_SOC
+            if loop.time() >= due_s or (moved and not failed):
+                failed = not await self._save()
+                due_s = loop.time() + every_s
+
+    async def save_last(self) -> None:
+        """Save that the run has ended cleanly; a disk that hangs is left alone after ``LAST_S``."""
+        try:
+            async with asyncio.timeout(LAST_S):
+                await self._save(clean=True)
+        except TimeoutError:
+            log.warning("the disk hangs: the last checkpoint is not written", file=str(self._checkpoint.path))
+
+    @property
+    def _taught(self) -> tuple[int, float]:
+        """Samples and SOC now."""
+        state = self._estimator.state[0]
+        return int(state["samples"]), float(np.nan_to_num(state["soc"]))  # a fuel cell has none, NaN equals nothing
+
+    async def _save(self, *, clean: bool = False) -> bool:
+        """Save what is not saved yet: False, it cannot be written.
+
+        What is saved already keeps its time: it would seem to be of now, and not of before nobody measured.
+        """
+        taught = self._taught
+        if not taught[0] or taught == self._saved:
+            return not clean or await self._write(self._mark(clean=clean))
+        state, ledger = self._estimator.record.copy(), self._ledger(clean=clean)
+        if not await self._write(lambda: self._checkpoint.save(state, ledger)):
+            return False
+        self._publisher.checkpoint, self._saved = "saved", taught
+        return True
+
+    def _mark(self, *, clean: bool) -> Callable[[], None]:
+        ledger = self._ledger(clean=clean)
+        return lambda: self._checkpoint.mark(ledger)
+
+    def _ledger(self, *, clean: bool) -> Ledger:
+        return Ledger(self._restarts, self._tally.total, clean)
+
+    async def _write(self, write: Callable[[], None]) -> bool:
+        """Have the disk take something. False: it does not."""
+        file = str(self._checkpoint.path)
+        future = asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, write)
+        try:
+            await asyncio.wait({future}, timeout=HUNG_S)  # wait_for of Python 3.11 may swallow that we are to end
+            if not future.done():
+                self._publisher.checkpoint = "not saved: the disk hangs"
+                log.warning("checkpoint cannot be saved", file=file, error="the disk hangs")
+            await future
+        except OSError as error:
+            self._publisher.checkpoint = f"cannot be saved: {error}"
+            log.warning("checkpoint cannot be saved", file=file, error=str(error))
+            return False
+        return True

@@ -1,0 +1,181 @@
+"""What a pack's runs leave to the next: counters, crashes, unseen time, files of all formats, an SOC that a rest corrects."""
+
+import asyncio
+import shutil
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.settings import Settings
+from bms_estimator.service import saving
+from bms_estimator.service.checkpoint import FORMAT, CheckpointFile, Ledger
+from bms_estimator.service.live import new_estimator, run_live
+from bms_estimator.service.moment import Moment
+from bms_estimator.snapshot.totals import gap_lengths
+from tests.collector import Collector
+from tests.patience import LONG_S
+from tests.scripted_source import ScriptedSource
+from tests.service.test_checkpoint import CELL, NEW, SETTINGS, a_used_pack, edited, often, ran
+
+OLD_FILES = {4: 0.5762, 5: 0.4149}
+"""SOC by format: 4 is that of 0.1.0."""
+
+
+def at(hours: float) -> Moment:
+    return Moment(1.7e9 + 3600.0 * hours, synchronised=True, boot_s=5000.0 + 3600.0 * hours, boot="one")
+
+
+async def run_at(hours: float, folder: Path, *rows: tuple[float, float, float], settings: Settings = SETTINGS) -> Any:
+    """A run over ``rows`` that begins so late. Returns its estimator and its last snapshot."""
+    source, sink = ScriptedSource(), Collector()
+    source.give(*rows)
+    source.finish()
+    checkpoint = CheckpointFile(folder, settings, CELL, lambda: at(hours))
+    running = run_live(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    return await asyncio.wait_for(running, LONG_S), sink.snapshots[-1]
+
+
+async def test_counters_outlive_restarts_and_what_nobody_saw_is_added_up(tmp_path: Path) -> None:
+    await run_at(0.0, tmp_path, (0.0, 0.1, 3.8), (1.0, 0.1, 3.8), (1.5, 0.1, 9.9), (61.0, 0.1, 3.8), (62.0, 0.1, 3.8))
+    _, last = await run_at(1.0, tmp_path, (7.0, 0.1, 3.8), (8.0, 0.1, 3.8))
+    health = last.health
+    assert health.samples["samples"] == 2
+    assert health.samples["dropped_range"] == 0
+    assert health.total.samples["samples"] == 6
+    assert health.total.samples["dropped_range"] == 1
+    assert health.total.samples["gaps"] == 1
+    assert health.total.since.startswith("2023-11-14T22:13:20")
+    assert health.unseen_s == pytest.approx(3600.0, abs=LONG_S)
+    assert health.total.unseen_s == pytest.approx(health.unseen_s + 60.0)
+    assert (health.restarts, health.total.crashes) == (1, 0)
+
+
+async def test_a_run_without_a_sample_changes_no_counter_and_not_the_age_of_the_state(tmp_path: Path) -> None:
+    await run_at(0.0, tmp_path, (0.0, 0.1, 3.8))
+    await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))
+    found = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(2.0)).load()
+    assert found.unseen_s == pytest.approx(7200.0)
+    assert found.ledger.restarts == 2
+    assert found.ledger.total.samples["dropped_range"] == 1
+
+
+async def killed(folder: Path, *, with_a_sample: bool) -> None:
+    """A run that leaves no word: its last save is not made."""
+
+    class Killed(CheckpointFile):
+        def _write(self, content: dict[str, Any], ledger: Ledger) -> None:
+            if not ledger.clean:
+                super()._write(content, ledger)
+                written.set()
+
+    written = threading.Event()
+    async with often(Killed(folder, SETTINGS, CELL)) as (source, _, _):
+        if with_a_sample:
+            source.give((0.0, 0.1, 3.8))
+        assert await asyncio.to_thread(written.wait, LONG_S)
+
+
+async def test_starts_after_a_run_that_left_no_word_are_counted_as_crashes(tmp_path: Path) -> None:
+    counted = []
+    await ran(tmp_path, samples=1)
+    for with_a_sample in (True, False):
+        counted.append((await ran(tmp_path, samples=1)).health.total.crashes)
+        await killed(tmp_path, with_a_sample=with_a_sample)
+    counted.append((await ran(tmp_path, samples=1)).health.total.crashes)
+    counted.append((await ran(tmp_path, samples=1)).health.total.crashes)
+    assert counted == [0, 1, 2, 2]
+
+
+@pytest.mark.parametrize("version", OLD_FILES)
+async def test_checkpoints_of_all_formats_since_0_1_0_are_taken_up(tmp_path: Path, version: int) -> None:
+    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
+    name = "pack.npz" if version == 4 else checkpoint.path.name
+    shutil.copy(Path(__file__).with_name(f"checkpoint_format_{version}.npz"), tmp_path / name)
+    run = await ran(tmp_path, samples=1)
+    assert run.health.checkpoint == f"restored: SOC {OLD_FILES[version]}"
+    assert (run.health.restarts, run.health.total.crashes) == (4, 0)
+    assert run.health.total.since.startswith("2023-11-14T22:13:20")
+    with np.load(checkpoint.path) as now:
+        assert now["format"] == FORMAT
+    assert (await ran(tmp_path, samples=1)).health.restarts == 5
+
+
+async def test_a_checkpoint_that_is_older_than_configured_is_refused_and_without_that_none_is(tmp_path: Path) -> None:
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(a_used_pack().record, NEW)
+    for hours, settings, reason in (
+        (24 * 400.0, SETTINGS, ""),
+        (47.0, edited("state", longest_days=2.0), ""),
+        (49.0, edited("state", longest_days=2.0), "refused: it is 2.0 days old, state.longest_days is 2"),
+    ):
+        assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: at(hours)).load().reason == reason
+
+
+async def test_a_state_folder_that_is_deleted_is_made_anew_for_its_owner_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "state"
+    async with often(CheckpointFile(folder, SETTINGS, CELL)) as (source, sink, _):
+        for second in range(3):
+            seen = len(sink.snapshots)
+            source.give((float(second), 0.1, 3.8))
+            await sink.until(
+                lambda s, n=second + 1: s.health.samples["samples"] == n and s.health.checkpoint == "saved", skip=seen
+            )
+            while not folder.exists():  # noqa: ASYNC110 - the disk tells nobody
+                await asyncio.sleep(0.01)
+            assert folder.stat().st_mode & 0o777 == 0o700
+            shutil.rmtree(folder, ignore_errors=True)
+    assert [path.stat().st_mode & 0o777 for path in folder.iterdir()] == [0o600]
+
+
+async def test_a_disk_that_hangs_stops_neither_the_estimate_nor_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(saving, "HUNG_S", 0.01)
+    monkeypatch.setattr(saving, "LAST_S", 0.01)
+    release = threading.Event()
+
+    class Hung(CheckpointFile):
+        def save(self, *_: Any) -> None:
+            release.wait()
+
+    async with often(Hung(tmp_path, SETTINGS, CELL)) as (source, sink, task):
+        source.give((0.0, 0.1, 3.8))
+        await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs")
+        source.give((1.0, 0.1, 3.8))
+        await sink.until(lambda s: s.health.samples["samples"] == 2)
+        source.finish()
+        await asyncio.wait_for(task, LONG_S)
+    release.set()
+
+
+async def test_after_a_long_rest_the_soc_is_that_of_the_voltage_again(tmp_path: Path) -> None:
+    """The service was off for a week, in which somebody has charged the pack."""
+    estimator = new_estimator(SETTINGS, CELL)
+    for second in range(600):
+        estimator.step(float(second), 0.0, 3.75)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(estimator.record, NEW)
+    told, _ = await run_at(24.0 * 7.0, tmp_path, *((float(i), 0.0, 3.95) for i in range(60)))
+    fresh = new_estimator(Settings(), CELL)  # its SOC is that of its first voltage
+    fresh.step(0.0, 0.0, 3.95)
+    assert fresh.state["soc"][0] > estimator.state["soc"][0] + 0.3
+    assert told.state["soc"][0] == pytest.approx(fresh.state["soc"][0], abs=0.03)
+    assert abs(told.state["soc"][0] - fresh.state["soc"][0]) < 2.0 * told.record["filter"]["soc_std"][0]
+
+
+def test_gaps_are_measured_as_the_kernel_finds_them() -> None:
+    estimator, rng = new_estimator(SETTINGS, CELL), np.random.default_rng(5)
+    gap_s = float(estimator.settings["gap_s"][0])
+    steps = rng.choice([0.1, 1.0, 2.0 * gap_s, 100.0, -50.0], 400)
+    times = np.cumsum(steps)
+    found = []
+    for time_s in times:
+        gaps, before_s, step_s = (float(estimator.state[n][0]) for n in ("gaps", "time_s", "step_s"))
+        started = estimator.state["started"][0]
+        estimator.step(float(time_s), 0.0, 3.8)
+        if started:
+            one = gap_lengths(np.array([time_s]), before_s, step_s, gap_s, np.inf)
+            assert len(one) == estimator.state["gaps"][0] - gaps
+            found += one
+    assert gap_lengths(times[1:], float(times[0]), 0.0, gap_s, np.inf) == pytest.approx(found)
