@@ -1,10 +1,14 @@
 """``bms-estimator board``: what a board says of itself, and what is set once when it is new."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.service.serve import state_folder
+from bms_estimator.sources.board_memory import NO_BOARD, BoardMemory
 from bms_estimator.sources.ports import NoPortError, resolve_port
 from bms_estimator.sources.probe import AskedBoard
 from bms_estimator.sources.protocol import (
@@ -60,6 +64,13 @@ def board(
             min=1, max=2**32 - 1, help="sets the board's serial number; shown in hexadecimal", show_default=False
         ),
     ] = None,
+    accept: Annotated[
+        Path | None,
+        typer.Option(
+            help="settings of a pack: its service takes the next board that comes as the pack's; no port is opened",
+            show_default=False,
+        ),
+    ] = None,
     baud: Annotated[int, typer.Option(min=1200, help="of the board")] = BAUD,
 ) -> None:
     """Show what a board says of itself, and set what it keeps in its EEPROM: bandgap, gains and serial number.
@@ -67,6 +78,9 @@ def board(
     Voltage and current are as right as the bandgap is, which differs by up to 10 % from board to board, and as the gains
     of divider and current sensor are.
     """
+    if accept is not None:
+        _accept_next(load_settings(accept))
+        return
     try:
         with AskedBoard(resolve_port(port), baud) as asked:
             hello = asked.hello()
@@ -85,6 +99,25 @@ def board(
                 typer.echo(f"serial: was {hello.serial:08x}, now {told.serial:08x}")
     except NoPortError as error:
         raise UserError(str(error)) from None
+
+
+def _accept_next(settings: Settings) -> None:
+    """Have the pack's service forget its board.
+
+    Raises:
+        UserError: Its settings name the board, or the file cannot be written.
+    """
+    if settings.sensor.serial:
+        raise UserError(f"sensor.serial = {settings.sensor.serial}: the settings name the board; change it there")
+    memory = BoardMemory(state_folder(settings), settings.pack.name)
+    before = memory.load().get("serial")
+    try:
+        memory.keep(NO_BOARD)
+    except OSError as error:
+        raise UserError(f"{memory.path}: cannot be written: {error.strerror}") from error
+    typer.echo(
+        f"{f'board {before} is forgotten' if before else 'no board was known'}: the next that comes is the pack's"
+    )
 
 
 def _bandgap_v(asked: AskedBoard, hello: Hello, aref_v: float) -> float:

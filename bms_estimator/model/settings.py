@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
@@ -42,6 +42,11 @@ class SensorSettings(Strict):
     port: str = Field(
         default="auto", description="device path, best under /dev/serial/by-id; auto: the only board found"
     )
+    serial: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")] | None = Field(
+        default=None,
+        description='the only board that is taken, as `bms-estimator board` shows its number, such as "0000002a"; '
+        "the first that came, which is remembered, when left out",
+    )
     protocol: Literal["binary", "text"] = Field(default="binary", description="frames of the firmware, or text lines")
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(default=500_000)
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
@@ -52,6 +57,12 @@ class SensorSettings(Strict):
     voltage_noise_v: NotNegative | None = Field(
         default=None, description="standard deviation of one voltage sample; half a step when left out"
     )
+
+    @model_validator(mode="after")
+    def _text_has_no_serial(self) -> Self:
+        if self.serial and self.protocol == "text":
+            raise ValueError("serial: a board that prints text tells no serial number; leave it out")
+        return self
 
     @property
     def sample_period_s(self) -> float:

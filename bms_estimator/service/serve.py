@@ -21,6 +21,7 @@ from bms_estimator.service.notify import Notifier
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
+from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.serial_board import SerialBoard, Tap
 from bms_estimator.store.database import Database
 from bms_estimator.store.outbox import Outbox
@@ -60,7 +61,8 @@ async def serve(
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     delivery, all_sinks = Delivery(), list(sinks)
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
-    board = SerialBoard(settings.sensor, tap=tap)
+    memory = BoardMemory(folder, settings.pack.name) if folder else None
+    board = SerialBoard(settings.sensor, tap=tap, memory=memory)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     outbox = Outbox(database, most=settings.store.outbox_messages)
     if settings.mqtt is not None:

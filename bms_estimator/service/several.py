@@ -24,7 +24,9 @@ async def serve_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
     """
     names = [settings.pack.name for settings, _ in packs]
     _differ("pack.name", names)
-    _differ("sensor.port", [settings.sensor.port for settings, _ in packs])
+    sensors = [settings.sensor for settings, _ in packs]
+    _differ("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
+    _differ("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
     stop, notifier = stop_on_signal(), Notifier(names)
 
     async def serve_one(settings: Settings, cell: PackModel) -> None:

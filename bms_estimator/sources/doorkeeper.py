@@ -1,17 +1,26 @@
-"""Whether a board that was found is the one with which it began: under ``auto`` another may have been plugged in."""
+"""Whether the board on the line is the pack's: the one that was told, or remembered, or with which this run began.
+
+Another board has another divider: its voltages would be wrong by several percent, and nothing else would tell.
+"""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from threading import Thread
 
+import structlog
+
+from bms_estimator.sources.board_memory import NO_BOARD, REMEMBERED, BoardMemory
 from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.line import Read
 
 HELD_READS = 4096
 """So many reads are kept for a board that has not told its serial number yet: seconds at any rate."""
 
+log = structlog.get_logger(__name__)
+
 
 class OtherBoardError(Exception):
-    """The board's serial number is not the one with which it began."""
+    """The board's serial number is not that of the pack's."""
 
 
 class Doorkeeper:
@@ -19,40 +28,102 @@ class Doorkeeper:
 
     Args:
         make: A dialect that hears them meanwhile.
-
-    Attributes:
-        serial: Of the board with which it began; empty: any board may come.
+        serial: Of the pack's board, as the settings have it; empty: as remembered, else of the first board that comes.
+        memory: What outlives a restart; None: nothing does.
     """
 
-    def __init__(self, make: Callable[[], Dialect]) -> None:
-        self._make = make
-        self.serial = ""
+    def __init__(self, make: Callable[[], Dialect], serial: str = "", memory: BoardMemory | None = None) -> None:
+        self._make, self._told, self._memory = make, serial, memory
+        self._known: Mapping[str, str] = memory.load() if memory else {}
+        self._nameless = False
         self.stranger: Dialect | None = None
         """What hears a board that is not known yet."""
         self._held = deque[Read](maxlen=HELD_READS)
+
+    @property
+    def serial(self) -> str:
+        """Of the pack's board; empty: any may come."""
+        return self._told or self._known.get("serial", "")
 
     def opened(self) -> None:
         """The port was opened anew."""
         self.stranger = self._make() if self.serial else None
         self._held.clear()
 
-    def admit(self, read: Read) -> Sequence[Read]:
-        """The reads that may pass now.
+    def look_again(self) -> None:
+        """Take note that somebody has accepted another board. A file that is gone tells nothing of the kind."""
+        if self._memory and self._memory.load() == NO_BOARD:
+            self._known = NO_BOARD
+
+    def admit(self, read: Read, dialect: Dialect) -> Sequence[Read]:
+        """The reads that ``dialect``, which hears the pack's board, may be fed now.
 
         Raises:
-            OtherBoardError: None ever will.
+            OtherBoardError: Neither this one nor those after it.
         """
         if self.stranger is None:
+            if self.serial and (swapped := dialect.serial_in(read[1])) is not None:
+                self._check(swapped)
             return (read,)
         self._held.append(read)
         self.stranger.feed(*read)
-        found = self.stranger.board
-        if not found:
+        if not self.stranger.board:
             return ()
-        if (other := found.get("serial", "")) != self.serial:
-            raise OtherBoardError(
-                f"board {other or 'without a serial number'} is not the one with which this began, {self.serial}: "
-                "plug that in, or name the port in sensor.port and start anew"
-            )
+        self._check(self.stranger.board.get("serial", ""))
         self.stranger = None
         return list(self._held)
+
+    def know(self, board: Mapping[str, str]) -> None:
+        """Samples of ``board`` are taken: it is the pack's from now on. What has changed is said, and remembered."""
+        if not board:
+            return
+        if not board.get("serial"):
+            self._say_nameless()
+            return
+        before, self._known = self._known, {name: board.get(name, "") for name in REMEMBERED}
+        if self._known == before:
+            return
+        changes = [name for name in REMEMBERED if before.get(name) and before[name] != self._known[name]]
+        if changes:
+            changed = {name: f"{before[name]} to {self._known[name]}" for name in changes}
+            log.warning(
+                "the board is calibrated differently" if "serial" not in changes else "another board", **changed
+            )
+        else:
+            log.info("this is the pack's board from now on", **self._known)
+        if self._memory:  # a disk that hangs holds up nothing
+            Thread(target=_keep, args=(self._memory, self._known), daemon=True).start()
+
+    def _check(self, found: str) -> None:
+        """Let a board in.
+
+        Raises:
+            OtherBoardError: It is another.
+        """
+        if found == self.serial:
+            return
+        accept = (
+            "or set sensor.serial to its number"
+            if self._told
+            else "or, if it takes its place, run `bms-estimator board --accept` with the pack's settings file"
+            if self._memory
+            else "or start anew"
+        )
+        raise OtherBoardError(
+            f"board {found or 'without a serial number'} is not the pack's, {self.serial}: plug that in, {accept}"
+        )
+
+    def _say_nameless(self) -> None:
+        if not self._nameless:
+            self._nameless = True
+            log.warning(
+                "the board has no serial number: another in its place would not be noticed",
+                hint="give it one with `bms-estimator board --serial`",
+            )
+
+
+def _keep(memory: BoardMemory, board: Mapping[str, str]) -> None:
+    try:
+        memory.keep(board)
+    except OSError as error:
+        log.warning("the board cannot be remembered", file=str(memory.path), reason=str(error))

@@ -1,5 +1,6 @@
 """The binary board's bytes to samples: ``wire.framing`` with its state, its messages and its counters."""
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import Enum
@@ -9,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.sources.protocol import Ack, AckResult, Hello, MessageType
+from bms_estimator.sources.protocol import DELIMITER, Ack, AckResult, Hello, MessageType, ProtocolError, unseal
 from bms_estimator.sources.wire.board_clock import clock_ppm
-from bms_estimator.sources.wire.framing import DECODER, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
+from bms_estimator.sources.wire.framing import DECODER, HELLO_BYTES, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
 from bms_estimator.sources.wire.scaling import SCALING, reference
 
 CurrentSign = Literal["discharge_positive", "charge_positive"]
@@ -22,6 +23,8 @@ PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
 """What printed lines are made of."""
 MOST_CLOCK_PPM = 20_000.0
 """No resonator is so far off: the host slept meanwhile, or the board is a simulated one in a hurry [1e-6]."""
+HELLO_FRAME_BYTES = HELLO_BYTES + 1
+"""Of a hello in COBS, without its delimiter."""
 _MESSAGES = 8
 
 
@@ -99,8 +102,11 @@ class FrameDecoder:
             return {}
         return {
             "firmware": hello.firmware,
-            "serial": f"{hello.serial:08x}" if hello.serial else "",
+            "serial": _hexadecimal(hello.serial),
             "sample_rate_hz": str(hello.rate_hz),
+            "divider": f"{hello.divider_ppm * 1e-6:g}",
+            "volts_per_ampere": f"{hello.current_uv_per_a * 1e-6:g}",
+            "bandgap_v": f"{hello.bandgap_uv * 1e-6:g}",
         }
 
     @property
@@ -139,6 +145,16 @@ class FrameDecoder:
         if state["frames_received"] == 0 and state["before_hello"] > 0:
             return FrameFault.NO_HELLO
         return None
+
+    def serial_in(self, data: bytes) -> str | None:
+        """Serial number of the last hello that ends in ``data``, which is not fed; empty of a board that has none."""
+        state, found = self._state[0], None
+        begun = state["buffer"][: state["length"]].tobytes()
+        for frame in (begun + data).split(DELIMITER)[:-1]:
+            if len(frame) == HELLO_FRAME_BYTES:
+                with contextlib.suppress(ProtocolError):
+                    found = _hexadecimal(Hello.decode(unseal(frame)).serial)
+        return found
 
     def forget_hello(self) -> None:
         """There is none until the next comes; samples keep the scaling of the last."""
@@ -207,6 +223,10 @@ class FrameDecoder:
         elif packet[3] in _ACK_RESULTS:
             self._acks.append(Ack.decode(packet[: 2 + Ack.LAYOUT.size].tobytes()))
             del self._acks[:-_MESSAGES]
+
+
+def _hexadecimal(serial: int) -> str:
+    return f"{serial:08x}" if serial else ""
 
 
 _ACK_RESULTS = frozenset(AckResult)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import structlog
 
 from bms_estimator.model.clock import since_boot
-from bms_estimator.sources.ports import NoPortError, open_port, resolve_port
+from bms_estimator.sources.ports import NoPortError
 
 if TYPE_CHECKING:
     import serial
@@ -34,8 +34,7 @@ class Line:
     Arrival times are the wall clock at start plus a clock that never steps since; it goes on while the machine sleeps.
 
     Args:
-        port: Device path, or ``auto``.
-        baud: [1/s].
+        open_next: Opens the port, wherever it is: its path, and the port.
         say: Is told why the port is not open.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
@@ -48,15 +47,14 @@ class Line:
 
     def __init__(
         self,
-        port: str,
-        baud: int,
+        open_next: Callable[[], tuple[str, "serial.Serial"]],
         *,
         say: Callable[[str], None],
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
         first_retry_s: float = FIRST_RETRY_S,
     ) -> None:
-        self._name, self._baud, self._say = port, baud, say
+        self._open_next, self._say = open_next, say
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
         self._reads: asyncio.Queue[Read | None] = asyncio.Queue()
@@ -80,8 +78,7 @@ class Line:
             await asyncio.sleep(self._retry_s)
             self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
             try:
-                path = resolve_port(self._name)
-                self._port = open_port(path, self._baud)
+                path, self._port = self._open_next()
             except (NoPortError, OSError) as error:
                 self._say(f"waiting for {error}")
                 continue

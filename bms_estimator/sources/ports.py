@@ -53,17 +53,22 @@ def resolve_port(port: str) -> str:
         if not Path(port).exists():
             raise NoPortError(f"{port}: it does not exist")
         return port
-    there = [port for port in list_ports.comports() if port.vid is not None]
-    names = {os.path.realpath(path): str(path) for path in stable_names()}
-    found = sorted(names.get(os.path.realpath(port.device), port.device) for port in there if may_be_board(port))
+    found = board_ports()
     if len(found) == 1:
         return found[0]
     if found:
         raise NoPortError(f"auto: {len(found)} serial ports are there; choose one: {', '.join(found)}")
-    if there:
+    if there := [port for port in list_ports.comports() if port.vid is not None]:
         others = ", ".join(f"{port.device} ({port.product or port.description})" for port in there)
         raise NoPortError(f"auto: no port of a known board is there; if it is one of these, name it: {others}")
     raise NoPortError("auto: no USB serial port is there")
+
+
+def board_ports() -> list[str]:
+    """Ports that may be a board's, under their stable names where they have one."""
+    names = {os.path.realpath(path): str(path) for path in stable_names()}
+    there = [port.device for port in list_ports.comports() if may_be_board(port)]
+    return sorted(names.get(os.path.realpath(device), device) for device in there)
 
 
 def may_be_board(port: ListPortInfo) -> bool:
@@ -87,7 +92,9 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
         return serial.Serial(path, baud, timeout=timeout_s, exclusive=True)
     except (OSError, termios.error, ValueError, OverflowError) as error:  # a port may die while it is opened
         if isinstance(error, OSError) and error.errno in (errno.EBUSY, errno.EAGAIN):
-            raise NoPortError(f"{path}: held by {holder(path) or 'another process'}") from None
+            raise NoPortError(
+                f"{path}: held by {holder(path) or 'another process, or another pack of this one'}"
+            ) from None
         raise NoPortError(f"{path}: cannot be opened: {error}") from None
 
 

@@ -5,7 +5,7 @@ import contextlib
 import math
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from typing import Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import structlog
 
@@ -13,10 +13,16 @@ from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
 from bms_estimator.sources.line import FIRST_RETRY_S, Line, Read
+from bms_estimator.sources.ports import NoPortError, open_port
+from bms_estimator.sources.whereabouts import HELD_S, LEFT_S, Whereabouts
+
+if TYPE_CHECKING:
+    import serial
 
 TALK_S = 0.25
 """So often is sent what is due [s]."""
@@ -50,10 +56,11 @@ class SerialBoard:
     """Async source of SAMPLE blocks from a board.
 
     All that makes a sample passes ``dialect.feed(arrival_s, data)``: a capture of these calls replays to the same bits.
-    With the port ``auto`` it stays with the first board that tells a serial number.
+    It stays with the pack's board, and looks for it on other ports, as ``Doorkeeper`` and ``Whereabouts`` say.
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
+        memory: Remembers the pack's board; None: it is known for this run only.
         tap: Gets the same (arrival time, bytes) as the dialect.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
@@ -65,6 +72,7 @@ class SerialBoard:
         self,
         settings: SensorSettings,
         *,
+        memory: BoardMemory | None = None,
         tap: Tap | None = None,
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
@@ -75,10 +83,10 @@ class SerialBoard:
         self._monotonic, self._silent_s = monotonic, silent_s
         make_dialect(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
         self._dialect = make_dialect(settings)
-        self._door = Doorkeeper(lambda: make_dialect(settings))
+        self._door = Doorkeeper(lambda: make_dialect(settings), settings.serial or "", memory)
+        self._where = Whereabouts(settings.port, monotonic)
         self._line = Line(
-            settings.port,
-            settings.baud,
+            self._open_next,
             say=self._say,
             wall=wall,
             monotonic=monotonic,
@@ -86,7 +94,8 @@ class SerialBoard:
         )
         self._message: str | None = "not opened yet"
         self._openings = 0  # of the line, as far as its reads have been taken
-        self._refused = False  # the message says why a board is not taken
+        self._refused = False  # the message says why what is on the port is not taken
+        self._path = ""  # of the port that is open
         self._logged_s = -math.inf
         self._logged_faults = 0
         self._decoded = asyncio.Event()
@@ -154,12 +163,17 @@ class SerialBoard:
             self._door.opened()
             return ()
         try:
-            return self._door.admit(read)
+            return self._door.admit(read, self._dialect)
         except OtherBoardError as error:
-            self._say(f"refused: {error}")
-            self._refused = True
-            self._line.lost.set()
+            self._leave(f"{self._path}: refused: {error}")
             return ()
+
+    def _leave(self, message: str) -> None:
+        """What is on the port is not taken: look elsewhere."""
+        self._say(message)
+        self._refused = True
+        self._where.leave(self._path, LEFT_S)
+        self._line.lost.set()
 
     @property
     def _listener(self) -> Dialect:
@@ -202,10 +216,25 @@ class SerialBoard:
         if command.refusal:
             raise UserError(command.refusal)
 
+    def _open_next(self) -> tuple[str, "serial.Serial"]:
+        """Open the port on which the board may be.
+
+        Raises:
+            NoPortError: There is none, or it cannot be opened.
+        """
+        path = self._where.next(self._door.serial)
+        try:
+            return path, open_port(path, self._settings.baud)
+        except NoPortError:
+            self._where.leave(path, HELD_S)
+            raise
+
     async def _stay_open(self) -> None:
         """Open, attend until lost, and again."""
         while True:
-            path = await self._line.open()
+            if self._refused:
+                await asyncio.to_thread(self._door.look_again)
+            path = self._path = await self._line.open()
             try:
                 await self._attend(path)
             finally:
@@ -224,15 +253,21 @@ class SerialBoard:
             now_s = self._monotonic()
             if self._frames() != frames:
                 heard_s, frames = now_s, self._frames()
-                if self._settings.port == "auto" and not self._door.serial:
-                    self._door.serial = self.board.get("serial", "")
+                self._door.know(self.board)
             elif self._refused:
                 continue
             elif fault := self._listener.fault:
-                self._say(f"{path} at {self._settings.baud} baud: {fault}")
+                self._say_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
             elif now_s - heard_s >= self._silent_s:
-                self._say(f"{path}: open, but silent")
+                self._say_or_leave(f"{path}: open, but silent")
             self._log_faults()
+
+    def _say_or_leave(self, message: str) -> None:
+        """Say why no samples come, and look elsewhere where the board only might be."""
+        if self._where.may_stay:
+            self._say(message)
+        else:
+            self._leave(message)
 
     async def _talk(self) -> None:
         """Send what falls due, until it is time to look whether samples come or the line is lost."""

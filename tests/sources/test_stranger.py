@@ -1,4 +1,4 @@
-"""What is on the port need not be the board: nothing is sent to a stranger, and under ``auto`` one board is kept to."""
+"""What is on the port need not be the board: nothing is sent to a stranger, and under ``auto`` one board is kept to; ``test_pinned_board`` has the rest."""
 
 import asyncio
 import contextlib
@@ -124,7 +124,7 @@ async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -
         await until(lambda: source.message)
         async with plugged_in(auto, serial=2, voltage_v=11.1):
             await until(lambda: source.message and "refused" in source.message)
-            assert "board 00000002 is not the one with which this began, 00000001" in (source.message or "")
+            assert "board 00000002 is not the pack's, 00000001" in (source.message or "")
             await until(lambda: source.counters["reconnects"] >= 2)  # it was looked at once more
         taken_before = len(blocks)
         async with plugged_in(auto, serial=1):
@@ -144,12 +144,3 @@ async def test_auto_says_what_comes_in_place_of_its_own_board(auto: Path) -> Non
             await until(lambda: source.message and "prints text" in source.message)
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-
-
-async def test_a_port_that_was_named_may_hold_another_board(auto: Path) -> None:
-    blocks = list[SampleBlock]()
-    source = SerialBoard(SensorSettings(port=str(auto)), first_retry_s=0.05)
-    async with taken(source, blocks):
-        for serial in (1, 2):
-            async with plugged_in(auto, serial=serial):
-                await until(lambda serial=serial: source.board.get("serial") == f"{serial:08x}")

@@ -80,6 +80,10 @@ class Dialect(ABC):
         self.cells = cell_block(cells)
         return np.concatenate(blocks)
 
+    def serial_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for those that tell one
+        """Serial number that the device would have told by the end of ``data``, which is not fed; None: it would tell none there."""
+        return None
+
     def opened(self) -> None:  # noqa: B027 - most have nothing to forget
         """The port was opened anew: what comes next may be another device's, or the same one's after a reset."""
 

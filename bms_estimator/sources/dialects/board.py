@@ -88,6 +88,10 @@ class BoardDialect(Dialect):
         """Full range of the board's converter [V]; NaN before it is known."""
         return self._decoder.reference_v
 
+    def serial_in(self, data: bytes) -> str | None:
+        """Of the last hello that ends in ``data``."""
+        return self._decoder.serial_in(data)
+
     def opened(self) -> None:
         """There is no hello until the next comes, nor is a command given again; samples keep the scaling of the last."""
         self._decoder.forget_hello()

@@ -1,0 +1,73 @@
+"""The board that a pack's service remembers from one start to the next: its serial number and its calibration."""
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import structlog
+
+REMEMBERED = ("serial", "divider", "volts_per_ampere", "bandgap_v")
+"""Of what a board says of itself."""
+NO_BOARD: Mapping[str, str] = dict.fromkeys(REMEMBERED, "")
+"""What stands in the file once another board is to be accepted."""
+_SERIAL = re.compile(r"([0-9a-f]{8})?")
+LONGEST_FILE = 4096
+"""A longer file is none of ours [bytes]."""
+
+log = structlog.get_logger(__name__)
+
+
+class BoardMemory:
+    """``<pack.name>.board.json`` in the state folder, for its owner alone.
+
+    A file of its own, not the checkpoint: that one is kept for each meaning of the state and begins anew with another
+    cell, while the board on the line stays the same; and what is in it may be read, and forgotten, by a person.
+
+    Args:
+        folder: The state folder.
+        pack: The pack's name.
+    """
+
+    def __init__(self, folder: Path, pack: str) -> None:
+        self.path = folder / f"{pack}.board.json"
+
+    def load(self) -> Mapping[str, str]:
+        """What was kept last; empty where nothing was, or nothing that can be used, which is logged."""
+        try:
+            descriptor = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            with open(descriptor, "rb") as file:  # noqa: PTH123 - a descriptor has no Path
+                return _checked(json.loads(file.read(LONGEST_FILE)))
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, RecursionError) as error:
+            log.warning("the board of the last run is not known", file=str(self.path), reason=str(error))
+            return {}
+
+    def keep(self, board: Mapping[str, str]) -> None:
+        """Write atomically.
+
+        Raises:
+            OSError: The disk does not take it.
+        """
+        new = self.path.with_suffix(".new")
+        new.unlink(missing_ok=True)
+        with open(new, "xb", opener=lambda path, flags: os.open(path, flags, 0o600)) as file:
+            file.write(json.dumps(dict(board)).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(self.path)
+
+
+def _checked(found: object) -> Mapping[str, str]:
+    """What a file held.
+
+    Raises:
+        ValueError: It is no board.
+    """
+    if not isinstance(found, dict) or not all(isinstance(found.get(name), str) for name in REMEMBERED):
+        raise ValueError("it tells no board")
+    if not _SERIAL.fullmatch(found["serial"]):
+        raise ValueError(f"serial {found['serial'][:20]!r} is none")
+    return {name: found[name] for name in REMEMBERED}
