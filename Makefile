@@ -11,7 +11,7 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare anywhere unseen chapter5 ablation learning fuelcell firmware kernels lock
+.PHONY: help venv apt check test demo benchmark compare anywhere unseen soak chapter5 ablation learning fuelcell firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -55,6 +55,9 @@ chapter5: venv ## the experiments of the thesis's chapter 5 on real captures, be
 
 unseen: venv ## the SOC through kills, restarts and gaps, on real captures: minutes
 	@$(BIN)/python -m tests.benchmarks.unseen $(ARGS)
+
+soak: venv ## service, broker and line killed at random, e.g. make soak ARGS="1000 3600 1": kills, seconds, seed
+	@$(BIN)/python -m tests.benchmarks.soak $(ARGS)
 
 ablation: venv ## what each part of the filter is worth, on real captures, e.g. make ablation ARGS=LFP: minutes
 	@$(BIN)/python -m tests.benchmarks.ablation $(ARGS)

@@ -18,9 +18,9 @@ class Row:
     met: bool | None
 
 
-def show(rows: Iterable[Row]) -> bool:
+def show(rows: Iterable[Row], title: str = "bms_estimator benchmarks") -> bool:
     """Print the rows as they come. Returns whether all targets were met."""
-    table = Table(title="bms_estimator benchmarks")
+    table = Table(title=title)
     for column in ("what", "target", "measured", "met"):
         table.add_column(column)
     all_met = True
