@@ -33,7 +33,7 @@ from tests.command_line import PROGRAM
 from tests.mosquitto import Broker
 from tests.patience import LONG_S
 
-CELL, SERIES, RATE_HZ, PUBLISH_RATE_HZ = "ncr18650", 4, 50, 2
+CELL, SERIES, SOC, RATE_HZ, PUBLISH_RATE_HZ = "ncr18650", 4, 0.8, 50, 2
 DIVIDER = 4.0
 LOAD_C = 1.5
 """Steps of the load reach from a quarter of it, charging, to all of it."""
@@ -53,6 +53,9 @@ PACK = """
 name = "soak"
 cell = "{cell}"
 series = {series}
+initial_soc = {soc}
+[identifier]
+soc_std = 0.02
 [sensor]
 port = "{folder}/board"
 sample_rate_hz = {rate_hz}
@@ -71,7 +74,7 @@ class Sensors:
 
     def __init__(self, account: Account) -> None:
         cell = load_cell(CELL).pack(SERIES, 1)
-        self._pack = SimulatedPack(cell, random_steps(LOAD_C * cell.cell.capacity_ah, 1), soc=0.8)
+        self._pack = SimulatedPack(cell, random_steps(LOAD_C * cell.cell.capacity_ah, 1), soc=SOC)
         self._account, self._begin_s, self.offset_s = account, time.monotonic(), 0.0
 
     def plug(self, board_s: float) -> None:
@@ -112,7 +115,14 @@ class Soak:
         self.board = VirtualBoard(self.sensors, rate_hz=RATE_HZ, parts=BoardParts(divider=DIVIDER))
         self.log = self.folder / "log"
         self.pack = self.folder / "pack.toml"
-        values = {"cell": CELL, "series": SERIES, "folder": self.folder, "url": self.broker.url, "rate_hz": RATE_HZ}
+        values = {
+            "cell": CELL,
+            "soc": SOC,
+            "series": SERIES,
+            "folder": self.folder,
+            "url": self.broker.url,
+            "rate_hz": RATE_HZ,
+        }
         resolution_v = 5.0 * DIVIDER / 1024
         self.pack.write_text(PACK.format(**values, publish_rate_hz=PUBLISH_RATE_HZ, resolution_v=resolution_v))
 
@@ -125,6 +135,8 @@ class Soak:
             self.service = await self._start()
             stack.push_async_callback(self._end_service)
             await self._states_after(time.time())
+            while not any((self.folder / "state").glob("*.npz")):  # noqa: ASYNC110 - nobody tells when a file is there
+                await asyncio.sleep(0.05)
             faults = {"service": (SERVICE_S, self._kill_service), "line": (LINE_S, self._kill_line)}
             faults["broker"] = (BROKER_S, self._kill_broker)
             await asyncio.gather(*(self._again(name, *fault) for name, fault in faults.items()))
