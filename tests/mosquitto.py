@@ -4,6 +4,7 @@ import asyncio
 import getpass
 import json
 import shutil
+import signal
 import socket
 import subprocess
 import time
@@ -52,6 +53,15 @@ class Broker:
                     return self
             time.sleep(0.02)
         raise AssertionError("mosquitto did not start")
+
+    def freeze(self) -> None:
+        """It answers nothing, though the kernel still accepts its connections."""
+        assert self._process
+        self._process.send_signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        assert self._process
+        self._process.send_signal(signal.SIGCONT)
 
     def stop(self) -> None:
         if self._process is not None:

@@ -6,7 +6,7 @@ import logging
 import socket
 from collections.abc import AsyncIterator, Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import aiomqtt
 import structlog
@@ -22,11 +22,6 @@ from bms_estimator.sinks.connection import Hello, LinkError, Received
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sinks.reasons import UNSUPPORTED_VERSION, words
 
-KEEPALIVE_S = 10
-"""After so long a silence the broker is asked for a sign of life, for which it has as long again. One that lost us
-without a word publishes the will after one and a half times this [s]."""
-ACKNOWLEDGED_S = 15.0
-"""A broker that lives but takes longer to acknowledge is lost; NATS takes 10 s to find a new leader [s]."""
 PARTING_S = 1.0
 """A connection that broke cannot be ended in good order [s]."""
 NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -54,6 +49,21 @@ _logger.propagate = False
 _logger.addHandler(_ToLog())
 
 
+class Patience(NamedTuple):
+    """How long silence is borne."""
+
+    connected_s: float = 10.0
+    """Name server, TCP, TLS and the broker's answer together may take so long [s]."""
+    keepalive_s: int = 10
+    """After so long a silence the broker is asked for a sign of life, for which it has as long again. One that lost us
+    without a word publishes the will after one and a half times this [s]."""
+    acknowledged_s: float = 15.0
+    """A broker that lives but takes longer for a message is lost; NATS takes 10 s to find a new leader [s]."""
+
+
+PATIENCE = Patience()
+
+
 class ClosedError(aiomqtt.MqttError):
     """The broker has closed the connection in place of an answer to CONNECT."""
 
@@ -65,9 +75,10 @@ class Client(aiomqtt.Client):
         arguments: Address, name, password and TLS for aiomqtt.
         protocol: Which MQTT.
         hello: How it begins.
+        patience: When it is taken as lost.
     """
 
-    def __init__(self, arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello) -> None:
+    def __init__(self, arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello, patience: Patience) -> None:
         limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
         limit.MaximumPacketSize = MOST_BYTES
         self._is_5 = protocol is ProtocolVersion.V5
@@ -77,12 +88,13 @@ class Client(aiomqtt.Client):
             properties=limit if self._is_5 else None,
             identifier=hello.identifier,
             will=aiomqtt.Will(*hello.will),
-            keepalive=KEEPALIVE_S,
+            keepalive=patience.keepalive_s,
             max_queued_incoming_messages=MOST_WAITING,
             queue_type=partial(Inbox, hello.lose),  # type: ignore[arg-type]  # it is only called
             socket_options=[NO_DELAY],
             logger=_logger,
         )
+        self._acknowledged_s = patience.acknowledged_s
         self.protocol = "MQTT 5" if self._is_5 else "MQTT 3.1.1"
         self._answers: dict[int, asyncio.Future[str | None]] = {}
         self._in_flight = asyncio.Semaphore(self._client.max_inflight_messages)
@@ -101,10 +113,10 @@ class Client(aiomqtt.Client):
             answer: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
             self._answers[info.mid] = answer
             try:
-                async with asyncio.timeout(ACKNOWLEDGED_S):
+                async with asyncio.timeout(self._acknowledged_s):
                     return await answer
             except TimeoutError:
-                raise LinkError(f"the broker has not acknowledged a message for {ACKNOWLEDGED_S:g} s") from None
+                raise LinkError(f"the broker has not acknowledged a message for {self._acknowledged_s:g} s") from None
             finally:
                 self._answers.pop(info.mid, None)
 
@@ -181,13 +193,15 @@ class Client(aiomqtt.Client):
 
 
 @contextlib.asynccontextmanager
-async def connected(arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello) -> AsyncIterator[Client]:
+async def connected(
+    arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello, patience: Patience
+) -> AsyncIterator[Client]:
     """A connection while the context lasts.
 
     Raises:
         aiomqtt.MqttError: The broker cannot be reached, or refuses.
     """
-    client = Client(arguments, protocol, hello)
+    client = Client(arguments, protocol, hello, patience)
     try:
         await client.__aenter__()
     except BaseException:

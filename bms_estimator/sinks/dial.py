@@ -11,11 +11,8 @@ from aiomqtt import ProtocolVersion
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks.brokers import Broker, password, tls_context
-from bms_estimator.sinks.client import Client, connected, may_know_3_1_1, refusal
+from bms_estimator.sinks.client import PATIENCE, Client, Patience, connected, may_know_3_1_1, refusal
 from bms_estimator.sinks.connection import Hello, LinkError
-
-CONNECTED_S = 10.0
-"""Name server, TCP, TLS and the broker's answer together may take so long [s]."""
 
 
 class Dial:
@@ -23,11 +20,11 @@ class Dial:
 
     Args:
         settings: Name, password and certificates. The files are read anew for each connection.
-        connected_s: How long one connection may take [s].
+        patience: How long silence is borne.
     """
 
-    def __init__(self, settings: MqttSettings, connected_s: float = CONNECTED_S) -> None:
-        self._settings, self._connected_s = settings, connected_s
+    def __init__(self, settings: MqttSettings, patience: Patience = PATIENCE) -> None:
+        self._settings, self._patience = settings, patience
         self._silent: set[str] = set()  # gave no answer at all to MQTT 5, as a stopped broker does, and a very old one
 
     @contextlib.asynccontextmanager
@@ -51,16 +48,18 @@ class Dial:
     ) -> Client:
         protocol = ProtocolVersion.V311 if url in self._silent else ProtocolVersion.V5
         try:
-            async with asyncio.timeout(self._connected_s):
+            async with asyncio.timeout(self._patience.connected_s):
                 try:
-                    return await stack.enter_async_context(connected(arguments, protocol, hello))
+                    return await stack.enter_async_context(connected(arguments, protocol, hello, self._patience))
                 except aiomqtt.MqttError as error:
                     if protocol is ProtocolVersion.V311 or not may_know_3_1_1(error):
                         raise
-                return await stack.enter_async_context(connected(arguments, ProtocolVersion.V311, hello))
+                return await stack.enter_async_context(
+                    connected(arguments, ProtocolVersion.V311, hello, self._patience)
+                )
         except TimeoutError:
             self._silent ^= {url}  # the other version next time
-            raise LinkError(f"no answer within {self._connected_s:g} s") from None
+            raise LinkError(f"no answer within {self._patience.connected_s:g} s") from None
 
     def _arguments(self, broker: Broker) -> dict[str, Any]:
         """For aiomqtt; reads files.

@@ -190,6 +190,7 @@ def test_check_warns_of_a_credential_that_only_the_running_service_sees(name, pa
 def test_check_finds_a_credential_by_its_name_alone(pack, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     (tmp_path / "mqtt-password").write_text("secret\n")
+    (tmp_path / "mqtt-password").chmod(0o600)
     pack.write_text('[mqtt]\npassword_file = "mqtt-password"\n')
     assert run(capsys, "config", "check", pack)[::2] == (0, "")
 

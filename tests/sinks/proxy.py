@@ -17,14 +17,16 @@ class Proxy:
 
     Attributes:
         port: Where it listens.
+        swallows: All that comes from either side is lost, and nobody hears of it; for connections of that time for good.
+        away: Who comes is turned away.
         half_open_ended: Set when the broker has ended a connection that was left half-open.
     """
 
     def __init__(self, port: int, *, knows_5: bool = True) -> None:
         self._broker_port, self._knows_5 = port, knows_5
-        self._clients: list[asyncio.StreamWriter] = []
+        self._clients: list[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = []
         self._tasks: set[asyncio.Task[None]] = set()
-        self._half_open = False
+        self._half_open = self.swallows = self.away = False
         self.half_open_ended = asyncio.Event()
 
     @property
@@ -42,10 +44,18 @@ class Proxy:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
+    def leave(self) -> None:
+        """The network is away: both ends of all connections hear of it, and who comes is turned away."""
+        self.away = True
+        for client, broker in self._clients:
+            client.transport.abort()
+            broker.transport.abort()
+        self._clients = []
+
     def cut(self) -> None:
         """The clients lose their connections, of which the broker hears nothing."""
         self._half_open = True
-        for client in self._clients:
+        for client, _ in self._clients:
             client.transport.abort()
         self._clients = []
 
@@ -59,17 +69,22 @@ class Proxy:
         self._tasks.discard(task)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self.away:
+            return
         start = await reader.readuntil(b"MQTT") + await reader.readexactly(1)
         if start.endswith(b"\x05") and not self._knows_5:
             writer.write(REFUSED)
             await writer.drain()
             return
+        while self.swallows:  # what came is lost
+            if not await reader.read(65_536):
+                return
         from_broker, to_broker = await asyncio.open_connection("127.0.0.1", self._broker_port)
         to_broker.write(start)
-        self._clients.append(writer)
-        up = asyncio.create_task(pump(reader, to_broker))
+        self._clients.append((writer, to_broker))
+        up = asyncio.create_task(self._pump(reader, to_broker))
         try:
-            await pump(from_broker, writer)
+            await self._pump(from_broker, writer)
             while await from_broker.read(4096):  # the client is gone, the broker does not know
                 pass
             if self._half_open:
@@ -78,12 +93,14 @@ class Proxy:
             up.cancel()
             to_broker.transport.abort()
 
-
-async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Hand on until either end is gone."""
-    with contextlib.suppress(ConnectionError):
-        while data := await reader.read(65_536):
-            if writer.transport.is_closing():
-                return
-            writer.write(data)
-            await writer.drain()
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Hand on until either end is gone."""
+        lost = False
+        with contextlib.suppress(ConnectionError):
+            while data := await reader.read(65_536):
+                lost |= self.swallows
+                if writer.transport.is_closing():
+                    return
+                if not lost:
+                    writer.write(data)
+                    await writer.drain()

@@ -3,7 +3,7 @@ import json
 import subprocess
 from collections.abc import AsyncIterator, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import aiomqtt
 import pytest
@@ -21,11 +21,12 @@ from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.link import LONGEST_DELAY_S, Link
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sinks.mqtt import MqttSink
-from bms_estimator.sinks.requests import NAMES, Requests
+from bms_estimator.sinks.requests import Requests
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.patience import LONG_S
 from tests.sinks.proxy import Proxy
+from tests.sinks.service import Sink, until
 from tests.sinks.snapshots import ONE, snapshot
 
 MOST_KEPT = 4
@@ -35,42 +36,8 @@ HELLO = Hello("test", Message("bms/pack/availability", b"offline", 1, retain=Tru
 DYNAMIC_SECURITY = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
 
 
-class Sink:
-    """A sink for the pack, and what it counts; every request is answered with its name."""
-
-    def __init__(self, url: str, **options: Any) -> None:
-        self.delivery = Delivery()
-        self.requests = Requests(self.delivery, ["set_soc", "current_zero"])
-        self.asked: list[str] = []
-        for name in NAMES:
-            self.requests.offer(name, self._handler(name))
-        options = {"first_delay_s": 0.1, "birth_delay_s": 0.1} | options
-        outbox = Outbox(None, most=MOST_KEPT)
-        self.mqtt = MqttSink(MqttSettings(url=url), "pack", self.requests, self.delivery, outbox, **options)
-
-    def _handler(self, name: str) -> Any:
-        async def answer(_: Mapping[str, Any]) -> Mapping[str, Any]:
-            self.asked.append(name)
-            return {"name": name}
-
-        return answer
-
-    async def __aenter__(self) -> Self:
-        await self.mqtt.__aenter__()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.mqtt.__aexit__(None, None, None)
-
-
 async def never(_: Connection) -> None:
     raise AssertionError("there is no broker")
-
-
-async def until(condition: Any) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - counters have no event
-            await asyncio.sleep(0.01)
 
 
 @pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])

@@ -1,0 +1,72 @@
+"""A sink as the service has it, and states that can be told apart."""
+
+import asyncio
+import itertools
+import json
+from collections.abc import Callable, Mapping
+from typing import Any, Self
+
+from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.settings import MqttSettings
+from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.backlog import WINDOW
+from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.sinks.requests import NAMES, Requests
+from bms_estimator.store.outbox import Outbox
+from tests.mosquitto import Listener
+from tests.patience import LONG_S
+from tests.sinks.snapshots import ONE
+
+STATE = "bms/pack/state"
+
+
+class Sink:
+    """A sink for the pack, and what it counts; every request is answered with its name."""
+
+    def __init__(self, url: str | tuple[str, ...], most_kept: int = 4, **options: Any) -> None:
+        self.delivery = Delivery()
+        self.requests = Requests(self.delivery, ["set_soc", "current_zero"])
+        self.asked: list[str] = []
+        for name in NAMES:
+            self.requests.offer(name, self._handler(name))
+        options = {"first_delay_s": 0.1, "birth_delay_s": 0.1} | options
+        outbox = Outbox(None, most=most_kept)
+        self.mqtt = MqttSink(MqttSettings(url=url), "pack", self.requests, self.delivery, outbox, **options)
+
+    def _handler(self, name: str) -> Any:
+        async def answer(_: Mapping[str, Any]) -> Mapping[str, Any]:
+            self.asked.append(name)
+            return {"name": name}
+
+        return answer
+
+    async def __aenter__(self) -> Self:
+        await self.mqtt.__aenter__()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.mqtt.__aexit__(None, None, None)
+
+
+def state(number: int) -> Snapshot:
+    """A snapshot whose estimate has a number."""
+    assert ONE.estimate
+    return ONE._replace(estimate=ONE.estimate.model_copy(update={"frames_received": number}))
+
+
+def numbers(live: Listener) -> list[int]:
+    """Of the states that have come."""
+    return [json.loads(payload)["frames_received"] for payload in live.all(STATE)]
+
+
+def assert_all_in_order(come: list[int], count: int) -> None:
+    """All states from 0 on came, none out of order; what came twice was among those on their way when a line broke."""
+    assert list(dict.fromkeys(come)) == list(range(count))
+    for before, after in itertools.pairwise(come):
+        assert before - WINDOW < after <= before + 1, f"{before}, then {after}"
+
+
+async def until(condition: Callable[[], Any]) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - counters have no event
+            await asyncio.sleep(0.01)
