@@ -12,7 +12,7 @@ from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.run import LOG_LINES
 from bms_estimator.demo.board import find_build
 from bms_estimator.demo.demo import run_demo
-from bms_estimator.service.logs import configure_logs
+from bms_estimator.service.logs import configure_logs, drained
 from bms_estimator.service.warm_up import load_kernels
 
 
@@ -41,4 +41,6 @@ def demo(
     configure_logs(log if sys.stdout.isatty() else None)
     with compiling_shown():
         load_kernels()
-    typer.echo(asyncio.run(run_demo(build, rate_hz=rate_hz, speed=speed, port=port, seconds=seconds, log=log)))
+    with drained():
+        totals = asyncio.run(run_demo(build, rate_hz=rate_hz, speed=speed, port=port, seconds=seconds, log=log))
+    typer.echo(totals)

@@ -16,7 +16,7 @@ from bms_estimator.cli.pack import load_pack, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import SensorSettings, Settings
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
-from bms_estimator.service.logs import configure_logs
+from bms_estimator.service.logs import configure_logs, drained
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.serial_board import SerialBoard
@@ -45,7 +45,7 @@ def record(
     settings = load_pack(pack)[0] if pack else Settings()
     protocol = "text" if text else None
     sensor = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol).sensor
-    with Recording(out, header_of(sensor)) as recording:
+    with drained(), Recording(out, header_of(sensor)) as recording:
         progress = asyncio.run(_record(sensor, recording, seconds))
     if isinstance(error := recording.ended.exception(), OSError):
         raise UserError(f"recording ended: {error.strerror}")

@@ -15,7 +15,7 @@ from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.logs import configure_logs
+from bms_estimator.service.logs import configure_logs, drained
 from bms_estimator.service.serve import serve, state_folder
 from bms_estimator.service.several import serve_several
 from bms_estimator.service.warm_up import load_kernels
@@ -54,7 +54,8 @@ def run(
         raise UserError("--port, --record and --view are for one pack")
     configure_logs()
     _load_kernels()
-    asyncio.run(serve_several(loaded))
+    with drained():
+        asyncio.run(serve_several(loaded))
 
 
 def _run_one(settings: Settings, cell: PackModel, port: str | None, record: Path | None, *, view: bool) -> None:
@@ -63,7 +64,7 @@ def _run_one(settings: Settings, cell: PackModel, port: str | None, record: Path
     configure_logs(log if view and sys.stdout.isatty() else None)
     recorder = Recording(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
     sinks = [ConsoleSink(log=log)] if view else []
-    with recorder as tap:
+    with drained(), recorder as tap:
         _load_kernels()
         asyncio.run(serve(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings)))
 

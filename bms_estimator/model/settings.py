@@ -13,6 +13,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Command = Literal["set_soc", "current_zero"]
 """A request that changes something."""
+LogLevel = Literal["info", "warning", "error"]
 DeviceName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 
 
@@ -229,6 +230,12 @@ class StoreSettings(Strict):
     )
 
 
+class LogSettings(Strict):
+    """What goes to the log."""
+
+    level: LogLevel = Field(default="info", description="and what is worse")
+
+
 class Settings(Strict):
     """One pack's settings file."""
 
@@ -240,6 +247,7 @@ class Settings(Strict):
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
+    log: LogSettings = LogSettings()
 
     @model_validator(mode="before")
     @classmethod

@@ -3,10 +3,17 @@
 import contextlib
 import os
 import sys
-from collections.abc import Callable, MutableSequence
-from typing import Any
+from collections.abc import Callable, Iterator, MutableMapping, MutableSequence
+from typing import Any, get_args
 
 import structlog
+
+from bms_estimator.model.settings import LogLevel
+from bms_estimator.service.stderr import stderr
+
+LEVELS: tuple[LogLevel, ...] = get_args(LogLevel)
+_levels: dict[str, LogLevel] = {}
+"""By pack."""
 
 
 def configure_logs(lines: MutableSequence[str] | None = None) -> None:
@@ -26,19 +33,39 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
         processors=[
             structlog.contextvars.merge_contextvars,
             structlog.processors.add_log_level,
+            _talkative,
             structlog.processors.TimeStamper(fmt="iso" if wide else "%H:%M:%SZ", utc=True),
             *last,
         ],
-        logger_factory=lambda *_: _Lines(_print if lines is None else lines.append),
+        logger_factory=lambda *_: _Lines(stderr.take if lines is None else lines.append),
         cache_logger_on_first_use=True,
     )
 
 
-def _print(message: str) -> None:
-    """A line on stderr; where a full disk does not take it, it is lost and nothing else."""
-    with contextlib.suppress(OSError):
-        sys.stderr.write(f"{message}\n")
-        sys.stderr.flush()
+@contextlib.contextmanager
+def drained() -> Iterator[None]:
+    """In the end the log is written before what the command line says of an error."""
+    try:
+        yield
+    finally:
+        stderr.drain()
+
+
+def set_level(pack: str, level: LogLevel) -> None:
+    """What is logged at least; of a process with several packs by the most talkative of them."""
+    _levels[pack] = level
+
+
+def _talkative(_: object, __: str, line: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    """Drop what is below the level.
+
+    Raises:
+        structlog.DropEvent: It is.
+    """
+    least = min((LEVELS.index(level) for level in _levels.values()), default=0)
+    if line["level"] in LEVELS and LEVELS.index(line["level"]) < least:
+        raise structlog.DropEvent
+    return line
 
 
 class _Lines:

@@ -17,6 +17,7 @@ from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import run_live
+from bms_estimator.service.logs import set_level
 from bms_estimator.service.notify import Notifier
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
@@ -57,6 +58,7 @@ async def serve(
         UserError: A setting that cannot be used.
     """
     stop = stop_on_signal(stop)
+    set_level(settings.pack.name, settings.log.level)
     for line in implausible(settings, cell):
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     delivery, all_sinks = Delivery(), list(sinks)

@@ -3,9 +3,10 @@
 import asyncio
 import contextlib
 import json
+import os
 import signal
 from asyncio.subprocess import Process
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -110,6 +111,34 @@ async def test_a_full_disk_does_not_end_the_service(
                 await live.wait_json("bms/pack/health", lambda h: h["uptime_s"] > health["uptime_s"] + 2.0)
                 process.send_signal(signal.SIGTERM)
                 assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+    board.cancel()
+
+
+@contextlib.contextmanager
+def unread_pipe() -> Iterator[int]:
+    """The end to write to of a pipe that is full, and that nobody reads."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(write, bytes(4096))
+    os.set_blocking(write, True)
+    try:
+        yield write
+    finally:
+        os.close(read)
+        os.close(write)
+
+
+async def test_a_log_that_nobody_reads_stops_nothing(tmp_path: Path, line: Line, broker: Broker) -> None:
+    line.plug()
+    board = asyncio.create_task(feed(line))
+    with unread_pipe() as log:
+        async with Listener(broker) as live, service(pack_file(tmp_path, line, broker), stderr=log) as process:
+            await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 100)
+            process.send_signal(signal.SIGTERM)
+            await live.wait("bms/pack/availability", lambda p: p == b"offline")
+            assert await asyncio.wait_for(process.wait(), LONG_S) == 0
     board.cancel()
 
 
