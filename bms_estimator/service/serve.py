@@ -74,7 +74,7 @@ async def serve(
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
-            stack.enter_context(alone(folder / f"{settings.pack.name}.lock"))
+            stack.enter_context(alone(folder, settings.pack.name))
         if database:
             await stack.enter_async_context(database)
         await stack.enter_async_context(outbox)

@@ -17,11 +17,9 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.ekf_state import NODE, OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Health
 from bms_estimator.model.settings import Settings
 from bms_estimator.service import live, saving
-from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import FORMAT, KEPT, CheckpointFile, Ledger, fields, pack_identity
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.resume import resume
@@ -290,10 +288,7 @@ def test_what_is_written_is_private_and_goes_through_no_planted_link(tmp_path: P
     file, victim = CheckpointFile(tmp_path, SETTINGS, CELL), tmp_path / "victim"
     victim.write_text("precious")
     file.path.with_suffix(".new").symlink_to(victim)
-    (tmp_path / "pack.lock").symlink_to(victim)
     file.save(new_estimator(SETTINGS, CELL).record, NEW)
-    with alone(tmp_path / "pack.lock"):
-        pass
     assert victim.read_text() == "precious"
     assert stat.S_IMODE(file.path.lstat().st_mode) == 0o600
 
@@ -323,14 +318,6 @@ def test_an_identifier_that_is_switched_on_begins_at_the_soc_that_was_counted() 
         identifying.step(float(i), 0.0, 3.8)
     assert identifying.state["soc"][0] == pytest.approx(0.5, abs=0.15)
     assert 0.01 < identifying.record["filter"]["soc_std"][0] < 0.35
-
-
-def test_a_pack_is_served_once_at_a_time(tmp_path: Path) -> None:
-    served = pytest.raises(UserError, match=f"served already, by process {os.getpid()}")
-    with alone(tmp_path / "pack.lock"), served, alone(tmp_path / "pack.lock"):
-        pass
-    with alone(tmp_path / "pack.lock"), alone(tmp_path / "other.lock"):
-        pass
 
 
 @asynccontextmanager

@@ -1,0 +1,65 @@
+"""One service for each pack, whatever becomes of its folder, and whoever else is on the machine."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.service.alone import _name, alone
+
+NOBODY = 65534
+SQUAT = """
+import os, socket, sys
+os.setuid(int(sys.argv[2]))
+held = socket.socket(socket.AF_UNIX)
+held.bind("\\0" + sys.argv[1])
+held.listen(1)
+print(flush=True)
+sys.stdin.read()
+"""
+"""Holds the name of its first argument as the user of its second until its input ends."""
+
+
+def test_a_pack_is_served_once_at_a_time(tmp_path: Path) -> None:
+    served = pytest.raises(UserError, match=f"^pack: this pack is served already, by process {os.getpid()}$")
+    for _ in range(2):
+        with alone(tmp_path, "pack"), served, alone(tmp_path, "pack"):
+            pass
+    with alone(tmp_path, "pack"), alone(tmp_path, "other"), alone(tmp_path / "elsewhere", "pack"):
+        pass
+
+
+def test_a_folder_that_is_deleted_and_made_anew_lets_no_second_service_in(tmp_path: Path) -> None:
+    folder = tmp_path / "state"
+    folder.mkdir()
+    (tmp_path / "link").symlink_to(folder)
+    with alone(folder, "pack"):
+        shutil.rmtree(folder)
+        with pytest.raises(UserError, match="served already"), alone(folder, "pack"):
+            pass
+        folder.mkdir()
+        with pytest.raises(UserError, match="served already"), alone(tmp_path / "link", "pack"):
+            pass
+        assert not list(folder.iterdir())
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
+def test_a_stranger_who_takes_the_name_first_does_not_keep_the_service_from_starting(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", SQUAT, _name(tmp_path, "pack")[1:], str(NOBODY)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe) as stranger:
+        assert stranger.stdout
+        assert stranger.stdout.readline()
+        with capture_logs() as lines, alone(tmp_path, "pack"):
+            pass
+        assert [line["user"] for line in lines] == [NOBODY]
+        os.chown(tmp_path, NOBODY, NOBODY)  # one who may write the folder is a service
+        with pytest.raises(UserError, match=f"by process {stranger.pid}"), alone(tmp_path, "pack"):
+            pass
+        assert stranger.stdin
+        stranger.stdin.close()
