@@ -8,10 +8,10 @@ COMPARE := .venv-compare
 ARGS    ?=
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
-APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients systemd systemd-container udev
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare anywhere unseen soak chapter5 ablation learning fuelcell firmware kernels lock
+.PHONY: help venv apt check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,6 +37,9 @@ test: apt venv ## all there is to check: packages, style, types, firmware, pytes
 demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory --silent firmware || echo "the firmware does not build here: the Python board serves"; fi
 	@$(BIN)/bms-estimator demo $(ARGS)
+
+nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
+	ALL_NODES=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)
 
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)

@@ -1,0 +1,33 @@
+"""Certificates for tests, made by openssl: an authority, and who it vouches for."""
+
+import subprocess
+from pathlib import Path
+
+EC_KEY = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+HERE = "subjectAltName=IP:127.0.0.1,DNS:localhost"
+
+
+def openssl(*arguments: str | Path) -> None:
+    subprocess.run(["openssl", *arguments], check=True, capture_output=True)
+
+
+class Authority:
+    """Signs certificates; its own is ``certificate``."""
+
+    def __init__(self, folder: Path, name: str = "ca") -> None:
+        self._folder = folder
+        self.certificate, self._key = folder / f"{name}.crt", folder / f"{name}.key"
+        openssl(
+            "req", "-x509", *EC_KEY, "-keyout", self._key, "-out", self.certificate, "-days", "2", "-subj", "/CN=CA"
+        )
+
+    def vouch_for(self, name: str) -> tuple[Path, Path]:
+        """Certificate and key of somebody on this machine."""
+        certificate, key, request = (self._folder / f"{name}.{kind}" for kind in ("crt", "key", "csr"))
+        names = self._folder / "names"
+        names.write_text(HERE)
+        openssl("req", *EC_KEY, "-keyout", key, "-out", request, "-subj", f"/CN={name}")
+        openssl("x509", "-req", "-in", request, "-CA", self.certificate, "-CAkey", self._key, "-CAcreateserial",
+                "-out", certificate, "-days", "2", "-extfile", names)  # fmt: skip
+        key.chmod(0o600)
+        return certificate, key
