@@ -32,15 +32,19 @@ MOST_BYTES = 16_384
 """Nothing that comes is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
 HEAD_BYTES = 16
 """What a published message has beside topic and payload, at most."""
+SOCKET_BROKE = "failed to receive on socket: "
+"""How paho's line of an error of the socket begins."""
 
 log = structlog.get_logger(__name__)
 
 
 class _ToLog(logging.Handler):
-    """What paho and aiomqtt have to say goes where all lines go."""
+    """What paho and aiomqtt have to say goes where all lines go; why a socket broke the link says."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        log.warning("mqtt client", said=record.getMessage())
+        said = record.getMessage()
+        if not said.startswith(SOCKET_BROKE):
+            log.warning("mqtt client", said=said)
 
 
 _logger = logging.getLogger(__name__)
@@ -95,6 +99,7 @@ class Client(aiomqtt.Client):
             logger=_logger,
         )
         self._acknowledged_s = patience.acknowledged_s
+        self._client.on_log = self._on_log
         self.protocol = "MQTT 5" if self._is_5 else "MQTT 3.1.1"
         self._answers: dict[int, asyncio.Future[str | None]] = {}
         self._in_flight = asyncio.Semaphore(self._client.max_inflight_messages)
@@ -185,6 +190,10 @@ class Client(aiomqtt.Client):
         if not self._connected.done() and not self._abandoned:
             self._connected.set_exception(ClosedError(self._why))
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
+
+    def _on_log(self, client: Any, userdata: Any, level: int, said: str) -> None:  # noqa: ARG002
+        if said.startswith(SOCKET_BROKE):
+            self._why = said.removeprefix(SOCKET_BROKE)
 
     def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Any) -> None:  # noqa: ARG002
         answer = self._answers.get(mid)

@@ -68,14 +68,15 @@ async def test_our_certificate_opens_the_broker(strict_broker: Broker, folder: P
         await live.wait(STATE)
 
 
-@pytest.mark.parametrize("name", [None, "stranger"])
-async def test_who_has_no_certificate_of_the_broker_s_authority_is_told_that_the_broker_refuses(
-    strict_broker: Broker, folder: Path, name: str | None
+@pytest.mark.parametrize(("name", "why"), [(None, "certificate required"), ("stranger", "unknown ca")])
+async def test_who_has_no_certificate_of_the_broker_s_authority_is_told_so(
+    strict_broker: Broker, folder: Path, name: str | None, why: str
 ) -> None:
     with structlog.testing.capture_logs() as logs:
         async with sink(settings(strict_broker, folder, name)):
             await until(lambda: [line for line in logs if line["event"] == "broker not reachable"])
-    assert not [line for line in logs if line["event"] == "broker connected"]
+    assert {line["event"] for line in logs} == {"broker not reachable"}
+    assert why in logs[0]["reason"]
 
 
 async def test_a_certificate_that_is_replaced_is_used_without_a_restart(
