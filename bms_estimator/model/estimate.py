@@ -119,6 +119,10 @@ class Health(Report):
     lock_losses: int = Field(description="times the observer lost track")
     gain_rearms: int = Field(description="times k was started again before the gain turned")
     publish_drops: int = Field(description="states that the broker could not take in time")
+    broker_losses: int = Field(description="connections to a broker that were lost, since start")
+    broker_trouble: str | None = Field(
+        description="why a broker was lost or could not be reached last; null: never since start"
+    )
     refused_topics: list[str] = Field(description="what the broker denies, as far as it can be told; empty: nothing")
     availability_corrections: int = Field(description="times somebody else wrote an availability and was put right")
     requests: dict[str, int] = Field(description="by what became of them, since start")

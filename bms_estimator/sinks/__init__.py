@@ -18,9 +18,13 @@ class Delivery:
     """What became of what one pack sends and of what is asked of it, since start; topic ``health`` shows it."""
 
     drops: int = 0
-    """States and events that found no room while the broker was away."""
+    """States and events that found no room while the broker was away, or that it refused."""
     waiting: int = 0
     """States and events that the broker has not acknowledged yet."""
+    losses: int = 0
+    """Connections to a broker that were lost."""
+    trouble: str | None = None
+    """Why the last one was lost, or a broker could not be reached."""
     refused_topics: list[str] = field(default_factory=list)
     """What the broker denies, as far as it can be told."""
     corrections: int = 0

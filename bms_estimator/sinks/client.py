@@ -195,6 +195,15 @@ class Client(aiomqtt.Client):
         if said.startswith(SOCKET_BROKE):
             self._why = said.removeprefix(SOCKET_BROKE)
 
+    def _on_socket_register_write(self, client: Any, userdata: Any, sock: socket.socket) -> None:  # noqa: ARG002
+        """As the base has it, which may watch a socket that was closed meanwhile, or another of its number."""
+
+        def watch() -> None:
+            if sock.fileno() >= 0:
+                self._loop.add_writer(sock, client.loop_write)
+
+        self._loop.call_soon_threadsafe(watch)
+
     def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Any) -> None:  # noqa: ARG002
         answer = self._answers.get(mid)
         if answer is not None and not answer.done():

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import structlog
 
+from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.brokers import Broker
 from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError
 
@@ -33,6 +34,7 @@ class Link:
         hello: How each connection begins.
         connect: Makes a connection.
         serve: Uses it until it is lost or the link is closed.
+        delivery: What went wrong is noted there.
         first_delay_s: The first pause [s].
     """
 
@@ -42,9 +44,11 @@ class Link:
         hello: Hello,
         connect: Connect,
         serve: Callable[[Connection], Awaitable[None]],
+        delivery: Delivery,
         first_delay_s: float = FIRST_DELAY_S,
     ) -> None:
         self._brokers, self._hello, self._connect, self._serve = brokers, hello, connect, serve
+        self._delivery = delivery
         self._first_delay_s = self._delay_s = first_delay_s
         self._said: dict[str, tuple[str, float]] = {}  # by URL: the last reason and when it was logged
         self.closing = asyncio.Event()
@@ -66,7 +70,7 @@ class Link:
     async def _attempt(self, broker: Broker) -> bool:
         """One broker; True when it was worth the name of a connection."""
         loop = asyncio.get_running_loop()
-        since_s = None
+        since_s: float | None = None
         try:
             async with self._connect(broker, self._hello) as connection:
                 since_s = loop.time()
@@ -74,6 +78,7 @@ class Link:
                 self._said.clear()
                 await self._serve(connection)
         except* LinkError as errors:
+            self._delivery.losses += since_s is not None
             self._say(broker, "broker not reachable" if since_s is None else "broker lost", errors)
         return since_s is not None and loop.time() - since_s >= LASTING_S
 
@@ -82,6 +87,7 @@ class Link:
         while isinstance(errors, BaseExceptionGroup):
             errors = errors.exceptions[0]
         reason, now_s = str(errors), asyncio.get_running_loop().time()
+        self._delivery.trouble = reason
         said, at_s = self._said.get(broker.url, ("", 0.0))
         if reason != said or now_s - at_s >= LOG_S:
             self._said[broker.url] = reason, now_s

@@ -78,7 +78,7 @@ class MqttSink:
         hello = Hello(identifier, will, lambda kind, topic: requests.refuse(kind, topic[:MOST_SHOWN]))
         for warning in check(settings):
             log.warning("a secret that is none", reason=warning)
-        self._link = Link(brokers(settings), hello, connect or Dial(settings), self._serve, first_delay_s)
+        self._link = Link(brokers(settings), hello, connect or Dial(settings), self._serve, delivery, first_delay_s)
         self._slot: Snapshot | None = None
         self._before: Snapshot | None = None  # the last one that was taken
         self._sent = Sent()  # only the sending task sets it

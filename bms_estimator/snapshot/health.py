@@ -110,6 +110,8 @@ def health_report(
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),
         publish_drops=delivery.drops,
+        broker_losses=delivery.losses,
+        broker_trouble=delivery.trouble,
         refused_topics=list(delivery.refused_topics),
         availability_corrections=delivery.corrections,
         requests=dict(delivery.requests),

@@ -59,6 +59,12 @@ class Proxy:
             client.transport.abort()
         self._clients = []
 
+    def end(self, reason: int) -> None:
+        """The connections are ended as a broker of MQTT 5 does that has a reason."""
+        for client, _ in self._clients:
+            client.write(bytes([0xE0, 1, reason]))
+        self.away = True
+
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task

@@ -117,7 +117,7 @@ async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path:
                 self.closing.set()
 
     settings = MqttSettings(url=Broker(tmp_path).url)
-    await Impatient(brokers(settings), HELLO, Dial(settings), serve=never).run()
+    await Impatient(brokers(settings), HELLO, Dial(settings), never, Delivery()).run()
     assert max(pauses) <= LONGEST_DELAY_S == 30.0
     assert pauses[0] <= 5.0 < pauses[3]
     assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"

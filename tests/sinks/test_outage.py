@@ -19,8 +19,8 @@ SOON = Patience(connected_s=1.0, keepalive_s=1, acknowledged_s=1.0)
 """A busy machine may take a broker for lost that is not: then it is found again."""
 
 
-def dial(url: str | tuple[str, ...]) -> dict[str, Any]:
-    return {"connect": Dial(MqttSettings(url=url), SOON), "most_kept": 10_000}
+def dial(url: str | tuple[str, ...], patience: Patience = SOON) -> dict[str, Any]:
+    return {"connect": Dial(MqttSettings(url=url), patience), "most_kept": 10_000}
 
 
 @pytest.fixture
@@ -103,8 +103,8 @@ async def test_a_line_that_falls_silent_is_given_up_for_the_next_broker(broker: 
 async def test_a_line_that_falls_silent_while_nothing_is_to_be_said_is_found_out(broker: Broker) -> None:
     async with Proxy(broker.port) as silent, Listener(broker) as live:
         with structlog.testing.capture_logs() as logs:
-            async with Sink(silent.url, **dial(silent.url)) as sink:
-                await live.wait("bms/pack/availability")
+            async with Sink(silent.url, **dial(silent.url, Patience(keepalive_s=1))) as sink:
+                await live.wait("bms/pack/schema")
                 silent.swallows = True
                 await until(lambda: any(line["event"] == "broker lost" for line in logs))
                 silent.swallows = False
