@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from bms_estimator.model.estimate import Estimate, Health, Info, ParameterReport, Report, Snapshot
+from bms_estimator.model.event import Event, events
 from bms_estimator.sinks.home_assistant import PROBLEMS, VALUES, discovery, discovery_topic
 from bms_estimator.sinks.home_assistant_values import Shown, next_problems, next_values
 
@@ -54,16 +55,15 @@ class Messages:
         sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
         return [self._retained(AVAILABILITY, b"online"), *sensor]
 
-    def kept(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:  # noqa: ARG002 - of use to events
+    def kept(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
         """What a snapshot brings that must reach the broker, late if need be: each has its own time.
 
         Args:
             before: The snapshot before this one; None of the first.
             snapshot: The snapshot.
         """
-        if snapshot.estimate is None:
-            return []
-        return [Message(f"{self.root}/state", _report(snapshot.estimate), 1, retain=False)]
+        happened = [self._kept("event", event) for event in events(before, snapshot)]
+        return happened + ([self._kept("state", snapshot.estimate)] if snapshot.estimate else [])
 
     def due(self, sent: Sent, snapshot: Snapshot, now_s: float) -> tuple[list[Message], Sent]:
         """What a snapshot brings that the broker has not got yet, beside what is ``kept``.
@@ -108,6 +108,9 @@ class Messages:
     def _discovery(self, info: Info) -> dict[str, Any]:
         return discovery(info, self.root, self._sample_period_s)
 
+    def _kept(self, topic: str, report: Report) -> Message:
+        return Message(f"{self.root}/{topic}", _report(report), 1, retain=False)
+
     def _live(self, topic: str, payload: bytes) -> Message:
         return Message(f"{self.root}/{topic}", payload, 0, retain=False)
 
@@ -117,7 +120,13 @@ class Messages:
 
 def schema() -> dict[str, Any]:
     """JSON schema of each topic's payload."""
-    topics: dict[str, type[Report]] = {"state": Estimate, "parameters": ParameterReport, "health": Health, "info": Info}
+    topics: dict[str, type[Report]] = {
+        "state": Estimate,
+        "event": Event,
+        "parameters": ParameterReport,
+        "health": Health,
+        "info": Info,
+    }
     return {topic: model.model_json_schema() for topic, model in topics.items()}
 
 

@@ -41,10 +41,19 @@ def test_what_is_retained_has_qos_1_and_what_is_live_is_neither():
 
 
 def test_a_state_is_kept_until_the_broker_has_it_and_there_is_none_without_samples():
-    [state] = MESSAGES.kept(None, ONE)
+    [state] = MESSAGES.kept(ONE, ONE)
     assert (state.topic, state.qos, state.retain) == ("bms/pack/state", 1, False)
     assert topics(MESSAGES.kept(ONE, ONE)) == ["state"]
     assert MESSAGES.kept(ONE, NOTHING_YET) == []
+
+
+def test_an_event_is_kept_as_a_state_is_and_comes_before_it():
+    event, *_, state = MESSAGES.kept(None, ONE)
+    assert (event.topic, event.qos, event.retain) == ("bms/pack/event", 1, False)
+    told = json.loads(event.payload)
+    assert (told["name"], told["time"]) == ("start", ONE.health.publish_time)
+    assert set(told) == set(schema()["event"]["properties"])
+    assert state.topic == "bms/pack/state"
 
 
 def test_what_has_not_changed_is_not_said_again():
@@ -84,7 +93,7 @@ def test_the_availabilities_that_are_right_are_those_last_said():
 
 
 def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missing():
-    state = json.loads(MESSAGES.kept(None, ONE)[0].payload)
+    state = json.loads(MESSAGES.kept(ONE, ONE)[0].payload)
     described = schema()["state"]["properties"]
     assert set(state) == set(described) == set(schema()["state"]["required"])
     assert all("description" in field for field in described.values())

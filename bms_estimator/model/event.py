@@ -1,0 +1,97 @@
+"""Topic ``event``: what happened to a pack, once each, found by comparing one snapshot with the one before. Pure."""
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from pydantic import Field
+
+from bms_estimator.model.estimate import Health, Report, Snapshot
+from bms_estimator.model.suspect import Suspect
+
+LEAST_UNSEEN_S = 1.0
+"""Shorter gaps are counted in ``health`` alone [s]."""
+NOT_SAVED = ("cannot be saved", "not saved")
+"""What ``health.checkpoint`` begins with when the disk does not take it."""
+
+Name = Literal[
+    "start",
+    "unseen",
+    "sensor_offline",
+    "sensor_online",
+    "suspicion",
+    "suspicion_cleared",
+    "checkpoint_fails",
+    "checkpoint_saved",
+]
+
+
+class Event(Report):
+    """Topic ``event``, not retained: something that happened."""
+
+    time: str = Field(description="when it was seen, ISO 8601, UTC")
+    name: Name = Field(description="what it is")
+    text: str = Field(description="for people: the reason, what to do")
+
+
+class _Found(NamedTuple):
+    name: Name
+    text: str
+
+
+def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
+    """What happened between two snapshots.
+
+    Args:
+        before: The snapshot before; None: the service has just started.
+        snapshot: The snapshot.
+    """
+    health = snapshot.health
+    if before is None:
+        started = _Found("start", f"checkpoint: {health.checkpoint}")
+        found = [started, *_sensor(None, health), *_suspicions([], health.suspects), *_checkpoint("", health)]
+    elif before.health is health:
+        return []
+    else:
+        was = before.health
+        unseen = _unseen(health.total.unseen_s - was.total.unseen_s)
+        found = [*unseen, *_sensor(was, health), *_suspicions(was.suspects, health.suspects)]
+        found += _checkpoint(was.checkpoint, health)
+    return [Event(time=health.publish_time, name=name, text=text) for name, text in found]
+
+
+def _unseen(unseen_s: float) -> Iterator[_Found]:
+    if unseen_s >= LEAST_UNSEEN_S:
+        yield _Found("unseen", f"nobody measured for {unseen_s:.1f} s")
+
+
+def _sensor(was: Health | None, health: Health) -> Iterator[_Found]:
+    if was is not None and was.sensor_online == health.sensor_online:
+        return
+    if health.sensor_online:
+        yield _Found("sensor_online", "samples come")
+    elif was is not None:  # at start none has come yet
+        yield _Found("sensor_offline", health.sensor_message or "")
+
+
+def _suspicions(was: list[str], now: list[str]) -> Iterator[_Found]:
+    """Those that came and went; numbers in their sentences may change meanwhile."""
+    before, after = ({_kind(sentence): sentence for sentence in sentences} for sentences in (was, now))
+    for kind, sentence in after.items():
+        if kind not in before:
+            yield _Found("suspicion", sentence)
+    for kind, sentence in before.items():
+        if kind not in after:
+            yield _Found("suspicion_cleared", sentence)
+
+
+def _kind(sentence: str) -> str:
+    """The part of a suspicion that does not change."""
+    return next((suspect.text for suspect in Suspect if sentence.endswith(suspect.text)), sentence)
+
+
+def _checkpoint(was: str, health: Health) -> Iterator[_Found]:
+    failed, fails = was.startswith(NOT_SAVED), health.checkpoint.startswith(NOT_SAVED)
+    if fails and not failed:
+        yield _Found("checkpoint_fails", health.checkpoint)
+    elif failed and not fails:
+        yield _Found("checkpoint_saved", health.checkpoint)
