@@ -43,6 +43,7 @@ COMMANDS = {
     ),
     "capacity": Entry("bms_estimator.cli.capacity:capacity", "Capacity from rests and the charge between them."),
     "cell": Entry("bms_estimator.cli.cell:app", "What a pack's service has learned, as a cell file."),
+    "history": Entry("bms_estimator.cli.history:history", "What the service kept of a pack, by the minute, as CSV."),
     "validate": Entry("bms_estimator.cli.validate:validate_command", "A cell's model against a capture, open loop."),
     "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),

@@ -25,6 +25,7 @@ from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.serial_board import SerialBoard, Tap
 from bms_estimator.store.database import Database
+from bms_estimator.store.history import History
 from bms_estimator.store.outbox import Outbox
 
 log = structlog.get_logger(__name__)
@@ -66,6 +67,8 @@ async def serve(
     memory = BoardMemory(folder, settings.pack.name) if folder else None
     board = SerialBoard(settings.sensor, tap=tap, memory=memory)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
+    if database and settings.store.history_days:
+        all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
     if settings.mqtt is not None:
         sample_period_s = settings.sensor.sample_period_s

@@ -18,7 +18,8 @@ MIGRATIONS = (
         temperature_c REAL, temperature_min_c REAL, temperature_max_c REAL,
         soc REAL, soc_std REAL,
         charge_out_ah REAL, charge_in_ah REAL, energy_out_wh REAL, energy_in_wh REAL,
-        seen_s REAL
+        seen_s REAL,
+        publications INTEGER NOT NULL
     );
     CREATE TABLE event (
         number INTEGER PRIMARY KEY,

@@ -1,0 +1,154 @@
+"""The pack's history: a row for each minute, and what happened, for as long as is set.
+
+Written each minute in one transaction, off the event loop. ``kill -9`` costs the minute that was open, and the one that
+was not yet written.
+"""
+
+import asyncio
+import contextlib
+import sqlite3
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Self
+
+from bms_estimator.model.estimate import Estimate, Snapshot
+from bms_estimator.model.event import Event, events
+from bms_estimator.store.database import Database, StoreError, trim
+from bms_estimator.store.minute import MINUTE_S, Minute, OpenMinute, epoch_s, minute_of
+
+MINUTES_A_DAY = 1440
+WAITING_MINUTES = 2 * MINUTES_A_DAY
+"""So many rows wait in memory for a disk that cannot be written."""
+WAITING_EVENTS = 1000
+MOST_EVENTS = 50_000
+"""In the database: a line that comes and goes each second must not fill the disk."""
+
+_COLUMNS = Minute._fields
+_MEANS = ("voltage_v", "current_a", "temperature_c")
+_LAST = ("soc", "soc_std")
+
+
+def _merged(column: str) -> str:
+    """SQL of a column of two rows of one minute: a service that is started again in it goes on with it."""
+    old, new = f"minute.{column}", f"excluded.{column}"
+    if column in _LAST:
+        return f"{column} = coalesce({new}, {old})"
+    if column in _MEANS:
+        weighted = f"({old} * minute.publications + {new} * excluded.publications)"
+        return f"{column} = coalesce({weighted} / (minute.publications + excluded.publications), {new}, {old})"
+    if "_min_" in column or "_max_" in column:
+        extreme = "min" if "_min_" in column else "max"
+        return f"{column} = coalesce({extreme}({old}, {new}), {new}, {old})"
+    return f"{column} = {old} + {new}"
+
+
+_INSERT = (
+    f"INSERT INTO minute ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) "  # noqa: S608 - names of ours
+    f"ON CONFLICT (time_s) DO UPDATE SET {', '.join(map(_merged, _COLUMNS[1:]))}"
+)
+
+
+class History:
+    """A sink that keeps minutes and events.
+
+    Args:
+        database: Where.
+        days: So many days of minutes are kept, of a service that runs all day.
+    """
+
+    def __init__(self, database: Database, *, days: int) -> None:
+        self._database, self._most = database, days * MINUTES_A_DAY
+        self._before: Snapshot | None = None
+        self._last: Estimate | None = None
+        self._open: OpenMinute | None = None
+        self._minutes: deque[Minute] = deque(maxlen=WAITING_MINUTES)
+        self._events: deque[Event] = deque(maxlen=WAITING_EVENTS)
+        self._due = asyncio.Event()
+        self._unpruned = MINUTES_A_DAY  # minutes since the last look at what is too old; the first one looks
+        self._task: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        """Start to write."""
+        self._task = asyncio.create_task(self._stay_written(), name="history")
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        """Write the minute that is open, too."""
+        if self._task is None:
+            return
+        self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._task
+        self._close_minute()
+        with contextlib.suppress(StoreError):
+            await self._write()
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Take a snapshot; returns at once and never fails."""
+        self._events.extend(events(self._before, snapshot))
+        self._before = snapshot
+        if snapshot.estimate is not None:
+            self._add(snapshot.estimate)
+
+    def _add(self, estimate: Estimate) -> None:
+        time_s = minute_of(epoch_s(estimate.time))
+        if self._open is None or self._open.time_s != time_s:
+            self._close_minute()
+            self._open = OpenMinute(time_s)
+        self._open.add(estimate, self._last.board_time_s if self._last else None)
+        self._last = estimate
+
+    def _close_minute(self) -> None:
+        row = self._open.row() if self._open else None
+        self._open = None
+        if row is not None:
+            self._minutes.append(row)
+            self._due.set()
+
+    async def _stay_written(self) -> None:
+        """Each minute; what the disk does not take is tried with the next."""
+        while True:
+            with contextlib.suppress(TimeoutError):  # without samples no minute ends, but something may happen
+                async with asyncio.timeout(MINUTE_S):
+                    await self._due.wait()
+            self._due.clear()
+            with contextlib.suppress(StoreError):
+                await self._write()
+
+    async def _write(self) -> None:
+        minutes, happened = list(self._minutes), list(self._events)
+        if not minutes and not happened:
+            return
+        prune = self._unpruned + len(minutes) > MINUTES_A_DAY
+
+        def write(connection: sqlite3.Connection) -> None:
+            connection.executemany(_INSERT, minutes)
+            rows = [(epoch_s(event.time), event.name, event.text) for event in happened]
+            connection.executemany("INSERT INTO event (time_s, name, text) VALUES (?, ?, ?)", rows)
+            if prune:
+                _prune(connection, self._most)
+
+        await self._database.call(write)
+        for waiting, written in ((self._minutes, minutes), (self._events, happened)):
+            _remove(waiting, written)
+        self._unpruned = 0 if prune else self._unpruned + len(minutes)
+
+
+def _remove(waiting: deque[Any], written: Sequence[object]) -> None:
+    """What is at the front and was written; some of it may have been pushed out meanwhile."""
+    gone = set(map(id, written))
+    while waiting and id(waiting[0]) in gone:
+        waiting.popleft()
+
+
+def _prune(connection: sqlite3.Connection, most: int) -> None:
+    """Leave the newest: by number and not by the clock, for one that jumps ahead must not cost all there is."""
+    oldest = connection.execute(
+        "SELECT time_s FROM minute ORDER BY time_s DESC LIMIT 1 OFFSET ?", (most - 1,)
+    ).fetchone()
+    if oldest is not None:
+        connection.execute("DELETE FROM minute WHERE time_s < ?", oldest)
+        connection.execute("DELETE FROM event WHERE time_s < ?", oldest)
+    beyond = "SELECT number FROM event ORDER BY number DESC LIMIT 1 OFFSET ?"
+    connection.execute(f"DELETE FROM event WHERE number <= ({beyond})", (MOST_EVENTS,))  # noqa: S608
+    trim(connection)

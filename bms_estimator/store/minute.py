@@ -1,0 +1,106 @@
+"""A minute of a pack: means, extremes and sums of what was published in it. Pure."""
+
+import math
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import NamedTuple
+
+from bms_estimator.model.estimate import Estimate
+
+MINUTE_S = 60
+LONGEST_S = 30.0
+"""Between two publications; longer is a gap, over which no charge is counted [s]."""
+
+
+class Minute(NamedTuple):
+    """One row of history; None where nothing was told. Means and extremes are of what was published."""
+
+    time_s: int
+    """Its begin [s since 1970]."""
+    voltage_v: float
+    voltage_min_v: float
+    voltage_max_v: float
+    current_a: float
+    """Positive on discharge."""
+    current_min_a: float
+    current_max_a: float
+    temperature_c: float | None
+    temperature_min_c: float | None
+    temperature_max_c: float | None
+    soc: float | None
+    """The last, 0..1."""
+    soc_std: float | None
+    charge_out_ah: float
+    charge_in_ah: float
+    energy_out_wh: float
+    energy_in_wh: float
+    seen_s: float
+    """So much of it was measured."""
+    publications: int
+
+
+@dataclass
+class _Mean:
+    """Of one quantity."""
+
+    count: int = 0
+    total: float = 0.0
+    least: float = math.inf
+    most: float = -math.inf
+
+    def add(self, value: float | None) -> None:
+        if value is not None:
+            self.count += 1
+            self.total += value
+            self.least, self.most = min(self.least, value), max(self.most, value)
+
+    @property
+    def values(self) -> tuple[float, float, float]:
+        return self.total / self.count, self.least, self.most
+
+
+@dataclass
+class OpenMinute:
+    """The minute that goes on; ``time_s`` is its begin [s since 1970]."""
+
+    time_s: int
+    _voltage: _Mean = field(default_factory=_Mean)
+    _current: _Mean = field(default_factory=_Mean)
+    _temperature: _Mean = field(default_factory=_Mean)
+    _last: Estimate | None = None
+    _charge_as: list[float] = field(default_factory=lambda: [0.0, 0.0])  # out, in
+    _energy_ws: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    _seen_s: float = 0.0
+
+    def add(self, estimate: Estimate, before_s: float | None) -> None:
+        """Take a publication; ``before_s`` is the board's time at the one before [s], None when there was none."""
+        self._voltage.add(estimate.voltage_v)
+        self._current.add(estimate.current_a)
+        self._temperature.add(estimate.temperature_c)
+        self._last = estimate
+        span_s = estimate.board_time_s - before_s if before_s is not None else 0.0
+        if 0.0 < span_s <= LONGEST_S:
+            self._seen_s += span_s
+            self._charge_as[estimate.current_a < 0.0] += abs(estimate.current_a) * span_s
+            self._energy_ws[estimate.power_w < 0.0] += abs(estimate.power_w) * span_s
+
+    def row(self) -> Minute | None:
+        """What it came to; None when nothing was published."""
+        if self._last is None:
+            return None
+        charge_out, charge_in = (each / 3600.0 for each in self._charge_as)
+        energy_out, energy_in = (each / 3600.0 for each in self._energy_ws)
+        measured = *self._voltage.values, *self._current.values
+        temperature = self._temperature.values if self._temperature.count else (None, None, None)
+        sums = charge_out, charge_in, energy_out, energy_in, self._seen_s, self._voltage.count
+        return Minute._make((self.time_s, *measured, *temperature, self._last.soc, self._last.soc_std, *sums))
+
+
+def epoch_s(time: str) -> float:
+    """Seconds since 1970 of a published time."""
+    return datetime.fromisoformat(time).timestamp()
+
+
+def minute_of(epoch: float) -> int:
+    """Begin of the minute [s since 1970]."""
+    return int(epoch // MINUTE_S) * MINUTE_S

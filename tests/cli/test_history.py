@@ -1,0 +1,63 @@
+"""``history``: a table that a program can read, of the database that the service writes."""
+
+import csv
+import io
+
+import pytest
+
+from bms_estimator.store.database import Database
+from bms_estimator.store.history import History
+from tests.command_line import run
+from tests.store.test_history import at, keep
+
+
+@pytest.fixture
+async def pack(tmp_path):
+    (tmp_path / "pack.toml").write_text(f'[state]\nfolder = "{tmp_path}"\n')
+    await keep(tmp_path / "pack.sqlite", [at(30.0 * s) for s in range(10)])
+    return tmp_path / "pack.toml"
+
+
+def table(text):
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_minutes_are_printed_with_their_units_and_times(pack, capsys):
+    code, out, err = run(capsys, "history", pack)
+    assert (code, err) == (0, "")
+    first, *others = table(out)
+    assert (first["time"], first["current_a"], first["publications"]) == ("2023-11-14T22:14:00.000Z", "2", "2")
+    assert len(others) == 4
+
+
+def test_a_span_in_longer_steps_goes_to_a_file_that_is_not_replaced_unasked(pack, capsys):
+    out_file = pack.with_name("out.csv")
+    arguments = ["history", pack, "--since", "2023-11-14T22:15", "--until", "2023-11-14T22:17:00", "--out", out_file]
+    assert run(capsys, *arguments, "--step", 3600) == (0, "", "")
+    [row] = table(out_file.read_text())
+    assert (row["time"], row["publications"]) == ("2023-11-14T22:00:00.000Z", "4")
+    code, _, err = run(capsys, *arguments)
+    assert (code, "exists already" in err) == (2, True)
+
+
+def test_events_are_printed(pack, capsys):
+    _, out, _ = run(capsys, "history", pack, "--events")
+    assert [row["name"] for row in table(out)] == ["start", "sensor_online"]
+
+
+async def test_it_reads_while_the_service_runs(pack, capsys):
+    async with Database(pack.with_name("pack.sqlite")) as database, History(database, days=1) as history:
+        history.publish(at(600.0))
+        await history._write()
+        code, out, _ = run(capsys, "history", pack)
+    assert (code, len(table(out))) == (0, 5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [(["--step", "90"], "must be whole minutes"), (["--folder", "/nonexistent"], "no history there")],
+)
+def test_what_cannot_be_is_said(pack, capsys, arguments, said):
+    code, out, err = run(capsys, "history", pack, *arguments)
+    assert (code, out) == (2, "")
+    assert said in err

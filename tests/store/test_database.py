@@ -1,0 +1,160 @@
+"""The database when its disk, its file or its folder fails: said once, gone on without, back by itself."""
+
+import asyncio
+import os
+import shutil
+import sqlite3
+import stat
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import structlog
+
+from bms_estimator.store.database import Database, StoreError
+from tests.full_disk import full_disk
+from tests.patience import LONG_S
+
+__all__ = ["full_disk"]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "pack.sqlite"
+
+
+def put(number: int) -> Callable[[sqlite3.Connection], Any]:
+    def insert(connection: sqlite3.Connection) -> None:
+        connection.execute("INSERT INTO outbox VALUES (?, 't', zeroblob(100000), 1, 0)", (number,))
+
+    return insert
+
+
+def numbers(connection: sqlite3.Connection) -> list[int]:
+    return [number for (number,) in connection.execute("SELECT number FROM outbox ORDER BY number")]
+
+
+async def test_its_files_are_for_their_owner_alone(path):
+    async with Database(path) as database:
+        await database.call(put(1))
+        assert {each.name for each in path.parent.iterdir()} == {path.name, f"{path.name}-wal", f"{path.name}-shm"}
+        assert {stat.S_IMODE(each.stat().st_mode) for each in path.parent.iterdir()} == {0o600}
+
+
+async def test_a_transaction_that_fails_leaves_nothing(path):
+    def half(connection: sqlite3.Connection) -> None:
+        put(1)(connection)
+        raise sqlite3.OperationalError("half way")
+
+    async with Database(path, retry_s=0.0) as database:
+        with pytest.raises(StoreError, match="half way"):
+            await database.call(half)
+        assert await database.call(numbers) == []
+
+
+@pytest.mark.parametrize("suffix", ["", "-wal", "-shm"])
+async def test_a_planted_link_is_not_followed(path, suffix):
+    target = path.with_name("target")
+    target.write_bytes(b"precious")
+    path.with_name(path.name + suffix).symlink_to(target)
+    async with Database(path) as database:
+        await database.call(put(1))
+        assert await database.call(numbers) == [1]
+    assert target.read_bytes() == b"precious"
+
+
+async def test_a_file_that_is_no_database_is_set_aside_and_a_new_one_begun(path):
+    path.write_bytes(os.urandom(10_000))
+    damaged = path.read_bytes()
+    with structlog.testing.capture_logs() as logs:
+        async with Database(path) as database:
+            await database.call(put(1))
+    assert path.with_name("pack.refused.sqlite").read_bytes() == damaged
+    assert [line["event"] for line in logs] == ["database set aside, a new one is begun"]
+
+
+async def test_a_database_that_is_damaged_inside_is_set_aside_too(path):
+    async with Database(path) as database:
+        for number in range(50):
+            await database.call(put(number))
+    with path.open("r+b") as file:
+        file.seek(4096)
+        file.write(b"\xff" * (path.stat().st_size - 8192))
+    async with Database(path) as database:
+        assert await database.call(numbers) == []
+    assert path.with_name("pack.refused.sqlite").exists()
+
+
+async def test_a_database_of_a_later_version_is_kept_aside_whole(path):
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    async with Database(path) as database:
+        assert await database.call(numbers) == []
+    with sqlite3.connect(path.with_name("pack.refused.sqlite")) as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (99,)
+    connection.close()
+
+
+async def test_a_full_disk_is_said_once_and_used_again_when_it_has_room(full_disk):
+    with structlog.testing.capture_logs() as logs:
+        async with Database(full_disk / "pack.sqlite", retry_s=0.0) as database:
+            for _ in range(3):
+                with pytest.raises(StoreError):
+                    await database.call(put(1))
+            assert database.reason
+            os.system(f"mount -o remount,size=4m {full_disk}")  # noqa: ASYNC221
+            await database.call(put(1))
+            assert (database.reason, await database.call(numbers)) == ("", [1])
+    assert [line["log_level"] for line in logs] == ["warning", "info"]
+
+
+async def test_a_disk_that_failed_is_not_asked_again_at_once(path):
+    path.parent.joinpath("asked").touch()
+    asked = 0
+
+    def fail(_: sqlite3.Connection) -> None:
+        nonlocal asked
+        asked += 1
+        raise sqlite3.OperationalError("broken")
+
+    async with Database(path, retry_s=1e6) as database:
+        for _ in range(3):
+            with pytest.raises(StoreError, match="broken"):
+                await database.call(fail)
+    assert asked == 1
+
+
+async def test_a_folder_that_is_deleted_is_made_anew(tmp_path):
+    path = tmp_path / "state" / "pack.sqlite"
+    async with Database(path) as database:
+        await database.call(put(1))
+        shutil.rmtree(path.parent)
+        await database.call(put(2))
+        assert await database.call(numbers) == [2]
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+
+
+async def test_a_disk_that_hangs_stops_nothing_and_is_used_again(path):
+    gate = threading.Event()
+    async with Database(path, hang_s=0.05, retry_s=0.0) as database:
+        with pytest.raises(StoreError, match="has not answered"):
+            await database.call(lambda _: gate.wait(LONG_S))
+        with pytest.raises(StoreError, match="has not answered"):
+            await database.call(numbers)  # at once: it is not even asked
+        gate.set()
+        async with asyncio.timeout(LONG_S):
+            while database.reason:
+                try:
+                    await database.call(numbers)
+                except StoreError:
+                    await asyncio.sleep(0.01)
+
+
+async def test_a_fault_of_ours_is_raised(path):
+    async with Database(path) as database:
+        with pytest.raises(KeyError):
+            await database.call(lambda _: {}["x"])
+        assert await database.call(numbers) == []

@@ -1,0 +1,158 @@
+"""Minutes of a pack: what they hold, that a restart goes on with one, that they can be read meanwhile."""
+
+import asyncio
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.estimate import Snapshot
+from bms_estimator.store.database import Database
+from bms_estimator.store.history import History
+from bms_estimator.store.minute import Minute
+from bms_estimator.store.reading import HistoryFile
+from tests.patience import LONG_S
+from tests.sinks.snapshots import ONE
+
+BEGIN_S = 1_700_000_040
+"""Of a minute."""
+
+
+def at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, **changes: object) -> Snapshot:
+    """A publication ``second`` seconds after ``BEGIN_S``."""
+    assert ONE.estimate
+    told = {
+        "time": iso_utc(BEGIN_S + second),
+        "board_time_s": second,
+        "current_a": current_a,
+        "voltage_v": voltage_v,
+        "power_w": current_a * voltage_v,
+    }
+    return ONE._replace(estimate=ONE.estimate.model_copy(update=told | changes))
+
+
+async def keep(path: Path, snapshots: list[Snapshot], days: int = 366) -> None:
+    async with Database(path) as database, History(database, days=days) as history:
+        for each in snapshots:
+            history.publish(each)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "pack.sqlite"
+
+
+def rows(path: Path, step_s: int = 60) -> list[Minute]:
+    return HistoryFile(path).rows(0.0, 2e10, step_s)
+
+
+async def test_a_minute_has_means_extremes_and_sums_of_what_was_published(path):
+    currents = [3.6] * 30 + [-7.2] * 30
+    await keep(path, [at(float(s), a, soc=0.5 + s / 1000, temperature_c=None) for s, a in enumerate(currents)])
+    [row] = rows(path)
+    assert (row.time_s, row.publications, row.seen_s) == (BEGIN_S, 60, 59.0)
+    assert (row.current_a, row.current_min_a, row.current_max_a) == (pytest.approx(-1.8), -7.2, 3.6)
+    assert (row.charge_out_ah, row.charge_in_ah) == (pytest.approx(0.029), pytest.approx(0.06))
+    assert (row.energy_out_wh, row.energy_in_wh) == (pytest.approx(0.116), pytest.approx(0.24))
+    assert (row.soc, row.temperature_c) == (pytest.approx(0.559), None)
+
+
+async def test_a_gap_counts_no_charge(path):
+    await keep(path, [at(0.0), at(1.0), at(3000.0), at(3001.0)])
+    assert sum(row.seen_s for row in rows(path)) == 2.0
+
+
+async def test_a_service_started_again_goes_on_with_its_minute(path):
+    whole = [at(float(s), s / 10, 3.0 + s / 100, temperature_c=20.0 + s if s % 2 else None) for s in range(60)]
+    await keep(path.with_name("whole.sqlite"), whole)
+    await keep(path, whole[:25])
+    await keep(path, whole[25:])
+    [row], [wanted] = rows(path), rows(path.with_name("whole.sqlite"))
+    assert row.seen_s == wanted.seen_s - 1.0  # nobody saw from one run to the other
+    for name in (
+        "voltage_v",
+        "voltage_min_v",
+        "voltage_max_v",
+        "current_a",
+        "temperature_min_c",
+        "soc",
+        "publications",
+    ):
+        assert getattr(row, name) == pytest.approx(getattr(wanted, name)), name
+
+
+async def test_longer_steps_put_minutes_together(path):
+    await keep(path, [at(float(s), s / 60, 3.0, soc=1.0 - s / 7200) for s in range(0, 7200, 10)])
+    minutes, [first, second, last] = rows(path), rows(path, 3600)
+    assert len(minutes) == 120
+    assert sum(row.charge_out_ah for row in (first, second, last)) == pytest.approx(
+        sum(row.charge_out_ah for row in minutes)
+    )
+    assert (last.soc, last.current_max_a) == (minutes[-1].soc, minutes[-1].current_max_a)
+    assert first.current_min_a == 0.0
+    assert first.time_s % 3600 == 0
+
+
+async def test_only_the_newest_days_are_kept_and_a_clock_that_jumps_ahead_costs_none(path):
+    await keep(path, [at(60.0 * minute) for minute in range(1500)])
+    await keep(path, [at(1e9)], days=1)
+    kept = rows(path)
+    assert len(kept) == 1440
+    assert [row.time_s for row in kept[:2]] == [BEGIN_S + 60 * 61, BEGIN_S + 60 * 62]
+
+
+async def test_events_are_kept_and_read_in_order(path):
+    lost = at(1.0)._replace(health=ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "no board"}))
+    await keep(path, [at(0.0), lost])
+    names = [event.name for event in HistoryFile(path).events(0.0, 2e10)]
+    assert names == ["start", "sensor_online", "sensor_offline"]
+
+
+async def test_history_is_read_while_the_service_writes_it(path):
+    async with Database(path) as database, History(database, days=366) as history:
+        history.publish(at(0.0))
+        history.publish(at(60.0))  # ends the minute
+        async with asyncio.timeout(LONG_S):
+            while not path.exists() or not await asyncio.to_thread(read_or_nothing, path):  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+
+
+def read_or_nothing(path: Path) -> list[Minute]:
+    try:
+        return rows(path)
+    except UserError:
+        return []  # the table is being made
+
+
+async def test_rows_wait_for_a_disk_that_fails(path):
+    path.mkdir()
+    (path / "file").touch()
+    async with Database(path, retry_s=0.0) as database, History(database, days=366) as history:
+        database._file._refuse_planted = refuse  # type: ignore[method-assign]
+        history.publish(at(0.0))
+        history.publish(at(60.0))
+        async with asyncio.timeout(LONG_S):
+            while not database.reason:  # noqa: ASYNC110 - it has no event
+                await asyncio.sleep(0.01)
+        (path / "file").unlink()
+        path.rmdir()
+    assert [row.time_s for row in rows(path)] == [BEGIN_S, BEGIN_S + 60]
+
+
+def refuse(_: Path) -> None:
+    """Leave what is there: here it is to be in the way."""
+
+
+def test_what_cannot_be_read_is_said(path):
+    with pytest.raises(UserError, match="no history there"):
+        rows(path)
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(UserError, match="later version"):
+        rows(path)
+    path.write_bytes(b"x" * 5000)
+    with pytest.raises(UserError, match="cannot be read: file is not a database"):
+        rows(path)
