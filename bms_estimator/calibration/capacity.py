@@ -35,6 +35,10 @@ LEAST_SWING = 0.15
 """SOC between the lowest and the highest anchor that a capacity needs."""
 LARGEST_RELATIVE_STD = 0.2
 """A capacity less certain than that is none."""
+BEYOND = 3.0
+"""A rest so many standard deviations beyond the curve's ends is none of this cell."""
+DISAGREE = 9.0
+"""Squared: anchors off by more than so many of their standard deviations do not go together."""
 HYST_LEFT = 0.3
 """Part of the hysteresis that is not known even when the way is."""
 FAR = 20.0
@@ -104,8 +108,10 @@ def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std
         offset_std_a: Standard deviation of the offset of the current sensor [A]; None: as the identifier takes it.
 
     Raises:
-        UserError: No two anchors that are apart; why is said for each rest.
+        UserError: No two anchors that are apart, and why is said for each rest; or sign of the current, curve and captures
+            do not go together; or two captures are the same.
     """
+    _check_apart(captures)
     p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(current_offset_std_a=offset_std_a), 1e-3, None)[0]
     anchors: list[Anchor] = []
     rejected: list[str] = []
@@ -118,8 +124,38 @@ def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std
     alone = {a.part for a in anchors if sum(b.part == a.part for b in anchors) == 1}
     rejected += [f"{_where(a)}: no other anchor without a gap between" for a in anchors if a.part in alone]
     used = [a for a in anchors if a.part not in alone]
-    _check_swing(used, rejected)
+    _check_range(anchors, p)
+    _check_swing(used, rejected, cell.cell.capacity_ah)
     return _solved(used, rejected, p)
+
+
+def _check_apart(captures: Sequence[Columns]) -> None:
+    """Have each capture once: twice the same would seem twice as certain.
+
+    Raises:
+        UserError: Two are the same.
+    """
+    for one, other in itertools.combinations(captures, 2):
+        if all(np.array_equal(one.rows[name], other.rows[name]) for name in ("time_s", "current_a", "voltage_v")):
+            raise UserError(f"{one.name} and {other.name}: the same samples; give each capture once")
+
+
+def _check_range(anchors: Sequence[Anchor], p: np.void) -> None:
+    """Have most rests on the curve.
+
+    Raises:
+        UserError: They are beyond its ends: it is another cell's.
+    """
+    low_v, high_v = float(p["ocv_v"][0]), float(p["ocv_v"][-1])
+    beyond = [
+        a for a in anchors if max(low_v - a.rest.ocv_v, a.rest.ocv_v - high_v) > BEYOND * np.hypot(a.own_v, a.curve_v)
+    ]
+    if 2 * len(beyond) > len(anchors):
+        volts = [a.rest.ocv_v for a in beyond]
+        raise UserError(
+            f"no capacity: {len(beyond)} of {len(anchors)} rests, at {min(volts):.3f}..{max(volts):.3f} V, are beyond the "
+            f"curve of the cell, {low_v:.3f}..{high_v:.3f} V: is it this cell's, and of as many in series?"
+        )
 
 
 def continuous(good: SampleBlock, capacity_ah: float) -> list[tuple[int, int]]:
@@ -194,14 +230,21 @@ def _anchor(
     )
 
 
-def _check_swing(anchors: Sequence[Anchor], rejected: Sequence[str]) -> None:
+def _check_swing(anchors: Sequence[Anchor], rejected: Sequence[str], capacity_ah: float) -> None:
     reasons = "".join(f"\n  {line}" for line in rejected[:8])
     if not anchors:
         raise UserError(
             "no capacity: no two rests tell the SOC with the charge between them counted; rest the cell for half an hour "
             f"near full and again near empty, or give a whole slow discharge to `ocv`{':' if reasons else ''}{reasons}"
         )
-    swing = max(np.ptp([a.soc for a in anchors if a.part == part]) for part in {a.part for a in anchors})
+    parts = [[a for a in anchors if a.part == part] for part in {a.part for a in anchors}]
+    swing = max(np.ptp([a.soc for a in part]) for part in parts)
+    counted = max(np.ptp([a.counted_ah for a in part]) for part in parts) / capacity_ah
+    if swing < LEAST_SWING <= 0.5 * counted:
+        raise UserError(
+            f"no capacity: the voltages of the rests are at most {swing:.2f} of SOC apart, the charge between them is "
+            f"{counted:.2f} of the declared capacity: is the curve this cell's, and the unit of the current ampere?"
+        )
     if swing < LEAST_SWING:
         raise UserError(
             f"no capacity: the anchors of a capture are at most {swing:.2f} of SOC apart, at least {LEAST_SWING} are "
@@ -228,6 +271,16 @@ def _solved(anchors: Sequence[Anchor], rejected: Sequence[str], p: np.void) -> C
     worse = float(left @ precision @ left) / freedom if freedom > 0 else 1.0
     covariance *= max(1.0, worse)
     relative = float(np.sqrt(covariance[0, 0]) / abs(x[0]))
+    if x[0] < 0.0 and relative < LARGEST_RELATIVE_STD:
+        raise UserError(
+            "no capacity: the voltages of the rests rise where charge is counted out of the cell: "
+            "check the sign of the current (--current-sign)"
+        )
+    if worse > DISAGREE:
+        raise UserError(
+            f"no capacity: voltages and charge of {len(anchors)} anchors disagree, by {np.sqrt(worse):.1f} times what their "
+            f"errors explain: is the curve this cell's, and were the captures taken of one cell?"
+        )
     if x[0] <= 0.0 or relative > LARGEST_RELATIVE_STD:
         raise UserError(
             f"no capacity: {len(anchors)} anchors tell it to {100.0 * relative:.0f} % only: longer rests, further apart, "

@@ -4,16 +4,52 @@ import tomllib
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic_core.core_schema import CoreSchema, no_info_before_validator_function
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.secret import without_secrets
 
 
+def _number(value: object) -> object:
+    """A number as it is.
+
+    Raises:
+        ValueError: pydantic would take it for one: ``true`` for 1, and the text "3_9" for 39.
+    """
+    if isinstance(value, bool):
+        raise ValueError("must be a number")  # noqa: TRY004 - what pydantic takes for a wrong value
+    if isinstance(value, str):
+        raise ValueError("must be a number, without quotes")  # noqa: TRY004
+    return value
+
+
+def _make_strict(schema: Any) -> None:
+    """Let each number and truth value within a schema be nothing else."""
+    kind = schema.get("type") if isinstance(schema, dict) else None
+    if kind == "bool":
+        schema["strict"] = True
+    elif kind in ("int", "float"):
+        lax = dict(schema)
+        schema.clear()
+        schema.update(no_info_before_validator_function(_number, lax))
+    else:
+        parts = schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ()
+        for part in parts:
+            _make_strict(part)
+
+
 class Strict(BaseModel):
-    """Base of all configured values: unknown keys are errors, values do not change after load."""
+    """Base of all configured values: unknown keys are errors, numbers are numbers, values do not change after load."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """As pydantic has it, but a number is one: it would take ``true`` for 1 and the text "3_9" for 39."""
+        schema = handler(source)
+        _make_strict(schema)
+        return schema
 
 
 T = TypeVar("T", bound=BaseModel)
@@ -31,6 +67,8 @@ def read_toml(path: Path, model: type[T]) -> T:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise UserError(f"{path}: not valid TOML: nested too deeply") from None
     try:
         return model.model_validate(table)
     except ValidationError as error:

@@ -78,7 +78,7 @@ class Publisher:
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._sample_s = -math.inf  # monotonic, of the last accepted sample
-        self._impossible = ""  # the last sample that was out of range
+        self._impossible = ""  # why the last sample that was dropped is none, where that can be said
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -94,7 +94,7 @@ class Publisher:
             self._window.add(trace, self._clock.wall(), self._source.cells)
             self._sample_s = now_s
         if trace.size < block.size:
-            self._impossible = impossible_sample(block, self._estimator.settings[0]) or self._impossible
+            self._impossible = impossible_sample(block, self._estimator.settings[0]) or ""
         if now_s >= self._due_s:
             self.publish()
 

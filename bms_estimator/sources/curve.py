@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.sources.number import measured
 
 Floats = NDArray[np.float64]
 
@@ -76,7 +77,7 @@ def _number(path: Path, line: int, name: str, cell: str | None) -> float:
     if cell is None:
         return float("nan")
     try:
-        return float(cell)
+        return measured(cell)
     except ValueError:
         raise UserError(f"{path}: line {line}: {name} = {cell!r}: must be a number") from None
 

@@ -58,6 +58,8 @@ class FrameCounters:
     """Samples that came before their scaling was known."""
     overruns: int = 0
     """Samples before which the board had no room on the line."""
+    implausible: int = 0
+    """Temperatures that no pack has: handed on as not measured."""
     resets: int = 0
     clock_jumps: int = 0
     """Samples that came long before their time stamp: from then on the board's clock counts anew, by arrival."""

@@ -18,24 +18,24 @@ cut one is ignored. A file whose name ends in .gz is read as gzip.
 """
 
 import binascii
+import dataclasses
 import gzip
 import json
 import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Literal, Self, cast
+from typing import IO, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import SensorSettings
-from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.wire.capture_records import RECORD_OVERHEAD_BYTES, split_records
 
 MAGIC = b"BMSRAW1\n"
@@ -48,20 +48,28 @@ _LENGTH = struct.Struct("<I")
 _CRC = struct.Struct("<H")
 _LONGEST_HEADER_BYTES = 1 << 20
 
-Mode = Literal["binary", "text"]
+
+@dataclass(config=ConfigDict(strict=True, extra="ignore", frozen=True))
+class _Versioned:
+    """What a header of any version tells."""
+
+    version: int
 
 
-@dataclass(frozen=True)
+@dataclass(config=ConfigDict(strict=True, extra="ignore", frozen=True))
 class CaptureHeader:
     """What was recorded."""
 
-    mode: Mode = "binary"
+    mode: str = "binary"
     port: str = ""
     baud: int = 0
-    current_sign: CurrentSign = "discharge_positive"
+    current_sign: str = "discharge_positive"
     started: str = ""
     """Wall clock at the first byte, ISO 8601 UTC; set by the writer when empty."""
     version: int = VERSION
+
+
+_VERSIONED, _HEADER = TypeAdapter(_Versioned), TypeAdapter(CaptureHeader)
 
 
 def header_of(sensor: SensorSettings) -> CaptureHeader:
@@ -77,7 +85,7 @@ def sensor_of(path: Path) -> SensorSettings:
     """
     header = read_header(path)
     try:
-        return SensorSettings(protocol=header.mode, current_sign=header.current_sign)
+        return SensorSettings.model_validate({"protocol": header.mode, "current_sign": header.current_sign})
     except ValidationError:
         raise UserError(
             f"{path}: recorded from mode {header.mode!r}, current_sign {header.current_sign!r}: "
@@ -85,7 +93,7 @@ def sensor_of(path: Path) -> SensorSettings:
         ) from None
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class CaptureBatch:
     """Some reads of the line, in the shape that a decoder's ``feed_reads`` takes."""
 
@@ -118,7 +126,7 @@ class CaptureWriter:
 
     def __init__(self, path: Path, header: CaptureHeader) -> None:
         started = header.started or datetime.now(tz=UTC).isoformat(timespec="milliseconds")
-        head = json.dumps(asdict(header) | {"started": started}).encode()
+        head = json.dumps(dataclasses.asdict(header) | {"started": started}).encode()
         try:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
         except FileExistsError:
@@ -206,7 +214,10 @@ def read_capture(path: Path) -> Iterator[CaptureBatch]:
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
     with file:
-        _read_header(path, file)
+        try:
+            _read_header(path, file)
+        except (OSError, EOFError, zlib.error) as error:
+            raise UserError(f"{path}: cannot be read: {error}") from None
         rest = b""
         while more := _read_some(file, CHUNK_BYTES):
             raw = np.frombuffer(rest + more, dtype=np.uint8)
@@ -217,7 +228,7 @@ def read_capture(path: Path) -> Iterator[CaptureBatch]:
             if batch.damaged:
                 return
         if rest:
-            yield replace(_split(np.frombuffer(b"", dtype=np.uint8))[0], unread_bytes=len(rest))
+            yield dataclasses.replace(_split(np.frombuffer(b"", dtype=np.uint8))[0], unread_bytes=len(rest))
 
 
 def _split(raw: NDArray[np.uint8]) -> tuple[CaptureBatch, int]:
@@ -238,10 +249,10 @@ def _open(path: Path) -> IO[bytes]:
 
 
 def _read_some(file: IO[bytes], size: int) -> bytes:
-    """Up to ``size`` bytes; a gzip file that was cut off ends where it was cut."""
+    """Up to ``size`` bytes; a gzip file that was cut off or is damaged ends where it is."""
     try:
         return file.read(size)
-    except (EOFError, zlib.error):
+    except (EOFError, gzip.BadGzipFile, zlib.error):
         return b""
 
 
@@ -255,8 +266,21 @@ def _read_header(path: Path, file: IO[bytes]) -> CaptureHeader:
     text, crc = file.read(min(length, _LONGEST_HEADER_BYTES)), file.read(_CRC.size)
     if len(text) != length or len(crc) != _CRC.size or _CRC.unpack(crc)[0] != binascii.crc_hqx(text, 0xFFFF):
         raise UserError(f"{path}: its header is damaged or cut off")
-    values = json.loads(text)
-    if values["version"] != VERSION:
-        raise UserError(f"{path}: version {values['version']}, this program reads version {VERSION}")
-    names = {field.name for field in fields(CaptureHeader)}
-    return CaptureHeader(**{name: value for name, value in values.items() if name in names})
+    return _checked_header(path, text)
+
+
+def _checked_header(path: Path, text: bytes) -> CaptureHeader:
+    """The header whose JSON is ``text``.
+
+    Raises:
+        UserError: It is none, or one of a later version; the message names the file and what is wrong.
+    """
+    try:
+        found = _VERSIONED.validate_json(text)
+        if found.version != VERSION:
+            raise UserError(f"{path}: version {found.version}, this program reads version {VERSION}")
+        return _HEADER.validate_json(text)
+    except ValidationError as error:
+        wrong = error.errors(include_url=False)[0]
+        where = "".join(f"{key}: " for key in wrong["loc"])
+        raise UserError(f"{path}: its header is none of this program's: {where}{wrong['msg'].lower()}") from None

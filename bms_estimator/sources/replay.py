@@ -31,6 +31,10 @@ class Capture(Protocol):
     def fraction(self) -> float:
         """How much has been read, 0..1."""
 
+    @property
+    def implausible(self) -> int:
+        """Readings that no pack has, handed on as not measured."""
+
     def __iter__(self) -> Iterator[SampleBlock]:
         """Blocks of samples.
 
@@ -70,6 +74,11 @@ class RawCapture:
         """How much has been read, 0..1; too fast where the file is packed."""
         return min(self._read / self._size, 1.0)
 
+    @property
+    def implausible(self) -> int:
+        """As the decoder counts them."""
+        return self.decoder.counters["implausible"]
+
     def __iter__(self) -> Iterator[SampleBlock]:
         """Blocks of samples, as ``Capture`` says."""
         for batch in read_capture(self._path):
@@ -105,8 +114,10 @@ class Replay:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The decoder's; of a table, how many rows came."""
-        return self._decoder.counters if self._decoder else {"frames_received": self.samples}
+        """The decoder's; of a table, how many rows came, and temperatures that are none."""
+        if self._decoder:
+            return self._decoder.counters
+        return {"frames_received": self.samples, "implausible": self.capture.implausible}
 
     @property
     def board(self) -> Mapping[str, str]:

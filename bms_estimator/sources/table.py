@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.number import LEAST_C, MOST_C, forget_beyond, measured
 
 BLOCK_ROWS = 65_536
 
@@ -82,6 +83,7 @@ class CsvTable:
 
     def __init__(self, path: Path, sign: Sign) -> None:
         self._path, self._sign = path, sign
+        self.implausible = 0
         self._raw: IO[bytes] | None = None
         self._size = 0
 
@@ -121,7 +123,9 @@ class CsvTable:
             line += len(lines)
             if len(values):
                 rows += len(values)
-                yield _block(values.T, columns)
+                block, implausible = _block(values.T, columns)
+                self.implausible += implausible
+                yield block
         if rows == 0:
             raise UserError(f"{self._path}: no samples after the header in line {line}")
 
@@ -149,9 +153,9 @@ class CsvTable:
         return np.array(rows)
 
     def _number(self, cell: str, line: int, column: str) -> float:
-        """An empty cell is a missing value: NaN."""
+        """An empty cell, or a word for it, is a missing value: NaN."""
         try:
-            return float(cell) if cell.strip() else np.nan
+            return measured(cell) if cell.strip() else np.nan
         except ValueError:
             raise UserError(f"{self._path}: line {line}: {column} = {cell!r}: must be a number") from None
 
@@ -166,7 +170,7 @@ class ParquetTable:
 
     def __init__(self, path: Path, sign: Sign) -> None:
         self._path, self._sign = path, sign
-        self.fraction = 0.0
+        self.fraction, self.implausible = 0.0, 0
 
     def __iter__(self) -> Iterator[SampleBlock]:
         """Blocks of at most ``BLOCK_ROWS`` samples, current positive on discharge.
@@ -187,7 +191,9 @@ class ParquetTable:
                     rows += batch.num_rows
                     self.fraction = rows / file.metadata.num_rows
                     values = [self._numbers(batch.column(name), name) for name in columns.names]
-                    yield _block(values, columns)
+                    block, implausible = _block(values, columns)
+                    self.implausible += implausible
+                    yield block
         except pa.ArrowInvalid as error:
             raise UserError(f"{self._path}: not a whole Parquet file: {error}") from None
         except OSError as error:
@@ -223,10 +229,26 @@ def samples_of(table: ByName, sign: Sign) -> SampleBlock:
     """The samples of a table in memory.
 
     Raises:
-        UserError: A column is missing.
+        UserError: A column is missing, or is not of numbers.
     """
     columns = _columns("the table", list(table), sign)
-    return _block([np.asarray(table[name], dtype=np.float64) for name in columns.names], columns)
+    return _block([_numeric(name, table[name]) for name in columns.names], columns)[0]
+
+
+def _numeric(name: str, column: ArrayLike) -> NDArray[np.float64]:
+    """A column of a table in memory; None in it is a missing value: NaN.
+
+    Raises:
+        UserError: There are not numbers in it.
+    """
+    values = np.asarray(column)
+    if values.dtype.kind == "O" and all(value is None or isinstance(value, int | float) for value in values.flat):
+        values = values.astype(np.float64)
+    if values.dtype.kind not in "fiu" or values.ndim != 1:
+        raise UserError(
+            f"the table: column {name} holds {values.dtype} of shape {values.shape}: must be numbers, one a row"
+        )
+    return values.astype(np.float64)
 
 
 def _is_data(line: str) -> bool:
@@ -262,11 +284,11 @@ def _wanted(spelling: Spelling) -> str:
     return f"{','.join(spelling[:3])}[,{spelling.temperature_c}]"
 
 
-def _block(values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns: _Columns) -> SampleBlock:
-    """Samples from columns of values in the order of ``columns``."""
+def _block(values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns: _Columns) -> tuple[SampleBlock, int]:
+    """Samples from columns of values in the order of ``columns``, and how many temperatures were none."""
     block = np.zeros(len(values[0]), dtype=SAMPLE)
     block["time_s"] = values[0]
     block["current_a"] = columns.discharge_sign * values[1]
     block["voltage_v"] = values[2]
     block["temperature_c"] = values[3] if len(values) > 3 else np.nan
-    return block
+    return block, forget_beyond(block["temperature_c"], LEAST_C, MOST_C)

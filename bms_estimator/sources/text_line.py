@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from math import nan
 from typing import NamedTuple
 
+from bms_estimator.sources.number import NUMBER, measured, number
+
 
 class Reading(NamedTuple):
     """What one line says."""
@@ -39,11 +41,11 @@ _KNOWN = {
 """Name in a line: what it is, and its unit if the name holds it."""
 
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _PAIR = re.compile(
     r"(?<![A-Za-z0-9_])([A-Za-z_][A-Za-z0-9_]*)\s*[=:]\s*"
-    rf"({_NUMBER}(?:,{_NUMBER})*)"
+    rf"({NUMBER}(?:,{NUMBER})*)"
     r"(?:\s*([A-Za-z]{1,8})\b(?!\s*[=:]))?"  # a unit, unless it is the next name
+    r"(?!\w|\.\d|,[-+.\d])"  # half a number is none
 )
 
 
@@ -61,8 +63,10 @@ def read_line(line: bytes) -> Reading | None:
             return _told(_members(line))
         if b"=" in line or b":" in line:
             return _told(_pairs(line.decode("ascii", "replace")))
-        voltage_v, current_a, *others = map(float, line.translate(_SEPARATORS).split())
-        return Reading(voltage_v, current_a, others[0] if others else nan) if len(others) <= 1 else None
+        columns = line.translate(_SEPARATORS).decode("ascii").split()
+        if len(columns) not in (2, 3):
+            return None
+        return Reading(number(columns[0]), number(columns[1]), measured(columns[2]) if len(columns) == 3 else nan)
     except (ValueError, OverflowError, RecursionError):
         return None
 
@@ -73,11 +77,11 @@ Said = tuple[str, list[float], str]
 
 def _pairs(text: str) -> Iterable[Said]:
     for name, values, unit in _PAIR.findall(text):
-        yield name, [float(value) for value in values.split(",")], unit
+        yield name, [number(value) for value in values.split(",")], unit
 
 
 def _members(line: bytes) -> Iterable[Said]:
-    for name, value in json.loads(line.decode()).items():
+    for name, value in json.loads(line.decode(), parse_float=number, parse_constant=number).items():
         values = value if isinstance(value, list) else [value]
         if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
             yield name, [float(v) for v in values], ""

@@ -66,3 +66,37 @@ def test_no_rests_are_refused_with_what_to_do(tmp_path, capsys):
     assert (code, text) == (2, "")
     assert "error: no capacity: no two rests tell the SOC" in err
     assert "rest the cell for half an hour" in err
+
+
+def test_a_wrong_sign_is_named_and_no_longer_rest_advised(capsys, capture):
+    code, _, err = run(capsys, "capacity", capture, "--cell", "ncr18650", "--current-sign", "charge_positive")
+    assert code == 2
+    assert "check the sign of the current (--current-sign)" in err
+    assert "rest" not in err.replace("the rests", "")
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("lto", "rests, at 3.322..4.160 V, are beyond the curve of the cell, 1.500..2.700 V: is it this cell's"),
+        (
+            "lfp",
+            "0.02 of SOC apart, the charge between them is 0.90 of the declared capacity: is the curve this cell's",
+        ),
+        ("lmo", "anchors disagree, by 5.2 times what their errors explain: is the curve this cell's"),
+    ],
+)
+def test_a_wrong_cell_is_named_and_no_longer_rest_advised(capsys, capture, cell, said):
+    code, _, err = run(capsys, "capacity", capture, "--cell", cell, "--capacity-ah", "3")
+    assert code == 2
+    assert said in err
+    assert "longer rests" not in err
+    assert "rest again" not in err
+
+
+def test_the_same_capture_twice_is_no_new_data(capsys, capture, tmp_path):
+    other = tmp_path / "copy.csv"
+    other.write_bytes(capture.read_bytes())
+    code, _, err = run(capsys, "capacity", capture, other, "--cell", "ncr18650")
+    assert code == 2
+    assert err == "error: rests.csv and copy.csv: the same samples; give each capture once\n"

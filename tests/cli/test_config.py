@@ -53,7 +53,7 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ("[pack]\nsereis = 2\n", ["pack.sereis", "unknown key"]),
         ("[wrong]\na = 1\n", ["wrong", "unknown key"]),
         ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary' or 'text'"]),
-        ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "integer"]),
+        ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "number, without quotes"]),
         ("[observer]\nlambda = -1\n", ["observer.lambda = -1", "greater than 0"]),
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),
         ('[pack]\ncell = ""\n', ["pack.cell = ''", "at least 1 character", "shipped cell's name"]),

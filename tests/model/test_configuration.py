@@ -31,6 +31,9 @@ def edited(tmp_path: Path, old: str, new: str) -> Path:
         ("capacity_ah = 0.275", "capacity_ah = 0.275\ncapacty = 1", r"cell\.toml: cell\.capacty.*: unknown key"),
         ("capacity_ah = 0.275", 'capacity_ah = "much"', r"cell\.capacity_ah = 'much': .*number"),
         ("capacity_ah = 0.275", "capacity_ah = nan", r"cell\.capacity_ah = nan: .*"),
+        ("capacity_ah = 0.275", "capacity_ah = true", r"cell\.capacity_ah = True: must be a number \(rated capacity"),
+        ("capacity_ah = 0.275", 'capacity_ah = "3_9"', r"cell\.capacity_ah = '3_9': must be a number, without quotes"),
+        ("upper = 1.0, lower = 0.1", "upper = true, lower = 0.1", r"adaptation\.a1\.upper = True: must be a number"),
         ("voltage_min_v = 1.5", "voltage_min_v = 4.6", r"must increase in this order"),
         ("upper = 1.0, lower = 0.1", "upper = 1.0, lower = 2.0", r"adaptation\.a1.*lower = 2\.0 is above upper = 1\.0"),
         ("a12 =", "a16 =", r"adaptation\.a16: no such parameter; a1 to a15 adapt"),
@@ -131,3 +134,29 @@ def test_pack_scales_the_cell() -> None:
     assert pack.bounds(1).limit == pytest.approx(cell.bounds(1).limit * 1.5)
     assert pack.bounds(9).limit == pytest.approx(cell.bounds(9).limit / 1.5)
     assert pack.bounds(8).limit == cell.bounds(8).limit
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[pack]\ncapacity_ah = true", "pack.capacity_ah = True: must be a number"),
+        ("[pack]\nseries = true", "pack.series = True: must be a number"),
+        ('[pack]\nseries = "1_4"', "pack.series = '1_4': must be a number, without quotes"),
+        ("[identifier]\nenabled = 1", "identifier.enabled = 1: Input should be a valid boolean"),
+        ('[identifier]\nenabled = "yes"', "identifier.enabled = 'yes': Input should be a valid boolean"),
+        ("[observer]\nrearm_gain = false", "observer.rearm_gain = False: must be a number"),
+        ("a = " + 3000 * "[", "not valid TOML: nested too deeply"),
+    ],
+)
+def test_a_number_is_a_number_and_a_truth_value_is_one(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text(text)
+    with pytest.raises(UserError) as error:
+        load_settings(path)
+    assert str(error.value).startswith(f"{path}: {said}")
+
+
+def test_a_whole_number_may_be_written_with_a_point(tmp_path: Path) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text("[pack]\nseries = 4.0\ncapacity_ah = 3\n")
+    assert load_settings(path).pack.series == 4

@@ -245,3 +245,25 @@ async def test_lowest_and_highest_cell_reach_the_published_state(line: Line) -> 
     assert (without.estimate.cell_lowest_v, without.estimate.cell_highest_v) == (None, None)
     assert told.estimate
     assert (told.estimate.cell_lowest_v, told.estimate.cell_highest_v) == (3.79, 3.81)
+
+
+async def test_a_reason_that_has_passed_is_not_told_any_more(line: Line) -> None:
+    """A board whose hello scales by zero has no numbers; before, its voltage was out of range."""
+    async with service(line) as live:
+        live.line.write(frames(0, 5, voltage_sum=16_000_000))
+        await live.until(lambda s: "where 1.5..4.5 V" in (s.health.sensor_message or ""))
+        live.line.write(replace(HELLO, boot_id=8, current_uv_per_a=0).encode() + frames(0, 5))
+        said = await live.until(lambda s: s.health.samples["dropped_not_finite"] == 5)
+    message = said.health.sensor_message or ""
+    assert message.endswith("; the last of them tells no current: is the sensor connected?")
+
+
+async def test_a_temperature_and_cells_that_no_pack_has_are_not_published(line: Line) -> None:
+    async with service(line, hello=b"\n", protocol="text") as live:
+        live.line.write(b"V=3.8 I=0.1 T=1e308 cells=3.8,1e308\n")
+        told = await live.until(lambda s: s.estimate is not None)
+        _, health = await live.end()
+    assert told.estimate is not None
+    assert told.estimate.temperature_c is None
+    assert (told.estimate.cell_lowest_v, told.estimate.cell_highest_v) == (3.8, 3.8)
+    assert health.line["implausible"] == 2

@@ -72,10 +72,34 @@ def test_the_voltages_of_single_cells(line: bytes) -> None:
         b'{"voltage": 13.3, "current": 2',
         b'{"voltage": 1' + 400 * b"0" + b', "current": 2}',
         b'{"a":' + 500 * b"[" + 500 * b"]" + b"}",
+        b"3_9,2.0",
+        b"13.3,2.0,2_5",
+        b"nan,2.0",
+        b"13.3,inf",
+        b"1e999,2.0",
+        "١٣.٣,2".encode(),
+        b"V=3_9 I=2",
+        b"V=13.3.1 I=2",
+        b"V=0x1F I=2",
+        b"V=1e999 I=2",
+        b'{"voltage": NaN, "current": 2}',
+        b'{"voltage": 13.3, "current": -Infinity}',
+        b'{"voltage": 1e999, "current": 2}',
     ],
 )
 def test_what_does_not_tell_both_says_nothing(line: bytes) -> None:
     assert read_line(line) is None
+
+
+@pytest.mark.parametrize("line", [b"13.3,2.0,nan", b"13.3 2.0 NaN", b"13.3;2.0;-inf", b"13.3,2.0,ovf"])
+def test_a_word_for_no_temperature_is_none(line: bytes) -> None:
+    reading = read_line(line)
+    assert reading is not None
+    assert math.isnan(reading.temperature_c)
+
+
+def test_half_a_list_of_cells_is_none() -> None:
+    assert read_line(b"V=6.6 I=2 cells=3.31,3_2") == Reading(6.6, 2.0)
 
 
 fragments = st.sampled_from(
@@ -97,10 +121,15 @@ fragments = st.sampled_from(
         b"]",
         b"}",
         b"e9",
+        b"_",
+        b"nan",
+        b"1e308",
     ]
 )
 
 
 @given(st.binary(max_size=300) | st.lists(fragments, max_size=40).map(b"".join))
-def test_no_bytes_make_it_raise(line: bytes) -> None:
-    read_line(line)
+def test_no_bytes_make_it_raise_or_tell_of_what_is_not_finite(line: bytes) -> None:
+    reading = read_line(line)
+    if reading is not None:
+        assert all(map(math.isfinite, (reading.voltage_v, reading.current_a, *reading.cells_v)))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.dialects import Dialect, cell_block
 from bms_estimator.sources.frames import PRINTABLE, CurrentSign
+from bms_estimator.sources.number import LEAST_C, LEAST_CELL_V, MOST_C, MOST_CELL_V, forget_beyond
 from bms_estimator.sources.text_line import Reading, read_line
 
 LINE_BYTES = 1024
@@ -32,7 +33,7 @@ class TextDialect(Dialect):
         self._overlong = False  # the line is too long, its rest is skipped
         self._in_step = False  # once a line has ended: what came before may be half a line
         self._first_s = self._last_s = float("nan")
-        self._bytes = self._samples = self._errors = self._too_long = 0
+        self._bytes = self._samples = self._errors = self._too_long = self._implausible = 0
         self._bad: bytes | None = None  # the first line since the last good one that said nothing
         self._good: Reading | None = None
 
@@ -44,6 +45,7 @@ class TextDialect(Dialect):
             "frames_received": self._samples,
             "text_errors": self._errors,
             "length_errors": self._too_long,
+            "implausible": self._implausible,
         }
 
     @property
@@ -76,12 +78,14 @@ class TextDialect(Dialect):
             self._begin_overlong(self._rest)
             self._rest, self._overlong = b"", True
         self.cells = cell_block([reading.cells_v for reading in readings])
+        self._implausible += forget_beyond(self.cells, LEAST_CELL_V, MOST_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
         if readings:
             self._samples += len(readings)
             block["voltage_v"] = [reading.voltage_v for reading in readings]
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
             block["temperature_c"] = [reading.temperature_c for reading in readings]
+            self._implausible += forget_beyond(block["temperature_c"], LEAST_C, MOST_C)
             block["status"] = 0
             block["time_s"] = self._times(arrival_s, len(readings))
         return block

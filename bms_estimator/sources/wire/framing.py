@@ -4,12 +4,15 @@ One decoder serves the live line and the replay. All it knows between calls stan
 depends on how the bytes were cut into calls, except for the arrival time of the byte that ends a frame.
 """
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.state import Record
 from bms_estimator.model.sample import SampleStatus
+from bms_estimator.sources.number import LEAST_C, MOST_C
 from bms_estimator.sources.protocol import MODULUS, PROTOCOL_VERSION, BoardStatus, MessageType
 from bms_estimator.sources.wire.board_clock import CLOCK_WINDOWS, forget_clock, take_arrival
 from bms_estimator.sources.wire.scaling import (
@@ -73,6 +76,7 @@ DECODER = np.dtype(
         ("before_hello", "i8"),
         ("overruns", "i8"),
         ("resets", "i8"),
+        ("implausible", "i8"),  # temperatures that no pack has
         ("clock_jumps", "i8"),  # times the board's clock was not believed
     ],
     align=True,
@@ -305,6 +309,9 @@ def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     out.voltage_v = voltage(s, float(take(p, 10, 3)), count, reference_v)
     out.current_a = d.current_sign * current(s, float(take(p, 13, 3)), count, reference_v)
     out.temperature_c = temperature(s)
+    if out.temperature_c < LEAST_C or out.temperature_c > MOST_C:
+        out.temperature_c = math.nan
+        d.implausible += 1
     out.status = place | (bits & _SATURATED_OR_OVERRUN)
     return 1
 

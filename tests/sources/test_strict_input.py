@@ -1,0 +1,146 @@
+"""What comes from others is a number or is refused, with the file, the place and what is wrong."""
+
+import binascii
+import gzip
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.curve import read_curve
+from bms_estimator.sources.dialects.board import BoardDialect
+from bms_estimator.sources.dialects.text import TextDialect
+from bms_estimator.sources.number import measured, number
+from bms_estimator.sources.protocol import Hello, SampleMessage, unseal
+from bms_estimator.sources.raw_capture import MAGIC, CaptureHeader, CaptureWriter, read_capture, read_header
+from bms_estimator.sources.replay import Replay, load_capture, open_capture
+from tests.sources.test_decoder_fuzz import HELLO
+
+HEAD = "time_s,current_a,voltage_v,temperature_c\n"
+
+
+@pytest.mark.parametrize("text", ["3.9", " 3.9\r", "+3.9", "39e-1", "003.9"])
+def test_a_decimal_number_is_one(text: str) -> None:
+    assert number(text) == 3.9
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["3_9", "", " ", "٣", "\uff13", "nan", "inf", "1e999", "0x1f", "1d5", "3,9", "3.9V", "--3", "1e", ".", "1 2"],
+)
+def test_what_is_no_decimal_number_is_none(text: str) -> None:
+    with pytest.raises(ValueError, match="no decimal number"):
+        number(text)
+
+
+def test_a_word_for_nothing_is_nothing() -> None:
+    assert all(math.isnan(measured(text)) for text in ("nan", "NaN", "-nan", "inf", "-Infinity", "ovf"))
+
+
+@pytest.mark.parametrize("cell", ["3_9", "٣", "0x10", "True"])
+def test_a_cell_of_a_table_that_python_takes_for_a_number_is_refused(tmp_path: Path, cell: str) -> None:
+    path = tmp_path / "odd.csv"
+    path.write_text(f"{HEAD}0,1,3.7,25\n1,1,{cell},25\n", encoding="utf-8")
+    with pytest.raises(UserError, match=rf"odd\.csv: line 3: voltage_v = '{cell}': must be a number"):
+        load_capture(path)
+
+
+@pytest.mark.parametrize("word", ["nan", "inf", "", "-Infinity", "1e999"])
+async def test_what_was_not_measured_is_missing_in_a_table_and_a_temperature_that_is_none_is_counted(
+    tmp_path: Path, word: str
+) -> None:
+    path = tmp_path / "hot.csv"
+    path.write_text(f"{HEAD}0,1,3.7,1e308\n1,1,3.7,-61\n2,1,3.7,{'nan' if word == '1e999' else word}\n3,1,3.7,25\n")
+    replay = Replay(open_capture(path))
+    blocks = [block async for block in replay]
+    assert np.concatenate(blocks)["temperature_c"].tolist() == pytest.approx(
+        [math.nan, math.nan, math.nan, 25], nan_ok=True
+    )
+    assert replay.counters["implausible"] == (2 if word in ("nan", "", "1e999") else 3)
+
+
+@pytest.mark.parametrize("column", [["3_9", "3.7"], ["3.7", "3.7"], [b"1", b"2"], [1j, 2j], [[1], [2]], [True, False]])
+def test_a_column_in_memory_that_is_not_of_numbers_is_refused(column: list[object]) -> None:
+    with pytest.raises(UserError, match="the table: column voltage_v holds"):
+        load_capture({"time_s": [0.0, 1.0], "current_a": [0, 0], "voltage_v": column})
+
+
+def test_none_in_a_column_in_memory_is_missing() -> None:
+    columns = load_capture({"time_s": [0, 1], "current_a": [None, 1], "voltage_v": [3.7, 3.7]})
+    assert columns["current_a"].tolist() == pytest.approx([math.nan, 1.0], nan_ok=True)
+
+
+def test_a_curve_takes_decimal_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "ocv.csv"
+    path.write_text("soc,ocv_v\n0,3.0\n1,4_2\n")
+    with pytest.raises(UserError, match=r"ocv\.csv: line 3: ocv_v = '4_2': must be a number"):
+        read_curve(path)
+
+
+def header(path: Path, text: bytes) -> Path:
+    """A capture whose header is ``text``, with a right CRC."""
+    crc = binascii.crc_hqx(text, 0xFFFF)
+    path.write_bytes(MAGIC + len(text).to_bytes(4, "little") + text + crc.to_bytes(2, "little"))
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(b"", b"[]", b"{}", b"null", b"1", b'"x"', b"{", b"\xff", 5000 * b"["),
+        *(b'{"version": true}', b'{"version": "1"}', b'{"version": 1' + 5000 * b"0" + b"}"),
+        *(b'{"version": 1, "mode": 7}', b'{"version": 1, "baud": "fast"}', b'{"version": 1, "port": null}'),
+        b'{"version": 1, "started": 1e999}',
+    ],
+    ids=lambda text: text[:24].decode("latin-1"),
+)
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_capture_whose_header_is_odd_is_refused_with_its_name(tmp_path: Path, text: bytes, packed: bool) -> None:
+    path = header(tmp_path / "odd.bms", text)
+    if packed:
+        path = tmp_path / "odd.bms.gz"
+        path.write_bytes(gzip.compress((tmp_path / "odd.bms").read_bytes()))
+    for read in (read_header, lambda path: list(read_capture(path)), open_capture):
+        with pytest.raises(UserError, match=rf"^{path}: its header is none of this program's: "):
+            read(path)
+
+
+def test_a_later_version_and_an_unknown_device_are_named(tmp_path: Path) -> None:
+    path = header(tmp_path / "new.bms", b'{"version": 2, "mode": {"any": "thing"}}')
+    with pytest.raises(UserError, match=r"new\.bms: version 2, this program reads version 1"):
+        read_header(path)
+    path = header(path, json.dumps({"version": 1, "mode": "modbus", "more": [1]}).encode())
+    with pytest.raises(UserError, match=r"new\.bms: recorded from mode 'modbus'"):
+        open_capture(path)
+
+
+def test_a_packed_capture_whose_end_is_damaged_ends_there(tmp_path: Path) -> None:
+    path = tmp_path / "line.bms"
+    with CaptureWriter(path, CaptureHeader()) as writer:
+        writer.write(1.0, HELLO)
+    packed = bytearray(gzip.compress(path.read_bytes()))
+    packed[-6] ^= 1  # of the CRC of what was packed
+    damaged = path.with_suffix(".bms.gz")
+    damaged.write_bytes(packed)
+    assert sum(batch.ends.size for batch in read_capture(damaged)) <= 1
+
+
+def test_a_text_line_s_temperature_and_cells_beyond_reason_are_dropped_and_counted() -> None:
+    dialect = TextDialect()
+    block = dialect.feed(0.0, b"\nV=7.2 I=1 T=1e308 cells=3.6,1e308\nV=7.2 I=1 T=25 cells=3.6,3.6\n")
+    assert block["temperature_c"].tolist() == pytest.approx([math.nan, 25.0], nan_ok=True)
+    assert dialect.cells[0].tolist() == pytest.approx([3.6, math.nan], nan_ok=True)
+    assert dialect.counters["implausible"] == 2
+
+
+def test_a_board_s_temperature_beyond_reason_is_dropped_and_counted() -> None:
+    dialect = BoardDialect()
+    odd = replace(Hello.decode(unseal(HELLO)), ntc_beta_k=200)
+    ntc = [SampleMessage(i, 10_000 * (i + 1), 34_571, 21_405, 38, 60, 1, 0x18).encode() for i in range(3)]
+    block = dialect.feed(0.0, odd.encode() + b"".join(ntc))
+    assert np.isnan(block["temperature_c"]).all()
+    assert dialect.counters["implausible"] == 3
