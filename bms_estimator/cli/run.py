@@ -4,8 +4,10 @@ import asyncio
 import contextlib
 import sys
 from collections import deque
+from collections.abc import Coroutine, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import structlog
 import typer
@@ -14,8 +16,9 @@ from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.settings import Settings, load_settings
 from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.service.reload import Reload, reload_on_hangup
 from bms_estimator.service.serve import serve, state_folder
 from bms_estimator.service.several import serve_several
 from bms_estimator.service.warm_up import load_kernels
@@ -44,29 +47,45 @@ def run(
 
     Several packs are served in one process, each with its own board and connection to the broker.
     """
-    loaded = [load_pack(pack) for pack in packs or [Path("pack.toml")]]
-    if mqtt:
-        loaded = [(with_broker(settings, mqtt), cell) for settings, cell in loaded]
+    paths = packs or [Path("pack.toml")]
+    told = partial(_told, port=port, mqtt=mqtt)
+    loaded = [(told(settings), cell) for settings, cell in map(load_pack, paths)]
+    reads = [lambda path=path: told(load_settings(path)) for path in paths]
+    reloads = [Reload(settings, read) for (settings, _), read in zip(loaded, reads, strict=True)]
     if len(loaded) == 1:
-        _run_one(*loaded[0], port, record, view=sys.stdout.isatty() if view is None else view)
+        _run_one(*loaded[0], reloads[0], record, view=sys.stdout.isatty() if view is None else view)
         return
     if port or record or view:
         raise UserError("--port, --record and --view are for one pack")
     configure_logs()
     _load_kernels()
     with drained():
-        asyncio.run(serve_several(loaded))
+        asyncio.run(_reloading(serve_several(loaded, reloads), reloads))
 
 
-def _run_one(settings: Settings, cell: PackModel, port: str | None, record: Path | None, *, view: bool) -> None:
-    settings = with_sensor(settings, port=port)
+def _told(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
+    """With what the command line says."""
+    if mqtt:
+        settings = with_broker(settings, mqtt)
+    return with_sensor(settings, port=port)
+
+
+async def _reloading(service: Coroutine[Any, Any, object], reloads: Sequence[Reload]) -> None:
+    """Serve, and read the settings anew on SIGHUP; where there is a terminal it says that this is gone, and ends us."""
+    if not (sys.stdin and sys.stdin.isatty()):
+        reload_on_hangup(reloads)
+    await service
+
+
+def _run_one(settings: Settings, cell: PackModel, reload: Reload, record: Path | None, *, view: bool) -> None:
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if view and sys.stdout.isatty() else None)
     recorder = Recording(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
     sinks = [ConsoleSink(log=log)] if view else []
     with drained(), recorder as tap:
         _load_kernels()
-        asyncio.run(serve(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings)))
+        service = serve(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings), reload=reload)
+        asyncio.run(_reloading(service, [reload]))
 
 
 def _load_kernels() -> None:

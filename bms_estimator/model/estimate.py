@@ -87,6 +87,29 @@ class ParameterReport(Report):
     )
 
 
+class LoopHealth(Report):
+    """How long what comes in waits, and for what."""
+
+    latency_p50_s: float | None = Field(
+        description="from the arrival of bytes to their estimate since the last health, median [s]; null without samples"
+    )
+    latency_p99_s: float | None = Field(description="the same, 99 of 100 are shorter [s]")
+    latency_max_s: float | None = Field(description="the same, longest [s]")
+    reads_waiting: int = Field(description="reads of the line that wait for the estimator")
+    log_lines_lost: int = Field(description="lines of the log that nobody has read, since start")
+    disk_free_mib: float | None = Field(
+        description="where the state is kept, at the last checkpoint [MiB]; null before, and without"
+    )
+
+
+class RecordingHealth(Report):
+    """The recording of the board's raw bytes."""
+
+    on: bool = Field(description="false: it has ended, the log says why")
+    bytes: int = Field(description="of the line, taken so far")
+    missed_reads: int = Field(description="reads that are not in the file")
+
+
 class Totals(Report):
     """What is counted over restarts; what came after the last checkpoint before a kill is missing."""
 
@@ -127,6 +150,8 @@ class Health(Report):
     availability_corrections: int = Field(description="times somebody else wrote an availability and was put right")
     requests: dict[str, int] = Field(description="by what became of them, since start")
     checkpoint: str = Field(description="what became of the last checkpoint")
+    loop: LoopHealth
+    recording: RecordingHealth | None = Field(description="null: nothing is recorded")
     unseen_s: float | None = Field(
         description="how long nobody measured in the last gap of the samples or before the start [s]; "
         "null: never since the start, or nobody knows"

@@ -114,6 +114,8 @@ class CheckpointFile:
         self._longest_days = settings.state.longest_days
         self._content: dict[str, Any] = {}  # of the file, as far as it is no ledger
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
+        self.disk_free_mib: float | None = None
+        """Where the file is, when it was written last [MiB]."""
         self.thread = DiskThread("checkpoint")
         """Where to call ``save`` and ``mark``: a call that nobody waits for any more still ends before the next one begins."""
         self.saved: tuple[int, float] | None = None
@@ -147,6 +149,8 @@ class CheckpointFile:
         total = ledger.total.model_dump_json()
         np.savez(packed, format=FORMAT, restarts=ledger.restarts, total=total, clean=ledger.clean, **content)
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        disk = os.statvfs(self.path.parent)
+        self.disk_free_mib = disk.f_bavail * disk.f_frsize / 2**20
         new = self.path.with_suffix(".new")
         new.unlink(missing_ok=True)
         with open(new, "xb", opener=_private) as file:

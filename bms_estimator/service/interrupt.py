@@ -7,9 +7,13 @@ from typing import Any
 
 
 def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
-    """An event, ``stop`` where it is given, that SIGINT and SIGTERM set in place of ending the process."""
+    """An event, ``stop`` where it is given, that SIGINT and SIGTERM set in place of ending the process.
+
+    SIGHUP, too, as when the terminal is closed, unless somebody handles or ignores it.
+    """
     stop = stop or asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    unheard = [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL else []
+    for number in (signal.SIGINT, signal.SIGTERM, *unheard):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     return stop
 

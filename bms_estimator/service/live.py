@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,22 +13,27 @@ import structlog
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
+from bms_estimator.service.reload import Reload
 from bms_estimator.service.resume import resume
 from bms_estimator.service.saving import Saving
+from bms_estimator.service.stderr import stderr
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.snapshot.totals import Tally, new_totals
-from bms_estimator.sources import Source
+from bms_estimator.sources import Pulse, Source
 
 LAG_STEP_S = 0.1
 """How often the loop's lag is measured [s]: what blocks it for longer is always seen."""
+STATUS_S = 60.0
+"""How often systemd hears of a new SOC; that samples come or cease it hears at once [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -45,6 +51,9 @@ async def run_live(
     current_zero: Callable[[], Awaitable[None]] | None = None,
     notifier: Notifier | None = None,
     clock: Clock | None = None,
+    reload: Reload | None = None,
+    pulse: Callable[[], Pulse] | None = None,
+    recording: Callable[[], RecordingHealth | None] = lambda: None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
 
@@ -60,6 +69,9 @@ async def run_live(
         current_zero: Has the board take the present current as zero; None: it cannot.
         notifier: Who hears that the loop is ready and alive.
         clock: The clocks.
+        reload: Where this loop offers what it can change while it runs; None: nothing is read anew.
+        pulse: Whether the source lives; None: it does not say.
+        recording: State of a recording; None where nothing is recorded.
 
     Returns:
         The estimator as the last sample left it.
@@ -81,9 +93,19 @@ async def run_live(
         tally=tally,
         checkpoint=restored,
         delivery=delivery,
+        pulse=pulse,
+        recording=recording,
     )
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
+    every_s = settings.state.checkpoint_s
+    saving = (
+        Saving(checkpoint, estimator, publisher, tally, restarts=ledger.restarts, every_s=every_s)
+        if checkpoint
+        else None
+    )
+    if reload:
+        _offer_changes(reload, publisher, saving)
     async with contextlib.AsyncExitStack() as stack:
         for sink in sinks:
             await stack.enter_async_context(sink)
@@ -91,12 +113,13 @@ async def run_live(
         notifier.ready(name)
         tasks = [
             _estimate(source, tally, publisher, lambda: since_boot() - restored_s),
-            _keep_alive(publisher, notifier, name),
+            _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),
         ]
-        saving = Saving(checkpoint, estimator, publisher, tally, ledger.restarts) if checkpoint else None
         if saving:
-            tasks.append(saving.save_often(settings.state.checkpoint_s))
+            tasks.append(saving.save_often())
+        if reload:
+            tasks.append(_reload(reload, notifier, name))
         try:
             await until_first_ends(*tasks, stop.wait())
         finally:  # a fault ends the loop, too
@@ -135,14 +158,37 @@ async def _estimate(source: Source, tally: Tally, publisher: Publisher, waited_s
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
 
-async def _keep_alive(publisher: Publisher, notifier: Notifier, name: str) -> None:
-    """Publish that nothing comes, and pat the watchdog."""
+async def _keep_alive(publisher: Publisher, notifier: Notifier, name: str, clock: Clock) -> None:
+    """Publish that nothing comes, and pat the watchdog while samples come or somebody still tries to have them."""
     longest_s = notifier.watchdog_s / 3.0 or publisher.period_s
+    said, online, said_s = "", False, -math.inf
     while True:
-        notifier.alive(name)
+        if publisher.alive:
+            notifier.alive(name)
+        publisher.log_lines_lost = stderr.lost
+        now_s, status, now_online = clock.monotonic(), publisher.status, publisher.snapshot.health.sensor_online
+        if status != said and (now_s - said_s >= STATUS_S or now_online != online):
+            notifier.status(name, status)
+            said, online, said_s = status, now_online, now_s
         await asyncio.sleep(min(max(publisher.wait_s, 0.01), longest_s))
         if publisher.wait_s == 0.0:
             publisher.publish()
+
+
+async def _reload(reload: Reload, notifier: Notifier, name: str) -> None:
+    """Read the settings anew whenever somebody asks."""
+    while True:
+        await reload.asked.wait()
+        reload.asked.clear()
+        notifier.reloading(name)
+        await reload.reload()
+        notifier.ready(name)
+
+
+def _offer_changes(reload: Reload, publisher: Publisher, saving: Saving | None) -> None:
+    reload.offer("publish.rate_hz", publisher.set_rate)
+    if saving:
+        reload.offer("state.checkpoint_s", partial(setattr, saving, "every_s"))
 
 
 async def _measure_lag(publisher: Publisher) -> None:

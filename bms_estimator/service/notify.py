@@ -2,6 +2,7 @@
 
 import os
 import socket
+import time
 from collections.abc import Collection, Mapping
 
 
@@ -19,6 +20,7 @@ class Notifier:
     def __init__(self, packs: Collection[str], environment: Mapping[str, str] = os.environ) -> None:
         self._packs = frozenset(packs)
         self._awaited: dict[str, set[str]] = {}
+        self._texts = dict.fromkeys(packs, "")
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
@@ -26,8 +28,18 @@ class Notifier:
         """Time after which systemd takes us for dead [s]; 0: it does not watch."""
 
     def ready(self, pack: str) -> None:
-        """The pack's loop runs."""
-        self._send_with_last(pack, f"READY=1\nSTATUS=estimating {', '.join(sorted(self._packs))}")
+        """The pack's loop runs, or goes on after its settings were read."""
+        self._send_with_last(pack, "READY=1", f"\n{self._status}")
+
+    def status(self, pack: str, text: str) -> None:
+        """How the pack is, for ``systemctl status``."""
+        self._texts[pack] = text
+        self._send(self._status)
+
+    def reloading(self, pack: str) -> None:
+        """The pack's settings are read anew; ``ready`` ends that."""
+        self._awaited.setdefault("READY=1", set()).add(pack)
+        self._send(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def alive(self, pack: str) -> None:
         """The pack's loop turns."""
@@ -37,12 +49,17 @@ class Notifier:
         """The pack's loop has ended."""
         self._send_with_last(pack, "STOPPING=1")
 
-    def _send_with_last(self, pack: str, state: str) -> None:
+    @property
+    def _status(self) -> str:
+        packs = (f"{pack}: {text}" if text else pack for pack, text in sorted(self._texts.items()))
+        return f"STATUS=estimating {', '.join(packs)}"
+
+    def _send_with_last(self, pack: str, state: str, more: str = "") -> None:
         awaited = self._awaited.setdefault(state, set(self._packs))
         awaited.discard(pack)
         if not awaited:
             del self._awaited[state]
-            self._send(state)
+            self._send(f"{state}{more}")
 
     def _send(self, state: str) -> None:
         """A deaf systemd is no reason to fail."""

@@ -1,6 +1,7 @@
 """When the state is saved: with the first sample, as the SOC moves, once in a while, and at the end."""
 
 import asyncio
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -32,27 +33,39 @@ class Saving:
         publisher: Is told what becomes of it.
         tally: What is counted over restarts.
         restarts: Starts that found a checkpoint.
+        every_s: How often is saved at least [s].
+
+    Attributes:
+        every_s: May be changed.
     """
 
     def __init__(
-        self, checkpoint: CheckpointFile, estimator: Estimator, publisher: Publisher, tally: Tally, restarts: int
+        self,
+        checkpoint: CheckpointFile,
+        estimator: Estimator,
+        publisher: Publisher,
+        tally: Tally,
+        *,
+        restarts: int,
+        every_s: float,
     ) -> None:
+        self.every_s = every_s
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
         self._tally, self._restarts = tally, restarts
         self._saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 
-    async def save_often(self, every_s: float) -> None:
+    async def save_often(self) -> None:
         """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC`` or there is a first sample."""
         await self._write(self._mark(clean=False))  # from now on a run that leaves no word has crashed
         loop = asyncio.get_running_loop()
-        due_s, failed = 0.0, False
+        saved_s, failed = -math.inf, False
         while True:
-            await asyncio.sleep(min(LOOK_S, every_s))
+            await asyncio.sleep(min(LOOK_S, self.every_s))
             moved = self._saved is None or abs(self._estimator.state["soc"][0] - self._saved[1]) >= SAVED_SOC
-            if loop.time() >= due_s or (moved and not failed):
+            if loop.time() >= saved_s + self.every_s or (moved and not failed):
                 failed = not await self._save()
-                due_s = loop.time() + every_s
+                saved_s = loop.time()
 
     async def save_last(self) -> None:
         """Save that the run has ended cleanly; a disk that hangs is left alone after ``LAST_S``."""
@@ -99,6 +112,7 @@ class Saving:
                 self._publisher.checkpoint = "not saved: the disk hangs"
                 log.warning("checkpoint cannot be saved", file=file, error="the disk hangs")
             await future
+            self._publisher.disk_free_mib = self._checkpoint.disk_free_mib
         except OSError as error:
             self._publisher.checkpoint = f"cannot be saved: {error}"
             log.warning("checkpoint cannot be saved", file=file, error=str(error))

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import structlog
@@ -11,6 +12,7 @@ import structlog
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.alone import alone
@@ -19,10 +21,12 @@ from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import run_live
 from bms_estimator.service.logs import set_level
 from bms_estimator.service.notify import Notifier
+from bms_estimator.service.reload import Reload
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources.board_memory import BoardMemory
+from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.serial_board import SerialBoard, Tap
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
@@ -40,6 +44,7 @@ async def serve(
     stop: asyncio.Event | None = None,
     folder: Path | None = None,
     notifier: Notifier | None = None,
+    reload: Reload | None = None,
 ) -> Estimator:
     """Run until SIGINT or SIGTERM.
 
@@ -51,6 +56,7 @@ async def serve(
         stop: Set by someone else to end as a signal does.
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
+        reload: Where is offered what can be changed while it runs.
 
     Returns:
         The estimator as the last sample left it.
@@ -70,6 +76,9 @@ async def serve(
     if database and settings.store.history_days:
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
+    if reload:
+        reload.offer("log.level", partial(set_level, settings.pack.name))
+        reload.offer("mqtt.commands", requests.allow)
     if settings.mqtt is not None:
         sample_period_s = settings.sensor.sample_period_s
         mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=sample_period_s)
@@ -92,7 +101,17 @@ async def serve(
             delivery=delivery,
             current_zero=board.current_zero,
             notifier=notifier,
+            reload=reload,
+            pulse=board.pulse,
+            recording=partial(recording_health, tap),
         )
+
+
+def recording_health(tap: Tap | None) -> RecordingHealth | None:
+    """State of a recording; None where there is none."""
+    if not isinstance(tap, Recording):
+        return None
+    return RecordingHealth(on=not tap.ended.done(), bytes=tap.bytes, missed_reads=tap.missed_reads)
 
 
 def state_folder(settings: Settings) -> Path:

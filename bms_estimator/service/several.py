@@ -10,14 +10,16 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.notify import Notifier
+from bms_estimator.service.reload import Reload
 from bms_estimator.service.serve import serve, state_folder
 
 
-async def serve_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
+async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[Reload]) -> None:
     """Serve packs until SIGINT or SIGTERM. When one ends, all end in good order: who starts us starts all again.
 
     Args:
         packs: The settings of each pack, and the pack as one object.
+        reloads: Of each pack.
 
     Raises:
         UserError: A setting that cannot be used, with the pack's name before it; or two packs share a name or a port.
@@ -29,16 +31,18 @@ async def serve_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
     _differ("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
     stop, notifier = stop_on_signal(), Notifier(names)
 
-    async def serve_one(settings: Settings, cell: PackModel) -> None:
+    async def serve_one(settings: Settings, cell: PackModel, reload: Reload) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
-            await serve(settings, cell, stop=stop, folder=state_folder(settings), notifier=notifier)
+            await serve(settings, cell, stop=stop, folder=state_folder(settings), notifier=notifier, reload=reload)
         except UserError as error:
             raise UserError(f"{settings.pack.name}: {error}") from error
         finally:
             stop.set()
 
-    results = await asyncio.gather(*(serve_one(*pack) for pack in packs), return_exceptions=True)
+    results = await asyncio.gather(
+        *(serve_one(*pack, reload) for pack, reload in zip(packs, reloads, strict=True)), return_exceptions=True
+    )
     for result in results:
         if isinstance(result, BaseException):
             raise result

@@ -60,6 +60,10 @@ class Requests:
         """Make a request of ``NAMES`` answerable."""
         self._handlers[name] = handler
 
+    def allow(self, commands: Collection[Command]) -> None:
+        """Allow these commands from now on, and no others."""
+        self._allowed = commands
+
     async def respond(self, name: str, payload: bytes) -> bytes | None:
         """The response to one request: JSON of status, data, error, transaction.
 

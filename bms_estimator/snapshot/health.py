@@ -8,7 +8,7 @@ import numpy as np
 
 from bms_estimator.kernels.input_checks import COUNTERS
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Health, Totals
+from bms_estimator.model.estimate import Health, LoopHealth, RecordingHealth, Totals
 from bms_estimator.model.suspect import Suspect
 from bms_estimator.sinks import Delivery
 
@@ -74,6 +74,8 @@ def health_report(
     clock_ppm: float | None,
     total: Totals,
     unseen_s: float | None,
+    loop: LoopHealth,
+    recording: RecordingHealth | None,
 ) -> Health:
     """Topic ``health``.
 
@@ -91,6 +93,8 @@ def health_report(
         clock_ppm: The source's.
         total: Counted over restarts.
         unseen_s: How long nobody measured last [s]; None: never, or nobody knows.
+        loop: How long what comes in waits.
+        recording: The state of one; None: nothing is recorded.
     """
     state = record["observer"]
     return Health(
@@ -116,6 +120,8 @@ def health_report(
         availability_corrections=delivery.corrections,
         requests=dict(delivery.requests),
         checkpoint=checkpoint,
+        loop=loop,
+        recording=recording,
         unseen_s=unseen_s,
         total=total,
     )

@@ -1,32 +1,37 @@
 """Snapshots at the publish rate: from window, estimator and source to all sinks."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.estimate import Estimate, Health, Info, Snapshot
+from bms_estimator.model.estimate import Estimate, Health, Info, LoopHealth, RecordingHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
 from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
 from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
 from bms_estimator.snapshot.impossible import impossible_sample
+from bms_estimator.snapshot.latency import Latency
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.rest import Rest
 from bms_estimator.snapshot.topics import estimate_report, info_report
 from bms_estimator.snapshot.totals import Tally, new_totals
 from bms_estimator.snapshot.window import Window, WindowSummary
-from bms_estimator.sources import Source
+from bms_estimator.sources import Pulse, Source
 
 log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
 """Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
+
+
+UNTENDED_S = 20.0
+"""A source that has not looked after its line for so long hangs: it tries a port that is missing each 10 s at least [s]."""
 
 
 class Publisher:
@@ -43,9 +48,13 @@ class Publisher:
         restarts: Starts that found a checkpoint.
         checkpoint: What became of the checkpoint at start.
         delivery: What became of what was sent and asked.
+        pulse: Whether the source lives; None: it does not say.
+        recording: State of a recording; None where nothing is recorded.
 
     Attributes:
         checkpoint: What became of the last checkpoint.
+        disk_free_mib: Where it is [MiB].
+        log_lines_lost: Since start.
         latest: The last estimate that there was.
         snapshot: The last snapshot.
     """
@@ -63,6 +72,8 @@ class Publisher:
         restarts: int = 0,
         checkpoint: str = "off",
         delivery: Delivery | None = None,
+        pulse: Callable[[], Pulse] | None = None,
+        recording: Callable[[], RecordingHealth | None] = lambda: None,
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
         self._source, self._sinks, self._clock = source, sinks, clock
@@ -70,9 +81,10 @@ class Publisher:
         self._restarts, self._delivery = restarts, delivery or Delivery()
         self._rest = Rest(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
-        self.checkpoint = checkpoint
-        self.period_s = 1.0 / settings.publish.rate_hz
-        self._fresh_s = FRESH_PERIODS * max(self.period_s, settings.sensor.sample_period_s)
+        self._pulse, self._recording, self._latency = pulse, recording, Latency()
+        self.checkpoint, self.log_lines_lost = checkpoint, 0
+        self.disk_free_mib: float | None = None
+        self.set_rate(settings.publish.rate_hz)
         self._window = Window()
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
@@ -82,6 +94,13 @@ class Publisher:
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
+    def set_rate(self, rate_hz: float) -> None:
+        """Publish so often from the next publication on [1/s]."""
+        publish = self._settings.publish.model_copy(update={"rate_hz": rate_hz})
+        self._settings = self._settings.model_copy(update={"publish": publish})
+        self.period_s = 1.0 / rate_hz
+        self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sensor.sample_period_s)
+
     @property
     def wait_s(self) -> float:
         """Until a snapshot is overdue, which tells that no samples come [s]."""
@@ -89,6 +108,8 @@ class Publisher:
 
     def add(self, block: SampleBlock, trace: TraceBlock) -> None:
         """Take a block and what the estimator made of it; publish when it is time."""
+        if self._pulse:
+            self._latency.add(self._pulse().late_s)
         now_s = self._clock.monotonic()
         if trace.size:
             self._window.add(trace, self._clock.wall(), self._source.cells)
@@ -121,6 +142,20 @@ class Publisher:
         """Publish the end, all of it made anew."""
         self._slow_s = -math.inf
         self.publish()
+
+    @property
+    def alive(self) -> bool:
+        """Whether samples flow, or what brings them still tries and says why they do not."""
+        fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
+        return fresh or self._pulse is None or self._pulse().untended_s <= UNTENDED_S
+
+    @property
+    def status(self) -> str:
+        """The pack in a few words."""
+        if self.snapshot.health.sensor_message:
+            return f"no samples: {self.snapshot.health.sensor_message}"
+        soc = self.latest.soc if self.latest else None
+        return "" if soc is None else f"SOC {soc:.2f}"
 
     @property
     def disturbed(self) -> str | None:
@@ -168,6 +203,19 @@ class Publisher:
             clock_ppm=self._source.clock_ppm,
             total=self._tally.total,
             unseen_s=self._tally.unseen_s,
+            loop=self._loop(),
+            recording=self._recording(),
+        )
+
+    def _loop(self) -> LoopHealth:
+        p50_s, p99_s, most_s = self._latency.take() or (None, None, None)
+        return LoopHealth(
+            latency_p50_s=p50_s,
+            latency_p99_s=p99_s,
+            latency_max_s=most_s,
+            reads_waiting=self._pulse().waiting if self._pulse else 0,
+            log_lines_lost=self.log_lines_lost,
+            disk_free_mib=self.disk_free_mib,
         )
 
     def _info(self) -> Info:

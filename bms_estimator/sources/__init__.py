@@ -1,9 +1,20 @@
 """Where samples come from: serial boards, captures, tables."""
 
 from collections.abc import AsyncIterator, Mapping
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 from bms_estimator.model.sample import CellBlock, SampleBlock
+
+
+class Pulse(NamedTuple):
+    """Whether what brings samples lives."""
+
+    untended_s: float
+    """Since its task last looked after the line, or tried to open it [s]."""
+    late_s: float
+    """Since the bytes of the block that came last were read [s]."""
+    waiting: int
+    """Reads of the line that nobody has taken yet."""
 
 
 class Source(Protocol):

@@ -72,6 +72,11 @@ class Line:
         """Whether bytes can be sent."""
         return self._port is not None
 
+    @property
+    def waiting(self) -> int:
+        """Reads that nobody has taken yet."""
+        return self._reads.qsize()
+
     async def open(self) -> str:
         """Path of the port as soon as it can be opened; each attempt waits longer until one was ``good``."""
         while True:

@@ -13,6 +13,7 @@ from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
+from bms_estimator.sources import Pulse
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.dialects.table import make_dialect
@@ -96,6 +97,8 @@ class SerialBoard:
         self._openings = 0  # of the line, as far as its reads have been taken
         self._refused = False  # the message says why what is on the port is not taken
         self._path = ""  # of the port that is open
+        self._tended_s = monotonic()  # when the task last turned
+        self._arrived_s = math.nan  # of the last block's bytes, on the line's clock
         self._logged_s = -math.inf
         self._logged_faults = 0
         self._decoded = asyncio.Event()
@@ -127,6 +130,11 @@ class SerialBoard:
         """How much faster the board's clock runs than the monotonic one."""
         return self._dialect.clock_ppm
 
+    def pulse(self) -> Pulse:
+        """Whether line and task live."""
+        now_s = self._line.now_s
+        return Pulse(self._monotonic() - self._tended_s, now_s - self._arrived_s, self._line.waiting)
+
     async def __aenter__(self) -> Self:
         """Begin to open the port; it need not be there yet."""
         self._task = asyncio.create_task(self._stay_open(), name="serial board")
@@ -148,6 +156,7 @@ class SerialBoard:
             for arrival_s, data in self._admit(read):
                 block = self._decode(arrival_s, data)
                 if block.size:
+                    self._arrived_s = arrival_s
                     if self._message is not None:
                         self._message, self._refused = None, False
                         self._line.good()
@@ -272,6 +281,7 @@ class SerialBoard:
     async def _talk(self) -> None:
         """Send what falls due, until it is time to look whether samples come or the line is lost."""
         for _ in range(TALKS):
+            self._tended_s = self._monotonic()
             self._send_due()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(TALK_S):
@@ -283,6 +293,7 @@ class SerialBoard:
 
     def _say(self, message: str) -> None:
         """Say why no samples come, once for each reason."""
+        self._tended_s = self._monotonic()
         if message != self._message:
             log.warning("no samples", reason=message)
         self._message, self._refused = message, False

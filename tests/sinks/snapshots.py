@@ -4,7 +4,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.estimate import LoopHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
@@ -17,6 +17,15 @@ from bms_estimator.snapshot.totals import new_totals
 from bms_estimator.snapshot.window import Window
 
 NOW = 1_700_000_000.0
+
+IDLE = LoopHealth(
+    latency_p50_s=None,
+    latency_p99_s=None,
+    latency_max_s=None,
+    reads_waiting=0,
+    log_lines_lost=0,
+    disk_free_mib=None,
+)
 
 
 def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None) -> Snapshot:
@@ -60,6 +69,8 @@ def _of(
             delivery=delivery or Delivery(),
             total=new_totals(NOW),
             unseen_s=None,
+            loop=IDLE,
+            recording=None,
         ),
         info_report(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW, temperature_sensor=False),
     )
