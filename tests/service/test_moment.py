@@ -9,9 +9,10 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.checkpoint import CheckpointFile
+from bms_estimator.service.checkpoint import CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator
 from bms_estimator.service.moment import Moment, moment, synchronised
+from bms_estimator.snapshot.totals import new_totals
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()
 SAVED = Moment(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, boot="one")
@@ -33,7 +34,7 @@ def test_a_checkpoint_is_as_old_as_the_clock_that_can_be_trusted_says(
 ) -> None:
     estimator = new_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record, restarts=0)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record, Ledger(0, new_totals(0.0)))
     later = replace(SAVED, **changes)
     assert CheckpointFile(tmp_path, SETTINGS, CELL, lambda: later).load().unseen_s == unseen_s
 

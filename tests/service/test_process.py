@@ -5,11 +5,13 @@ import contextlib
 import json
 import os
 import signal
+import sys
 from asyncio.subprocess import Process
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 import pytest
 
 from tests.command_line import PROGRAM
@@ -40,10 +42,29 @@ url = "{broker.url}"
     return path
 
 
+HUNG_DISK = """
+import os, threading
+hangs = threading.Event()
+os.fsync = lambda _: hangs.wait()
+from bms_estimator.cli.main import main
+from bms_estimator.service import saving
+saving.HUNG_S = saving.LAST_S = 0.1
+main()
+"""
+"""The program on a disk that never answers once something is to be on it."""
+
+
 @contextlib.asynccontextmanager
-async def service(*packs: Path, stderr: int | IO[str] = asyncio.subprocess.PIPE) -> AsyncIterator[Process]:
+async def service(
+    *packs: Path, stderr: int | IO[str] = asyncio.subprocess.PIPE, program: Sequence[str] = (str(PROGRAM),)
+) -> AsyncIterator[Process]:
     process = await asyncio.create_subprocess_exec(
-        str(PROGRAM), "run", *map(str, packs), stdout=asyncio.subprocess.DEVNULL, stderr=stderr
+        *program,
+        "run",
+        *map(str, packs),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=stderr,
     )
     try:
         yield process
@@ -140,6 +161,68 @@ async def test_a_log_that_nobody_reads_stops_nothing(tmp_path: Path, line: Line,
             await live.wait("bms/pack/availability", lambda p: p == b"offline")
             assert await asyncio.wait_for(process.wait(), LONG_S) == 0
     board.cancel()
+
+
+async def test_a_service_that_is_asked_to_end_saves_first_though_its_broker_stands_still(
+    tmp_path: Path, line: Line, broker: Broker, state_home: Path
+) -> None:
+    line.plug()
+    board = asyncio.create_task(feed(line))
+    async with Listener(broker) as live, service(pack_file(tmp_path, line, broker)) as process:
+        told = await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 50)
+        broker.freeze()
+        await ended(process)
+        broker.thaw()
+    board.cancel()
+    (kept,) = checkpoints(state_home)
+    with np.load(kept) as saved:
+        assert saved["clean"]
+        assert saved["state.observer.samples"][0] >= told["frames_received"]
+
+
+async def test_a_disk_that_never_answers_stops_neither_the_estimate_nor_the_end(
+    tmp_path: Path, line: Line, broker: Broker
+) -> None:
+    line.plug()
+    board = asyncio.create_task(feed(line))
+    program = [sys.executable, "-c", HUNG_DISK]
+    async with Listener(broker) as live, service(pack_file(tmp_path, line, broker), program=program) as process:
+        await live.wait_json("bms/pack/health", lambda h: h["checkpoint"] == "not saved: the disk hangs")
+        await live.wait_json("bms/pack/state", skip=len(live.messages))
+        lines = await ended(process)
+        await live.wait("bms/pack/availability", lambda p: p == b"offline")
+    assert "the disk hangs: the last checkpoint is not written" in {line["event"] for line in lines}
+    board.cancel()
+
+
+async def test_a_hangup_reloads_the_settings_of_all_packs_and_ends_nothing(
+    tmp_path: Path, line: Line, broker: Broker
+) -> None:
+    packs = [pack_file(tmp_path, line, broker, "house"), pack_file(tmp_path, Line(tmp_path / "none"), broker, "shed")]
+    async with Listener(broker) as live, service(*packs) as process:
+        for pack in packs:
+            await live.wait(f"bms/{pack.stem}/health")
+        refused = await asked(live, "set_soc")
+        change = packs[0].read_text().replace("[mqtt]", '[mqtt]\ncommands = ["set_soc"]')
+        packs[0].write_text(change.replace("rate_hz = 10", "rate_hz = 5"))
+        packs[1].write_text("[pack]\nseries = 0\n")
+        process.send_signal(signal.SIGHUP)
+        await live.wait_json("bms/house/info", lambda info: info["publish_rate_hz"] == 5.0)
+        granted = await asked(live, "set_soc")
+        log = await ended(process)
+    assert "not allowed" in refused
+    assert "must be a number" in granted  # it is allowed now
+    said = {line["pack"]: line for line in log if line["event"].startswith("settings")}
+    assert said["house"]["changed"] == ["publish.rate_hz", "mqtt.commands"]
+    assert "pack.series" in said["shed"]["reason"]
+
+
+async def asked(live: Listener, request: str) -> str:
+    """What is said against a request."""
+    before = len(live.messages)
+    await live.publish(f"bms/house/request/{request}", b"{}")
+    answer = await live.wait_json(f"bms/house/response/{request}", skip=before)
+    return str(answer["error"])
 
 
 async def test_a_disk_without_room_for_a_folder_is_no_error_that_a_service_is_given_up_for(
