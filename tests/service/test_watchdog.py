@@ -1,0 +1,159 @@
+"""What systemd and health hear of a loop that turns, of a source that hangs, and of what waits."""
+
+import asyncio
+import contextlib
+import socket
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.model.settings import SensorSettings
+from bms_estimator.service.live import run_live
+from bms_estimator.service.notify import Notifier
+from bms_estimator.service.serve import recording_health
+from bms_estimator.snapshot import publisher
+from bms_estimator.snapshot.latency import Latency
+from bms_estimator.sources import Pulse
+from bms_estimator.sources.line import Line
+from bms_estimator.sources.raw_capture import header_of
+from bms_estimator.sources.recording import Recording
+from bms_estimator.sources.serial_board import SerialBoard
+from tests.collector import Collector
+from tests.patience import LONG_S
+from tests.scripted_source import ScriptedSource
+from tests.service.test_checkpoint import CELL, SETTINGS
+
+
+class Systemd:
+    """Hears one pack."""
+
+    def __init__(self, path: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self._socket.setblocking(False)
+        self.notifier = Notifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "30000"})
+
+    async def hear(self, wanted: str) -> str:
+        """Wait for a state that begins so."""
+        async with asyncio.timeout(LONG_S):
+            while True:
+                state = (await asyncio.get_running_loop().sock_recv(self._socket, 4096)).decode()
+                if state.startswith(wanted):
+                    return state
+
+    def heard(self) -> list[str]:
+        """What has come since."""
+        states = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                states.append(self._socket.recv(4096).decode())
+        return states
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def systemd(tmp_path: Path):
+    systemd = Systemd(tmp_path / "notify")
+    yield systemd
+    systemd.close()
+
+
+async def test_a_source_that_hangs_is_not_covered_by_the_loop_that_turns(systemd: Systemd) -> None:
+    pulse = Pulse(0.0, 0.0, 0)
+    source, sink = ScriptedSource(), Collector()
+    edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
+    task = asyncio.create_task(run_live(SETTINGS, CELL, **edges, pulse=lambda: pulse))
+    await systemd.hear("WATCHDOG=1")  # nothing comes, but somebody tries
+    pulse = Pulse(publisher.UNTENDED_S + 1.0, 0.0, 0)
+    for _ in range(3):
+        await sink.until(lambda _: True, skip=len(sink.snapshots))
+    systemd.heard()
+    for _ in range(3):
+        await sink.until(lambda _: True, skip=len(sink.snapshots))
+    assert "WATCHDOG=1" not in systemd.heard()
+    source.give((0.0, 0.1, 3.8))  # what flows needs nobody to look after it
+    await systemd.hear("WATCHDOG=1")
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
+async def test_the_task_of_a_board_tells_whether_it_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    now_s, opened = 0.0, asyncio.Event()
+
+    async def hang(_: Line) -> str:
+        opened.set()
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    sensor = SensorSettings(port=str(tmp_path / "none"))
+    async with SerialBoard(sensor, monotonic=lambda: now_s, first_retry_s=0.001) as board:
+        for _ in range(3):
+            now_s += 10.0
+            async with asyncio.timeout(LONG_S):
+                while board.pulse().untended_s > 0.0:  # noqa: ASYNC110 - the board tells nobody
+                    await asyncio.sleep(0.001)
+    monkeypatch.setattr(Line, "open", hang)
+    async with SerialBoard(sensor, monotonic=lambda: now_s) as board:
+        await asyncio.wait_for(opened.wait(), LONG_S)
+        now_s += 100.0
+        assert board.pulse().untended_s == 100.0
+
+
+async def test_systemctl_status_shows_the_soc_and_why_samples_do_not_come(systemd: Systemd) -> None:
+    source, sink = ScriptedSource(), Collector()
+    edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
+    task = asyncio.create_task(run_live(SETTINGS, CELL, **edges))
+    assert await systemd.hear("READY=1") == "READY=1\nSTATUS=estimating pack"
+    source.message = "waiting for /dev/none: it does not exist"
+    await systemd.hear("STATUS=estimating pack: no samples: ")
+    source.give((0.0, 0.1, 3.8))
+    assert (await systemd.hear("STATUS=estimating pack: SOC 0.")).removeprefix("STATUS=estimating pack: SOC ")[
+        :3
+    ] == "0.5"
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
+async def test_health_tells_how_long_bytes_wait_and_how_many_reads() -> None:
+    source, sink = ScriptedSource(), Collector()
+    late_s = [0.3]
+    edges = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
+    live = run_live(SETTINGS, CELL, **edges, pulse=lambda: Pulse(0.0, late_s[0], 7))
+    task = asyncio.create_task(live)
+    first = await sink.until(lambda _: True)
+    assert first.health.loop.latency_p50_s is None
+    assert first.health.loop.reads_waiting == 7
+    assert first.health.recording is None
+    source.give((0.0, 0.1, 3.8))
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+    told = {s.health.loop.latency_max_s: s.health.loop for s in sink.snapshots}[0.3]
+    assert (told.latency_p50_s, told.latency_p99_s) == (0.3, 0.3)
+
+
+def test_percentiles_of_the_latency_are_right_to_a_fifth() -> None:
+    latency = Latency()
+    assert latency.take() is None
+    for late_s in [0.002] * 97 + [0.05, 0.05, 0.7]:
+        latency.add(late_s)
+    p50_s, p99_s, most_s = latency.take() or (0.0, 0.0, 0.0)
+    assert 0.002 <= p50_s < 0.0024
+    assert 0.05 <= p99_s < 0.06
+    assert most_s == 0.7
+    for late_s in (-1.0, 0.0, 1e6):
+        latency.add(late_s)
+    assert latency.take() == pytest.approx((1e-5, 284.0, 1e6), rel=0.5)
+
+
+def test_health_tells_of_a_recording(tmp_path: Path) -> None:
+    assert recording_health(None) is None
+    with Recording(tmp_path / "raw", header_of(SensorSettings())) as recording:
+        recording.write(0.0, b"12345")
+        on = recording_health(recording)
+        assert on
+        assert (on.on, on.bytes, on.missed_reads) == (True, 5, 0)
+    ended = recording_health(recording)
+    assert ended
+    assert not ended.on
