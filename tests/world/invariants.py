@@ -1,0 +1,162 @@
+"""What must hold, whatever happens. Each number that bounds something stands here."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from bms_estimator.model.estimate import Snapshot
+from bms_estimator.sources.protocol import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
+from tests.world.broker import Connection, Packet
+
+MOST_STDS = 4.0
+"""The true SOC is never further from the estimate than so many of its standard deviations, and ``SOC_FLOOR``."""
+SOC_FLOOR = 0.004
+"""What a published SOC may be off whatever its std says: the sample that it belongs to may be the one before."""
+USUAL_STDS = 2.0
+MOST_TASKS = 40
+MOST_READS = 64
+MOST_READY = 2000
+
+
+class InvariantError(Exception):
+    """Something that must hold does not."""
+
+
+class Reference:
+    """The valid samples in the bytes that a process was given, by the codec that decodes one message at a time."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self.samples = 0
+
+    def feed(self, data: bytes) -> None:
+        *frames, self._rest = (self._rest + data).split(DELIMITER)
+        for frame in frames:
+            try:
+                packet = unseal(frame) if frame else b""
+            except ProtocolError:
+                continue
+            self.samples += len(packet) == 22 and packet[:2] == bytes((PROTOCOL_VERSION, MessageType.SAMPLE))
+
+
+@dataclass
+class Said:
+    """States that the service has given away, and what the broker has of them."""
+
+    payloads: dict[bytes, int] = field(default_factory=dict)
+    """Payload -> its number."""
+    process: list[int] = field(default_factory=list)
+    """Of each, which process said it."""
+    last: int = -1
+    """The newest that the broker has."""
+    received: dict[int, list[tuple[Connection, int]]] = field(default_factory=dict)
+    """Number -> on which connections it came, and under which packet identifier."""
+    doubled: int = 0
+
+    def say(self, payload: bytes, process: int) -> None:
+        self.payloads[payload] = len(self.process)
+        self.process.append(process)
+
+    def take(self, packet: Packet, connection: Connection | None) -> str:
+        """The broker has received a state. Returns what is wrong with that."""
+        number = self.payloads.get(packet.payload)
+        if number is None:
+            return "a state that nobody said"
+        if connection is None:
+            return "a state that came without a connection"
+        earlier = self.received.setdefault(number, [])
+        for other, mid in earlier:
+            if other is connection:
+                return f"state {number} came twice on one connection"
+            if mid in other.acknowledged:
+                return f"state {number} came again though its acknowledgement had come"
+        if earlier:
+            self.doubled += 1
+        elif number < self.last:
+            return f"state {number} came after state {self.last}"
+        earlier.append((connection, packet.mid))
+        self.last = max(self.last, number)
+        return ""
+
+    def lost(self, process: int, since: int = 0) -> list[int]:
+        """What a process said, from a number on, and the broker never got."""
+        return [n for n, by in enumerate(self.process) if by == process and n >= since and n not in self.received]
+
+
+@dataclass
+class Band:
+    """How the SOC did."""
+
+    states: int = 0
+    inside: int = 0
+    worst_stds: float = 0.0
+    worst_error: float = 0.0
+
+    def take(self, snapshot: Snapshot, true_soc: float) -> str:
+        """A snapshot with its truth. Returns what is wrong with that."""
+        e = snapshot.estimate
+        if e is None or e.soc is None or e.soc_std is None:
+            return ""
+        error = abs(e.soc - true_soc)
+        self.states += 1
+        self.inside += error <= USUAL_STDS * e.soc_std
+        self.worst_error = max(self.worst_error, error)
+        beyond = max(error - SOC_FLOOR, 0.0) / e.soc_std
+        self.worst_stds = max(self.worst_stds, beyond)
+        if beyond > MOST_STDS:
+            return f"SOC {e.soc:.4f} +- {e.soc_std:.4f}, true {true_soc:.4f}"
+        return ""
+
+
+@dataclass
+class Truth:
+    """Something that others are told of: since when it holds, and whether they know."""
+
+    within_s: float
+    """So long after it has come to hold they must know."""
+    now: str | None = None
+    wrong_since_s: float | None = None
+    longest_s: float = 0.0
+    """It took them at most."""
+
+    def check(self, truth: str | None, told: str | None, now_s: float) -> str:
+        """Compare; ``truth`` is None while nobody can be told. Returns what is wrong."""
+        right = truth is None or told == truth or (truth == "offline" and told is None)
+        if right or truth != self.now:
+            self.wrong_since_s = None if right else now_s
+        elif self.wrong_since_s is None:
+            self.wrong_since_s = now_s
+        self.now = truth
+        wrong_s = 0.0 if self.wrong_since_s is None else now_s - self.wrong_since_s
+        self.longest_s = max(self.longest_s, wrong_s)
+        return f"{told}, but {truth} for {wrong_s:.0f} s" if wrong_s > self.within_s else ""
+
+
+def text(payload: bytes | None) -> str | None:
+    return None if payload is None else payload.decode(errors="replace")
+
+
+def numbers(value: Any) -> Iterator[float]:
+    """All numbers of a JSON value."""
+    if isinstance(value, dict):
+        for part in value.values():
+            yield from numbers(part)
+    elif isinstance(value, list):
+        for part in value:
+            yield from numbers(part)
+    elif isinstance(value, float):
+        yield value
+
+
+def is_json(payload: bytes) -> bool:
+    """Whether a payload is strict JSON: no NaN, no infinity."""
+    try:
+        json.loads(payload, parse_constant=_refuse)
+    except ValueError:
+        return False
+    return True
+
+
+def _refuse(token: str) -> float:
+    raise ValueError(token)

@@ -1,0 +1,237 @@
+"""Virtual time: one heap of events for the whole world, and an asyncio loop for each process that lives in it.
+
+Nothing runs at the same time as anything else, and nothing waits: when nobody has anything to do, it is later.
+"""
+
+import asyncio
+import contextlib
+import heapq
+import random
+import sys
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterator
+from typing import Any
+
+MOST_CLOSINGS = 20
+"""A coroutine that is thrown away may go on to so many further awaits."""
+
+
+class KilledError(BaseException):
+    """The process that called has ended."""
+
+
+class Timeline:
+    """What happens when: events of the world and timers of the processes in it, in order of time.
+
+    Args:
+        dice: Decides which of those that fall due together comes first.
+    """
+
+    def __init__(self, dice: random.Random) -> None:
+        self.now_s = 0.0
+        self._dice, self._count = dice, 0
+        self._events: list[tuple[float, float, int, Callable[[], None]]] = []
+
+    def __len__(self) -> int:
+        return len(self._events)
+
+    def at(self, when_s: float, event: Callable[[], None]) -> None:
+        """Have ``event`` happen; at once where ``when_s`` has passed."""
+        self._count += 1
+        heapq.heappush(self._events, (max(when_s, self.now_s), self._dice.random(), self._count, event))
+
+    def after(self, delay_s: float, event: Callable[[], None]) -> None:
+        """The same, ``delay_s`` from now."""
+        self.at(self.now_s + delay_s, event)
+
+    def step(self) -> None:
+        """On to the next event."""
+        self.now_s, _, _, event = heapq.heappop(self._events)
+        event()
+
+
+class ProcessLoop(asyncio.AbstractEventLoop):
+    """The event loop of one process. It ends as a process does: at any handle, and nothing of it runs any more.
+
+    Args:
+        timeline: The world's.
+        dice: Draws what is left open: which task goes first, how long a thread takes.
+    """
+
+    def __init__(self, timeline: Timeline, dice: random.Random, *, shuffled: bool = False) -> None:
+        self._timeline, self._dice, self._shuffled = timeline, dice, shuffled
+        self._ready: deque[asyncio.Handle] = deque()
+        self._readers: dict[int, asyncio.Handle] = {}
+        self._tasks: list[asyncio.Task[Any]] = []
+        self._made = 0
+        self.alive = True
+        self.frozen_until_s = 0.0
+        self.handles = 0
+        """So many have run."""
+        self.faults: list[str] = []
+        """What nobody caught."""
+        self.submit: Callable[[Any, Callable[[], Any], asyncio.Future[Any]], None] = lambda executor, job, done: None
+        """Takes what is to run in a thread of an executor."""
+
+    # what a process asks of its loop
+
+    def time(self) -> float:
+        return self._timeline.now_s
+
+    def call_soon(self, callback: Any, *args: Any, context: Any = None) -> asyncio.Handle:
+        handle = asyncio.Handle(callback, args, self, context)
+        if self.alive:
+            self._ready.append(handle)
+        return handle
+
+    call_soon_threadsafe = call_soon
+
+    def call_at(self, when: float, callback: Any, *args: Any, context: Any = None) -> asyncio.TimerHandle:
+        handle = asyncio.TimerHandle(when, callback, args, self, context)
+        if self.alive:
+            self._timeline.at(max(when, self.frozen_until_s), lambda: self._fall_due(handle))
+        return handle
+
+    def call_later(self, delay: float, callback: Any, *args: Any, context: Any = None) -> asyncio.TimerHandle:
+        return self.call_at(self.time() + delay, callback, *args, context=context)
+
+    def _timer_handle_cancelled(self, handle: asyncio.TimerHandle) -> None:
+        pass
+
+    def create_future(self) -> asyncio.Future[Any]:
+        if not self.alive:
+            raise KilledError
+        return asyncio.Future(loop=self)
+
+    def create_task(self, coro: Coroutine[Any, Any, Any], *, name: str | None = None, context: Any = None) -> Any:
+        if not self.alive:
+            coro.close()
+            raise KilledError
+        self._made += 1
+        task = asyncio.Task(coro, loop=self, name=name or f"task {self._made}", context=context)
+        self._tasks = [task for task in self._tasks if not task.done()] if self._made % 64 == 0 else self._tasks
+        self._tasks.append(task)
+        return task
+
+    def run_in_executor(self, executor: Any, func: Any, *args: Any) -> asyncio.Future[Any]:
+        if not self.alive:
+            raise KilledError
+        done = self.create_future()
+        self.submit(executor, lambda: func(*args), done)
+        return done
+
+    def add_reader(self, fd: int, callback: Any, *args: Any) -> None:
+        self._readers[fd] = asyncio.Handle(callback, args, self, None)
+
+    def remove_reader(self, fd: int) -> bool:
+        reader = self._readers.pop(fd, None)
+        if reader is not None:
+            reader.cancel()
+        return reader is not None
+
+    def add_signal_handler(self, sig: int, callback: Any, *args: Any) -> None:
+        pass
+
+    def remove_signal_handler(self, sig: int) -> bool:
+        return True
+
+    def get_debug(self) -> bool:
+        return False
+
+    def is_running(self) -> bool:
+        return self.alive
+
+    def is_closed(self) -> bool:
+        return not self.alive
+
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        if self.alive:
+            self.faults.append(f"{context.get('message')}: {context.get('exception')!r}")
+
+    async def shutdown_asyncgens(self) -> None:
+        pass
+
+    # what the world does with it
+
+    @property
+    def busy(self) -> bool:
+        """Whether it has something to do now."""
+        return self.alive and bool(self._ready) and self._timeline.now_s >= self.frozen_until_s
+
+    @property
+    def waiting(self) -> int:
+        """Handles that are ready."""
+        return len(self._ready)
+
+    def readable(self, fd: int) -> None:
+        """A descriptor has bytes."""
+        reader = self._readers.get(fd)
+        if reader is not None and self.alive:
+            self._ready.append(reader)
+
+    def step(self) -> None:
+        """Run one handle."""
+        if self._shuffled and len(self._ready) > 1:
+            self._ready.rotate(-self._dice.randrange(len(self._ready)))
+        handle = self._ready.popleft()
+        if handle.cancelled():
+            return
+        self.handles += 1
+        asyncio._set_running_loop(self)
+        try:
+            handle._run()
+        finally:
+            asyncio._set_running_loop(None)
+
+    def freeze(self, until_s: float) -> None:
+        """The process gets no processor for a while."""
+        self.frozen_until_s = until_s
+        self._timeline.at(until_s, lambda: None)
+
+    def kill(self) -> None:
+        """The process is gone: what it holds is given back to the system, and no line of it runs to any effect."""
+        if not self.alive:
+            return
+        self.alive = False
+        self._ready.clear()
+        self._readers.clear()
+        kept, sys.unraisablehook = sys.unraisablehook, lambda _: None
+        try:
+            with self._running():
+                for task in self._tasks:
+                    task._log_destroy_pending = False
+                    if not task.done():
+                        _close(task.get_coro())
+                self._tasks.clear()
+                self._ready.clear()
+        finally:
+            sys.unraisablehook = kept
+
+    def start(self, main: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+        """The first task."""
+        with self._running():
+            return self.create_task(main, name="main")
+
+    def _fall_due(self, handle: asyncio.TimerHandle) -> None:
+        if self.alive and not handle.cancelled():
+            self._ready.append(handle)
+
+    @contextlib.contextmanager
+    def _running(self) -> Iterator[None]:
+        asyncio._set_running_loop(self)
+        try:
+            yield
+        finally:
+            asyncio._set_running_loop(None)
+
+
+def _close(coroutine: Any) -> None:
+    """Throw a coroutine away, whatever it still wants to wait for."""
+    for _ in range(MOST_CLOSINGS):
+        try:
+            coroutine.close()
+        except RuntimeError:  # it awaits while it is thrown away: as often as it has such places
+            continue
+        except BaseException:  # noqa: BLE001 - nobody is there to hear it
+            pass
+        return

@@ -1,0 +1,529 @@
+"""One world from one seed: pack, board, cable, machine, disk, broker, the service in it, and what befalls them."""
+
+import asyncio
+import contextlib
+import hashlib
+import random
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import structlog
+
+from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.settings import MqttSettings, PackSettings, PublishSettings, SensorSettings, Settings
+from bms_estimator.service import serve as service
+from bms_estimator.service.checkpoint import REFUSED, CheckpointFile
+from bms_estimator.simulation.virtual_converter import BoardParts
+from tests.world import invariants
+from tests.world.broker import Broker, Connection, LateError, Packet
+from tests.world.disk import Disk, PowerCutError
+from tests.world.faults import Fault, schedule
+from tests.world.invariants import Band, InvariantError, Reference, Said, Truth
+from tests.world.line import Board, Cable
+from tests.world.loop import KilledError, ProcessLoop, Timeline
+from tests.world.pack import CELL, new_pack
+from tests.world.seams import Clocks, seams
+
+NAME = "pack"
+ROOT = f"bms/{NAME}"
+PUBLISH_HZ = 0.1
+RESOLUTION_V, NOISE_V = 5.0 / 1024, 0.001
+"""Of a board whose converter sees the cell without a divider."""
+THREAD_S = 0.0005, 0.05
+"""So long a call in a thread takes [s]."""
+CALM_S = 420.0
+"""At the end nothing happens, and all must be as it should [s]."""
+SHARED = Path("/dev/shm")
+LAST_LINES = 60
+BOOT_S = 5.0
+
+
+@dataclass
+class Result:
+    """What became of a seed."""
+
+    seed: int
+    seconds: float
+    wrong: str = ""
+    digest: str = ""
+    """Of all that was published, and when: the same bits give the same."""
+    log: list[str] = field(default_factory=list)
+    band: Band = field(default_factory=Band)
+    figures: dict[str, float] = field(default_factory=dict)
+
+
+class Probe:
+    """A further sink of the service: sees each snapshot as all sinks do."""
+
+    def __init__(self, take: Callable[[Snapshot], None]) -> None:
+        self.publish = take
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+
+@dataclass
+class Process:
+    """One run of the service."""
+
+    number: int
+    loop: ProcessLoop
+    stop: asyncio.Event
+    main: asyncio.Task[Any] | None = None
+    board: Any = None
+    snapshot: Snapshot | None = None
+    reference: Reference = field(default_factory=Reference)
+    delivered_s: float = 0.0
+    foreign: bool = False
+    """It was given bytes of another board."""
+    first_state: int = 0
+
+
+class World:
+    """All of it.
+
+    Args:
+        seed: From which all follows.
+        seconds: How long it lasts.
+        faults: What befalls it; None: as the seed has it.
+    """
+
+    def __init__(self, seed: int, seconds: float, faults: list[Fault] | None = None) -> None:
+        dice = random.Random(seed)
+        self.dice = {
+            name: random.Random(dice.randrange(1 << 62))
+            for name in ("time", "service", "threads", "pack", "board", "cable", "disk", "broker", "faults", "drawn")
+        }
+        self.seed, self.seconds = seed, seconds
+        self.timeline = Timeline(self.dice["time"])
+        self.clocks = Clocks(lambda: self.timeline.now_s)
+        self.settings = self._draw_settings(dice)
+        self.shuffled = dice.random() < 0.5
+        self.folder = Path(tempfile.mkdtemp(prefix="bms-world-", dir=SHARED if SHARED.is_dir() else None))
+        self._path = str(self.folder).encode()
+        self.disk = Disk(self.folder / "state", self.dice["disk"])
+        self.cable = Cable(self.folder / "dev", self.timeline, self.dice["cable"], self._readable)
+        self.cable.delivered = self._delivered
+        self.broker = Broker(self.timeline, self.dice["broker"], self._received)
+        self.broker.knows_five = dice.random() < 0.8
+        self.pack = new_pack(self.dice["pack"])
+        text = self.settings.sensor.protocol == "text"
+        first_rate_hz = dice.choice((1, 10, 100))
+        self.board = Board(
+            dice.randrange(1, 1 << 32), BoardParts(divider=1.0), self.dice["board"], text=text,
+            first_rate_hz=1 if text else first_rate_hz,
+        )  # fmt: skip
+        self.foreigner = Board(
+            dice.randrange(1, 1 << 32), BoardParts(divider=1.08), self.dice["board"], text=text, first_rate_hz=1
+        )
+        self.cable.resets_when_opened = dice.random() < 0.7
+        self.port_name = "ttyACM0"
+        self.cable.plug(self.board, self.port_name)
+        self.seen_soc = self.pack.soc
+        self.sampled_s = 0.0
+        self.powered = True
+        self.process: Process | None = None
+        self.runs = 0
+        self.kill_after: int | None = None
+        self.disk_hung = False
+        self._jobs: dict[int, deque[tuple[Process, Callable[[], Any], asyncio.Future[Any]]]] = {}
+        self._working: set[int] = set()
+        self.said, self.band = Said(), Band()
+        self.online = Truth(ONLINE_S)
+        self.sensor_online = Truth(SENSOR_ONLINE_S)
+        self.will_certain = True
+        self._digest = hashlib.sha256()
+        self.log: deque[str] = deque(maxlen=LAST_LINES)
+        self.figures: dict[str, float] = {"handles": 0, "runs": 0, "states": 0}
+        self.faults = schedule(self.dice["drawn"], seconds - CALM_S, auto=self.auto) if faults is None else faults
+        self.say_lines = False
+
+    def _draw_settings(self, dice: random.Random) -> Settings:
+        text = dice.random() < 0.2
+        rate_hz = 10 if dice.random() < 0.03 else 1
+        self.auto = dice.random() < 0.5
+        return Settings(
+            pack=PackSettings(name=NAME, cell="chen_mora"),
+            sensor=SensorSettings(
+                port="auto", protocol="text" if text else "binary", sample_rate_hz=rate_hz,
+                voltage_resolution_v=RESOLUTION_V, voltage_noise_v=NOISE_V,
+            ),
+            publish=PublishSettings(rate_hz=PUBLISH_HZ),
+            mqtt=MqttSettings(url="mqtt://broker"),
+        )  # fmt: skip
+
+    # the run
+
+    def run(self) -> Result:
+        """Until the end, or until something does not hold that must."""
+        if not self.auto:
+            port = str(self.cable.folder / self.port_name)
+            sensor = self.settings.sensor.model_copy(update={"port": port})
+            self.settings = self.settings.model_copy(update={"sensor": sensor})
+        wrong = ""
+        with contextlib.ExitStack() as stack:
+            stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
+            stack.enter_context(seams(self.clocks, self.dice["service"]))
+            stack.enter_context(self.disk.installed())
+            stack.enter_context(self.cable.installed())
+            stack.enter_context(self.broker.installed())
+            stack.enter_context(self._log_kept())
+            stack.enter_context(self._board_seen())
+            stack.callback(self.end_process, silently=False)
+            try:
+                self._live()
+            except InvariantError as error:
+                wrong = f"at {self.timeline.now_s:.3f} s: {error}"
+        return self._result(wrong)
+
+    def _result(self, wrong: str) -> Result:
+        self.figures |= {
+            "online_s": self.online.longest_s,
+            "sensor_online_s": self.sensor_online.longest_s,
+            "doubled": self.said.doubled,
+            "faults": len(self.faults),
+            "runs": self.runs,
+        }
+        digest = self._digest.hexdigest()[:16]
+        return Result(self.seed, self.timeline.now_s, wrong, digest, list(self.log), self.band, self.figures)
+
+    def _live(self) -> None:
+        self._tick_board()
+        self._look()
+        self.start_process()
+        for fault in self.faults:
+            self.timeline.at(fault.at_s, lambda fault=fault: self._befall(fault))
+        while self.timeline.now_s < self.seconds:
+            process = self.process
+            if process is not None and process.loop.busy:
+                self._step(process)
+            else:
+                self.timeline.step()
+        self._check_end()
+
+    def _step(self, process: Process) -> None:
+        """One handle of the service, unless it is killed before."""
+        if self.kill_after is not None:
+            self.kill_after -= 1
+            if self.kill_after < 0:
+                self.kill_after = None
+                self.note("killed")
+                self.end_process(silently=False)
+                return
+        process.loop.step()
+        if process.loop.faults and "MqttCodeError" in process.loop.faults[0]:
+            process.loop.faults.clear()  # aiomqtt keeps the reason of a lost connection, and may never be asked for it
+        if process.loop.faults:
+            self.fail(f"nobody caught: {process.loop.faults[0]}")
+        if process.main is not None and process.main.done():
+            self._ended(process)
+
+    def _ended(self, process: Process) -> None:
+        """The service has ended by itself."""
+        error = None if process.main is None or process.main.cancelled() else process.main.exception()
+        if error is not None:
+            self.fail(f"the service has ended: {error!r}")
+        self.note("ended in good order")
+        self.end_process(silently=False)
+
+    def start_process(self) -> None:
+        """The service is started, if there is power and it does not run."""
+        if not self.powered or self.process is not None or self.timeline.now_s >= self.seconds:
+            return
+        self.runs += 1
+        loop = ProcessLoop(self.timeline, self.dice["service"], shuffled=self.shuffled)
+        process = Process(self.runs, loop, asyncio.Event(), first_state=len(self.said.process))
+        loop.submit = lambda executor, job, done: self._submit(process, executor, job, done)
+        self.process = process
+        self.broker.loop = loop
+        self.note(f"start {self.runs}")
+        self._check_files()
+        process.main = loop.start(
+            service.serve(
+                self.settings,
+                CELL,
+                sinks=[Probe(lambda snapshot: self._published(process, snapshot))],
+                stop=process.stop,
+                folder=self.disk.folder,
+            )  # fmt: skip
+        )
+
+    def end_process(self, *, silently: bool) -> None:
+        """The process is no more; ``silently``: nor is the machine."""
+        process, self.process = self.process, None
+        if process is None:
+            return
+        self.figures["handles"] += process.loop.handles
+        self.kill_after = None
+        self.disk.arm = None
+        self.broker.loop = None
+        known = any(c.loop is process.loop and c.broker_open for c in self.broker.connections)
+        self.will_certain = known or self.broker.retained.get(f"{ROOT}/availability") != b"online"
+        process.loop.kill()
+        self._jobs.clear()
+        self._working.clear()
+        self.cable.forget()
+        self.broker.process_ended(process.loop, silently=silently)
+        self.timeline.after(min(self.dice["faults"].expovariate(1.0 / 20.0) + 0.2, 300.0), self.start_process)
+
+    def cut_power(self, off_s: float) -> None:
+        """The machine is without power, and back after a time; the board, too, is fed by it."""
+        self.note("power cut")
+        self.powered = False
+        self.end_process(silently=True)
+        self.disk.cut()
+
+        def back() -> None:
+            self.powered = True
+            self.clocks.boot = f"boot {self.timeline.now_s}"
+            self.clocks.booted_s = self.timeline.now_s
+            self.board.reset()
+            self.note("power back")
+            self.timeline.after(BOOT_S, self.start_process)
+
+        self.timeline.after(off_s, back)
+
+    # threads
+
+    def _submit(self, process: Process, executor: Any, job: Callable[[], Any], done: asyncio.Future[Any]) -> None:
+        """A call in a thread; those of one executor that has one thread come one after the other."""
+        single = getattr(executor, "_max_workers", 2) == 1
+        if not single:
+            self._work_later(process, job, done, None)
+            return
+        queue = self._jobs.setdefault(id(executor), deque())
+        queue.append((process, job, done))
+        if id(executor) not in self._working:
+            self._next_job(id(executor))
+
+    def _next_job(self, executor: int) -> None:
+        queue = self._jobs.get(executor)
+        if queue:
+            self._working.add(executor)
+            self._work_later(*queue.popleft(), executor)
+        else:
+            self._working.discard(executor)
+
+    def _work_later(
+        self, process: Process, job: Callable[[], Any], done: asyncio.Future[Any], executor: int | None
+    ) -> None:
+        self.timeline.after(self.dice["threads"].uniform(*THREAD_S), lambda: self._work(process, job, done, executor))
+
+    def _work(self, process: Process, job: Callable[[], Any], done: asyncio.Future[Any], executor: int | None) -> None:
+        if not process.loop.alive:
+            return
+        if executor is not None and self.disk_hung:
+            self.timeline.after(1.0, lambda: self._work(process, job, done, executor))
+            return
+        try:
+            value, error = job(), None
+        except LateError as late:
+            failed = late.error
+            self.timeline.after(late.seconds, lambda: process.loop.call_soon(_fill, done, None, failed))
+            return
+        except KilledError:
+            self.note("killed at a write")
+            self.end_process(silently=False)
+            return
+        except PowerCutError:
+            self.cut_power(self.dice["faults"].uniform(1.0, 300.0))
+            return
+        except Exception as caught:  # noqa: BLE001 - whatever it is, the service gets it
+            value, error = None, caught
+        process.loop.call_soon(_fill, done, value, error)
+        if executor is not None:
+            self._next_job(executor)
+
+    # the board
+
+    def _tick_board(self) -> None:
+        """A sample."""
+        board = self.cable.board or self.board
+        now_s = self.timeline.now_s
+        reading = self.pack(now_s)
+        if self.powered:
+            sent = board.sample(reading)
+            if self.cable.board is not None and self.cable.opening is not None and not self.cable.noise.mute:
+                if board is self.board:
+                    self.seen_soc, self.sampled_s = self.pack.soc, now_s
+                elif self.process is not None:
+                    self.process.foreign = True
+                self.cable.send(sent)
+        self.timeline.after(board.period_s, self._tick_board)
+
+    def _readable(self, descriptor: int) -> None:
+        if self.process is not None:
+            self.process.loop.readable(descriptor)
+
+    def _delivered(self, data: bytes) -> None:
+        if self.process is not None:
+            self.process.reference.feed(data)
+            self.process.delivered_s = self.timeline.now_s
+
+    # what the service says
+
+    def _published(self, process: Process, snapshot: Snapshot) -> None:
+        """A snapshot, as each sink gets it."""
+        process.snapshot = snapshot
+        if snapshot.estimate is None:
+            return
+        self.said.say(snapshot.estimate.model_dump_json().encode(), process.number)
+        self.figures["states"] += 1
+        if process.foreign:
+            return  # TODO
+        if wrong := self.band.take(snapshot, self.seen_soc):
+            self.fail(wrong)
+
+    def _received(self, packet: Packet, connection: Connection | None) -> None:
+        """The broker has a message."""
+        self._digest.update(f"{self.timeline.now_s:.9f} {packet.topic}".encode())
+        self._digest.update(packet.payload.replace(self._path, b"."))
+        if self.say_lines:
+            self.note(f"broker: {packet.topic} {packet.payload[:60]!r}")
+        if packet.topic == f"{ROOT}/state" and (wrong := self.said.take(packet, connection)):
+            self.fail(wrong)
+
+    # what must hold
+
+    def _look(self) -> None:
+        """Once a second."""
+        now_s = self.timeline.now_s
+        process = self.process
+        if process is not None and not process.loop.busy and now_s >= process.loop.frozen_until_s:
+            self._check_counts(process)
+            if now_s % 10.0 < 1.0:
+                self._check_memory(process)
+        self._check_availability(now_s)
+        self.timeline.after(1.0, self._look)
+
+    def _check_counts(self, process: Process) -> None:
+        """Each valid sample that came was taken, or dropped and counted."""
+        if process.board is None or self.settings.sensor.protocol != "binary":
+            return
+        counters = process.board.counters
+        if self.timeline.now_s - process.delivered_s > 0.05 and not process.foreign and self._reads(process) == 0:
+            taken = sum(counters[name] for name in ("frames_received", "duplicates", "out_of_order", "before_hello"))
+            held = process.board._door.stranger is not None
+            if taken != process.reference.samples and not held:
+                self.fail(f"{process.reference.samples} samples came, {taken} are counted: {counters}")
+
+    def _reads(self, process: Process) -> int:
+        return int(process.board._line._reads.qsize())
+
+    def _check_memory(self, process: Process) -> None:
+        """Nothing grows."""
+        tasks = sum(not task.done() for task in process.loop._tasks)
+        if tasks > invariants.MOST_TASKS:
+            self.fail(f"{tasks} tasks")
+        if process.loop.waiting > invariants.MOST_READY:
+            self.fail(f"{process.loop.waiting} handles wait")
+        if process.board is not None and self._reads(process) > invariants.MOST_READS:
+            self.fail(f"{self._reads(process)} reads wait")
+
+    def _check_availability(self, now_s: float) -> None:
+        """What the broker retains of us is true."""
+        broker, process = self.broker, self.process
+        can_tell = broker.up and broker.reachable and now_s >= broker.frozen_until_s
+        truth = None
+        if can_tell and process is not None and now_s >= process.loop.frozen_until_s and not process.stop.is_set():
+            truth = "online"
+        elif can_tell and process is None and self.will_certain:
+            truth = "offline"
+        retained = broker.retained.get
+        if wrong := self.online.check(truth, invariants.text(retained(f"{ROOT}/availability")), now_s):
+            self.fail(f"availability: {wrong}")
+        if truth == "online":
+            silent_s = now_s - self.sampled_s
+            truth = "online" if silent_s < 2.0 else "offline"
+        else:
+            truth = None
+        noisy = self.cable.noise.flip or self.cable.noise.lose or (process is not None and process.foreign)
+        told = invariants.text(retained(f"{ROOT}/sensor/availability"))
+        if wrong := self.sensor_online.check(None if noisy else truth, told, now_s):
+            self.fail(f"sensor availability: {wrong}")
+
+    def _check_files(self) -> None:
+        """What is on the disk is whole."""
+        found = CheckpointFile(self.disk.folder, self.settings, CELL, now=self.clocks.moment).load()
+        if found.reason.startswith(REFUSED):
+            self.fail(f"the checkpoint is {found.reason}")
+
+    def _check_end(self) -> None:
+        """After a time without faults all is as it should be."""
+        process = self.process
+        if process is None:
+            self.fail("the service does not run")
+        lost = self.said.lost(process.number, process.first_state)
+        if len(lost) > 1 or (lost and lost[0] != len(self.said.process) - 1):
+            self.fail(f"of the states of the last run the broker never got {lost}")
+
+    def fail(self, wrong: str) -> None:
+        """Something does not hold."""
+        raise InvariantError(wrong)
+
+    # what befalls it
+
+    def _befall(self, fault: Fault) -> None:
+        self.note(f"fault: {fault}")
+        fault.befall(self)
+
+    # the rest
+
+    def note(self, line: str) -> None:
+        """For who looks into a seed."""
+        self.log.append(f"{self.timeline.now_s:10.3f} {line}")
+
+    @contextlib.contextmanager
+    def _log_kept(self) -> Iterator[None]:
+        """The service's log lines come between our own."""
+        kept = structlog.get_config()
+
+        def keep(_: Any, level: str, event: dict[str, Any]) -> str:
+            text = " ".join(f"{name}={value}" for name, value in event.items() if name != "event")
+            self.note(f"  {level}: {event.get('event')} {text}"[:300])
+            raise structlog.DropEvent
+
+        structlog.configure(processors=[keep], cache_logger_on_first_use=False)
+        try:
+            yield
+        finally:
+            structlog.configure(**kept)
+
+    @contextlib.contextmanager
+    def _board_seen(self) -> Iterator[None]:
+        """The counters of the service's source are read."""
+        made = service.SerialBoard
+
+        def make(*arguments: Any, **named: Any) -> Any:
+            board = made(*arguments, **named)
+            if self.process is not None:
+                self.process.board = board
+            return board
+
+        service.SerialBoard = make
+        try:
+            yield
+        finally:
+            service.SerialBoard = made
+
+
+ONLINE_S = 90.0
+"""So long after the broker can be told the retained availability is right."""
+SENSOR_ONLINE_S = 120.0
+
+
+def _fill(done: asyncio.Future[Any], value: Any, error: BaseException | None) -> None:
+    if done.done():
+        return
+    if error is None:
+        done.set_result(value)
+    else:
+        done.set_exception(error)
