@@ -189,6 +189,8 @@ class Client(aiomqtt.Client):
             self._why = "the broker gave no sign of life"
         if not self._connected.done() and not self._abandoned:
             self._connected.set_exception(ClosedError(self._why))
+        if self._connected.cancelled():  # nobody waits any more; the base would ask it for its exception
+            return
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
 
     def _on_log(self, client: Any, userdata: Any, level: int, said: str) -> None:  # noqa: ARG002

@@ -27,6 +27,11 @@ LOOK_S = 2.0
 REFUSED_VERSION = ReasonCode(PacketTypes.CONNACK, identifier=132)
 ACCEPTED = ReasonCode(PacketTypes.CONNACK, identifier=0)
 TAKEN = ReasonCode(PacketTypes.PUBACK, identifier=0)
+LOST = ReasonCode(PacketTypes.DISCONNECT, "Unspecified error")
+SILENT = ReasonCode(PacketTypes.DISCONNECT, "Keep alive timeout")
+PARTED = ReasonCode(PacketTypes.DISCONNECT, "Normal disconnection")
+NO_FLAGS = SimpleNamespace(is_disconnect_packet_from_server=False, session_present=False)
+MOST_IN_FLIGHT = 20
 GRANTED = ReasonCode(PacketTypes.SUBACK, identifier=0)
 
 
@@ -66,8 +71,8 @@ class Connection:
     said_by_client_s: float = 0.0
     pinged_s: float | None = None
     wanted: list[str] = field(default_factory=list)
-    acknowledged: set[int] = field(default_factory=set)
-    """Of its messages of QoS 1 those whose acknowledgement the client has."""
+    acknowledged: dict[int, float] = field(default_factory=dict)
+    """Of its messages of QoS 1 those whose acknowledgement the client has, and since when."""
 
     @property
     def usable(self) -> bool:
@@ -183,7 +188,7 @@ class Broker:
     def _greet(self, connection: Connection) -> None:
         client = connection.client
         if client.protocol == paho.MQTTv5 and not self.knows_five:
-            self._send_to_client(connection, lambda: client.on_connect(client, None, {}, REFUSED_VERSION, None))
+            self._send_to_client(connection, lambda: client.on_connect(client, None, NO_FLAGS, REFUSED_VERSION, None))
             self._end(connection, says_will=False)
             return
         for other in list(self.connections):
@@ -198,7 +203,7 @@ class Broker:
         if packet.qos:
 
             def acknowledge() -> None:
-                connection.acknowledged.add(packet.mid)
+                connection.acknowledged[packet.mid] = self._timeline.now_s
                 connection.client.on_publish(connection.client, None, packet.mid, TAKEN, None)
 
             self._send_to_client(connection, acknowledge)
@@ -240,7 +245,7 @@ class Broker:
 
     def _hang_up(self, connection: Connection) -> None:
         """The client sees that it is over."""
-        self._send_to_client(connection, lambda: connection.client.lost(paho.MQTT_ERR_CONN_LOST))
+        self._send_to_client(connection, lambda: connection.client.lost(LOST))
 
     def _look(self, connection: Connection) -> None:
         """Whether either side has been silent for too long."""
@@ -254,7 +259,7 @@ class Broker:
             self._hang_up(connection)
         if connection.client_open and connection.loop.alive and now_s >= connection.loop.frozen_until_s:
             if connection.pinged_s is not None and now_s - connection.pinged_s >= keepalive_s:
-                connection.loop.call_soon(connection.client.lost, paho.MQTT_ERR_KEEPALIVE)
+                connection.loop.call_soon(connection.client.lost, SILENT)
             elif connection.pinged_s is None and (
                 min(connection.heard_by_client_s, connection.said_by_client_s) <= now_s - keepalive_s
             ):
@@ -310,8 +315,8 @@ class VirtualPaho:
         self._client_id = (self.identifier or "").encode()
         self.keepalive_s = 60.0
         self.will: Packet | None = None
+        self.max_inflight_messages = MOST_IN_FLIGHT
         self._connection: Connection | None = None
-        self._is_connected = False
         self._mid = 0
         self.on_connect = self.on_disconnect = self.on_subscribe = self.on_unsubscribe = _ignored
         self.on_message = self.on_publish = self.on_socket_open = self.on_socket_close = _ignored
@@ -322,25 +327,22 @@ class VirtualPaho:
             return _ignored
         raise AttributeError(name)
 
-    def will_set(self, topic: str, payload: bytes, qos: int, retain: bool, properties: Any) -> None:
+    def will_set(self, topic: str, payload: bytes, qos: int, retain: bool, *_: Any) -> None:
         self.will = Packet(topic, payload, qos, retain, 0)
 
-    def connect(self, host: str, port: int, keepalive: float, *_: Any) -> None:
-        self.keepalive_s = keepalive
-        self._is_connected = False
+    def connect(self, *address: Any) -> None:
+        self.keepalive_s = address[2]
         self._connection = self._broker.connect(self)
 
     def connected(self, code: ReasonCode) -> None:
-        self._is_connected = True
-        self.on_connect(self, None, {}, code, None)
+        self.on_connect(self, None, NO_FLAGS, code, None)
 
-    def lost(self, code: int) -> None:
+    def lost(self, code: ReasonCode) -> None:
         if self._connection is not None and self._connection.client_open:
             self._connection.client_open = False
-            self._is_connected = False
             connection = self._connection
             self._broker._send_to_broker(connection, lambda: self._broker._end(connection, says_will=True))
-            self.on_disconnect(self, None, {}, code, None)
+            self.on_disconnect(self, None, NO_FLAGS, code, None)
 
     def socket(self) -> None:
         return None
@@ -352,7 +354,9 @@ class VirtualPaho:
         if connection is None or not connection.usable:
             return SimpleNamespace(rc=paho.MQTT_ERR_NO_CONN, mid=mid, is_published=lambda: False)
         self._broker.publish(connection, Packet(topic, payload, qos, retain, mid))
-        return SimpleNamespace(rc=paho.MQTT_ERR_SUCCESS, mid=mid, is_published=lambda: qos == 0)
+        if not qos:  # the system has taken it
+            connection.loop.call_soon(self.on_publish, self, None, mid, TAKEN, None)
+        return SimpleNamespace(rc=paho.MQTT_ERR_SUCCESS, mid=mid, is_published=lambda: False)
 
     def subscribe(self, topics: Any, *_: Any) -> tuple[int, int | None]:
         if self._connection is None or not self._connection.usable:
@@ -366,8 +370,7 @@ class VirtualPaho:
         if connection is None or not connection.usable:
             return int(paho.MQTT_ERR_NO_CONN)
         self._broker.disconnect(connection)
-        self._is_connected = False
-        connection.loop.call_soon(self.on_disconnect, self, None, {}, paho.MQTT_ERR_SUCCESS, None)
+        connection.loop.call_soon(self.on_disconnect, self, None, NO_FLAGS, PARTED, None)
         return int(paho.MQTT_ERR_SUCCESS)
 
 

@@ -8,6 +8,8 @@ import errno
 import os
 import random
 import shutil
+import sqlite3
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from tests.world.loop import KilledError
+
+
+SYNC_S = 31.0
+"""What a database has committed for so long is on the platter, as ``store.database`` has it."""
 
 
 class PowerCutError(BaseException):
@@ -41,6 +47,7 @@ class Disk:
     Attributes:
         full: Nothing new can be written.
         broken: Writing fails, the disk says.
+        hung: Calls for it do not return.
         arm: How it ends the process before long; None: it does not.
         operations: So many have changed it.
     """
@@ -50,7 +57,7 @@ class Disk:
         self._prefix = str(folder) + "/"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        self.full = self.broken = False
+        self.full = self.broken = self.hung = False
         self.arm: Arm | None = None
         self.operations = 0
         self._synced: dict[int, bytes] = {}
@@ -60,6 +67,14 @@ class Disk:
         self._pending: list[tuple[str, str, int]] = []
         """Names changed since the folder's fsync: operation, name, inode."""
         self._folders: set[int] = set()
+        self.connections: list[sqlite3.Connection] = []
+        """To databases, of the present process."""
+        self._logs: dict[str, deque[tuple[float, int]]] = {}
+
+    @property
+    def bad(self) -> bool:
+        """Whether it is at fault."""
+        return self.full or self.broken or self.hung
 
     @contextmanager
     def installed(self) -> Iterator[None]:
@@ -74,9 +89,47 @@ class Disk:
             for name, function in kept.items():
                 setattr(os, name, function)
 
+    def end_process(self) -> None:
+        """Whoever had a database open is gone, and has closed nothing."""
+        found = {path: path.read_bytes() for path in self._databases()}
+        for connection in self.connections:
+            connection.close()
+        self.connections.clear()
+        for path in self._databases():
+            path.unlink()
+        for path, content in found.items():
+            if not path.name.endswith("-shm"):
+                path.write_bytes(content)
+
+    def note_databases(self, now_s: float) -> None:
+        """Take note of how long the logs of the databases are: what is older than ``SYNC_S`` is on the platter."""
+        for path in self._databases():
+            if path.name.endswith("-wal"):
+                sizes = self._logs.setdefault(path.name, deque())
+                size = path.stat().st_size
+                if sizes and sizes[-1][1] > size:
+                    sizes.clear()  # a new log
+                sizes.append((now_s, size))
+                while len(sizes) > 1 and sizes[1][0] < now_s - SYNC_S:
+                    sizes.popleft()
+
+    def _databases(self) -> list[Path]:
+        return sorted(path for path in self.folder.iterdir() if ".sqlite" in path.name)
+
     def cut(self) -> None:
         """The power is cut: leave what is on the platter, and of the rest what chance leaves."""
-        content = {path.name: path.read_bytes() for path in self.folder.iterdir() if path.is_file()}
+        databases = {path: path.read_bytes() for path in self._databases()}
+        self._cut_files()
+        for path, content in databases.items():
+            if path.name.endswith("-wal"):
+                sizes = self._logs.get(path.name)
+                least = min(sizes[0][1], len(content)) if sizes else 0
+                path.write_bytes(content[: self._dice.randint(least, len(content))])
+            else:
+                path.write_bytes(content)
+
+    def _cut_files(self) -> None:
+        content = {path.name: path.read_bytes() for path in sorted(self.folder.iterdir()) if path.is_file()}
         inodes = {name: (self.folder / name).stat().st_ino for name in content}
         volatile = {inodes[name]: content[name] for name in content}
         names = dict(self._names)
@@ -99,11 +152,10 @@ class Disk:
             number = path.stat().st_ino
             self._names[name], self._synced[number] = number, left[inode]
 
-    def take_over(self) -> None:
-        """All that is there now is on the platter, as if it had been so for long."""
-        self._pending = []
-        self._names = {path.name: path.stat().st_ino for path in self.folder.iterdir() if path.is_file()}
-        self._synced = {inode: (self.folder / name).read_bytes() for name, inode in self._names.items()}
+    def connect(self, *arguments: Any, **named: Any) -> sqlite3.Connection:
+        """As ``sqlite3.connect``."""
+        self.connections.append(sqlite3.connect(*arguments, **named))
+        return self.connections[-1]
 
     def _left(self, inode: int, volatile: bytes) -> bytes:
         """What is left of a file."""
@@ -123,7 +175,11 @@ class Disk:
     def _ours(self, path: Any) -> str | None:
         """Name of a file of this disk."""
         text = os.fspath(path) if not isinstance(path, int) else ""
-        return text.removeprefix(self._prefix) if isinstance(text, str) and text.startswith(self._prefix) else None
+        return (
+            text.removeprefix(self._prefix)
+            if isinstance(text, str) and text.startswith(self._prefix) and ".sqlite" not in text
+            else None
+        )
 
     def _operation(self) -> None:
         """Something is about to change."""
@@ -168,7 +224,7 @@ class Disk:
                 self._operation()
                 self._flush_names()
                 return
-            path = os.readlink(f"/proc/self/fd/{descriptor}")
+            path = os.readlink(f"/proc/self/fd/{descriptor}")  # noqa: PTH115 - it is no file
             if self._ours(path) is None:
                 real(descriptor)
                 return
@@ -177,8 +233,7 @@ class Disk:
                 os.truncate(path, self._dice.randint(0, os.fstat(descriptor).st_size))
                 self._refuse()
             found = os.fstat(descriptor)
-            with open(path, "rb") as file:
-                self._synced[found.st_ino] = file.read()
+            self._synced[found.st_ino] = Path(path).read_bytes()
 
         return synced
 
@@ -200,7 +255,7 @@ class Disk:
                 return
             self._operation()
             self._refuse()
-            inode = os.stat(source).st_ino
+            inode = Path(source).stat().st_ino
             real(source, target)
             self._pending.append(("replace", name, inode))
 
@@ -210,7 +265,7 @@ class Disk:
         def unlinked(path: Any, *, dir_fd: int | None = None) -> None:
             name = self._ours(path)
             if name is None or dir_fd is not None:
-                real(path, dir_fd=dir_fd) if dir_fd is not None else real(path)
+                real(path, dir_fd=dir_fd)
                 return
             if os.path.lexists(path):
                 self._operation()
@@ -218,7 +273,3 @@ class Disk:
             real(path)
 
         return unlinked
-
-
-ENDS = (KilledError, PowerCutError)
-"""How a process may end at a write."""

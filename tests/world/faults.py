@@ -37,9 +37,11 @@ class Fault:
         return f"{self.kind} for {self.seconds:.1f} s, share {self.share:.3f}"
 
 
-def schedule(dice: random.Random, until_s: float, *, auto: bool) -> list[Fault]:
+def schedule(dice: random.Random, until_s: float, *, auto: bool, text: bool) -> list[Fault]:
     """What befalls a world, drawn."""
-    kinds = [kind for kind in KINDS if auto or kind not in ONLY_AUTO]
+    kinds = [
+        kind for kind in KINDS if not (kind == "boards swapped" and text) and not (kind == "port renamed" and not auto)
+    ]
     likely = dice.sample(kinds, k=dice.randint(2, len(kinds)))
     faults = []
     at_s = FIRST_S * dice.random()
@@ -131,11 +133,6 @@ def _disk(attribute: str) -> Callable[["World", Fault], None]:
     return befall
 
 
-def _hung(world: "World", fault: Fault) -> None:
-    world.disk_hung = True
-    world.timeline.after(fault.seconds, lambda: setattr(world, "disk_hung", False))
-
-
 def _kill(world: "World", fault: Fault) -> None:
     world.kill_after = int(200 * fault.share)
 
@@ -216,7 +213,7 @@ KINDS: dict[str, Callable[["World", Fault], None]] = {
     "wall clock stepped": _wall_step,
     "disk full": _disk("full"),
     "disk broken": _disk("broken"),
-    "disk hung": _hung,
+    "disk hung": _disk("hung"),
     "killed": _kill,
     "killed at a write": _kill_at_write,
     "power cut": _power_cut,
@@ -227,5 +224,3 @@ KINDS: dict[str, Callable[["World", Fault], None]] = {
     "availability forged": _forged,
     "birth message": _birth,
 }
-ONLY_AUTO = {"port renamed", "boards swapped"}
-"""A port that is named is that port, whatever is on it."""

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.sources.protocol import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
@@ -40,23 +40,50 @@ class Reference:
             self.samples += len(packet) == 22 and packet[:2] == bytes((PROTOCOL_VERSION, MessageType.SAMPLE))
 
 
+class State(NamedTuple):
+    """One that the service has given away."""
+
+    process: int
+    said_s: float
+
+
+class End(NamedTuple):
+    """How a process has ended."""
+
+    at_s: float
+    forgotten_s: float
+    """What it had said or heard for longer outlives it."""
+
+
+IN_FLIGHT_S = 15.0
+"""What was said last may still be on its way [s]."""
+
+
 @dataclass
 class Said:
     """States that the service has given away, and what the broker has of them."""
 
     payloads: dict[bytes, int] = field(default_factory=dict)
     """Payload -> its number."""
-    process: list[int] = field(default_factory=list)
-    """Of each, which process said it."""
+    states: list[State] = field(default_factory=list)
     last: int = -1
     """The newest that the broker has."""
     received: dict[int, list[tuple[Connection, int]]] = field(default_factory=dict)
     """Number -> on which connections it came, and under which packet identifier."""
+    ends: dict[int, End] = field(default_factory=dict)
+    """Of processes."""
     doubled: int = 0
+    forgotten: int = 0
+    """States that a kill or a power cut has cost."""
 
-    def say(self, payload: bytes, process: int) -> None:
-        self.payloads[payload] = len(self.process)
-        self.process.append(process)
+    def say(self, payload: bytes, process: int, now_s: float) -> None:
+        """The service gives one away."""
+        self.payloads[payload] = len(self.states)
+        self.states.append(State(process, now_s))
+
+    def end(self, process: int, now_s: float, forgotten_s: float) -> None:
+        """A process has ended."""
+        self.ends[process] = End(now_s, forgotten_s)
 
     def take(self, packet: Packet, connection: Connection | None) -> str:
         """The broker has received a state. Returns what is wrong with that."""
@@ -69,7 +96,7 @@ class Said:
         for other, mid in earlier:
             if other is connection:
                 return f"state {number} came twice on one connection"
-            if mid in other.acknowledged:
+            if self._known(other, mid, connection, self.states[number].process):
                 return f"state {number} came again though its acknowledgement had come"
         if earlier:
             self.doubled += 1
@@ -79,9 +106,30 @@ class Said:
         self.last = max(self.last, number)
         return ""
 
-    def lost(self, process: int, since: int = 0) -> list[int]:
-        """What a process said, from a number on, and the broker never got."""
-        return [n for n, by in enumerate(self.process) if by == process and n >= since and n not in self.received]
+    def _known(self, other: Connection, mid: int, connection: Connection, process: int) -> bool:
+        """Whether who sends on ``connection`` knows that the broker has acknowledged what came on ``other``."""
+        heard_s = other.acknowledged.get(mid)
+        if heard_s is None:
+            return False
+        if other.loop is connection.loop:
+            return True
+        ends = [end for number, end in self.ends.items() if number >= process]
+        return not any(heard_s > end.at_s - end.forgotten_s for end in ends)
+
+    def lost(self, now_s: float) -> list[int]:
+        """What the broker never got though nothing explains it."""
+        missing = [n for n in range(len(self.states)) if n not in self.received]
+        ends = self.ends.items()
+        lost = []
+        for n in missing:
+            state = self.states[n]
+            if state.said_s > now_s - IN_FLIGHT_S:
+                continue
+            if any(p >= state.process and state.said_s > end.at_s - end.forgotten_s for p, end in ends):
+                self.forgotten += 1
+            else:
+                lost.append(n)
+        return lost
 
 
 @dataclass

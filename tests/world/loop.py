@@ -10,6 +10,7 @@ import random
 import sys
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import Executor
 from typing import Any
 
 MOST_CLOSINGS = 20
@@ -55,11 +56,10 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
     Args:
         timeline: The world's.
-        dice: Draws what is left open: which task goes first, how long a thread takes.
     """
 
-    def __init__(self, timeline: Timeline, dice: random.Random, *, shuffled: bool = False) -> None:
-        self._timeline, self._dice, self._shuffled = timeline, dice, shuffled
+    def __init__(self, timeline: Timeline) -> None:
+        self._timeline = timeline
         self._ready: deque[asyncio.Handle] = deque()
         self._readers: dict[int, asyncio.Handle] = {}
         self._tasks: list[asyncio.Task[Any]] = []
@@ -70,8 +70,8 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         """So many have run."""
         self.faults: list[str] = []
         """What nobody caught."""
-        self.submit: Callable[[Any, Callable[[], Any], asyncio.Future[Any]], None] = lambda executor, job, done: None
-        """Takes what is to run in a thread of an executor."""
+        self.threads: Executor = Executor()
+        """Where calls run for which nobody names an executor."""
 
     # what a process asks of its loop
 
@@ -116,9 +116,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
     def run_in_executor(self, executor: Any, func: Any, *args: Any) -> asyncio.Future[Any]:
         if not self.alive:
             raise KilledError
-        done = self.create_future()
-        self.submit(executor, lambda: func(*args), done)
-        return done
+        return asyncio.wrap_future((executor or self.threads).submit(func, *args), loop=self)
 
     def add_reader(self, fd: int, callback: Any, *args: Any) -> None:
         self._readers[fd] = asyncio.Handle(callback, args, self, None)
@@ -129,10 +127,10 @@ class ProcessLoop(asyncio.AbstractEventLoop):
             reader.cancel()
         return reader is not None
 
-    def add_signal_handler(self, sig: int, callback: Any, *args: Any) -> None:
+    def add_signal_handler(self, *_: Any) -> None:
         pass
 
-    def remove_signal_handler(self, sig: int) -> bool:
+    def remove_signal_handler(self, *_: Any) -> bool:
         return True
 
     def get_debug(self) -> bool:
@@ -171,8 +169,6 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
     def step(self) -> None:
         """Run one handle."""
-        if self._shuffled and len(self._ready) > 1:
-            self._ready.rotate(-self._dice.randrange(len(self._ready)))
         handle = self._ready.popleft()
         if handle.cancelled():
             return

@@ -8,15 +8,21 @@ import contextlib
 import functools
 import random
 import secrets
+import sqlite3
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from threading import Thread
 from types import FunctionType, ModuleType
 from typing import Any
 
 from bms_estimator.model import clock
 from bms_estimator.service import moment
+from bms_estimator.service.disk_thread import DiskThread
 from bms_estimator.snapshot import health
+from tests.world.disk import Disk
+from tests.world.threads import Threads
 
 PACKAGE = "bms_estimator"
 
@@ -68,8 +74,8 @@ def _remembered(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @contextlib.contextmanager
-def seams(clocks: Clocks, dice: random.Random) -> Iterator[None]:
-    """Have the package ask ``clocks`` and ``dice``."""
+def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], disk: Disk) -> Iterator[None]:
+    """Have the package ask ``clocks`` and ``dice``, and ``threads`` and ``disk`` for what runs beside the loop."""
     instead: dict[int, Any] = {
         id(time.time): clocks.wall,
         id(time.monotonic): clocks.monotonic,
@@ -78,6 +84,10 @@ def seams(clocks: Clocks, dice: random.Random) -> Iterator[None]:
         id(moment.moment): clocks.moment,
         id(random.uniform): dice.uniform,
         id(random.random): dice.random,
+        id(ThreadPoolExecutor): lambda *args, **named: threads().executor(*args, **named),
+        id(DiskThread): lambda name: threads().executor(thread_name_prefix=name),
+        id(Thread): lambda **named: threads().thread(**named),
+        id(sqlite3): _Instead(sqlite3, connect=disk.connect),
         id(secrets.token_hex): lambda count: dice.randbytes(count).hex(),
         id(time): _Instead(
             time, time=clocks.wall, monotonic=clocks.monotonic, perf_counter=clocks.monotonic,

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import hashlib
+import math
 import random
 import shutil
 import tempfile
@@ -20,7 +21,7 @@ from bms_estimator.service import serve as service
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile
 from bms_estimator.simulation.virtual_converter import BoardParts
 from tests.world import invariants
-from tests.world.broker import Broker, Connection, LateError, Packet
+from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError
 from tests.world.faults import Fault, schedule
 from tests.world.invariants import Band, InvariantError, Reference, Said, Truth
@@ -28,14 +29,13 @@ from tests.world.line import Board, Cable
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 from tests.world.pack import CELL, new_pack
 from tests.world.seams import Clocks, seams
+from tests.world.threads import Threads
 
 NAME = "pack"
 ROOT = f"bms/{NAME}"
 PUBLISH_HZ = 0.1
 RESOLUTION_V, NOISE_V = 5.0 / 1024, 0.001
 """Of a board whose converter sees the cell without a divider."""
-THREAD_S = 0.0005, 0.05
-"""So long a call in a thread takes [s]."""
 CALM_S = 420.0
 """At the end nothing happens, and all must be as it should [s]."""
 SHARED = Path("/dev/shm")
@@ -84,7 +84,6 @@ class Process:
     delivered_s: float = 0.0
     foreign: bool = False
     """It was given bytes of another board."""
-    first_state: int = 0
 
 
 class World:
@@ -106,7 +105,6 @@ class World:
         self.timeline = Timeline(self.dice["time"])
         self.clocks = Clocks(lambda: self.timeline.now_s)
         self.settings = self._draw_settings(dice)
-        self.shuffled = dice.random() < 0.5
         self.folder = Path(tempfile.mkdtemp(prefix="bms-world-", dir=SHARED if SHARED.is_dir() else None))
         self._path = str(self.folder).encode()
         self.disk = Disk(self.folder / "state", self.dice["disk"])
@@ -133,9 +131,8 @@ class World:
         self.process: Process | None = None
         self.runs = 0
         self.kill_after: int | None = None
-        self.disk_hung = False
-        self._jobs: dict[int, deque[tuple[Process, Callable[[], Any], asyncio.Future[Any]]]] = {}
-        self._working: set[int] = set()
+        self.threads: Threads | None = None
+        self.disk_good_s = 0.0
         self.said, self.band = Said(), Band()
         self.online = Truth(ONLINE_S)
         self.sensor_online = Truth(SENSOR_ONLINE_S)
@@ -143,7 +140,9 @@ class World:
         self._digest = hashlib.sha256()
         self.log: deque[str] = deque(maxlen=LAST_LINES)
         self.figures: dict[str, float] = {"handles": 0, "runs": 0, "states": 0}
-        self.faults = schedule(self.dice["drawn"], seconds - CALM_S, auto=self.auto) if faults is None else faults
+        self.faults = (
+            schedule(self.dice["drawn"], seconds - CALM_S, auto=self.auto, text=text) if faults is None else faults
+        )
         self.say_lines = False
 
     def _draw_settings(self, dice: random.Random) -> Settings:
@@ -171,7 +170,7 @@ class World:
         wrong = ""
         with contextlib.ExitStack() as stack:
             stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
-            stack.enter_context(seams(self.clocks, self.dice["service"]))
+            stack.enter_context(seams(self.clocks, self.dice["service"], self._present_threads, self.disk))
             stack.enter_context(self.disk.installed())
             stack.enter_context(self.cable.installed())
             stack.enter_context(self.broker.installed())
@@ -189,6 +188,7 @@ class World:
             "online_s": self.online.longest_s,
             "sensor_online_s": self.sensor_online.longest_s,
             "doubled": self.said.doubled,
+            "forgotten": self.said.forgotten,
             "faults": len(self.faults),
             "runs": self.runs,
         }
@@ -234,14 +234,34 @@ class World:
         self.note("ended in good order")
         self.end_process(silently=False)
 
+    def _forgotten_s(self, *, clean: bool, silently: bool) -> float:
+        """What the service had heard or said for longer outlives its end [s]."""
+        trouble_s = self.timeline.now_s - self.disk_good_s
+        if trouble_s > 0.0 or self.disk.bad:
+            return math.inf
+        return POWER_S if silently else 0.0 if clean else KILL_S
+
+    def _ended_in_thread(self, how: type[BaseException]) -> None:
+        """A write has ended the process, or more."""
+        self.note(f"{how.__name__} at a write")
+        if how is PowerCutError:
+            self.cut_power(self.dice["faults"].uniform(1.0, 300.0))
+        else:
+            self.end_process(silently=False)
+
+    def _present_threads(self) -> Threads:
+        if self.threads is None:
+            raise KilledError
+        return self.threads
+
     def start_process(self) -> None:
         """The service is started, if there is power and it does not run."""
         if not self.powered or self.process is not None or self.timeline.now_s >= self.seconds:
             return
         self.runs += 1
-        loop = ProcessLoop(self.timeline, self.dice["service"], shuffled=self.shuffled)
-        process = Process(self.runs, loop, asyncio.Event(), first_state=len(self.said.process))
-        loop.submit = lambda executor, job, done: self._submit(process, executor, job, done)
+        loop = ProcessLoop(self.timeline)
+        process = Process(self.runs, loop, asyncio.Event())
+        self.threads = Threads(self.timeline, self.dice["threads"], loop, self.disk, self._ended_in_thread)
         self.process = process
         self.broker.loop = loop
         self.note(f"start {self.runs}")
@@ -261,6 +281,8 @@ class World:
         process, self.process = self.process, None
         if process is None:
             return
+        clean = process.main is not None and process.main.done()
+        self.said.end(process.number, self.timeline.now_s, self._forgotten_s(clean=clean, silently=silently))
         self.figures["handles"] += process.loop.handles
         self.kill_after = None
         self.disk.arm = None
@@ -268,8 +290,7 @@ class World:
         known = any(c.loop is process.loop and c.broker_open for c in self.broker.connections)
         self.will_certain = known or self.broker.retained.get(f"{ROOT}/availability") != b"online"
         process.loop.kill()
-        self._jobs.clear()
-        self._working.clear()
+        self.disk.end_process()
         self.cable.forget()
         self.broker.process_ended(process.loop, silently=silently)
         self.timeline.after(min(self.dice["faults"].expovariate(1.0 / 20.0) + 0.2, 300.0), self.start_process)
@@ -290,57 +311,6 @@ class World:
             self.timeline.after(BOOT_S, self.start_process)
 
         self.timeline.after(off_s, back)
-
-    # threads
-
-    def _submit(self, process: Process, executor: Any, job: Callable[[], Any], done: asyncio.Future[Any]) -> None:
-        """A call in a thread; those of one executor that has one thread come one after the other."""
-        single = getattr(executor, "_max_workers", 2) == 1
-        if not single:
-            self._work_later(process, job, done, None)
-            return
-        queue = self._jobs.setdefault(id(executor), deque())
-        queue.append((process, job, done))
-        if id(executor) not in self._working:
-            self._next_job(id(executor))
-
-    def _next_job(self, executor: int) -> None:
-        queue = self._jobs.get(executor)
-        if queue:
-            self._working.add(executor)
-            self._work_later(*queue.popleft(), executor)
-        else:
-            self._working.discard(executor)
-
-    def _work_later(
-        self, process: Process, job: Callable[[], Any], done: asyncio.Future[Any], executor: int | None
-    ) -> None:
-        self.timeline.after(self.dice["threads"].uniform(*THREAD_S), lambda: self._work(process, job, done, executor))
-
-    def _work(self, process: Process, job: Callable[[], Any], done: asyncio.Future[Any], executor: int | None) -> None:
-        if not process.loop.alive:
-            return
-        if executor is not None and self.disk_hung:
-            self.timeline.after(1.0, lambda: self._work(process, job, done, executor))
-            return
-        try:
-            value, error = job(), None
-        except LateError as late:
-            failed = late.error
-            self.timeline.after(late.seconds, lambda: process.loop.call_soon(_fill, done, None, failed))
-            return
-        except KilledError:
-            self.note("killed at a write")
-            self.end_process(silently=False)
-            return
-        except PowerCutError:
-            self.cut_power(self.dice["faults"].uniform(1.0, 300.0))
-            return
-        except Exception as caught:  # noqa: BLE001 - whatever it is, the service gets it
-            value, error = None, caught
-        process.loop.call_soon(_fill, done, value, error)
-        if executor is not None:
-            self._next_job(executor)
 
     # the board
 
@@ -375,7 +345,7 @@ class World:
         process.snapshot = snapshot
         if snapshot.estimate is None:
             return
-        self.said.say(snapshot.estimate.model_dump_json().encode(), process.number)
+        self.said.say(snapshot.estimate.model_dump_json().encode(), process.number, self.timeline.now_s)
         self.figures["states"] += 1
         if process.foreign:
             return  # TODO
@@ -402,6 +372,10 @@ class World:
             if now_s % 10.0 < 1.0:
                 self._check_memory(process)
         self._check_availability(now_s)
+        if self.disk.bad:
+            self.disk_good_s = now_s + RETRY_S
+        if process is not None and self.disk.connections:
+            self.disk.note_databases(now_s)
         self.timeline.after(1.0, self._look)
 
     def _check_counts(self, process: Process) -> None:
@@ -461,9 +435,8 @@ class World:
         process = self.process
         if process is None:
             self.fail("the service does not run")
-        lost = self.said.lost(process.number, process.first_state)
-        if len(lost) > 1 or (lost and lost[0] != len(self.said.process) - 1):
-            self.fail(f"of the states of the last run the broker never got {lost}")
+        if lost := self.said.lost(self.timeline.now_s):
+            self.fail(f"the broker never got the states {lost}")
 
     def fail(self, wrong: str) -> None:
         """Something does not hold."""
@@ -515,15 +488,13 @@ class World:
             service.SerialBoard = made
 
 
+KILL_S = 6.0
+"""A kill may cost what was said or acknowledged so long before: what waits is written each second, and of a broker that
+seems to be there only after three."""
+POWER_S = 37.0
+"""The same of a power cut: a commit reaches the platter within half a minute."""
+RETRY_S = 25.0
+"""So long after a disk has been at fault it is used again: a hung call is given 10 s, and 10 s pass until the next."""
 ONLINE_S = 90.0
 """So long after the broker can be told the retained availability is right."""
 SENSOR_ONLINE_S = 120.0
-
-
-def _fill(done: asyncio.Future[Any], value: Any, error: BaseException | None) -> None:
-    if done.done():
-        return
-    if error is None:
-        done.set_result(value)
-    else:
-        done.set_exception(error)
