@@ -67,6 +67,11 @@ class Database:
         await asyncio.wait([asyncio.wrap_future(closing)], timeout=self._hang_s)
         self._thread.shutdown(wait=False)
 
+    @property
+    def opened(self) -> int:
+        """How often the file was opened: what was there before may not be there any more."""
+        return self._file.opened
+
     async def call(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run ``work`` in a transaction.
 
@@ -109,6 +114,7 @@ class _File:
         self._connection: sqlite3.Connection | None = None
         self._inode = (0, 0)
         self._synced_s = 0.0
+        self.opened = 0
 
     def run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """One transaction; in a new file where the one that is there cannot be used."""
@@ -156,6 +162,7 @@ class _File:
         self._inode = _inode(self._path)
         self._connection = sqlite3.connect(self._path, timeout=LOCKED_S, isolation_level=None)
         self._prepare(self._connection)
+        self.opened += 1
         return self._connection
 
     def _prepare(self, connection: sqlite3.Connection) -> None:

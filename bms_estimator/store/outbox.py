@@ -38,6 +38,8 @@ class Outbox:
         self._opened = database is None
         self._offset: int | None = None  # of numbers on disk; known once it was looked at
         self._seen: deque[int] = deque(maxlen=BEHIND)  # the next number at the last looks
+        self._looks = 0
+        self._known = 0  # which opening of the database memory agrees with
         self._filled, self._wanted = asyncio.Event(), asyncio.Event()
         self._closing = False
         self._task: asyncio.Task[None] | None = None
@@ -113,6 +115,7 @@ class Outbox:
 
     def _behind(self) -> bool:
         """Whether what waits must be written."""
+        self._looks += 1
         self._seen.append(self._queue.next)
         oldest = self._queue.oldest
         return oldest is not None and (not self.connected or (len(self._seen) == BEHIND and oldest < self._seen[0]))
@@ -125,11 +128,13 @@ class Outbox:
             if self._offset is None:
                 found = await self._database.call(look)
                 self._offset = found.first - queue.found(found.messages, found.span)
+                self._known = self._database.opened
             work = self._due(self._offset, write=write)
             if work:
                 queue.writing(work.rows)
                 self._done(work, await self._database.call(work))
-            queue.sure, queue.passing = True, False
+            queue.sure, queue.passing = self._known == self._database.opened, False
+            self._known = self._database.opened
         except StoreError:
             queue.sure, queue.passing = False, True
         self._opened = True

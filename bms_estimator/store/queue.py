@@ -144,7 +144,10 @@ class Queue:
         stored.drops -= dropped
         known = {waiting.number for waiting in self._in_memory()}
         self._ready.extend(waiting for waiting in rows[dropped:] if waiting.number not in known)
-        stored.count = stored.count - len(rows) + dropped if len(rows) == asked else 0
+        stored.count -= len(rows) - dropped
+        if len(rows) < asked:  # what else was there is lost
+            self.dropped += stored.count
+            stored.count = 0
 
     def found(self, count: int, span: int) -> int:
         """An earlier run left messages on disk: they go before all that was not handed out.

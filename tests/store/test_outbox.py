@@ -1,9 +1,22 @@
 """The outbox against what it promises: in order, nothing lost but what found no room."""
 
 import asyncio
+import sqlite3
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
 
 from bms_estimator.sinks.messages import Message
+from bms_estimator.store import outbox as outbox_module
+from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
+from bms_estimator.store.queue import MEMORY_MOST
 from tests.patience import LONG_S
 
 
@@ -58,3 +71,160 @@ async def test_without_room_the_oldest_goes_that_is_not_on_its_way_and_is_counte
     assert await taken(outbox, 9) == [3, 4]
     outbox.rewind()
     assert await taken(outbox, 9) == [0, 3, 4]
+
+
+class Counting(Database):
+    """Counts its transactions."""
+
+    calls = 0
+
+    async def call(self, work: Callable[[sqlite3.Connection], Any]) -> Any:
+        self.calls += 1
+        return await super().call(work)
+
+
+@pytest.fixture
+def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of a database that is written a hundred times a second."""
+    monkeypatch.setattr(outbox_module, "FLUSH_S", 0.01)
+    return tmp_path / "pack.sqlite"
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - files have no event
+            await asyncio.sleep(0.01)
+
+
+def on_disk(path: Path) -> list[int]:
+    """Numbers of the messages in the database."""
+    try:
+        with closing(sqlite3.connect(path)) as connection:
+            return [int(payload) for (payload,) in connection.execute("SELECT payload FROM outbox ORDER BY number")]
+    except sqlite3.Error:
+        return []  # the table is being made
+
+
+async def test_nothing_is_written_while_the_broker_takes_what_comes(path):
+    async with Counting(path) as database, Outbox(database, most=100) as outbox:
+        outbox.connected = True
+        for number in range(50):
+            outbox.put(message(number))
+            [waiting] = await outbox.take(9)
+            looks = outbox._looks
+            outbox.sent(waiting.number)
+            await until(lambda looks=looks: outbox._looks > looks)
+    assert database.calls == 1, "the look at what an earlier run left"
+    assert on_disk(path) == []
+
+
+async def test_what_a_connected_broker_does_not_acknowledge_is_written_too(path):
+    async with Database(path) as database, Outbox(database, most=100) as outbox:
+        outbox.connected = True
+        outbox.put(message(0))
+        await outbox.take(1)
+        await until(lambda: on_disk(path) == [0])
+
+
+async def test_messages_outlive_a_clean_end_and_come_before_newer_ones(path):
+    async with Database(path) as database, Outbox(database, most=100) as outbox:
+        for number in range(5):
+            outbox.put(message(number))
+        first, *_ = await outbox.take(2)
+        outbox.sent(first.number)
+    async with Database(path) as database, Outbox(database, most=100) as outbox:
+        outbox.put(message(5))
+        got: list[int] = []
+        while len(got) < 5:
+            got += await taken(outbox, 99)
+    assert got == [1, 2, 3, 4, 5]
+
+
+async def test_more_than_memory_holds_comes_back_from_disk_in_order(path):
+    count = 3 * MEMORY_MOST
+    got: list[int] = []
+    async with Database(path) as database, Outbox(database, most=10 * count) as outbox:
+        for number in range(count):
+            outbox.put(message(number))
+            if number % 1000 == 0:
+                await until(lambda number=number: on_disk(path)[-1:] == [number])
+        await until(lambda: len(on_disk(path)) == count)
+        while len(got) < count:
+            async with asyncio.timeout(LONG_S):
+                for waiting in await outbox.take(50):
+                    got.append(int(waiting.message.payload))
+                    outbox.sent(waiting.number)
+        await until(lambda: on_disk(path) == [])
+    assert got == list(range(count))
+    assert (outbox.dropped, outbox.waiting) == (0, 0)
+
+
+async def test_a_disk_that_hangs_stops_no_message(path):
+    gate = threading.Event()
+    async with Database(path, hang_s=0.05, retry_s=0.0) as database, Outbox(database, most=100) as outbox:
+        await until(lambda: outbox._opened)
+        hung = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
+        for number in range(5):
+            outbox.put(message(number))
+        assert await taken(outbox, 9) == [0, 1, 2, 3, 4]
+        with pytest.raises(StoreError):
+            await hung
+        gate.set()
+        await until(lambda: on_disk(path) == [0, 1, 2, 3, 4])
+
+
+async def test_a_start_on_a_disk_that_hangs_sends_what_comes(path):
+    gate = threading.Event()
+    async with Database(path, hang_s=0.05, retry_s=0.0) as database:
+        hung = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
+        async with Outbox(database, most=100) as outbox:
+            outbox.put(message(0))
+            assert await taken(outbox, 9) == [0]
+            gate.set()
+            with pytest.raises(StoreError):
+                await hung
+
+
+async def test_a_database_that_is_deleted_costs_only_what_was_on_disk_alone_and_that_is_counted(path):
+    async with Database(path) as database, Outbox(database, most=10_000) as outbox:
+        for number in range(1500):
+            outbox.put(message(number))
+        await until(lambda: outbox._queue.stored.count == 500)
+        for file in path.parent.iterdir():
+            file.unlink()
+        outbox.put(message(1500))
+        await until(lambda: outbox.dropped == 500)
+        assert [*await taken(outbox, 1000), *await taken(outbox, 1000)] == [*range(1000), 1500]
+        await until(lambda: len(on_disk(path)) == 1001)
+
+
+KILLED = """
+import asyncio, sys
+from pathlib import Path
+from bms_estimator.sinks.messages import Message
+from bms_estimator.store.database import Database
+from bms_estimator.store.outbox import Outbox
+
+async def main():
+    async with Database(Path(sys.argv[1])) as database, Outbox(database, most=100_000) as outbox:
+        for number in range(100_000):
+            outbox.put(Message("t", str(number).encode(), 1, False))
+            print(number, flush=True)
+            await asyncio.sleep(0.001)
+
+asyncio.run(main())
+"""
+
+
+def test_kill_9_costs_what_was_not_yet_written_and_nothing_before(tmp_path):
+    path = tmp_path / "pack.sqlite"
+    with subprocess.Popen([sys.executable, "-c", KILLED, path], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        seen: list[int] = []
+        while len(seen) < 2:  # as somebody else sees it
+            process.stdout.readline()
+            seen = on_disk(path)
+        process.kill()
+    kept = on_disk(path)
+    assert kept == list(range(len(kept)))
+    assert len(kept) >= len(seen)

@@ -172,4 +172,4 @@ class Promises(RuleBasedStateMachine):
 
 
 TestPromises = Promises.TestCase
-TestPromises.settings = settings(max_examples=25, stateful_step_count=40, deadline=None)
+TestPromises.settings = settings(max_examples=15, stateful_step_count=40, deadline=None)
