@@ -96,6 +96,7 @@ class LoopHealth(Report):
     latency_p99_s: float | None = Field(description="the same, 99 of 100 are shorter [s]")
     latency_max_s: float | None = Field(description="the same, longest [s]")
     reads_waiting: int = Field(description="reads of the line that wait for the estimator")
+    messages_waiting: int = Field(description="states and events that the broker has not acknowledged yet")
     log_lines_lost: int = Field(description="lines of the log that nobody has read, since start")
     disk_free_mib: float | None = Field(
         description="where the state is kept, at the last checkpoint [MiB]; null before, and without"

@@ -41,10 +41,11 @@ class Messages:
     def __init__(self, base_topic: str, device: str, sample_period_s: float = 0.0) -> None:
         self.root = f"{base_topic}/{device}"
         self._device, self._sample_period_s = device, sample_period_s
+        self._schema = _json(schema())  # takes milliseconds, and here nothing waits yet
 
     def greeting(self) -> list[Message]:
         """What a broker is told first."""
-        return [self._retained(AVAILABILITY, b"online"), self._retained("schema", _json(schema()))]
+        return [self._retained(AVAILABILITY, b"online"), self._retained("schema", self._schema)]
 
     def farewell(self) -> list[Message]:
         """What it is told last; the last of these is the will, too."""

@@ -86,6 +86,7 @@ class Publisher:
         self.disk_free_mib: float | None = None
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
+        self._suspects = 0  # bits of ``Suspect``, as logged
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
@@ -178,9 +179,8 @@ class Publisher:
             self._slow_s = now_s
             parameters, info = parameter_report(self._estimator, wall_s), self._info()
         if old or health.sensor_online != (message is None):
-            before, health = health, self._health(now_s, message)
-            if health.suspects != before.suspects:
-                log.warning("suspicion", suspects=health.suspects or "none any more")
+            health = self._health(now_s, message)
+            self._log_suspicions(health)
         return Snapshot(estimate, parameters, health, info)
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
@@ -207,6 +207,13 @@ class Publisher:
             recording=self._recording(),
         )
 
+    def _log_suspicions(self, health: Health) -> None:
+        """Log that one is raised or cleared; numbers in the sentences may change."""
+        suspects = int(self._estimator.record["checks"]["suspects"][0])
+        if suspects != self._suspects:
+            self._suspects = suspects
+            log.warning("suspicion", suspects=health.suspects or "none any more")
+
     def _loop(self) -> LoopHealth:
         p50_s, p99_s, most_s = self._latency.take() or (None, None, None)
         return LoopHealth(
@@ -214,6 +221,7 @@ class Publisher:
             latency_p99_s=p99_s,
             latency_max_s=most_s,
             reads_waiting=self._pulse().waiting if self._pulse else 0,
+            messages_waiting=self._delivery.waiting,
             log_lines_lost=self.log_lines_lost,
             disk_free_mib=self.disk_free_mib,
         )

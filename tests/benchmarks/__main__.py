@@ -3,13 +3,20 @@
 import sys
 from itertools import chain
 
+import callbacks
 import capture
 import kernel
 import live
 import packs
 from table import show
 
-GROUPS = {"kernel": kernel.rows, "capture": capture.rows, "live": live.rows, "packs": packs.rows}
+GROUPS = {
+    "kernel": kernel.rows,
+    "capture": capture.rows,
+    "live": live.rows,
+    "packs": packs.rows,
+    "callbacks": callbacks.rows,
+}
 
 
 def main() -> None:

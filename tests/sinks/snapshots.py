@@ -23,6 +23,7 @@ IDLE = LoopHealth(
     latency_p99_s=None,
     latency_max_s=None,
     reads_waiting=0,
+    messages_waiting=0,
     log_lines_lost=0,
     disk_free_mib=None,
 )
