@@ -10,6 +10,8 @@ from pathlib import Path
 from bms_estimator.model.clock import since_boot
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+TIMESYNCD = Path("/run/systemd/timesync/synchronized")
+"""There once systemd-timesyncd has set the clock since the machine was started."""
 TIME_ERROR = 5
 """What adjtimex(2) returns while nothing sets the wall clock."""
 TIMEX_BYTES = 512
@@ -41,9 +43,10 @@ class Moment:
 
 
 def synchronised() -> bool:
-    """Whether the kernel holds the wall clock for right: it does not matter who sets it (timesyncd, chrony, ntpsec)."""
+    """Whether the wall clock is held for right: by the kernel, whoever sets it; where it may not be asked, by systemd-timesyncd."""
     only_read = ctypes.create_string_buffer(TIMEX_BYTES)
-    return int(ctypes.CDLL(None).adjtimex(only_read)) in range(TIME_ERROR)
+    state = int(ctypes.CDLL(None).adjtimex(only_read))
+    return TIMESYNCD.exists() if state < 0 else state < TIME_ERROR
 
 
 def moment() -> Moment:

@@ -3,21 +3,26 @@
 import asyncio
 import contextlib
 import os
+import re
 import socket
+import ssl
 import subprocess
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import aiomqtt
 import pytest
 
+from tests.deploy.boot import by_the_page
 from tests.patience import LONG_S
 
-PASSWORDS = {"bms-estimator": "one", "dashboard": "two", "homeassistant": "three"}
+PACKS = ("pack", "shed")
+PASSWORDS = {"pack": "one", "shed": "four", "dashboard": "two", "homeassistant": "three"}
 LAST = {
-    "bms/#": ("bms-estimator", "bms/pack/last"),
-    "bms/+/request/+": ("homeassistant", "bms/pack/request/last"),
+    "bms/#": ("pack", "bms/pack/last"),
     "homeassistant/#": ("homeassistant", "homeassistant/last"),
+    "bms/pack/request/+": ("homeassistant", "bms/pack/request/last"),
     "homeassistant/status": ("homeassistant", "homeassistant/status"),
 }
 """For each subscription who may publish to it what: once that has come, all before it has come or was denied."""
@@ -27,21 +32,32 @@ LAST = {
 def broker(program, deploy, free_port, tmp_path) -> Iterator[int]:
     """Port of a Mosquitto with the example's files, in a folder of its own."""
     mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
-    passwords = tmp_path / "bms.passwd"
-    passwords.touch(mode=0o600)
-    for user, password in PASSWORDS.items():
-        subprocess.run([passwd, "-b", passwords, user, password], check=True, capture_output=True)
-    (tmp_path / "bms.acl").write_text((deploy / "mosquitto/bms.acl").read_text())
+    write_users(tmp_path, deploy, passwd)
     text = (deploy / "mosquitto/bms.conf").read_text()
     assert "listener 1883 127.0.0.1" in text
     text = text.replace("listener 1883", f"listener {free_port}").replace("/etc/mosquitto", str(tmp_path))
-    if os.geteuid() == 0:
-        text += "user root\n"  # the folder is root's
-    (tmp_path / "bms.conf").write_text(text)
-    with subprocess.Popen([mosquitto, "-c", tmp_path / "bms.conf"], stderr=subprocess.PIPE, text=True) as process:
+    with running(mosquitto, tmp_path / "bms.conf", text, free_port):
+        yield free_port
+
+
+def write_users(folder: Path, deploy: Path, passwd: str) -> None:
+    """Passwords, and what each may do: a part for each pack, as the commands of docs/deploy.md put it together."""
+    passwords = folder / "bms.passwd"
+    passwords.touch(mode=0o600)
+    for user, password in PASSWORDS.items():
+        subprocess.run([passwd, "-b", passwords, user, password], check=True, capture_output=True)
+    part = (deploy / "mosquitto/pack.acl").read_text()
+    packs = [part.replace("PACK", name) for name in PACKS]
+    (folder / "bms.acl").write_text("".join([(deploy / "mosquitto/bms.acl").read_text(), *packs]))
+
+
+@contextlib.contextmanager
+def running(mosquitto: str, path: Path, text: str, port: int) -> Iterator[None]:
+    path.write_text(text + ("user root\n" if os.geteuid() == 0 else ""))  # the folder is root's
+    with subprocess.Popen([mosquitto, "-c", path], stderr=subprocess.PIPE, text=True) as process:
         try:
-            wait_for_port(process, free_port)
-            yield free_port
+            wait_for_port(process, port)
+            yield
         finally:
             process.terminate()
 
@@ -86,24 +102,87 @@ async def test_an_anonymous_client_is_refused(broker):
 
 async def test_a_wrong_password_is_refused(broker):
     with pytest.raises(aiomqtt.MqttError):
-        async with aiomqtt.Client("127.0.0.1", broker, username="bms-estimator", password="two", timeout=LONG_S):
+        async with aiomqtt.Client("127.0.0.1", broker, username="pack", password="two", timeout=LONG_S):
             pass
 
 
 async def test_the_estimator_publishes_what_the_dashboard_sees(broker):
     topics = ["bms/pack/state", "bms/pack/sensor/availability", "bms/pack/availability"]
-    assert await arrived(broker, "bms-estimator", topics, reader="dashboard", subscription="bms/#") == topics
+    assert await arrived(broker, "pack", topics, reader="dashboard", subscription="bms/#") == topics
 
 
 async def test_the_estimator_publishes_nothing_but_its_own_topics(broker):
-    topics = ["homeassistant/light/x/set", "other/topic", "homeassistant/device/pack/config"]
-    seen = await arrived(broker, "bms-estimator", topics, reader="homeassistant", subscription="homeassistant/#")
-    assert seen == ["homeassistant/device/pack/config"]
+    topics = ["homeassistant/light/x/set", "other/topic", "homeassistant/device/bms_pack/config"]
+    seen = await arrived(broker, "pack", topics, reader="homeassistant", subscription="homeassistant/#")
+    assert seen == ["homeassistant/device/bms_pack/config"]
+
+
+async def test_a_pack_writes_nothing_of_another(broker):
+    topics = ["bms/pack/state", "bms/pack/event", "bms/pack/availability", "bms/pack/response/soc", "bms/shed/state"]
+    assert await arrived(broker, "shed", topics, reader="dashboard", subscription="bms/#") == ["bms/shed/state"]
+    discovery = ["homeassistant/device/bms_pack/config", "homeassistant/device/bms_shed/config"]
+    seen = await arrived(broker, "shed", discovery, reader="homeassistant", subscription="homeassistant/#")
+    assert seen == discovery[1:]
+
+
+async def test_a_pack_hears_nothing_of_another(broker):
+    topics = ["bms/shed/request/state", "bms/pack/request/state"]
+    async with client(broker, "pack") as listening, client(broker, "homeassistant") as asking:
+        for topic in ("bms/+/request/+", "bms/pack/request/+"):
+            await listening.subscribe(topic)
+        for topic in topics:
+            await asking.publish(topic, b"{}", qos=1)
+        async with asyncio.timeout(LONG_S):
+            assert (await anext(listening.messages)).topic.value == "bms/pack/request/state"
+
+
+@pytest.fixture
+def certified(program, deploy, free_port, tmp_path) -> Iterator[int]:
+    """Port of the listener for other machines, with certificates made by the commands of docs/deploy.md."""
+    mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
+    program("openssl", "openssl")
+    commands = by_the_page("Certificates").replace("broker.lan", "localhost").replace("house", "pack")
+    commands += "openssl req -x509 $new -subj /CN=pack -keyout stranger.key -out stranger.crt\n"
+    subprocess.run(["bash", "-ec", commands], cwd=tmp_path, check=True, capture_output=True)
+    write_users(tmp_path, deploy, passwd)
+    text = (deploy / "mosquitto/bms.conf").read_text().replace("/etc/mosquitto/certs", str(tmp_path))
+    text = re.sub(
+        r"(?m)^# (?=(listener|cafile|certfile|keyfile|require_certificate|use_identity_as_username) )", "", text
+    )
+    text = text.replace("listener 1883 127.0.0.1\n", "").replace("listener 8883", f"listener {free_port}")
+    with running(mosquitto, tmp_path / "bms.conf", text.replace("/etc/mosquitto", str(tmp_path)), free_port):
+        yield free_port
+
+
+def with_certificate(port: int, folder: Path, name: str) -> aiomqtt.Client:
+    files = {"certfile": str(folder / f"{name}.crt"), "keyfile": str(folder / f"{name}.key")}
+    parameters = aiomqtt.TLSParameters(ca_certs=str(folder / "ca.crt"), cert_reqs=ssl.CERT_REQUIRED, **files)
+    return aiomqtt.Client("localhost", port, tls_params=parameters, timeout=LONG_S)
+
+
+async def test_a_certificate_says_whose_topics_a_pack_may_write(certified, tmp_path):
+    async with with_certificate(certified, tmp_path, "pack") as client:
+        await client.subscribe("bms/pack/availability")
+        for topic in ("bms/shed/availability", "bms/pack/availability"):
+            await client.publish(topic, topic, qos=1)
+        async with asyncio.timeout(LONG_S):
+            assert (await anext(client.messages)).topic.value == "bms/pack/availability"
+
+
+def test_nobody_without_a_certificate_of_the_authority_is_let_in(certified, tmp_path):
+    for name in (None, "stranger"):
+        context = ssl.create_default_context(cafile=tmp_path / "ca.crt")
+        if name:
+            context.load_cert_chain(tmp_path / f"{name}.crt", tmp_path / f"{name}.key")
+        line = socket.create_connection(("localhost", certified), LONG_S)
+        refused = pytest.raises((ssl.SSLError, ConnectionError))
+        with line, refused, context.wrap_socket(line, server_hostname="localhost") as secured:
+            secured.recv(1)  # a broker that let one in would wait for a first message
 
 
 async def test_the_dashboard_may_not_ask_and_home_assistant_may(broker):
     topics = ["bms/pack/request/soc"]
-    ask = {"reader": "bms-estimator", "subscription": "bms/+/request/+"}
+    ask = {"reader": "pack", "subscription": "bms/pack/request/+"}
     assert await arrived(broker, "dashboard", topics, **ask) == []
     assert await arrived(broker, "homeassistant", topics, **ask) == topics
 
@@ -114,16 +193,16 @@ async def test_nobody_but_the_estimator_may_publish_state(broker):
 
 
 async def test_the_estimator_hears_the_birth_message(broker):
-    seen = await arrived(broker, "homeassistant", [], reader="bms-estimator", subscription="homeassistant/status")
+    seen = await arrived(broker, "homeassistant", [], reader="pack", subscription="homeassistant/status")
     assert seen == []  # but the last, without which it would not have ended
 
 
 async def test_the_estimator_hears_who_else_writes_its_availabilities(broker):
     topics = ["bms/pack/availability", "bms/pack/sensor/availability", "bms/pack/request/last"]
-    async with client(broker, "bms-estimator") as estimator:
+    async with client(broker, "pack") as estimator:
         for topic in topics[:2]:
             await estimator.subscribe(topic)
-        await estimator.subscribe("bms/+/request/+")
+        await estimator.subscribe("bms/pack/request/+")
         async with client(broker, "homeassistant") as other:  # may not write the first two, so the estimator does
             for topic in topics[:2]:
                 await other.publish(topic, b"forged", qos=1)
@@ -139,8 +218,8 @@ async def test_the_estimator_hears_who_else_writes_its_availabilities(broker):
 
 
 async def test_a_message_that_would_fill_the_memory_goes_no_further(broker):
-    async with client(broker, "bms-estimator") as estimator:
-        await estimator.subscribe("bms/+/request/+")
+    async with client(broker, "pack") as estimator:
+        await estimator.subscribe("bms/pack/request/+")
         with contextlib.suppress(aiomqtt.MqttError):
             async with client(broker, "homeassistant") as flooder, asyncio.timeout(LONG_S):
                 sending = asyncio.create_task(flooder.publish("bms/pack/request/state", bytes(5_000_000), qos=1))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-HIGHEST_EXPOSURE = 2.5
+HIGHEST_EXPOSURE = 1.5
 
 
 @pytest.fixture(params=["bms-estimator.service", "bms-estimator@house.service"])
@@ -48,7 +48,7 @@ def test_the_driver_of_each_kind_of_usb_line_is_loaded_before_its_device_is_allo
         assert f"modprobe@{driver}.service" in " ".join(value for key, value in settings if key == relation).split()
 
 
-def test_exposure_is_at_most_2_5(program, unit):
+def test_exposure_is_at_most_1_5(program, unit):
     command = [program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", text)
