@@ -187,7 +187,9 @@ class Client(aiomqtt.Client):
             self._why = words(reason_code)
         elif reason_code == "Keep alive timeout":
             self._why = "the broker gave no sign of life"
-        if not self._connected.done() and not self._abandoned:
+        if self._abandoned:
+            return
+        if not self._connected.done():
             self._connected.set_exception(ClosedError(self._why))
         if self._connected.cancelled():  # nobody waits any more; the base would ask it for its exception
             return

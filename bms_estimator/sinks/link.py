@@ -57,10 +57,9 @@ class Link:
         """Stay connected until ``closing``."""
         tried = 0
         for broker in itertools.cycle(self._brokers):
-            lasted = await self._attempt(broker)
             if self.closing.is_set():
                 return
-            if lasted:
+            if await self._attempt(broker):
                 tried, self._delay_s = 0, self._first_delay_s
             tried += 1
             if tried % len(self._brokers) == 0:

@@ -93,6 +93,8 @@ class Proxy:
             await self._pump(from_broker, writer)
             while await from_broker.read(4096):  # the client is gone, the broker does not know
                 pass
+            if self.swallows:
+                await up
             if self._half_open:
                 self.half_open_ended.set()
         finally:
