@@ -142,7 +142,11 @@ class Health(Report):
     suspects: list[str] = Field(description="what the identifier suspects of its input, and what to do; empty: nothing")
     lock_losses: int = Field(description="times the observer lost track")
     gain_rearms: int = Field(description="times k was started again before the gain turned")
-    publish_drops: int = Field(description="states that the broker could not take in time")
+    publish_drops: int = Field(description="states and events that found no room, or that the broker refused")
+    publish_waiting: int = Field(description="states and events that the broker has not acknowledged yet")
+    store_trouble: str | None = Field(
+        description="why the disk does not keep what waits, nor the history; null: it does, or nothing is to be kept"
+    )
     broker_losses: int = Field(description="connections to a broker that were lost, since start")
     broker_trouble: str | None = Field(
         description="why a broker was lost or could not be reached last; null: never since start"

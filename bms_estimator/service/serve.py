@@ -68,11 +68,12 @@ async def serve(
     set_level(settings.pack.name, settings.log.level)
     for line in implausible(settings, cell):
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
-    delivery, all_sinks = Delivery(), list(sinks)
+    database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
+    delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
+    all_sinks = list(sinks)
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = BoardMemory(folder, settings.pack.name) if folder else None
     board = SerialBoard(settings.sensor, tap=tap, memory=memory)
-    database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     if database and settings.store.history_days:
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)

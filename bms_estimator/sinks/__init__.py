@@ -4,6 +4,7 @@ All sinks are peers: async context managers whose ``publish`` neither blocks nor
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
@@ -21,6 +22,8 @@ class Delivery:
     """States and events that found no room while the broker was away, or that it refused."""
     waiting: int = 0
     """States and events that the broker has not acknowledged yet."""
+    store_trouble: Callable[[], str] = field(default=str, compare=False)
+    """Why the disk does not keep what waits, nor the history; empty when it does, or nothing is to be kept."""
     losses: int = 0
     """Connections to a broker that were lost."""
     trouble: str | None = None

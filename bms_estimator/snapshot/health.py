@@ -114,6 +114,8 @@ def health_report(
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),
         publish_drops=delivery.drops,
+        publish_waiting=delivery.waiting,
+        store_trouble=delivery.store_trouble() or None,
         broker_losses=delivery.losses,
         broker_trouble=delivery.trouble,
         refused_topics=list(delivery.refused_topics),
