@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from bms_estimator.sinks.messages import Message
-from bms_estimator.store.database import trim
 from bms_estimator.store.queue import Waiting
 
 
@@ -75,6 +74,4 @@ class Work:
                 (*alone, self.page),
             ):
                 page.append(Waiting(number - self.offset, Message(topic, payload, qos, retain=bool(retain))))
-        if self.gone or self.drops:
-            trim(connection)
         return Outcome(count, page)

@@ -24,8 +24,10 @@ LOCKED_S = 5.0
 """How long somebody else may hold the file [s]."""
 LOG_BYTES = 4 << 20
 """To so much the write-ahead log is cut back."""
-FREE_PAGES = 256
-"""Of 4 KiB; more that are free go back to the file system."""
+FREE_PAGES = 1024
+"""Of 4 KiB; so many that are free are kept for what comes."""
+TRIMMED_PAGES = 4096
+"""So many after one transaction: those that are not the file's last are moved."""
 UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 Result = TypeVar("Result")
@@ -137,6 +139,7 @@ class _File:
             connection.execute("BEGIN IMMEDIATE")
             result = work(connection)
             connection.execute("COMMIT")
+            _trim(connection)
         except BaseException:
             self.close()
             raise
@@ -192,11 +195,12 @@ class _File:
         log.warning("database set aside, a new one is begun", file=str(self._path), reason=reason, aside=aside.name)
 
 
-def trim(connection: sqlite3.Connection) -> None:
-    """Give back free pages, some of them at a time."""
+def _trim(connection: sqlite3.Connection) -> None:
+    """Give back free pages once they are most of the file: what is left is moved at most once or twice."""
     (free,) = connection.execute("PRAGMA freelist_count").fetchone()
-    if free > FREE_PAGES:
-        connection.execute(f"PRAGMA incremental_vacuum({FREE_PAGES})").fetchall()
+    (pages,) = connection.execute("PRAGMA page_count").fetchone()
+    if free > max(FREE_PAGES, pages // 2):
+        connection.executescript(f"PRAGMA incremental_vacuum({TRIMMED_PAGES})")  # execute() stops after the first page
 
 
 def _inode(path: Path) -> tuple[int, int]:

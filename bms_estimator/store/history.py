@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from bms_estimator.model.estimate import Estimate, Snapshot
 from bms_estimator.model.event import Event, events
-from bms_estimator.store.database import Database, StoreError, trim
+from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.minute import MINUTE_S, Minute, OpenMinute, epoch_s, minute_of
 
 MINUTES_A_DAY = 1440
@@ -151,4 +151,3 @@ def _prune(connection: sqlite3.Connection, most: int) -> None:
         connection.execute("DELETE FROM event WHERE time_s < ?", oldest)
     beyond = "SELECT number FROM event ORDER BY number DESC LIMIT 1 OFFSET ?"
     connection.execute(f"DELETE FROM event WHERE number <= ({beyond})", (MOST_EVENTS,))  # noqa: S608
-    trim(connection)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.store.database import Database, StoreError
+from bms_estimator.store.database import FREE_PAGES, Database, StoreError
 from tests.full_disk import full_disk
 from tests.patience import LONG_S
 
@@ -158,3 +158,13 @@ async def test_a_fault_of_ours_is_raised(path):
         with pytest.raises(KeyError):
             await database.call(lambda _: {}["x"])
         assert await database.call(numbers) == []
+
+
+async def test_room_that_is_free_goes_back_to_the_file_system(path):
+    async with Database(path) as database:
+        for number in range(400):
+            await database.call(put(number))
+        await database.call(lambda connection: connection.execute("DELETE FROM outbox") and None)
+        for _ in range(5):
+            await database.call(numbers)
+    assert path.stat().st_size <= 4096 * (FREE_PAGES + 100)
