@@ -11,7 +11,7 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell firmware kernels lock
+.PHONY: help venv apt check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -70,6 +70,12 @@ fuelcell: venv ## figures of the fuel cell, docs/fuel-cell.md: half a minute
 
 learning: venv ## what the learning law and each of its parts are worth, simulated
 	@$(BIN)/python -m tests.benchmarks.learning_law
+
+fuzz: venv ## mutated inputs to all that reads foreign bytes, e.g. make fuzz ARGS="--decoders 100000 --parsers 10000 --only text"
+	@$(BIN)/python -m tests.benchmarks.fuzz $(ARGS)
+
+load: venv ## 5,000 frames/s for 10 min over a PTY, and a day of serial bytes, e.g. make load ARGS="--minutes 1 --hours 2"
+	@$(BIN)/python -m tests.benchmarks.endurance $(ARGS)
 
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \

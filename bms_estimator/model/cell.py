@@ -295,7 +295,7 @@ def is_fuel_cell(name_or_path: str | Path) -> bool:
         return True
     try:
         return "fuel_cell" in tomllib.loads(Path(name_or_path).read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError):
+    except (OSError, ValueError, RecursionError):
         return False  # whoever reads it as a cell says what is wrong
 
 

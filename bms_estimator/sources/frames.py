@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Literal
 
@@ -66,7 +66,7 @@ class FrameCounters:
 
     def as_dict(self) -> dict[str, int]:
         """By name."""
-        return asdict(self)
+        return dict(vars(self))
 
 
 class FrameDecoder:

@@ -50,7 +50,7 @@ def resolve_port(port: str) -> str:
         NoPortError: No board is there, or with ``auto`` more than one.
     """
     if port != "auto":
-        if not Path(port).exists():
+        if not os.path.exists(port):  # noqa: PTH110 - raises nothing, be the name too long
             raise NoPortError(f"{port}: it does not exist")
         return port
     found = board_ports()

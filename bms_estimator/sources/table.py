@@ -194,7 +194,7 @@ class ParquetTable:
                     block, implausible = _block(values, columns)
                     self.implausible += implausible
                     yield block
-        except pa.ArrowInvalid as error:
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, MemoryError) as error:
             raise UserError(f"{self._path}: not a whole Parquet file: {error}") from None
         except OSError as error:
             raise UserError(f"{self._path}: cannot be read: {error.strerror or error}") from None

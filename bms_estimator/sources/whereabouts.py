@@ -4,7 +4,6 @@ import math
 import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 from bms_estimator.sources.ports import NoPortError, board_ports, resolve_port
 
@@ -47,7 +46,7 @@ class Whereabouts:
         if self._port == "auto":
             home = there if len(there) == 1 else []
         else:
-            home = [self._port] if Path(self._port).exists() else []
+            home = [self._port] if os.path.exists(self._port) else []  # noqa: PTH110 - as in ``resolve_port``
         known = {os.path.realpath(path) for path in home}
         places, now_s = home + [path for path in there if os.path.realpath(path) not in known], self._monotonic()
         if not places:

@@ -1,0 +1,229 @@
+"""Load: thousands of frames a second through the service over a PTY, and a day of serial bytes through decoder and estimator.
+
+make load ARGS="--rate 5000 --minutes 10 --hours 24"
+"""
+
+import argparse
+import asyncio
+import math
+import multiprocessing as mp
+import os
+import signal
+import sys
+import tempfile
+import time
+import tty
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell import simulate_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.sources.dialects.board import BoardDialect
+from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
+from tests.benchmarks.table import Row, show
+from tests.benchmarks.wire import hello, sample_frames
+from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
+
+BOARD_RATE_HZ = 1000
+"""What the hello tells: the protocol knows no higher rate, the time stamps do."""
+SEND_S = 0.002
+"""So often the board's bytes leave, as on USB [s]."""
+CHUNK_S = 10.0
+"""The sender prepares so much at a time [s]."""
+WARM_S = 20.0
+"""Before it processor time and memory are not measured [s]."""
+HALF_DAY_S = 8.0 * 3600.0
+"""So long the pulses discharge, then they charge [s]."""
+MOST_CPU, MOST_GROWTH_MIB = 0.20, 2.0
+READ_BYTES = 4096
+PACK = """
+[pack]
+name = "load"
+cell = "{cell}"
+[sensor]
+port = "{port}"
+sample_rate_hz = {rate_hz}
+[mqtt]
+url = "{url}"
+[state]
+folder = "{folder}"
+"""
+
+
+def load(first: int, count: int, rate_hz: int, soc: float) -> tuple[SampleBlock, float]:
+    """Samples ``first`` and after of a pack under pulses, and the SOC at their end; branches begin at rest."""
+    cell = load_cell(CELL)
+    block = np.zeros(count, dtype=SAMPLE)
+    time_s = np.arange(first, first + count) / rate_hz
+    way = 1.0 - 2.0 * (time_s // HALF_DAY_S % 2.0)
+    current_a = ON_A * way * (time_s % (2.0 * HALF_PERIOD_S) < HALF_PERIOD_S)
+    voltage_v, socs = simulate_cell((soc, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
+    noise = np.random.default_rng(first).uniform(-0.5, 0.5, (2, count))
+    block["time_s"] = time_s
+    block["current_a"] = np.round(current_a / CURRENT_STEP_A + noise[0]) * CURRENT_STEP_A
+    block["voltage_v"] = np.round(voltage_v / VOLTAGE_STEP_V + noise[1]) * VOLTAGE_STEP_V
+    return block, float(socs[-1])
+
+
+def chunks(rate_hz: int, seconds: float, chunk_s: float) -> Iterator[bytes]:
+    """The line's bytes."""
+    soc, first, total = 0.9, 0, round(rate_hz * seconds)
+    while first < total:
+        count = min(round(rate_hz * chunk_s), total - first)
+        block, soc = load(first, count, rate_hz, soc)
+        yield sample_frames(block, first).tobytes()
+        first += count
+
+
+def send(master: int, rate_hz: int, seconds: float, sent: "mp.Queue[tuple[int, int]]") -> None:
+    """A process: frames in time, as a board sends them; what the line has no room for is lost, and counted."""
+    os.set_blocking(master, False)
+    frame_bytes = len(next(chunks(rate_hz, 1.0 / rate_hz, 1.0)))
+    begin_s, frames, lost = time.monotonic(), 0, 0
+    for chunk in chunks(rate_hz, seconds, CHUNK_S):
+        position = 0
+        while position < len(chunk):
+            time.sleep(SEND_S)
+            due = round((time.monotonic() - begin_s) * rate_hz) - frames
+            end = min(position + due * frame_bytes, len(chunk))
+            frames += (end - position) // frame_bytes
+            while position < end:
+                try:
+                    position += os.write(master, chunk[position:end])
+                except BlockingIOError:
+                    lost += (end - position + frame_bytes - 1) // frame_bytes
+                    position = end
+    sent.put((frames, lost))
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the service made of it."""
+
+    sent: int
+    no_room: int
+    """Frames for which the line had no room: the service had not read for long."""
+    line: dict[str, int]
+    samples: dict[str, int]
+    cpu: float
+    rss_mib: tuple[float, float]
+    """Mean of the first half and of the second."""
+
+
+async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> Run:
+    """Run the service behind a PTY."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    pack = folder / "load.toml"
+    pack.write_text(
+        PACK.format(cell=CELL, port=os.ttyname(slave), rate_hz=BOARD_RATE_HZ, url=broker.url, folder=folder)
+    )
+    program = Path(sys.executable).with_name("bms-estimator")
+    async with Listener(broker) as live:
+        with (folder / "log").open("w") as log:
+            service = await asyncio.create_subprocess_exec(program, "run", "--no-view", pack, stdout=log, stderr=log)
+        await live.wait_json("bms/load/health", lambda h: "no frame yet" in (h["sensor_message"] or ""))
+        os.write(master, b"\0" + hello(BOARD_RATE_HZ))
+        spawn = mp.get_context("spawn")
+        told: mp.Queue[tuple[int, int]] = spawn.Queue()
+        sender = spawn.Process(target=_send_over, args=(mp.reduction.DupFd(master), rate_hz, seconds, told))
+        sender.start()
+        await live.wait_json("bms/load/state")
+        process = psutil.Process(service.pid)
+        rss, begin_s, before_s = list[float](), 0.0, 0.0
+        started_s = time.monotonic()
+        while sender.is_alive() and service.returncode is None:
+            await asyncio.sleep(1.0)
+            live.messages.clear()
+            if time.monotonic() - started_s < min(WARM_S, 0.2 * seconds):
+                begin_s, before_s = time.monotonic(), sum(process.cpu_times()[:2])
+                continue
+            rss.append(process.memory_info().rss / 2**20)
+        cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
+        frames, no_room = told.get(timeout=LONG_S)
+        end = await live.wait_json(
+            "bms/load/health", lambda h: h["line"]["frames_received"] >= frames - no_room - h["line"]["crc_errors"]
+        )
+        service.send_signal(signal.SIGINT)
+        await service.wait()
+        os.close(slave)
+        os.close(master)
+    half = len(rss) // 2
+    means = float(np.mean(rss[:half])), float(np.mean(rss[half:]))
+    return Run(frames, no_room, end["line"], end["samples"], cpu, means)
+
+
+def _send_over(master: "mp.reduction.DupFd", *arguments: object) -> None:
+    send(master.detach(), *arguments)  # type: ignore[arg-type]
+
+
+def fed(rate_hz: int, seconds: float) -> tuple[BoardDialect, Estimator, float, list[float]]:
+    """All bytes through decoder and estimator in reads of ``READ_BYTES``: both, seconds that took, RSS each hour [MiB]."""
+    dialect, estimator, process = BoardDialect(), Estimator(load_cell(CELL)), psutil.Process()
+    dialect.feed(0.0, hello(rate_hz))
+    rss, took_s, bytes_fed = list[float](), 0.0, 0
+    bytes_per_s = rate_hz * len(next(chunks(rate_hz, 1.0 / rate_hz, 1.0)))
+    for chunk in chunks(rate_hz, seconds, 3600.0):
+        begin_s = time.perf_counter()
+        for begin in range(0, len(chunk), READ_BYTES):
+            data = chunk[begin : begin + READ_BYTES]
+            bytes_fed += len(data)
+            block = dialect.feed(bytes_fed / bytes_per_s, data)
+            if block.size:
+                estimator.run(block)
+        took_s += time.perf_counter() - begin_s
+        rss.append(process.memory_info().rss / 2**20)
+    return dialect, estimator, took_s, rss
+
+
+def rows(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure."""
+    if options.minutes:
+        with tempfile.TemporaryDirectory() as folder:
+            broker = Broker(Path(folder)).start()
+            try:
+                run = asyncio.run(serve(options.rate, 60.0 * options.minutes, Path(folder), broker))
+            finally:
+                broker.stop()
+        faults = {
+            name: run.line[name]
+            for name in ("frames_lost", "crc_errors", "cobs_errors", "length_errors", "clock_jumps")
+        }
+        taken = run.line["frames_received"]
+        what = f"{options.rate:,} frames/s for {options.minutes:g} min over a PTY"
+        good = taken == run.sent == run.samples["samples"] and not any(faults.values()) and not run.no_room
+        counted = ", ".join(f"{n} {name}" for name, n in (faults | {"without room": run.no_room}).items() if n)
+        yield Row(what, "none lost", f"{taken:,} of {run.sent:,} taken {counted}", good)
+        yield Row("  service's processor time", f"below {MOST_CPU:.0%} of a core", f"{run.cpu:.1%}", run.cpu < MOST_CPU)
+        first, second = run.rss_mib
+        growth = f"{first:.1f} MiB in the first half, {second:.1f} in the second"
+        yield Row("  resident memory", "flat", growth, second - first < MOST_GROWTH_MIB)
+    if options.hours:
+        dialect, estimator, took_s, rss = fed(100, 3600.0 * options.hours)
+        taken, samples = dialect.counters["frames_received"], int(estimator.state["samples"][0])
+        sent = round(360_000 * options.hours)
+        what = f"{options.hours:g} h of 100 Hz as serial bytes"
+        yield Row(what, "none lost", f"{samples:,} of {sent:,} in {took_s:.0f} s", sent == taken == samples)
+        begun = math.ceil(len(rss) / 6)  # what grows at first: the allocator's pools
+        growth = f"{rss[begun - 1]:.1f} MiB after {begun} h, {rss[-1]:.1f} at the end"
+        yield Row("  resident memory", "flat", growth, rss[-1] - rss[begun - 1] < MOST_GROWTH_MIB)
+
+
+def main() -> None:
+    """Measure what is asked for; 1 where a target was not met."""
+    parser = argparse.ArgumentParser(prog="make load", description=__doc__)
+    parser.add_argument("--rate", type=int, default=5000, help="frames per second over the PTY")
+    parser.add_argument("--minutes", type=float, default=10.0, help="for so long; 0: not at all")
+    parser.add_argument("--hours", type=float, default=24.0, help="of serial bytes at 100 Hz, at once; 0: not at all")
+    sys.exit(not show(rows(parser.parse_args())))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,433 @@
+"""Mutated inputs to everything that reads what others wrote: nothing but the documented errors, no hang.
+
+    make fuzz ARGS="--decoders 10_000_000 --parsers 1_000_000 --seed 1 --only frames text"
+
+Inputs are made from a kept corpus (tests/data/fuzz, a folder for each reader), the same ones by the same seed. What fails is
+kept there under its digest, and the tests try the whole corpus.
+"""
+
+import argparse
+import binascii
+import faulthandler
+import gzip
+import hashlib
+import io
+import json
+import logging
+import mmap
+import multiprocessing as mp
+import random
+import sys
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import structlog
+from serial.tools.list_ports_common import ListPortInfo
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import load_any
+from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.service.checkpoint import CheckpointFile
+from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.requests import Requests, number
+from bms_estimator.sources.board_memory import BoardMemory
+from bms_estimator.sources.curve import read_curve
+from bms_estimator.sources.dialects.board import BoardDialect
+from bms_estimator.sources.dialects.text import TextDialect
+from bms_estimator.sources.ports import NoPortError, may_be_board, resolve_port
+from bms_estimator.sources.protocol import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
+from bms_estimator.sources.raw_capture import MAGIC
+from bms_estimator.sources.replay import load_capture
+
+CORPUS = Path(__file__).parents[1] / "data" / "fuzz"
+LONGEST = 4096
+"""No input is longer [bytes]."""
+HANG_S = 240.0
+"""So long may a batch of inputs take before it counts as a hang [s]."""
+BATCH = 200
+ROOM = 1 << 20
+"""A repaired input is no longer [bytes]."""
+PROCESSES = 2
+
+Read = Callable[[bytes], object]
+"""Reads an input; raises what is documented, or nothing."""
+Repair = Callable[[random.Random, bytes], bytes]
+"""Makes a damaged input whole again where a checksum would keep it from going deeper."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader of foreign bytes.
+
+    Attributes:
+        make: From a folder of its own to who reads.
+        tokens: What its inputs are made of.
+        repair: See ``Repair``.
+        decoder: Has the decoders' number of inputs.
+        part: Of the number of inputs it gets, where one takes long.
+    """
+
+    make: Callable[[Path], Read]
+    tokens: Sequence[bytes] = ()
+    repair: Repair = lambda _, data: data
+    decoder: bool = False
+    part: float = 1.0
+
+
+def _frames(_: Path) -> Read:
+    def read(data: bytes) -> None:
+        dialect = BoardDialect(rate_hz=100)
+        dialect.feed(1.0, data[: len(data) // 2])
+        dialect.opened()
+        dialect.serial_in(data[len(data) // 2 :])
+        dialect.feed(2.0, data[len(data) // 2 :])
+        dialect.due(3.0)
+        assert dialect.counters["bytes_received"] <= len(data)
+        _ = dialect.fault, dialect.board, dialect.described, dialect.clock_ppm
+
+    return read
+
+
+def _text(_: Path) -> Read:
+    def read(data: bytes) -> None:
+        dialect = TextDialect()
+        dialect.feed(1.0, data)
+        _ = dialect.fault, dialect.described, dialect.counters
+
+    return read
+
+
+def _messages(_: Path) -> Read:
+    def read(data: bytes) -> None:
+        for decode in (Hello.decode, Ack.decode, SampleMessage.decode):
+            try:
+                decode(unseal(data))
+            except ProtocolError:
+                continue
+
+    return read
+
+
+def _file(name: str, load: Callable[[Path], object]) -> Callable[[Path], Read]:
+    """Of a file; what is wrong with it is said with its name."""
+
+    def make(folder: Path) -> Read:
+        path = folder / name
+
+        def read(data: bytes) -> None:
+            path.write_bytes(data)
+            try:
+                load(path)
+            except UserError as error:
+                assert name in str(error), f"an error without the name of the file: {error}"  # noqa: PT017
+
+        return read
+
+    return make
+
+
+def _requests(_: Path) -> Read:
+    counts = Delivery()
+    requests = Requests(counts, ("set_soc",), monotonic=lambda: float(sum(counts.requests.values())) * 60.0)
+
+    async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        return {"soc": number(arguments, "soc", 0.0, 1.0)}
+
+    requests.offer("set_soc", set_soc)
+
+    def read(data: bytes) -> None:
+        answering = requests.respond("set_soc", data)
+        try:
+            answering.send(None)
+        except StopIteration as answered:
+            if answered.value is not None:
+                json.loads(answered.value)
+        assert not counts.requests.get("failed"), "a fault of the service's own"
+
+    return read
+
+
+def _checkpoint(folder: Path) -> Read:
+    file = CheckpointFile(folder, Settings(), load_cell("ncr18650"))
+
+    def read(data: bytes) -> None:
+        file.path.write_bytes(data)
+        file.load()
+
+    return read
+
+
+def _memory(folder: Path) -> Read:
+    memory = BoardMemory(folder, "pack")
+
+    def read(data: bytes) -> None:
+        memory.path.write_bytes(data)
+        memory.load()
+
+    return read
+
+
+def _ports(_: Path) -> Read:
+    def read(data: bytes) -> None:
+        text = data.decode("utf-8", "surrogateescape")
+        port = ListPortInfo("ttyUSB0")
+        port.vid, port.pid, port.manufacturer, port.product, port.description = 0x1A86, 0x7523, text, text, text
+        may_be_board(port)
+        try:
+            resolve_port(text)
+        except NoPortError as error:
+            str(error)
+
+    return read
+
+
+def _sealed(random: random.Random, data: bytes) -> bytes:
+    """Frames with right CRCs again."""
+    frames = data.split(DELIMITER)
+    at = random.randrange(len(frames))
+    packet = frames[at] or b"\x01\x02"
+    try:
+        packet = unseal(packet)
+    except ProtocolError:
+        packet = packet[1:-2] or b"\x01\x02"
+    packet = bytearray(packet)
+    if random.random() < 0.5:
+        packet[random.randrange(len(packet))] = random.randrange(256)
+    frames[at] = seal(bytes(packet)).removesuffix(DELIMITER)
+    return DELIMITER.join(frames)
+
+
+def _headed(random: random.Random, data: bytes) -> bytes:
+    """A capture whose header has a right length and CRC again."""
+    begin, end = data.find(b"{"), data.find(b"}") + 1
+    if not 0 <= begin < end or random.random() < 0.3:
+        return data
+    text = data[begin:end]
+    crc = binascii.crc_hqx(text, 0xFFFF).to_bytes(2, "little")
+    return MAGIC + len(text).to_bytes(4, "little") + text + crc + data[end + 2 :]
+
+
+def _zipped(random: random.Random, data: bytes) -> bytes:
+    """A checkpoint one of whose fields is damaged, with right CRCs."""
+    if random.random() < 0.3:
+        return data
+    content = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO((CORPUS / "checkpoint" / "seed.npz").read_bytes())) as seed:
+        names = seed.namelist()
+        damaged = random.choice(names)
+        with zipfile.ZipFile(content, "w") as made:
+            for name in names:
+                field = seed.read(name)
+                made.writestr(name, mutated(random, field, TOKENS, [field]) if name == damaged else field)
+    return content.getvalue()
+
+
+NUMBERS = (
+    b"1e308",
+    b"-1e308",
+    b"1e999",
+    b"nan",
+    b"-inf",
+    b"3_9",
+    "٣".encode(),
+    b"0x1F",
+    b"-0",
+    b"0",
+    b"1" * 400,
+    b"true",
+)
+TOKENS = (*NUMBERS, b"\0", b"\xff", b"\n", b"\r\n", b",", b"=", b'"', b"[" * 40, b"{", b"}", b"_", b"#")
+_TOML = (
+    b"[pack]\n",
+    b"[sensor]\n",
+    b"[cell]\n",
+    b"[ocv]\n",
+    b"capacity_ah = true\n",
+    b"[[pack]]\n",
+    b"= [",
+    b'"""',
+    b"1979-05-27",
+)
+_JSON = (b"null", b'"version"', b": [", b'{"a":', b"\\ud800", b'"soc"', b'"transaction"')
+
+TARGETS: Mapping[str, Target] = {
+    "frames": Target(_frames, (DELIMITER, b"\x01\x01", b"\x01\x02", b"\xff\xff\xff\xff"), _sealed, decoder=True),
+    "text": Target(_text, (b"V=", b"I=", b"T=", b"cells=", b'{"voltage":', b";", b" mA", b"kV"), decoder=True),
+    "messages": Target(_messages, (DELIMITER, b"\x01\x02"), _sealed),
+    "settings": Target(_file("pack.toml", load_settings), _TOML),
+    "cell": Target(_file("cell.toml", load_any), _TOML, part=0.05),
+    "csv": Target(_file("table.csv", load_capture), (b"time_s", b"current_a", b"Voltage / V", b",,", b"\xef\xbb\xbf")),
+    "csv.gz": Target(
+        _file("table.csv.gz", load_capture), repair=lambda r, data: gzip.compress(data, 1) if r.random() < 0.5 else data
+    ),
+    "parquet": Target(_file("table.parquet", load_capture), (b"PAR1",), part=0.2),
+    "curve": Target(_file("curve.csv", read_curve), (b"soc", b"ocv_v", b"hysteresis_v", b",,")),
+    "capture": Target(_file("line.bms", load_capture), _JSON, _headed),
+    "requests": Target(_requests, _JSON),
+    "checkpoint": Target(_checkpoint, (b"PK\x03\x04", b"{'descr':", b"'|O'", b"'<f8'", b"(1,)"), _zipped, part=0.1),
+    "memory": Target(_memory, _JSON),
+    "ports": Target(_ports, (b"zigbee", b"auto", b"/dev/", b"../")),
+}
+
+
+def mutated(random: random.Random, data: bytes, tokens: Sequence[bytes], corpus: Sequence[bytes]) -> bytes:
+    """``data`` changed in one to eight places."""
+    changed = bytearray(data)
+    for _ in range(1 << random.randrange(4)):
+        at = random.randrange(len(changed) + 1)
+        end = min(at + random.randrange(1, 33), len(changed))
+        match random.randrange(7):
+            case 0 if changed:
+                changed[at % len(changed)] ^= 1 << random.randrange(8)
+            case 1 if changed:
+                changed[at % len(changed)] = random.randrange(256)
+            case 2:
+                changed[at:end] = b""
+            case 3:
+                changed[at:at] = changed[at:end]
+            case 4:
+                changed[at:end] = random.choice(tokens)
+            case 5:
+                changed[at:at] = random.choice(tokens)
+            case _:
+                other = random.choice(corpus)
+                begin = random.randrange(len(other) + 1)
+                changed[at:at] = other[begin : begin + random.randrange(65)]
+    return bytes(changed[:LONGEST])
+
+
+def inputs(name: str, seed: str, count: int) -> Iterator[bytes]:
+    """``count`` inputs of a reader, the same ones by the same seed and corpus."""
+    target, chosen, corpus = TARGETS[name], random.Random(f"{name} {seed}"), seeds(name, "seed*")
+    tokens = (*TOKENS, *target.tokens)
+    for _ in range(count):
+        yield target.repair(chosen, mutated(chosen, chosen.choice(corpus), tokens, corpus))
+
+
+def seeds(name: str, pattern: str = "*") -> list[bytes]:
+    """The corpus of a reader: what inputs are made from, and what once failed."""
+    return [path.read_bytes() for path in sorted((CORPUS / name).glob(pattern))]
+
+
+class FuzzError(Exception):
+    """An input made a reader raise what it should not."""
+
+    def __init__(self, data: bytes, error: BaseException) -> None:
+        super().__init__(f"{type(error).__name__}: {error}")
+        self.data = data
+
+
+def attempt(name: str, tried: Iterator[bytes], noted: Callable[[bytes], None] = lambda _: None) -> int:
+    """Let a reader read inputs. Returns how many.
+
+    Args:
+        name: Of the reader.
+        tried: Inputs.
+        noted: Is told of each input before it is read.
+
+    Raises:
+        FuzzError: The first that fails.
+    """
+    count = 0
+    with tempfile.TemporaryDirectory(dir=_memory_disk()) as folder:
+        read = TARGETS[name].make(Path(folder))
+        try:
+            for data in tried:
+                if count % BATCH == 0:
+                    faulthandler.dump_traceback_later(HANG_S, exit=True)
+                noted(data)
+                try:
+                    read(data)
+                except Exception as error:
+                    raise FuzzError(data, error) from error
+                count += 1
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+    return count
+
+
+def keep(name: str, data: bytes) -> Path:
+    """Put an input that fails into the corpus."""
+    path = CORPUS / name / f"failed-{hashlib.sha256(data).hexdigest()[:12]}"
+    path.write_bytes(data)
+    return path
+
+
+def quiet() -> None:
+    """Log nothing: readers say what was wrong with each input."""
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+
+
+def _memory_disk() -> str | None:
+    return "/dev/shm" if Path("/dev/shm").is_dir() else None
+
+
+def _work(name: str, seed: str, count: int, room: mmap.mmap, fault: "mp.Queue[str]") -> None:
+    """A process: the input that is read now stands in ``room``, for who finds it dead."""
+    quiet()
+
+    def note(data: bytes) -> None:
+        room[:4] = len(data).to_bytes(4, "little")
+        room[4 : 4 + len(data)] = data
+
+    try:
+        attempt(name, inputs(name, seed, count), note)
+    except FuzzError as error:
+        fault.put(f"{error} <- {error.__cause__!r}")
+        sys.exit(1)
+
+
+def fuzz(name: str, seed: int, count: int) -> bool:
+    """Try ``count`` inputs in all processes, and say what came of it. Returns whether none failed."""
+    fork = mp.get_context("fork")
+    begin_s, workers = time.monotonic(), []
+    for i in range(PROCESSES):
+        room, fault = mmap.mmap(-1, ROOM), fork.Queue()
+        worker = fork.Process(target=_work, args=(name, f"{seed}.{i}", count // PROCESSES, room, fault))
+        worker.start()
+        workers.append((worker, room, fault))
+    good = True
+    for worker, room, fault in workers:
+        worker.join()
+        if worker.exitcode:
+            good = False
+            path = keep(name, bytes(room[4 : 4 + int.from_bytes(room[:4], "little")]))
+            why = "hung or died" if fault.empty() else fault.get()
+            sys.stdout.write(f"{name}: {why}\n  kept: {path}\n")
+    passed_s = time.monotonic() - begin_s
+    per_minute = count / passed_s * 60.0
+    sys.stdout.write(
+        f"{name:12} {count:>12,} inputs in {passed_s:6.0f} s, {per_minute:>12,.0f} a minute {'' if good else 'FAILED'}\n"
+    )
+    sys.stdout.flush()
+    return good
+
+
+def main() -> None:
+    """Fuzz what is asked for; 1 where something failed."""
+    parser = argparse.ArgumentParser(
+        prog="make fuzz", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--decoders", type=int, default=10_000_000, help="inputs to each decoder of the line")
+    parser.add_argument(
+        "--parsers", type=int, default=1_000_000, help="inputs to each other reader; slow ones get a part"
+    )
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="*", default=list(TARGETS), choices=list(TARGETS))
+    options = parser.parse_args()
+    good = True
+    for name in options.only:
+        attempt(name, iter(seeds(name)[:1]))  # compiles
+        target = TARGETS[name]
+        good &= fuzz(name, options.seed, round(target.part * (options.decoders if target.decoder else options.parsers)))
+    sys.exit(not good)
+
+
+if __name__ == "__main__":
+    main()
