@@ -16,13 +16,17 @@ from pydantic import ValidationError
 from serial.tools import list_ports
 from structlog.testing import capture_logs
 
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.estimate import Snapshot
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.model.settings import PackSettings, SensorSettings, Settings
+from bms_estimator.service.serve import serve
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading
-from bms_estimator.sources import ports
+from bms_estimator.sources import ports, serial_board
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.serial_board import SerialBoard
+from tests.collector import Collector
 from tests.command_line import run
 from tests.patience import LONG_S
 from tests.serial_line import usb_port
@@ -43,6 +47,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     there.mkdir()
     monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path)) for path in there.iterdir()])
     monkeypatch.setattr(ports, "BY_ID", tmp_path / "by-id")
+    monkeypatch.setattr(serial_board, "TALK_S", 0.02)
     return there
 
 
@@ -270,6 +275,32 @@ async def test_a_memory_that_was_deleted_lets_no_other_board_in(folder: Path, me
             refused = taken.counters["reconnects"]
             await until(lambda: taken.counters["reconnects"] > refused)
             assert "refused" in (taken.message or "")
+
+
+async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_health(
+    folder: Path, tmp_path: Path, memory: BoardMemory
+) -> None:
+    port = folder / "ttyUSB0"
+    settings = Settings(
+        pack=PackSettings(name="house", cell="ncr18650", series=6), sensor=SensorSettings(port=str(port))
+    )
+
+    async def served(until_told: Callable[[Snapshot], bool]) -> Snapshot:
+        stop, sink = asyncio.Event(), Collector()
+        cell = load_cell("ncr18650").pack(6, 1)
+        running = asyncio.create_task(serve(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
+        try:
+            return await sink.until(until_told)
+        finally:
+            stop.set()
+            await running
+
+    async with board(port):
+        await served(lambda s: s.health.samples["samples"] > 0 and bool(memory.load()))
+    async with board(port, serial=2, voltage_v=OTHERS_V):
+        told = await served(lambda s: "refused" in (s.health.sensor_message or ""))
+    assert "board 00000002 is not the pack's, 00000001" in (told.health.sensor_message or "")
+    assert told.health.samples["samples"] <= 1  # that of the checkpoint
 
 
 def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memory: BoardMemory) -> None:
