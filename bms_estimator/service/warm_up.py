@@ -1,5 +1,7 @@
 """Everything a live run computes with, called once before it begins: nothing compiles once samples come."""
 
+import gc
+
 import numpy as np
 
 from bms_estimator.model.cell import load_cell
@@ -26,3 +28,5 @@ def load_kernels() -> None:
     estimator.resume(0.0)
     parameter_report(estimator, 0.0)
     remaining_charge(estimator, 0.0)
+    gc.collect()
+    gc.freeze()  # numba's objects stay: to look through them again and again stops the loop for 100 ms each time
