@@ -114,6 +114,7 @@ async def test_a_killed_service_is_offline_by_its_will_and_one_that_is_asked_say
         await live.wait("bms/pack/availability", lambda p: p == b"offline", skip=before)
     board.cancel()
     (kept,) = checkpoints(state_home)  # nobody has named a folder
+    assert {path.stat().st_mode & 0o077 for path in (kept.parent, *kept.parent.iterdir())} == {0}
     assert str(kept) in {line.get("file") for line in lines}
 
 
