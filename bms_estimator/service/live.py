@@ -120,12 +120,14 @@ async def run_live(
             tasks.append(saving.save_often())
         if reload:
             tasks.append(_reload(reload, notifier, name))
+        clean = False
         try:
             await until_first_ends(*tasks, stop.wait())
+            clean = True
         finally:  # a fault ends the loop, too
             notifier.stopping(name)
             if saving:  # before the sinks part, which may take seconds: who stops us may not wait for them
-                await saving.save_last()
+                await saving.save_last(clean=clean)
         publisher.publish_last()
     return estimator
 

@@ -67,11 +67,11 @@ class Saving:
                 failed = not await self._save()
                 saved_s = loop.time()
 
-    async def save_last(self) -> None:
-        """Save that the run has ended cleanly; a disk that hangs is left alone after ``LAST_S``."""
+    async def save_last(self, *, clean: bool) -> None:
+        """Save as the run ends, by itself where it is ``clean``; a disk that hangs is left alone after ``LAST_S``."""
         try:
             async with asyncio.timeout(LAST_S):
-                await self._save(clean=True)
+                await self._save(clean=clean)
         except TimeoutError:
             log.warning("the disk hangs: the last checkpoint is not written", file=str(self._checkpoint.path))
 

@@ -461,7 +461,9 @@ async def test_what_was_learned_is_saved_when_a_fault_ends_the_loop(tmp_path: Pa
     source.finish()
     with pytest.raises(ZeroDivisionError):
         await run_live(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=file)
-    assert file.load().state["observer.samples"] == 1
+    found = file.load()
+    assert found.state["observer.samples"] == 1
+    assert found.ledger.total.crashes == 1
 
 
 async def test_the_last_checkpoint_does_not_wait_for_a_broker_that_parts_slowly(tmp_path: Path) -> None:
