@@ -146,7 +146,9 @@ async def test_a_broker_that_accepts_and_says_nothing_is_passed_over(broker: Bro
     assert said[:2] == [("broker not reachable", broker.url), ("broker connected", other.url)]
 
 
-async def test_an_attempt_that_was_given_up_does_not_end_the_connection_that_came_after(broker: Broker) -> None:
+async def test_an_attempt_that_was_given_up_does_not_end_the_connection_that_came_after(
+    broker: Broker, caplog: pytest.LogCaptureFixture
+) -> None:
     broker.freeze()
     with structlog.testing.capture_logs() as logs:
         async with Sink(broker.url, **dial(broker.url)) as sink:
@@ -159,6 +161,7 @@ async def test_an_attempt_that_was_given_up_does_not_end_the_connection_that_cam
                 await live.wait_json(STATE, lambda s: s["frames_received"] == 19)
                 await until(lambda: sink.delivery.waiting == 0)
     assert not [line for line in logs if line["event"] == "broker lost"]
+    assert not [record for record in caplog.records if record.name == "asyncio"], "nothing is left that fails later"
 
 
 @pytest.fixture
