@@ -161,7 +161,11 @@ class _File:
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         for suffix in ("", "-wal", "-shm"):
             self._refuse_planted(self._path.with_name(self._path.name + suffix))
-        os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600))
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        try:
+            os.fchmod(descriptor, 0o600)  # SQLite gives its log the same
+        finally:
+            os.close(descriptor)
         self._inode = _inode(self._path)
         self._connection = sqlite3.connect(self._path, timeout=LOCKED_S, isolation_level=None)
         self._prepare(self._connection)

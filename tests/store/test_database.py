@@ -36,7 +36,8 @@ def numbers(connection: sqlite3.Connection) -> list[int]:
     return [number for (number,) in connection.execute("SELECT number FROM outbox ORDER BY number")]
 
 
-async def test_its_files_are_for_their_owner_alone(path):
+async def test_its_files_are_for_their_owner_alone_whoever_made_them(path):
+    path.touch(mode=0o644)
     async with Database(path) as database:
         await database.call(put(1))
         assert {each.name for each in path.parent.iterdir()} == {path.name, f"{path.name}-wal", f"{path.name}-shm"}

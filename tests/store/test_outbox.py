@@ -99,7 +99,7 @@ async def until(condition: Callable[[], bool]) -> None:
 def on_disk(path: Path) -> list[int]:
     """Numbers of the messages in the database."""
     try:
-        with closing(sqlite3.connect(path)) as connection:
+        with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
             return [int(payload) for (payload,) in connection.execute("SELECT payload FROM outbox ORDER BY number")]
     except sqlite3.Error:
         return []  # the table is being made

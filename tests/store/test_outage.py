@@ -1,0 +1,51 @@
+"""The real program while the broker is away: what it had estimated comes later, over a kill, in order and once."""
+
+import asyncio
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from tests.mosquitto import Broker, Listener, broker
+from tests.patience import LONG_S
+from tests.serial_line import Line, line
+from tests.service.test_process import ended, feed, pack_file, service
+
+__all__ = ["broker", "line"]
+
+TOPICS = ("bms/pack/state", "bms/pack/event")
+
+
+def on_disk(path: Path) -> list[tuple[str, str]]:
+    """Topic and time of what waits in the database."""
+    try:
+        with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
+            rows = connection.execute("SELECT topic, payload FROM outbox ORDER BY number").fetchall()
+    except sqlite3.Error:
+        return []  # not there yet
+    return [(topic, json.loads(payload)["time"]) for topic, payload in rows]
+
+
+async def test_states_of_an_outage_outlive_a_kill_and_come_first_in_order_and_once(
+    tmp_path: Path, line: Line, broker: Broker
+) -> None:
+    broker.stop()
+    line.plug()
+    board = asyncio.create_task(feed(line))
+    pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{tmp_path}"\n')
+    async with service(pack) as process:
+        async with asyncio.timeout(LONG_S):
+            while len(on_disk(tmp_path / "pack.sqlite")) < 25:  # noqa: ASYNC110 - a file has no event
+                await asyncio.sleep(0.05)
+        process.kill()
+    kept = on_disk(tmp_path / "pack.sqlite")
+    await asyncio.to_thread(broker.start)
+    async with Listener(broker) as live, service(pack) as process:
+        await live.wait_json("bms/pack/state", lambda state: state["time"] > kept[-1][1])
+        await ended(process)
+        heard = [(topic, json.loads(payload)["time"]) for topic, payload, _ in live.messages if topic in TOPICS]
+    board.cancel()
+    assert heard[: len(kept)] == kept
+    states = [time for topic, time in heard if topic == TOPICS[0]]
+    assert states == sorted(set(states))
+    assert on_disk(tmp_path / "pack.sqlite") == []
