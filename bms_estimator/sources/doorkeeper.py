@@ -35,7 +35,7 @@ class Doorkeeper:
     def __init__(self, make: Callable[[], Dialect], serial: str = "", memory: BoardMemory | None = None) -> None:
         self._make, self._told, self._memory = make, serial, memory
         self._known: Mapping[str, str] = memory.load() if memory else {}
-        self._nameless = False
+        self._nameless = self._looking = False
         self.stranger: Dialect | None = None
         """What hears a board that is not known yet."""
         self._held = deque[Read](maxlen=HELD_READS)
@@ -51,9 +51,18 @@ class Doorkeeper:
         self._held.clear()
 
     def look_again(self) -> None:
-        """Take note that somebody has accepted another board. A file that is gone tells nothing of the kind."""
-        if self._memory and self._memory.load() == NO_BOARD:
-            self._known = NO_BOARD
+        """Soon take note when somebody has accepted another board. A file that is gone tells nothing of the kind."""
+        if self._memory and not self._looking:
+            self._looking = True
+            Thread(target=self._look, args=(self._memory,), daemon=True).start()
+
+    def _look(self, memory: BoardMemory) -> None:
+        """In a thread of its own: a disk that hangs holds up nothing."""
+        try:
+            if memory.load() == NO_BOARD:
+                self._known = NO_BOARD
+        finally:
+            self._looking = False
 
     def admit(self, read: Read, dialect: Dialect) -> Sequence[Read]:
         """The reads that ``dialect``, which hears the pack's board, may be fed now.

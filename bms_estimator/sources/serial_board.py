@@ -242,7 +242,7 @@ class SerialBoard:
         """Open, attend until lost, and again."""
         while True:
             if self._refused:
-                await asyncio.to_thread(self._door.look_again)
+                self._door.look_again()
             path = self._path = await self._line.open()
             try:
                 await self._attend(path)
