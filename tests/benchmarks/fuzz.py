@@ -20,6 +20,7 @@ import random
 import sys
 import tempfile
 import time
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -270,7 +271,7 @@ TARGETS: Mapping[str, Target] = {
     "curve": Target(_file("curve.csv", read_curve), (b"soc", b"ocv_v", b"hysteresis_v", b",,")),
     "capture": Target(_file("line.bms", load_capture), _JSON, _headed),
     "requests": Target(_requests, _JSON),
-    "checkpoint": Target(_checkpoint, (b"PK\x03\x04", b"{'descr':", b"'|O'", b"'<f8'", b"(1,)"), _zipped, part=0.1),
+    "checkpoint": Target(_checkpoint, (b"PK\x03\x04", b"{'descr':", b"'|O'", b"'<f8'", b"(1,)"), _zipped, part=0.02),
     "memory": Target(_memory, _JSON),
     "ports": Target(_ports, (b"zigbee", b"auto", b"/dev/", b"../")),
 }
@@ -361,6 +362,7 @@ def keep(name: str, data: bytes) -> Path:
 
 def quiet() -> None:
     """Log nothing: readers say what was wrong with each input."""
+    warnings.simplefilter("ignore")
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
 
 
