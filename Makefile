@@ -5,13 +5,14 @@ BIN     := $(VENV)/bin
 PYTHON  ?= python3
 READY   := $(VENV)/.ready
 COMPARE := .venv-compare
+AUDIT   := .venv-audit
 ARGS    ?=
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz firmware kernels lock
+.PHONY: help venv apt audit check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -77,6 +78,11 @@ fuzz: venv ## mutated inputs to all that reads foreign bytes, e.g. make fuzz ARG
 load: venv ## 5,000 frames/s for 10 min over a PTY, and a day of serial bytes, e.g. make load ARGS="--minutes 1 --hours 2"
 	@$(BIN)/python -m tests.benchmarks.endurance $(ARGS)
 
+audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 3 where the data cannot be reached
+	@[ -x $(AUDIT)/bin/python ] || $(PYTHON) -m venv $(AUDIT)
+	@$(AUDIT)/bin/pip install --quiet --disable-pip-version-check pip-audit==2.10.1
+	@$(AUDIT)/bin/python .ci/audit.py
+
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
 	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
@@ -85,4 +91,4 @@ kernels: venv
 	$(BIN)/python -c 'from bms_estimator.service.warm_up import load_kernels; load_kernels()'
 
 lock: ## write requirements.lock anew after a change of dependencies (needs uv)
-	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --no-annotate --universal pyproject.toml -o requirements.lock
+	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --universal pyproject.toml -o requirements.lock
