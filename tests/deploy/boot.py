@@ -1,6 +1,7 @@
 """A small Debian that boots in a container from this machine's own /usr, with the service in it."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,41 +13,57 @@ from tests.deploy import kernel_cache
 
 PROJECT = Path(__file__).parents[2]
 LINKS = {"bin": "usr/bin", "sbin": "usr/sbin", "lib": "usr/lib", "lib64": "usr/lib64"}
-FOLDERS = ("etc/bms-estimator", "etc/systemd/system/multi-user.target.wants", "opt/bms-estimator/bin")
-EMPTY = ("usr", "var", "run", "tmp", "proc", "sys", "dev", "root", "home", "opt/python", "opt/packages", "opt/project")
+FOLDERS = ("etc/systemd/system/multi-user.target.wants", "etc/udev/rules.d", "opt/bms-estimator/bin", "root/bin")
+EMPTY = ("usr", "var", "run", "tmp", "proc", "sys", "dev", "home", "opt/python", "opt/packages", "opt/project")
 ACCOUNTS = ("passwd", "group", "os-release", "nsswitch.conf")
 
-PROGRAM = f"""#!/bin/sh
+PYTHON = f"""#!/bin/sh
 export PYTHONPATH=/opt/project:/opt/packages PYTHONDONTWRITEBYTECODE=1 LD_LIBRARY_PATH=/opt/python/lib
 exec /opt/python/bin/python{sys.version_info.major}.{sys.version_info.minor} -P -c \\
-    'from bms_estimator.cli import main; main()' "$@"
 """
-
-PACK = """
-[pack]
-name = "boot"
-cell = "chen_mora"
-
-[sensor]
-port = "/dev/bms/absent"
+PROGRAM = f"""{PYTHON}    'from bms_estimator.cli import main; main()' "$@"
 """
-
-CLOCK = """
-[Service]
-ExecStartPost=/opt/bms-estimator/bin/clock
+CLOCK = f"""{PYTHON}    '
+import ctypes
+from bms_estimator.service.moment import synchronised
+print("clock", ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)), synchronised(), flush=True)
+'
 """
 """What the service's own confinement lets it see of the clock."""
 
-READ_CLOCK = f"""#!/bin/sh
-export LD_LIBRARY_PATH=/opt/python/lib
-exec /opt/python/bin/python{sys.version_info.major}.{sys.version_info.minor} -c \\
-    'import ctypes; print("adjtimex", ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)), flush=True)'
+PACK = """
+[pack]
+name = "{name}"
+cell = "chen_mora"
+[sensor]
+port = "/dev/bms/{port}"
+sample_rate_hz = 10
+[mqtt]
+username = "{name}"
+password_file = "mqtt-password"
+"""
+SECRET = "open-sesame-4711"
+
+HARDER = """
+[Service]
+ExecStartPost=/opt/bms-estimator/bin/clock
+LoadCredential=mqtt-password:/root/mqtt-password
+WatchdogSec=5
+RestartSec=100ms
+# The board is on a pseudo-terminal.
+DeviceAllow=char-pts rw
+"""
+"""To both units: a watchdog that does not take long, and what is particular here."""
+
+BROKER = """
+listener 1883 127.0.0.1
+user root
+password_file /root/bms.passwd
+acl_file /root/bms.acl
 """
 
 JUDGE = """
 [Unit]
-Wants=bms-estimator.service
-After=bms-estimator.service
 SuccessAction=poweroff-force
 FailureAction=poweroff-force
 
@@ -54,21 +71,24 @@ FailureAction=poweroff-force
 Type=oneshot
 StandardOutput=append:/root/report
 StandardError=append:/root/report
-ExecStart=sh -c 'for n in $(seq 60); do ls /var/cache/private/bms-estimator/*/* >/dev/null 2>&1 && break; sleep 0.1; done'
-ExecStart=systemctl show bms-estimator -p ActiveState,SubState,NRestarts,Result,WatchdogUSec,StatusText,MainPID,User
-ExecStart=-sh -c 'grep -E "^(Uid|NoNewPrivs|Seccomp|CapEff):" /proc/$(systemctl show bms-estimator -P MainPID)/status'
-ExecStart=-sh -c 'xargs -0 -n1 echo </proc/$(systemctl show bms-estimator -P MainPID)/environ | grep BMS_BOOT_ID'
-ExecStart=find /var/cache/private/bms-estimator -name "*.nbi" -printf "cached %%f\\n"
-ExecStart=-systemctl restart bms-estimator
-ExecStart=-systemctl start bms-estimator@second
-ExecStart=systemctl show bms-estimator@second -p StatusText
-ExecStart=-sh -c 'ls /var/lib/private/bms-estimator; ls -d /var/cache/private/bms-estimator/* | wc -l'
-ExecStart=-systemctl stop bms-estimator@second
-ExecStart=systemctl show bms-estimator -p ActiveEnterTimestampMonotonic,InactiveExitTimestampMonotonic
-ExecStart=systemctl stop bms-estimator
-ExecStart=systemctl show bms-estimator -p Result
-ExecStart=journalctl --no-pager -o cat -u bms-estimator
+ExecStart=/root/judge
 """
+
+STANDINS = {
+    "sudo": 'exec "$@"',
+    "apt": "",
+    "python3": "",  # there is an environment
+    "udevadm": "",  # no container has a udev
+    "journalctl": "",  # it would look on for ever
+}
+"""Programs of the page that do nothing here."""
+
+
+def by_the_page(section: str, block: int = 0) -> str:
+    """The commands of docs/deploy.md: a block of indented lines in a section."""
+    text = (PROJECT / "docs/deploy.md").read_text()
+    inside = re.split(rf"(?m)^##+ {section}\n", text)[1].split("\n##")[0]
+    return [found for found in re.findall(r"(?:(?:^    .*)?\n)+", inside, re.MULTILINE) if found.strip()][block]
 
 
 def make_root(root: Path) -> None:
@@ -83,20 +103,49 @@ def make_root(root: Path) -> None:
         if (Path("/etc") / name).exists():
             shutil.copy(Path("/etc") / name, root / "etc")
     (root / "etc/machine-id").write_text(f"{uuid.uuid4().hex}\n")
-    program = root / "opt/bms-estimator/bin/bms-estimator"
-    program.write_text(PROGRAM)
-    program.chmod(0o755)
-    (root / "opt/bms-estimator/bin/clock").write_text(READ_CLOCK)
-    (root / "opt/bms-estimator/bin/clock").chmod(0o755)
-    for name in ("pack", "second"):
-        (root / f"etc/bms-estimator/{name}.toml").write_text(PACK.replace("boot", name))
-    shutil.copytree(PROJECT / "deploy", root / "etc/systemd/system", dirs_exist_ok=True)
-    (root / "etc/systemd/system/bms-estimator.service.d").mkdir()
-    (root / "etc/systemd/system/bms-estimator.service.d/clock.conf").write_text(CLOCK)
-    (root / "etc/systemd/system/judge.service").write_text(JUDGE)
+    write_program(root / "opt/bms-estimator/bin/bms-estimator", PROGRAM)
+    write_program(root / "opt/bms-estimator/bin/clock", CLOCK)
+    write_program(root / "opt/bms-estimator/bin/pip", "#!/bin/sh\n")
+    for name, does in STANDINS.items():
+        write_program(root / "root/bin" / name, f"#!/bin/sh\n{does}\n")
+    write_program(root / "root/judge", Path(__file__).with_name("judge.sh").read_text())
+    for name, port in (("pack", "board"), ("second", "absent")):
+        (root / f"root/{name}.toml").write_text(PACK.format(name=name, port=port))
+    settings = "cp /root/pack.toml /root/second.toml /etc/bms-estimator/"  # "then edit it"
+    install = re.sub(r"(?m)^.*config init .*$", rf"\g<0>\n{settings}", by_the_page("Install"))
+    for name, commands in (
+        ("install", install),
+        ("clock", by_the_page("Install", 1)),
+        ("uninstall", by_the_page("Uninstall")),
+    ):
+        (root / "root" / name).write_text(commands)
+    (root / "etc/hosts").write_text("127.0.0.1 localhost\n")
+    (root / "root/mqtt-password").write_text(SECRET)
+    (root / "root/bms.conf").write_text(BROKER)
+    acl = PROJECT / "deploy/mosquitto"
+    packs = [(acl / "pack.acl").read_text().replace("PACK", name) for name in ("pack", "second")]
+    (root / "root/bms.acl").write_text("".join([(acl / "bms.acl").read_text(), *packs]))
+    (root / "root/bms.passwd").touch(mode=0o600)
+    system = root / "etc/systemd/system"
+    for unit in ("bms-estimator", "bms-estimator@"):
+        (system / f"{unit}.service.d").mkdir()
+        (system / f"{unit}.service.d/harder.conf").write_text(HARDER)
+    shutil.copy(PROJECT / "deploy/bms-estimator@.service", system)
+    shutil.copy(PROJECT / "deploy/bms-estimator@.service.d/pack.conf", system / "bms-estimator@.service.d")
+    (system / "judge.service").write_text(JUDGE)
+    state = root / "var/lib/private/bms-estimator"
+    for folder in (state.parent, state):
+        folder.mkdir(mode=0o700, parents=True)  # as systemd wants it
+    shutil.copy(PROJECT / "tests/service/checkpoint_format_4.npz", state / "pack.npz")
     private = root / "var/cache/private"
     private.mkdir(mode=0o700, parents=True)  # as systemd wants it
     kernel_cache.fill(private / "bms-estimator", Path("/opt/project/bms_estimator"))
+    shutil.copytree(private / "bms-estimator", root / "root/cache")
+
+
+def write_program(path: Path, text: str) -> None:
+    path.write_text(text)
+    path.chmod(0o755)
 
 
 def boot(root: Path, systemd_nspawn: str, timeout_s: float) -> str:

@@ -1,0 +1,86 @@
+#!/bin/sh
+# Runs inside the container as the judge: does to the service what happens in years, and reports each part under a name.
+part() { echo "== $1"; }
+until_true() { # what ought to come comes; what does not is seen by the test
+    for _ in $(seq 300); do eval "$1" >/dev/null 2>&1 && return; sleep 0.1; done
+    echo "never true: $1"
+}
+show() { systemctl show bms-estimator -p ActiveState,NRestarts,Result,StatusText,User; }
+main_pid() { systemctl show "${1:-bms-estimator}" -P MainPID; }
+by_the_page() { PATH="/root/bin:$PATH" bash -ex "$1"; }
+lines() { journalctl --no-pager -o cat -u "${1:-bms-estimator}"; }
+cache=/var/cache/private/bms-estimator
+
+part install
+mosquitto_passwd -b /root/bms.passwd pack "$(cat /root/mqtt-password)"
+mosquitto_passwd -b /root/bms.passwd second "$(cat /root/mqtt-password)"
+mosquitto_passwd -b /root/bms.passwd dashboard two
+systemd-run --quiet --unit=broker mosquitto -c /root/bms.conf
+systemd-run --quiet --unit=board --setenv=NUMBA_CACHE_DIR=/root/cache sh -c \
+    '/opt/bms-estimator/bin/bms-estimator simulate --cell chen_mora --rate-hz 10 >/run/board'
+until_true 'grep -q /dev/pts/ /run/board'
+chgrp dialout "$(cat /run/board)" && chmod 660 "$(cat /run/board)" && mkdir /dev/bms && ln -s "$(cat /run/board)" /dev/bms/board
+cd /opt/project && by_the_page /root/install
+
+part first
+until_true "ls $cache/*/*"
+until_true 'journalctl -u bms-estimator | grep -q "port opened"'
+until_true 'timeout 5 mosquitto_sub -C 1 -u dashboard -P two -t bms/pack/state'
+show
+systemctl show bms-estimator -p WatchdogUSec
+grep -E "^(Uid|NoNewPrivs|Seccomp|CapEff):" "/proc/$(main_pid)/status"
+tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep BMS_BOOT_ID
+find $cache -name "sample_step.run-*.nbi" -printf "cached %f\n"
+nsenter -t "$(main_pid)" -m sh -c 'ls -A /home /root; touch /root/x /etc/x' 2>&1
+
+part secret
+secret=$(cat /root/mqtt-password)
+lines | grep -c "$secret"
+tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep -c "$secret"
+ps -eo args | grep -v grep | grep -c "$secret"
+timeout 5 mosquitto_sub -C 2 -u dashboard -P two -t bms/pack/health -t bms/pack/info | grep -c "$secret"
+
+part reload
+before=$(main_pid)
+systemctl reload bms-estimator
+until_true 'lines | grep -q "settings reloaded"'
+timeout 5 mosquitto_sub -C 2 -u dashboard -P two -t bms/pack/state | wc -l
+test "$before" = "$(main_pid)" && show
+
+part watchdog
+for name in $(find $cache -name "*.nbi" | sort | tail -n 1); do : >"$name"; done # as a power cut leaves them
+for name in $(find $cache -name "*.nbc" | sort | head -n 1); do : >"$name"; done
+mkdir -p /run/systemd/timesync && touch /run/systemd/timesync/synchronized
+kill -STOP "$(main_pid)"
+until_true 'systemctl show bms-estimator -P NRestarts | grep -qx 1 && systemctl is-active bms-estimator'
+show
+
+part clock
+by_the_page /root/clock
+show
+
+part second
+systemctl stop bms-estimator
+systemctl show bms-estimator -p Result
+ls /var/lib/private/bms-estimator
+systemctl start bms-estimator@second
+systemctl show bms-estimator@second -p StatusText
+ls -d $cache/* | wc -l
+systemctl stop bms-estimator@second
+
+part full
+mount -t tmpfs -o size=4k,mode=700 none /var/lib/private/bms-estimator
+dd if=/dev/zero of=/var/lib/private/bms-estimator/full bs=4k count=1 status=none
+systemctl start bms-estimator
+until_true 'timeout 5 mosquitto_sub -C 1 -u dashboard -P two -t bms/pack/health | grep -q "No space left"'
+show
+systemctl stop bms-estimator
+umount /var/lib/private/bms-estimator
+
+part journal
+lines
+lines bms-estimator@second
+
+part uninstall
+by_the_page /root/uninstall
+find /etc /opt /var/lib /var/cache /run -xdev -path /opt/project -prune -o -path /opt/packages -prune -o -name "*bms-estimator*" -print
