@@ -55,10 +55,6 @@ kill -STOP "$(main_pid)"
 until_true 'systemctl show bms-estimator -P NRestarts | grep -qx 1 && systemctl is-active bms-estimator'
 show
 
-part clock
-by_the_page /root/clock
-show
-
 part second
 systemctl stop bms-estimator
 systemctl show bms-estimator -p Result
@@ -71,7 +67,7 @@ systemctl stop bms-estimator@second
 part full
 mount -t tmpfs -o size=4k,mode=700 none /var/lib/private/bms-estimator
 dd if=/dev/zero of=/var/lib/private/bms-estimator/full bs=4k count=1 status=none
-systemctl start bms-estimator
+by_the_page /root/clock # which starts it again
 until_true 'timeout 5 mosquitto_sub -C 1 -u dashboard -P two -t bms/pack/health | grep -q "No space left"'
 show
 systemctl stop bms-estimator

@@ -90,7 +90,6 @@ def test_it_knows_whether_the_clock_is_set(report):
     asked = re.findall(r"^clock (-?\d) (\w+)$", report["journal"], re.MULTILINE)
     assert asked[:2] == [("-1", "False"), ("-1", "True")], report
     assert re.fullmatch("[0-5]", asked[2][0]), report
-    assert "ActiveState=active" in report["clock"]
 
 
 def test_a_second_pack_has_a_unit_of_its_own_and_shares_the_kernels(report):

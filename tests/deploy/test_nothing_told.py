@@ -1,0 +1,99 @@
+"""A service with a password and a key of its own: neither is found in anything that it tells or leaves behind."""
+
+import asyncio
+import ssl
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.command_line import PROGRAM
+from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.patience import LONG_S
+from tests.serial_line import Line, line
+from tests.sinks.certificates import Authority
+
+__all__ = ["line"]
+
+PASSWORD = "open-sesame-4711"
+PACK = """
+[pack]
+cell = "chen_mora"
+[sensor]
+port = "{folder}/board"
+protocol = "text"
+[publish]
+rate_hz = 10
+[mqtt]
+url = "mqtts://localhost:{port}"
+username = "pack"
+password_file = "mqtt-password"
+ca_file = "{folder}/ca.crt"
+cert_file = "{folder}/pack.crt"
+key_file = "pack.key"
+[state]
+folder = "{folder}/state"
+"""
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    authority = Authority(tmp_path)
+    for name in ("server", "pack"):
+        authority.vouch_for(name)
+    files = f"cafile {tmp_path}/ca.crt\ncertfile {tmp_path}/server.crt\nkeyfile {tmp_path}/server.key\n"
+    broker = Broker(tmp_path, f"{files}require_certificate true\nallow_anonymous true").start()
+    yield broker
+    broker.stop()
+
+
+async def test_a_password_and_a_key_are_told_nobody(tmp_path: Path, line: Line, broker: Broker, monkeypatch) -> None:
+    credentials = tmp_path / "credentials"
+    credentials.mkdir()
+    (credentials / "mqtt-password").write_text(PASSWORD)
+    key = (tmp_path / "pack.key").rename(credentials / "pack.key").read_text()
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(credentials))
+    secrets = [PASSWORD.encode(), key.splitlines()[1].encode()]
+    pack, capture = tmp_path / "pack.toml", tmp_path / "capture"
+    pack.write_text(PACK.format(folder=tmp_path, port=broker.port))
+    line.plug()
+    context = ssl.create_default_context(cafile=tmp_path / "ca.crt")
+    context.load_cert_chain(tmp_path / "pack.crt", credentials / "pack.key")
+    command = [PROGRAM, "run", "--record", capture, "--no-view", pack]
+    async with Listener(broker, tls_context=context) as live:
+        service = await asyncio.create_subprocess_exec(*command, stderr=asyncio.subprocess.PIPE)
+        try:
+            board = asyncio.create_task(feed(line))
+            await live.wait_json("bms/pack/state")
+            await live.wait_json("bms/pack/health", lambda health: health["sensor_online"])
+            proc = Path(f"/proc/{service.pid}")
+            told = [(proc / "cmdline").read_bytes(), (proc / "environ").read_bytes()]
+            board.cancel()
+            service.terminate()
+            assert service.stderr
+            told.append(await asyncio.wait_for(service.stderr.read(), LONG_S))
+            assert await service.wait() == 0
+        finally:
+            if service.returncode is None:
+                service.kill()
+    told += [payload for _, payload, _ in live.messages]
+    written = files_of(tmp_path)
+    assert len(written) >= 2
+    told += [path.read_bytes() for path in written]
+    assert b"broker connected" in told[2]
+    assert [secret for secret in secrets if any(secret in one for one in told)] == []
+    assert {oct(path.stat().st_mode & 0o777) for path in written if path.parent.name == "state"} == {"0o600"}
+
+
+def files_of(folder: Path) -> list[Path]:
+    """What the service has written."""
+    return [*folder.glob("capture*"), *(folder / "state").iterdir()]
+
+
+async def feed(line: Line) -> None:
+    """A board that prints text at 50 Hz."""
+    while True:
+        line.write(b"3.80,0.10,25.0\r\n")
+        await asyncio.sleep(0.02)
