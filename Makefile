@@ -12,7 +12,7 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz firmware kernels lock
+.PHONY: help venv apt audit check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -82,6 +82,9 @@ audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 
 	@[ -x $(AUDIT)/bin/python ] || $(PYTHON) -m venv $(AUDIT)
 	@$(AUDIT)/bin/pip install --quiet --disable-pip-version-check pip-audit==2.10.1
 	@$(AUDIT)/bin/python .ci/audit.py
+
+simulate: venv ## the whole service simulated: make simulate SEED=5, or many, e.g. make simulate ARGS="--seeds 1000": minutes
+	@$(BIN)/python -m tests.world $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \

@@ -16,9 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.world.loop import KilledError
-
-
 SYNC_S = 31.0
 """What a database has committed for so long is on the platter, as ``store.database`` has it."""
 
@@ -101,7 +98,19 @@ class Disk:
             if not path.name.endswith("-shm"):
                 path.write_bytes(content)
 
-    def note_databases(self, now_s: float) -> None:
+    def transaction(self, call: Callable[[], Any], now_s: float) -> Any:
+        """A call for a database, which SQLite refuses on a disk at fault.
+
+        Raises:
+            OperationalError: It does.
+        """
+        if self.full or self.broken:
+            raise sqlite3.OperationalError("database or disk is full" if self.full else "disk I/O error")
+        value = call()
+        self._note_databases(now_s)
+        return value
+
+    def _note_databases(self, now_s: float) -> None:
         """Take note of how long the logs of the databases are: what is older than ``SYNC_S`` is on the platter."""
         for path in self._databases():
             if path.name.endswith("-wal"):

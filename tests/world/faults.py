@@ -200,7 +200,7 @@ def _birth(world: "World", fault: Fault) -> None:
 KINDS: dict[str, Callable[["World", Fault], None]] = {
     "bytes flipped": _noisy(lambda share: Noise(flip=10.0 ** (-4.0 + 3.0 * share))),
     "bytes lost": _noisy(lambda share: Noise(lose=10.0 ** (-4.0 + 3.0 * share))),
-    "line mute": _noisy(lambda share: Noise(mute=True)),
+    "line mute": _noisy(lambda _: Noise(mute=True)),
     "port gone": _unplug,
     "port renamed": _rename,
     "board reset": _reset_board,

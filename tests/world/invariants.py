@@ -1,9 +1,8 @@
 """What must hold, whatever happens. Each number that bounds something stands here."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.sources.protocol import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
@@ -182,19 +181,8 @@ class Truth:
 
 
 def text(payload: bytes | None) -> str | None:
+    """A payload for people."""
     return None if payload is None else payload.decode(errors="replace")
-
-
-def numbers(value: Any) -> Iterator[float]:
-    """All numbers of a JSON value."""
-    if isinstance(value, dict):
-        for part in value.values():
-            yield from numbers(part)
-    elif isinstance(value, list):
-        for part in value:
-            yield from numbers(part)
-    elif isinstance(value, float):
-        yield value
 
 
 def is_json(payload: bytes) -> bool:

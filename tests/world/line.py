@@ -215,7 +215,7 @@ class Cable:
         self.openings: list[Opening] = []
         """Of the present process."""
         self.resets_when_opened = True
-        self.delivered: Callable[[bytes], None] = lambda data: None
+        self.delivered: Callable[[bytes], None] = lambda _: None
         """Told of what the service has been given."""
 
     def plug(self, board: Board, name: str) -> None:

@@ -6,6 +6,7 @@ module, a function or a default argument, is bound anew while the world lasts, i
 
 import contextlib
 import functools
+import os
 import random
 import secrets
 import sqlite3
@@ -14,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from threading import Thread
-from types import FunctionType, ModuleType
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 from bms_estimator.model import clock
@@ -110,6 +111,8 @@ def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], d
         setattr(module, constant, seconds)
     undo.append(functools.partial(setattr, health, "resident_mib", health.resident_mib))
     health.resident_mib = lambda: None  # it is this process's, and never the same
+    undo.append(functools.partial(setattr, os, "statvfs", os.statvfs))
+    os.statvfs = lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096)  # so is the room on this machine's disk
     for name, function in REMEMBERED:
         module = sys.modules[f"{PACKAGE}.{name}"]
         undo.append(functools.partial(setattr, module, function, getattr(module, function)))

@@ -1,7 +1,6 @@
 """Threads: a call in one takes a while, and happens all at once when the while has passed."""
 
 import random
-import sqlite3
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -65,9 +64,7 @@ class Threads:
             self._timeline.after(LOOK_S, lambda: self._work(call, future, then, database))
             return
         try:
-            if database and (self._disk.full or self._disk.broken):
-                raise sqlite3.OperationalError("database or disk is full" if self._disk.full else "disk I/O error")
-            value = call()
+            value = self._disk.transaction(call, self._timeline.now_s) if database else call()
         except LateError as late:
             error = late.error
             self._timeline.after(late.seconds, lambda: self.loop.alive and _end(future, None, error))

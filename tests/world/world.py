@@ -16,7 +16,14 @@ from typing import Any, Self
 import structlog
 
 from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.settings import MqttSettings, PackSettings, PublishSettings, SensorSettings, Settings
+from bms_estimator.model.settings import (
+    MqttSettings,
+    PackSettings,
+    PublishSettings,
+    SensorSettings,
+    Settings,
+    StateSettings,
+)
 from bms_estimator.service import serve as service
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile
 from bms_estimator.simulation.virtual_converter import BoardParts
@@ -41,6 +48,8 @@ CALM_S = 420.0
 SHARED = Path("/dev/shm")
 LAST_LINES = 60
 BOOT_S = 5.0
+LOOK_S = 5.0
+"""What costs more to look at is looked at so often [s]."""
 
 
 @dataclass
@@ -157,6 +166,7 @@ class World:
             ),
             publish=PublishSettings(rate_hz=PUBLISH_HZ),
             mqtt=MqttSettings(url="mqtt://broker"),
+            state=StateSettings(checkpoint_s=dice.choice((60.0, 300.0, 300.0))),
         )  # fmt: skip
 
     # the run
@@ -219,8 +229,6 @@ class World:
                 self.end_process(silently=False)
                 return
         process.loop.step()
-        if process.loop.faults and "MqttCodeError" in process.loop.faults[0]:
-            process.loop.faults.clear()  # aiomqtt keeps the reason of a lost connection, and may never be asked for it
         if process.loop.faults:
             self.fail(f"nobody caught: {process.loop.faults[0]}")
         if process.main is not None and process.main.done():
@@ -273,7 +281,7 @@ class World:
                 sinks=[Probe(lambda snapshot: self._published(process, snapshot))],
                 stop=process.stop,
                 folder=self.disk.folder,
-            )  # fmt: skip
+            )
         )
 
     def end_process(self, *, silently: bool) -> None:
@@ -347,8 +355,6 @@ class World:
             return
         self.said.say(snapshot.estimate.model_dump_json().encode(), process.number, self.timeline.now_s)
         self.figures["states"] += 1
-        if process.foreign:
-            return  # TODO
         if wrong := self.band.take(snapshot, self.seen_soc):
             self.fail(wrong)
 
@@ -358,6 +364,8 @@ class World:
         self._digest.update(packet.payload.replace(self._path, b"."))
         if self.say_lines:
             self.note(f"broker: {packet.topic} {packet.payload[:60]!r}")
+        if connection is not None and packet.payload[:1] == b"{" and not invariants.is_json(packet.payload):
+            self.fail(f"{packet.topic} is no strict JSON: {packet.payload[:200]!r}")
         if packet.topic == f"{ROOT}/state" and (wrong := self.said.take(packet, connection)):
             self.fail(wrong)
 
@@ -367,15 +375,14 @@ class World:
         """Once a second."""
         now_s = self.timeline.now_s
         process = self.process
-        if process is not None and not process.loop.busy and now_s >= process.loop.frozen_until_s:
+        idle = process is not None and not process.loop.busy and now_s >= process.loop.frozen_until_s
+        if process is not None and idle and now_s % LOOK_S < 1.0:
             self._check_counts(process)
-            if now_s % 10.0 < 1.0:
-                self._check_memory(process)
+            self._check_memory(process)
+            self._check_board(process)
         self._check_availability(now_s)
         if self.disk.bad:
             self.disk_good_s = now_s + RETRY_S
-        if process is not None and self.disk.connections:
-            self.disk.note_databases(now_s)
         self.timeline.after(1.0, self._look)
 
     def _check_counts(self, process: Process) -> None:
@@ -388,6 +395,14 @@ class World:
             held = process.board._door.stranger is not None
             if taken != process.reference.samples and not held:
                 self.fail(f"{process.reference.samples} samples came, {taken} are counted: {counters}")
+
+    def _check_board(self, process: Process) -> None:
+        """The samples that are taken are the pack's own board's."""
+        if process.board is None:
+            return
+        taken = process.board.board.get("serial")
+        if taken == f"{self.foreigner.serial_number:08x}":
+            self.fail(f"board {taken} is taken for the pack's")
 
     def _reads(self, process: Process) -> int:
         return int(process.board._line._reads.qsize())
@@ -495,6 +510,7 @@ POWER_S = 37.0
 """The same of a power cut: a commit reaches the platter within half a minute."""
 RETRY_S = 25.0
 """So long after a disk has been at fault it is used again: a hung call is given 10 s, and 10 s pass until the next."""
-ONLINE_S = 90.0
+ONLINE_S = 45.0
 """So long after the broker can be told the retained availability is right."""
-SENSOR_ONLINE_S = 120.0
+SENSOR_ONLINE_S = 50.0
+"""The same of the sensor's; samples count as gone after three publish periods of 10 s."""

@@ -1,0 +1,86 @@
+"""``make simulate``: worlds from seeds.
+
+python -m tests.world --seed 5              one world; its log where something does not hold
+python -m tests.world --seeds 1000          many, on all processors
+python -m tests.world --seed 5 --hours 24   longer
+"""
+
+import argparse
+import gc
+import multiprocessing
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+
+from bms_estimator.service.warm_up import load_kernels
+from tests.world.world import Result, World
+
+HOUR_S = 3600.0
+
+
+def run(seed: int, seconds: float) -> Result:
+    """One world."""
+    result = World(seed, seconds).run()
+    gc.collect()
+    return result
+
+
+def main() -> int:
+    """As the module says. Returns 1 where something did not hold."""
+    parser = argparse.ArgumentParser(prog="make simulate", description="The whole service, simulated from one seed.")
+    parser.add_argument("--seed", type=int, default=None, help="one world")
+    parser.add_argument("--seeds", type=int, default=20, help="so many worlds")
+    parser.add_argument("--first", type=int, default=0, help="the first seed of many")
+    parser.add_argument("--hours", type=float, default=1.0, help="how long a world lasts")
+    parser.add_argument("--processes", type=int, default=os.cpu_count(), help="worlds at the same time")
+    options = parser.parse_args()
+    load_kernels()
+    gc.disable()  # nothing is collected in the middle of a world
+    if options.seed is not None:
+        return _show(run(options.seed, options.hours * HOUR_S), log=True)
+    return _many(options)
+
+
+def _show(result: Result, *, log: bool = False) -> int:
+    """A line of a world, and its last lines where it failed."""
+    if log:
+        _say("\n".join(result.log))
+    band = result.band
+    share = 100.0 * band.inside / max(band.states, 1)
+    figures = ", ".join(f"{name} {value:g}" for name, value in result.figures.items())
+    _say(
+        f"seed {result.seed}: {result.wrong or 'all holds'}; SOC off by {100.0 * band.worst_error:.1f} % and "
+        f"{band.worst_stds:.1f} std at most, {share:.0f} % within 2 std; {figures}; digest {result.digest}"
+    )
+    return int(bool(result.wrong))
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def _many(options: argparse.Namespace) -> int:
+    begun_s, failed, stds, errors = time.monotonic(), [], [], []
+    seeds = range(options.first, options.first + options.seeds)
+    context = multiprocessing.get_context("fork")  # with what is compiled
+    with ProcessPoolExecutor(options.processes, context) as pool:
+        for result in pool.map(partial(run, seconds=options.hours * HOUR_S), seeds):
+            stds.append(result.band.worst_stds)
+            errors.append(result.band.worst_error)
+            if result.wrong:
+                failed.append(result.seed)
+                _say(f"make simulate SEED={result.seed}: {result.wrong}")
+    seconds = time.monotonic() - begun_s
+    _say(
+        f"{len(seeds)} worlds of {options.hours:g} h in {seconds:.0f} s, {seconds / len(seeds):.2f} s each on "
+        f"{options.processes} processors; SOC off by {100.0 * max(errors):.1f} % and {max(stds):.1f} std at most; "
+        f"{len(failed)} failed"
+    )
+    return int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,50 @@
+"""The service with a fault built in: what a simulation that finds nothing must still find."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from bms_estimator.service.checkpoint import CheckpointFile
+from bms_estimator.sinks.messages import Messages
+from bms_estimator.store.queue import Queue
+
+
+@contextlib.contextmanager
+def no_rewind() -> Iterator[None]:
+    """What was on its way when a connection broke is not sent again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Queue, "rewind", lambda _: None)
+        yield
+
+
+@contextlib.contextmanager
+def no_fsync() -> Iterator[None]:
+    """A checkpoint takes its name before its bytes are on the disk."""
+    written = CheckpointFile._write
+
+    def write(self: CheckpointFile, *arguments: Any) -> None:
+        kept, os.fsync = os.fsync, lambda _: None
+        try:
+            written(self, *arguments)
+        finally:
+            os.fsync = kept
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CheckpointFile, "_write", write)
+        yield
+
+
+@contextlib.contextmanager
+def no_sensor_availability() -> Iterator[None]:
+    """That the sensor has gone silent is not said."""
+    said = Messages._sensor
+
+    def sensor(self: Messages, health: Any) -> Any:
+        return said(self, health.model_copy(update={"sensor_online": True}))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Messages, "_sensor", sensor)
+        yield

@@ -1,0 +1,48 @@
+"""The whole service from a seed: short worlds, twice the same, and faults built in that must be found."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+import pytest
+
+from tests.world.faults import Fault
+from tests.world.mutants import no_fsync, no_rewind, no_sensor_availability
+from tests.world.world import World
+
+SEEDS = range(3)
+WORLD_S = 1000.0
+"""The last seven minutes of them are calm."""
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_all_holds_in_a_world(seed: int) -> None:
+    result = World(seed, WORLD_S).run()
+    assert not result.wrong, "\n".join([*result.log, f"make simulate SEED={seed}: {result.wrong}"])
+
+
+def test_a_seed_gives_the_same_bits_each_time() -> None:
+    first, second = World(7, 600.0).run(), World(7, 600.0).run()
+    assert first.digest == second.digest
+    assert first.figures == second.figures
+
+
+@pytest.mark.parametrize(
+    ("mutant", "faults", "found"),
+    [
+        (no_rewind, [Fault(60.0, "connections half open", 60.0, 0.5)], "the broker never got"),
+        (no_fsync, [Fault(60.0 + 7.0 * n, "power cut", 2.0, 0.5) for n in range(1, 40)], "the checkpoint is refused"),
+        (no_sensor_availability, [Fault(60.0, "port gone", 120.0, 0.5)], "sensor availability"),
+    ],
+)
+def test_a_fault_that_is_built_in_is_found(
+    mutant: Callable[[], AbstractContextManager[None]], faults: list[Fault], found: str
+) -> None:
+    with mutant():
+        result = World(1, 700.0, faults).run()
+    assert found in result.wrong
+
+
+def test_a_broker_that_does_not_answer_a_connection_in_time_leaves_no_fault_in_the_loop() -> None:
+    result = World(1, 600.0, [Fault(60.0, "broker frozen", 60.0, 0.5)]).run()
+    assert not result.wrong
+    assert any("no answer within" in line for line in result.log)
