@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from bms_estimator.sinks.connection import Hello, LinkError, Received
+from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING, Inbox
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sinks.reasons import UNSUPPORTED_VERSION, words
 
@@ -26,10 +27,6 @@ PARTING_S = 1.0
 """A connection that broke cannot be ended in good order [s]."""
 NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 """Small messages go at once."""
-MOST_WAITING = 100
-"""Messages that wait to be read; more are lost."""
-MOST_BYTES = 16_384
-"""Nothing that comes is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
 HEAD_BYTES = 16
 """What a published message has beside topic and payload, at most."""
 SOCKET_BROKE = "failed to receive on socket: "
@@ -247,26 +244,3 @@ def may_know_3_1_1(error: aiomqtt.MqttError) -> bool:
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
         return error.rc.value == UNSUPPORTED_VERSION
     return isinstance(error, ClosedError)
-
-
-class Inbox(asyncio.Queue[aiomqtt.Message]):
-    """What waits to be read; bounded in bytes, too, and without a log line for each message that is lost.
-
-    Args:
-        lose: Hears why and on which topic a message is lost.
-        maxsize: Messages.
-    """
-
-    def __init__(self, lose: Callable[[str, str], None], maxsize: int) -> None:
-        super().__init__(maxsize)
-        self._lose = lose
-
-    def put_nowait(self, item: aiomqtt.Message) -> None:
-        """Take a message, or say that it is lost."""
-        topic = item.topic.value
-        if len(topic) + len(item.payload) > MOST_BYTES:
-            self._lose("too_long", topic)
-        elif self.full():
-            self._lose("overflow", topic)
-        else:
-            super().put_nowait(item)

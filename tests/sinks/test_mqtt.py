@@ -16,9 +16,9 @@ from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import CORRECTION_S
 from bms_estimator.sinks.brokers import brokers, check
-from bms_estimator.sinks.client import MOST_BYTES, MOST_WAITING, Inbox
 from bms_estimator.sinks.connection import Connection, Hello
 from bms_estimator.sinks.dial import Dial
+from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING, Inbox
 from bms_estimator.sinks.link import LONGEST_DELAY_S, Link
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sinks.mqtt import MqttSink

@@ -1,0 +1,34 @@
+"""What came from the broker and waits to be read."""
+
+import asyncio
+from collections.abc import Callable
+
+import aiomqtt
+
+MOST_WAITING = 100
+"""Messages that wait to be read; more are lost."""
+MOST_BYTES = 16_384
+"""Nothing that comes is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
+
+
+class Inbox(asyncio.Queue[aiomqtt.Message]):
+    """What waits to be read; bounded in bytes, too, and without a log line for each message that is lost.
+
+    Args:
+        lose: Hears why and on which topic a message is lost.
+        maxsize: Messages.
+    """
+
+    def __init__(self, lose: Callable[[str, str], None], maxsize: int) -> None:
+        super().__init__(maxsize)
+        self._lose = lose
+
+    def put_nowait(self, item: aiomqtt.Message) -> None:
+        """Take a message, or say that it is lost."""
+        topic = item.topic.value
+        if len(topic) + len(item.payload) > MOST_BYTES:
+            self._lose("too_long", topic)
+        elif self.full():
+            self._lose("overflow", topic)
+        else:
+            super().put_nowait(item)
