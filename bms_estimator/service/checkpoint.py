@@ -22,9 +22,9 @@ from bms_estimator.model.cell import ChenMoraOcv
 from bms_estimator.model.estimate import Totals
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.disk_thread import DiskThread
 from bms_estimator.service.moment import Moment, moment
 from bms_estimator.snapshot.totals import new_totals
+from bms_estimator.store.disk_thread import DiskThread
 
 FORMAT = 6
 """Raise it when a field of an old name gets another meaning, and tell ``_MIGRATIONS`` how to read those before."""

@@ -9,7 +9,7 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.disk_thread import DiskThread
+from bms_estimator.store.disk_thread import DiskThread
 
 log = structlog.get_logger(__name__)
 

@@ -6,12 +6,12 @@ import sqlite3
 import stat
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import structlog
 
+from bms_estimator.store.disk_thread import DiskThread
 from bms_estimator.store.tables import NewerVersionError, migrate
 
 HANG_S = 10.0
@@ -54,8 +54,8 @@ class Database:
     def __init__(self, path: Path, *, hang_s: float = HANG_S, retry_s: float = RETRY_S) -> None:
         self.path, self.reason = path, ""
         self._hang_s, self._retry_s = hang_s, retry_s
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="database")
-        self._stuck: Future[Any] | None = None
+        self._thread = DiskThread("database")
+        self._stuck: asyncio.Future[Any] | None = None
         self._failed_s = -retry_s
         self._file = _File(path)
 
@@ -67,7 +67,6 @@ class Database:
         """Close the file, unless the disk hangs."""
         closing = self._thread.submit(self._file.close)
         await asyncio.wait([asyncio.wrap_future(closing)], timeout=self._hang_s)
-        self._thread.shutdown(wait=False)
 
     @property
     def opened(self) -> int:
@@ -89,7 +88,7 @@ class Database:
         if not done:
             waiter.add_done_callback(lambda late: late.cancelled() or late.exception())
             if not running.cancel():
-                self._stuck = running
+                self._stuck = waiter
             raise self._failure(f"the disk has not answered for {self._hang_s:g} s")
         try:
             result = waiter.result()

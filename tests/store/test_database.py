@@ -5,6 +5,8 @@ import os
 import shutil
 import sqlite3
 import stat
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -169,3 +171,23 @@ async def test_room_that_is_free_goes_back_to_the_file_system(path):
         for _ in range(5):
             await database.call(numbers)
     assert path.stat().st_size <= 4096 * (FREE_PAGES + 100)
+
+
+HUNG = """
+import asyncio, pathlib, sys, threading
+from bms_estimator.store.database import Database, StoreError
+
+async def main():
+    async with Database(pathlib.Path(sys.argv[1]), hang_s=0.05) as database:
+        try:
+            await database.call(lambda _: threading.Event().wait())
+        except StoreError as error:
+            print(error)
+
+asyncio.run(main())
+"""
+
+
+def test_a_process_ends_though_its_disk_hangs(path):
+    ended = subprocess.run([sys.executable, "-c", HUNG, path], timeout=LONG_S, capture_output=True, check=True)
+    assert b"has not answered" in ended.stdout

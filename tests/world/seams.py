@@ -20,8 +20,8 @@ from typing import Any
 
 from bms_estimator.model import clock
 from bms_estimator.service import moment
-from bms_estimator.service.disk_thread import DiskThread
 from bms_estimator.snapshot import health
+from bms_estimator.store.disk_thread import DiskThread
 from tests.world.disk import Disk
 from tests.world.threads import Threads
 
