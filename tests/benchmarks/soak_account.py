@@ -15,8 +15,8 @@ BAND = 3.0
 """Half the width of the band of the SOC, in its published standard deviations."""
 MOST_JUMP = 0.005
 """Of the SOC at a restart, beyond what flowed meanwhile."""
-UNSEEN_S = 2.5
-"""States come twice a second: so long without one is a gap, unless it is known why [s]."""
+UNSEEN_S = 5.0
+"""States come twice a second: so long without one is a gap, unless it is known why; a busy machine is late [s]."""
 MOST_RSS_MIB = 300.0
 
 Interval = tuple[float, float]
