@@ -41,6 +41,8 @@ FINEST_S = 0.1
 """The load goes on so finely while nobody measures [s]."""
 SERVICE_S, LINE_S, BROKER_S = 6.0, 7.0, 20.0
 """Means of the time from one kill to the next [s]."""
+WHILE_IT_STARTS = 0.2
+"""Part of the services that are not waited for before the time to their next kill begins."""
 LONGEST_AWAY_S = 6.0
 """A broker or a board is away for up to so long [s]."""
 KEPT_BROKER = (
@@ -151,6 +153,8 @@ class Soak:
                 return
             self.killed[name] += 1
             await kill()
+            if name == "service" and self.dice.random() > WHILE_IT_STARTS:
+                await self._states_after(time.time())
 
     async def _start(self) -> asyncio.subprocess.Process:
         with self.log.open("a") as log:
