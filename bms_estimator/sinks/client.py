@@ -118,6 +118,8 @@ class Client(aiomqtt.Client):
                 async with asyncio.timeout(self._acknowledged_s):
                     return await answer
             except TimeoutError:
+                if answer.done() and not answer.cancelled():  # both came while the process stood still
+                    return answer.result()
                 raise LinkError(f"the broker has not acknowledged a message for {self._acknowledged_s:g} s") from None
             finally:
                 self._answers.pop(info.mid, None)

@@ -92,7 +92,8 @@ def _swap(world: "World", fault: Fault) -> None:
 
 
 def _reset_board(world: "World", fault: Fault) -> None:
-    world.cable.send(world.board.reset())
+    if world.cable.board is not None:
+        world.cable.send(world.cable.board.reset())
 
 
 def _broker_down(world: "World", fault: Fault) -> None:
