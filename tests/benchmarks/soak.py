@@ -225,10 +225,14 @@ class Soak:
         self.wanted.set()
 
     async def _states_after(self, moment_s: float) -> None:
-        async with asyncio.timeout(LONG_S):
-            while not self.account.states or self.account.states[-1].time_s <= moment_s:
-                self.wanted.clear()
-                await self.wanted.wait()
+        try:
+            async with asyncio.timeout(LONG_S):
+                while not self.account.states or self.account.states[-1].time_s <= moment_s:
+                    self.wanted.clear()
+                    await self.wanted.wait()
+        except TimeoutError:
+            log = await asyncio.to_thread(self.log.read_text)
+            raise AssertionError(f"no state came; the service said: {log[-3000:]}") from None
 
     async def _watch(self) -> None:
         """Memory of the service, and when this machine had no time for anybody."""
