@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 SYNC_S = 31.0
-"""What a database has committed for so long is on the platter, as ``store.database`` has it."""
+"""What a database has committed for so long is on the platter: ``store.database`` sees to it with its next transaction, the
+system's own writing back without one."""
 
 
 class PowerCutError(BaseException):
@@ -119,20 +120,19 @@ class Disk:
                 if sizes and sizes[-1][1] > size:
                     sizes.clear()  # a new log
                 sizes.append((now_s, size))
-                while len(sizes) > 1 and sizes[1][0] < now_s - SYNC_S:
-                    sizes.popleft()
 
     def _databases(self) -> list[Path]:
         return sorted(path for path in self.folder.iterdir() if ".sqlite" in path.name)
 
-    def cut(self) -> None:
+    def cut(self, now_s: float) -> None:
         """The power is cut: leave what is on the platter, and of the rest what chance leaves."""
         databases = {path: path.read_bytes() for path in self._databases()}
         self._cut_files()
         for path, content in databases.items():
             if path.name.endswith("-wal"):
-                sizes = self._logs.get(path.name)
-                least = min(sizes[0][1], len(content)) if sizes else 0
+                sizes = self._logs.get(path.name, deque())
+                least = max((size for at_s, size in sizes if at_s < now_s - SYNC_S), default=0)
+                least = min(least, len(content))
                 path.write_bytes(content[: self._dice.randint(least, len(content))])
             else:
                 path.write_bytes(content)

@@ -249,8 +249,7 @@ class World:
 
     def _forgotten_s(self, *, clean: bool, silently: bool) -> float:
         """What the service had heard or said for longer outlives its end [s]."""
-        trouble_s = self.timeline.now_s - self.disk_good_s
-        if trouble_s > 0.0 or self.disk.bad:
+        if self.disk.bad or self.timeline.now_s < self.disk_good_s:
             return math.inf
         return POWER_S if silently else 0.0 if clean else KILL_S
 
@@ -313,7 +312,7 @@ class World:
         self.note("power cut")
         self.powered = False
         self.end_process(silently=True)
-        self.disk.cut()
+        self.disk.cut(self.timeline.now_s)
 
         def back() -> None:
             self.powered = True
