@@ -98,6 +98,7 @@ def _reset_board(world: "World", fault: Fault) -> None:
 
 def _broker_down(world: "World", fault: Fault) -> None:
     if world.broker.up:
+        world.will_certain &= world.process is not None or not world.broker.connections  # a will goes with its broker
         world.broker.stop(forgets=fault.share < 0.3)
         world.timeline.after(fault.seconds, world.broker.start)
 
