@@ -29,6 +29,11 @@ CellBlock = NDArray[np.float64]
 NO_CELLS: CellBlock = np.empty((0, 0))
 """Of a block without any, however long it is."""
 
+LEAST_C, MOST_C = -60.0, 200.0
+"""No sensor on a pack or a stack says anything beyond [degC]."""
+LEAST_CELL_V, MOST_CELL_V = -5.0, 10.0
+"""No single cell has a voltage beyond, be it reversed [V]."""
+
 
 class SampleStatus(IntFlag):
     """What the board says of a sample."""
@@ -38,3 +43,10 @@ class SampleStatus(IntFlag):
     OVERRUN = 4
     RESET = 8
     GAP = 16
+
+
+def forget_beyond(values: NDArray[np.float64], least: float, most: float) -> int:
+    """Make NaN, in place, what is outside ``least``..``most``. Returns how many there were."""
+    beyond = (values < least) | (values > most)
+    values[beyond] = np.nan
+    return int(np.count_nonzero(beyond))

@@ -1,19 +1,12 @@
-"""Foreign text to numbers: decimal ones and nothing else, and which of them a sensor on a pack may say."""
+"""Foreign text to numbers: decimal ones and nothing else."""
 
 import math
 import re
-
-import numpy as np
-from numpy.typing import NDArray
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 """A decimal number. Python's ``float`` also takes ``3_9`` for 39, other scripts' digits, ``nan`` and ``inf``."""
 NOT_MEASURED = frozenset({"nan", "inf", "infinity", "ovf"})
 """What programs print, perhaps with a sign, where there is no number."""
-LEAST_C, MOST_C = -60.0, 200.0
-"""No sensor on a pack or a stack says anything beyond [degC]."""
-LEAST_CELL_V, MOST_CELL_V = -5.0, 10.0
-"""No single cell has a voltage beyond, be it reversed [V]."""
 
 _WHOLE = re.compile(NUMBER)
 
@@ -37,10 +30,3 @@ def measured(text: str) -> float:
         ValueError: It is neither.
     """
     return math.nan if text.strip().lstrip("+-").lower() in NOT_MEASURED else number(text)
-
-
-def forget_beyond(values: NDArray[np.float64], least: float, most: float) -> int:
-    """Make NaN, in place, what is outside ``least``..``most``. Returns how many there were."""
-    beyond = (values < least) | (values > most)
-    values[beyond] = math.nan
-    return int(np.count_nonzero(beyond))

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import LEAST_C, MOST_C, SAMPLE, SampleBlock, forget_beyond
 from bms_estimator.sources.frames import CurrentSign
-from bms_estimator.sources.number import LEAST_C, MOST_C, forget_beyond, measured
+from bms_estimator.sources.number import measured
 
 BLOCK_ROWS = 65_536
 

@@ -5,10 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import LEAST_C, LEAST_CELL_V, MOST_C, MOST_CELL_V, SAMPLE, SampleBlock, forget_beyond
 from bms_estimator.sources.dialects import Dialect, cell_block
 from bms_estimator.sources.frames import PRINTABLE, CurrentSign
-from bms_estimator.sources.number import LEAST_C, LEAST_CELL_V, MOST_C, MOST_CELL_V, forget_beyond
 from bms_estimator.sources.text_line import Reading, read_line
 
 LINE_BYTES = 1024
