@@ -145,6 +145,7 @@ class VirtualBoard:
         self._line = bytearray()
         self._drained = asyncio.Event()
         self._master = self._slave = -1
+        self._loop: asyncio.AbstractEventLoop | None = None
         self.path = ""
         """Of the pseudo-terminal."""
         self.time_s = 0.0
@@ -163,6 +164,7 @@ class VirtualBoard:
 
     def __exit__(self, *_: object) -> None:
         """Pull the plug: the host's descriptor dies."""
+        self._unhear()  # before its number is given to another: a loop that still knew it would not hear that one
         for descriptor in (self._master, self._slave):
             if descriptor >= 0:
                 os.close(descriptor)
@@ -170,7 +172,7 @@ class VirtualBoard:
 
     async def run(self, seconds: float = math.inf) -> None:
         """Sample and send for ``seconds`` of the board's time, or until the signal ends."""
-        loop = asyncio.get_running_loop()
+        self._loop = loop = asyncio.get_running_loop()
         loop.add_reader(self._master, self._hear)
         try:
             await self._sample_until(self.time_s + seconds, loop)
@@ -178,8 +180,14 @@ class VirtualBoard:
                 async with asyncio.timeout(None if math.isinf(self._speed) else _PATIENCE_S):
                     await self._drain()
         finally:
-            loop.remove_reader(self._master)
-            loop.remove_writer(self._master)
+            self._unhear()
+
+    def _unhear(self) -> None:
+        """The loop in which it runs, if it does, looks at the line no longer."""
+        if self._loop is not None and self._master >= 0:
+            self._loop.remove_reader(self._master)
+            self._loop.remove_writer(self._master)
+        self._loop = None
 
     async def run_for_host(self) -> None:
         """``run`` from when a host opens the line: samples before would be lost."""
