@@ -25,6 +25,7 @@ from bms_estimator.model.settings import Settings
 from bms_estimator.service.moment import Moment, moment
 from bms_estimator.snapshot.totals import new_totals
 from bms_estimator.store.disk_thread import DiskThread
+from bms_estimator.store.private_file import write_private
 
 FORMAT = 6
 """Raise it when a field of an old name gets another meaning, and tell ``_MIGRATIONS`` how to read those before."""
@@ -151,18 +152,7 @@ class CheckpointFile:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         disk = os.statvfs(self.path.parent)
         self.disk_free_mib = disk.f_bavail * disk.f_frsize / 2**20
-        new = self.path.with_suffix(".new")
-        new.unlink(missing_ok=True)
-        with open(new, "xb", opener=_private) as file:
-            file.write(packed.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(self.path)
-        folder = os.open(self.path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        write_private(self.path, packed.getbuffer())
         self._content = content
         self._remove_oldest()
 
@@ -263,10 +253,6 @@ def _migrated(file: File) -> File:
     for step in range(version, FORMAT):
         file = _MIGRATIONS[step](file)
     return file
-
-
-def _private(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)
 
 
 def _read(path: Path) -> bytes:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import structlog
 
+from bms_estimator.store.private_file import write_private
+
 REMEMBERED = ("serial", "divider", "volts_per_ampere", "bandgap_v")
 """Of what a board says of itself."""
 NO_BOARD: Mapping[str, str] = dict.fromkeys(REMEMBERED, "")
@@ -51,13 +53,7 @@ class BoardMemory:
         Raises:
             OSError: The disk does not take it.
         """
-        new = self.path.with_suffix(".new")
-        new.unlink(missing_ok=True)
-        with open(new, "xb", opener=lambda path, flags: os.open(path, flags, 0o600)) as file:
-            file.write(json.dumps(dict(board)).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(self.path)
+        write_private(self.path, json.dumps(dict(board)).encode() + b"\n")
 
 
 def _checked(found: object) -> Mapping[str, str]:

@@ -3,6 +3,7 @@
 Another board has another divider: its voltages would be wrong by several percent, and nothing else would tell.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from threading import Thread
@@ -15,6 +16,9 @@ from bms_estimator.sources.line import Read
 
 HELD_READS = 4096
 """So many reads are kept for a board that has not told its serial number yet: seconds at any rate."""
+
+RETRY_S = 10.0
+"""A disk that did not take the board is tried again so often [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -35,7 +39,9 @@ class Doorkeeper:
     def __init__(self, make: Callable[[], Dialect], serial: str = "", memory: BoardMemory | None = None) -> None:
         self._make, self._told, self._memory = make, serial, memory
         self._known: Mapping[str, str] = memory.load() if memory else {}
-        self._nameless = self._looking = False
+        self._kept = self._known  # on disk
+        self._nameless = self._looking = self._keeping = self._failed = False
+        self._tried_s = -math.inf
         self.stranger: Dialect | None = None
         """What hears a board that is not known yet."""
         self._held = deque[Read](maxlen=HELD_READS)
@@ -60,7 +66,7 @@ class Doorkeeper:
         """In a thread of its own: a disk that hangs holds up nothing."""
         try:
             if memory.load() == NO_BOARD:
-                self._known = NO_BOARD
+                self._known = self._kept = NO_BOARD
         finally:
             self._looking = False
 
@@ -82,16 +88,25 @@ class Doorkeeper:
         self.stranger = None
         return list(self._held)
 
-    def know(self, board: Mapping[str, str]) -> None:
-        """Samples of ``board`` are taken: it is the pack's from now on. What has changed is said, and remembered."""
+    def know(self, board: Mapping[str, str], now_s: float) -> None:
+        """Samples of ``board`` are taken: it is the pack's from now on. What has changed is said, and remembered.
+
+        Args:
+            board: What it says of itself.
+            now_s: Monotonic clock [s].
+        """
         if not board:
             return
         if not board.get("serial"):
             self._say_nameless()
             return
         before, self._known = self._known, {name: board.get(name, "") for name in REMEMBERED}
-        if self._known == before:
-            return
+        if self._known != before:
+            self._say_new(before)
+        if self._known != self._kept:
+            self._remember(now_s)
+
+    def _say_new(self, before: Mapping[str, str]) -> None:
         changes = [name for name in REMEMBERED if before.get(name) and before[name] != self._known[name]]
         if changes:
             changed = {name: f"{before[name]} to {self._known[name]}" for name in changes}
@@ -100,8 +115,25 @@ class Doorkeeper:
             )
         else:
             log.info("this is the pack's board from now on", **self._known)
-        if self._memory:  # a disk that hangs holds up nothing
-            Thread(target=_keep, args=(self._memory, self._known), daemon=True).start()
+
+    def _remember(self, now_s: float) -> None:
+        """A disk that hangs holds up nothing; one that failed is tried again while samples come."""
+        if self._memory is None or self._keeping or (self._failed and now_s - self._tried_s < RETRY_S):
+            return
+        self._keeping, self._tried_s = True, now_s
+        Thread(target=self._keep, args=(self._memory, self._known), daemon=True).start()
+
+    def _keep(self, memory: BoardMemory, board: Mapping[str, str]) -> None:
+        """In a thread of its own."""
+        try:
+            memory.keep(board)
+            self._kept, self._failed = board, False
+        except OSError as error:
+            if not self._failed:
+                log.warning("the board cannot be remembered yet", file=str(memory.path), reason=str(error))
+            self._failed = True
+        finally:
+            self._keeping = False
 
     def _check(self, found: str) -> None:
         """Let a board in.
@@ -129,10 +161,3 @@ class Doorkeeper:
                 "the board has no serial number: another in its place would not be noticed",
                 hint="give it one with `bms-estimator board --serial`",
             )
-
-
-def _keep(memory: BoardMemory, board: Mapping[str, str]) -> None:
-    try:
-        memory.keep(board)
-    except OSError as error:
-        log.warning("the board cannot be remembered", file=str(memory.path), reason=str(error))

@@ -256,20 +256,21 @@ class SerialBoard:
         if not self._refused:
             self._message = f"{path}: open, no frame yet"
             log.info("port opened", port=path, baud=self._settings.baud)
-        heard_s, frames = self._monotonic(), self._frames()
+        heard_s, frames = self._monotonic(), self._dialect.counters["frames_received"]
         while not self._line.lost.is_set():
             await self._talk()
             now_s = self._monotonic()
-            if self._frames() != frames:
-                heard_s, frames = now_s, self._frames()
-                self._door.know(self.board)
+            counters = self._dialect.counters
+            if counters["frames_received"] != frames:
+                heard_s, frames = now_s, counters["frames_received"]
+                self._door.know(self.board, now_s)
             elif self._refused:
                 continue
             elif fault := self._listener.fault:
                 self._say_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
             elif now_s - heard_s >= self._silent_s:
                 self._say_or_leave(f"{path}: open, but silent")
-            self._log_faults()
+            self._log_faults(counters)
 
     def _say_or_leave(self, message: str) -> None:
         """Say why no samples come, and look elsewhere where the board only might be."""
@@ -288,9 +289,6 @@ class SerialBoard:
                     await self._line.lost.wait()
                     return
 
-    def _frames(self) -> int:
-        return self._dialect.counters["frames_received"]
-
     def _say(self, message: str) -> None:
         """Say why no samples come, once for each reason."""
         self._tended_s = self._monotonic()
@@ -298,9 +296,9 @@ class SerialBoard:
             log.warning("no samples", reason=message)
         self._message, self._refused = message, False
 
-    def _log_faults(self) -> None:
+    def _log_faults(self, counters: Mapping[str, int]) -> None:
         """Log that the line has new faults, rarely."""
-        counted = {name: n for name, n in self._dialect.counters.items() if name not in _NO_FAULTS and n}
+        counted = {name: n for name, n in counters.items() if name not in _NO_FAULTS and n}
         faults = sum(counted.values())
         now_s = self._monotonic()
         if faults != self._logged_faults and now_s - self._logged_s >= JUNK_LOG_S:

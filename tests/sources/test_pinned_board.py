@@ -23,7 +23,7 @@ from bms_estimator.model.settings import PackSettings, SensorSettings, Settings
 from bms_estimator.service.serve import serve
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading
-from bms_estimator.sources import ports, serial_board
+from bms_estimator.sources import doorkeeper, ports, serial_board
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.serial_board import SerialBoard
 from tests.collector import Collector
@@ -301,6 +301,21 @@ async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_
         told = await served(lambda s: "refused" in (s.health.sensor_message or ""))
     assert "board 00000002 is not the pack's, 00000001" in (told.health.sensor_message or "")
     assert told.health.samples["samples"] <= 1  # that of the checkpoint
+
+
+async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_it_does(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doorkeeper, "RETRY_S", 0.05, raising=False)
+    memory, said = BoardMemory(tmp_path / "gone", "house"), "the board cannot be remembered"
+    with capture_logs() as logs:
+        async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
+            await until(lambda: [line for line in logs if said in line["event"]])
+            seen = len(taken.blocks)
+            await until(lambda: len(taken.blocks) > seen + 3)
+            memory.path.parent.mkdir()
+            await remembered(memory, "00000001")
+    assert len([line for line in logs if said in line["event"]]) == 1
 
 
 def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memory: BoardMemory) -> None:
