@@ -4,5 +4,5 @@ import re
 
 
 def without_secrets(text: str) -> str:
-    """Text of a URL, or of several, without the name and the password that may stand before an @."""
-    return re.sub(r"//.*@", "//***@", text, flags=re.DOTALL)
+    """Text of a URL, or of several, without what stands before the last @: a name and a password, however it is written."""
+    return re.sub(r".*@", "***@", text, flags=re.DOTALL)

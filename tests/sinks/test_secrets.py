@@ -21,6 +21,9 @@ URLS = [
     f"http://me:{SECRET}@host",
     f"mqtt://:{SECRET}@host:99999",
     f"mqtt://me:{SECRET} more@host",
+    f"mqtt:/me:{SECRET}@host",
+    f"mqtt:me:{SECRET}@host",
+    f"me:{SECRET}@host:1883",
 ]
 
 
