@@ -48,7 +48,8 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
     health = snapshot.health
     if before is None:
         started = _Found("start", f"checkpoint: {health.checkpoint}")
-        found = [started, *_sensor(None, health), *_suspicions([], health.suspects), *_checkpoint("", health)]
+        found = [started, *_unseen(health.unseen_s or 0.0), *_sensor(None, health)]
+        found += [*_suspicions([], health.suspects), *_checkpoint("", health)]
     elif before.health is health:
         return []
     else:

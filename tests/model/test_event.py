@@ -66,6 +66,17 @@ def test_time_that_nobody_measured_is_told_with_its_length():
     assert events(unseen(2.0), unseen(2.5)) == []
 
 
+def test_time_that_nobody_measured_before_the_start_is_told_whether_the_first_health_counts_it_or_a_later_one():
+    at_once = with_health(unseen_s=3600.0, total=unseen(3600.0).health.total)
+    assert [(event.name, event.text) for event in events(None, at_once)][:2] == [
+        ("start", f"checkpoint: {ONE.health.checkpoint}"),
+        ("unseen", "nobody measured for 3600.0 s"),
+    ]
+    assert events(at_once, unseen(3600.0)) == []
+    assert "unseen" not in names(None, with_health(unseen_s=None, total=unseen(60.0).health.total))
+    assert "unseen" not in names(None, with_health(unseen_s=0.5))
+
+
 def test_nothing_happens_between_equal_snapshots():
     assert events(ONE, ONE) == []
     assert events(ONE, with_health()) == []

@@ -42,6 +42,7 @@ async def test_states_of_an_outage_outlive_a_kill_and_come_first_in_order_and_on
     await asyncio.to_thread(broker.start)
     async with Listener(broker) as live, service(pack) as process:
         await live.wait_json("bms/pack/state", lambda state: state["time"] > kept[-1][1])
+        await live.wait_json("bms/pack/event", lambda event: event["name"] == "unseen")
         await ended(process)
         heard = [(topic, json.loads(payload)["time"]) for topic, payload, _ in live.messages if topic in TOPICS]
     board.cancel()
