@@ -1,6 +1,7 @@
 """A pack's SQLite file, in a thread of its own: the event loop never waits for the disk, nor fails with it."""
 
 import asyncio
+import contextlib
 import os
 import sqlite3
 import stat
@@ -138,12 +139,13 @@ class _File:
             connection.execute("BEGIN IMMEDIATE")
             result = work(connection)
             connection.execute("COMMIT")
-            _trim(connection)
         except BaseException:
             self.close()
             raise
         if due:
             self._synced_s = time.monotonic()
+        with contextlib.suppress(sqlite3.Error):  # what is written is written; what ails the disk the next one says
+            _trim(connection)
         return result
 
     def close(self) -> None:

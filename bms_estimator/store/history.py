@@ -6,10 +6,10 @@ was not yet written.
 
 import asyncio
 import contextlib
+import secrets
 import sqlite3
 from collections import deque
-from collections.abc import Sequence
-from typing import Any, Self
+from typing import Self, TypeVar
 
 from bms_estimator.model.estimate import Estimate, Snapshot
 from bms_estimator.model.event import Event, events
@@ -22,6 +22,8 @@ WAITING_MINUTES = 2 * MINUTES_A_DAY
 WAITING_EVENTS = 1000
 MOST_EVENTS = 50_000
 """In the database: a line that comes and goes each second must not fill the disk."""
+
+Row = TypeVar("Row")
 
 _COLUMNS = Minute._fields
 _MEANS = ("voltage_v", "current_a", "temperature_c")
@@ -61,9 +63,11 @@ class History:
         self._before: Snapshot | None = None
         self._last: Estimate | None = None
         self._open: OpenMinute | None = None
-        self._minutes: deque[Minute] = deque(maxlen=WAITING_MINUTES)
-        self._events: deque[Event] = deque(maxlen=WAITING_EVENTS)
+        self._minutes: deque[tuple[int, Minute]] = deque(maxlen=WAITING_MINUTES)  # with their numbers
+        self._events: deque[tuple[int, Event]] = deque(maxlen=WAITING_EVENTS)
+        self._run, self._number = secrets.token_hex(8), 0
         self._due = asyncio.Event()
+        self._closing = False
         self._unpruned = MINUTES_A_DAY  # minutes since the last look at what is too old; the first one looks
         self._task: asyncio.Task[None] | None = None
 
@@ -76,16 +80,14 @@ class History:
         """Write the minute that is open, too."""
         if self._task is None:
             return
-        self._task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._task
         self._close_minute()
-        with contextlib.suppress(StoreError):
-            await self._write()
+        self._closing = True
+        self._due.set()
+        await self._task
 
     def publish(self, snapshot: Snapshot) -> None:
         """Take a snapshot; returns at once and never fails."""
-        self._events.extend(events(self._before, snapshot))
+        self._events.extend((self._next(), event) for event in events(self._before, snapshot))
         self._before = snapshot
         if snapshot.estimate is not None:
             self._add(snapshot.estimate)
@@ -102,42 +104,54 @@ class History:
         row = self._open.row() if self._open else None
         self._open = None
         if row is not None:
-            self._minutes.append(row)
+            self._minutes.append((self._next(), row))
             self._due.set()
+
+    def _next(self) -> int:
+        self._number += 1
+        return self._number
 
     async def _stay_written(self) -> None:
         """Each minute; what the disk does not take is tried with the next."""
-        while True:
+        while not self._closing:
             with contextlib.suppress(TimeoutError):  # without samples no minute ends, but something may happen
                 async with asyncio.timeout(MINUTE_S):
                     await self._due.wait()
             self._due.clear()
-            with contextlib.suppress(StoreError):
+            if not self._closing:
                 await self._write()
+        await self._write()
 
     async def _write(self) -> None:
-        minutes, happened = list(self._minutes), list(self._events)
+        """Write what waits. Whether an earlier try was written nobody may know: what is there already is left out."""
+        minutes, happened, last = list(self._minutes), list(self._events), self._number
         if not minutes and not happened:
             return
         prune = self._unpruned + len(minutes) > MINUTES_A_DAY
 
         def write(connection: sqlite3.Connection) -> None:
-            connection.executemany(_INSERT, minutes)
-            rows = [(epoch_s(event.time), event.name, event.text) for event in happened]
+            (there,) = connection.execute("SELECT max(number) FROM history_mark WHERE run = ?", (self._run,)).fetchone()
+            after = there or 0
+            connection.executemany(_INSERT, [row for number, row in minutes if number > after])
+            rows = [(epoch_s(event.time), event.name, event.text) for number, event in happened if number > after]
             connection.executemany("INSERT INTO event (time_s, name, text) VALUES (?, ?, ?)", rows)
+            connection.execute("DELETE FROM history_mark")
+            connection.execute("INSERT INTO history_mark VALUES (?, ?)", (self._run, last))
             if prune:
                 _prune(connection, self._most)
 
-        await self._database.call(write)
-        for waiting, written in ((self._minutes, minutes), (self._events, happened)):
-            _remove(waiting, written)
+        try:
+            await self._database.call(write)
+        except StoreError:
+            return
+        _remove(self._minutes, last)
+        _remove(self._events, last)
         self._unpruned = 0 if prune else self._unpruned + len(minutes)
 
 
-def _remove(waiting: deque[Any], written: Sequence[object]) -> None:
-    """What is at the front and was written; some of it may have been pushed out meanwhile."""
-    gone = set(map(id, written))
-    while waiting and id(waiting[0]) in gone:
+def _remove(waiting: deque[tuple[int, Row]], last: int) -> None:
+    """What was written, up to number ``last``."""
+    while waiting and waiting[0][0] <= last:
         waiting.popleft()
 
 

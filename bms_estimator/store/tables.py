@@ -29,6 +29,7 @@ MIGRATIONS = (
     );
     CREATE INDEX event_time ON event (time_s);
     """,
+    "CREATE TABLE history_mark (run TEXT NOT NULL, number INTEGER NOT NULL);",
 )
 """What makes version n + 1 of version n; never changed once released, only added to."""
 

@@ -2,14 +2,18 @@
 
 import asyncio
 import sqlite3
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Snapshot
-from bms_estimator.store.database import Database
+from bms_estimator.store import database as database_module
+from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.history import History
 from bms_estimator.store.minute import Minute
 from bms_estimator.store.reading import HistoryFile
@@ -156,3 +160,52 @@ def test_what_cannot_be_read_is_said(path):
     path.write_bytes(b"x" * 5000)
     with pytest.raises(UserError, match="cannot be read: file is not a database"):
         rows(path)
+
+
+class Late(Database):
+    """A disk that writes the first transactions though nobody hears of it."""
+
+    unheard = 0
+
+    async def call(self, work: Callable[[sqlite3.Connection], Any]) -> Any:
+        result = await super().call(work)
+        if self.unheard:
+            self.unheard -= 1
+            raise StoreError("nobody knows")
+        return result
+
+
+async def test_what_was_written_though_nobody_heard_is_not_written_again(path):
+    async with Late(path, retry_s=0.0) as database, History(database, days=366) as history:
+        database.unheard = 2
+        for second in range(0, 190, 10):
+            history.publish(at(float(second)))
+            async with asyncio.timeout(LONG_S):
+                while database.unheard > max(2 - second // 60, 0):  # noqa: ASYNC110 - it has no event
+                    await asyncio.sleep(0.001)
+    assert [(row.publications, row.seen_s) for row in rows(path)] == [(6, 50.0), (6, 60.0), (6, 60.0), (1, 10.0)]
+    assert len(HistoryFile(path).events(0.0, 2e10)) == 2
+
+
+async def test_an_end_while_a_minute_is_being_written_writes_it_once(path):
+    gate = threading.Event()
+    async with Database(path) as database, History(database, days=366) as history:
+        history.publish(at(0.0))
+        busy = asyncio.create_task(database.call(lambda _: gate.wait(LONG_S)))
+        await asyncio.sleep(0)
+        history.publish(at(60.0))
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)  # its write waits behind the other one
+        asyncio.get_running_loop().call_soon(gate.set)
+    await busy
+    assert [row.publications for row in rows(path)] == [1, 1]
+
+
+async def test_room_that_cannot_be_given_back_does_not_undo_what_is_written(path, monkeypatch):
+    def fail(_: sqlite3.Connection) -> None:
+        raise sqlite3.OperationalError("disk I/O error")
+
+    monkeypatch.setattr(database_module, "_trim", fail)
+    async with Database(path, retry_s=0.0) as database:
+        await database.call(lambda connection: connection.execute("DELETE FROM minute") and None)
+        assert not database.reason
