@@ -86,7 +86,9 @@ class History:
         await self._task
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Take a snapshot; returns at once and never fails."""
+        """Take a snapshot; returns at once."""
+        if self._task is not None and self._task.done():
+            self._task.result()  # only a fault of ours ends it: let it be seen
         self._events.extend((self._next(), event) for event in events(self._before, snapshot))
         self._before = snapshot
         if snapshot.estimate is not None:

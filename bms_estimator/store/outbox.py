@@ -38,7 +38,6 @@ class Outbox:
         self._opened = database is None
         self._offset: int | None = None  # of numbers on disk; known once it was looked at
         self._seen: deque[int] = deque(maxlen=BEHIND)  # the next number at the last looks
-        self._looks = 0
         self._known = 0  # which opening of the database memory agrees with
         self._filled, self._wanted = asyncio.Event(), asyncio.Event()
         self._closing = False
@@ -70,7 +69,9 @@ class Outbox:
         await self._task
 
     def put(self, message: Message) -> None:
-        """Keep a message; returns at once and never fails."""
+        """Keep a message; returns at once."""
+        if self._task is not None and self._task.done():
+            self._task.result()  # only a fault of ours ends it: let it be seen
         self._queue.put(message)
         self._tell()
 
@@ -115,7 +116,6 @@ class Outbox:
 
     def _behind(self) -> bool:
         """Whether what waits must be written."""
-        self._looks += 1
         self._seen.append(self._queue.next)
         oldest = self._queue.oldest
         return oldest is not None and (not self.connected or (len(self._seen) == BEHIND and oldest < self._seen[0]))

@@ -209,3 +209,24 @@ async def test_room_that_cannot_be_given_back_does_not_undo_what_is_written(path
     async with Database(path, retry_s=0.0) as database:
         await database.call(lambda connection: connection.execute("DELETE FROM minute") and None)
         assert not database.reason
+
+
+class Faulty(Database):
+    """One with a fault of ours."""
+
+    async def call(self, _: Callable[[sqlite3.Connection], Any]) -> Any:
+        raise KeyError("ours")
+
+
+async def publish_for_ever(history: History) -> None:
+    async with asyncio.timeout(LONG_S):
+        while True:
+            history.publish(at(0.0))
+            history.publish(at(60.0))
+            await asyncio.sleep(0)
+
+
+async def test_a_fault_of_ours_is_seen_and_does_not_end_history_in_silence(path):
+    history = await History(Faulty(path), days=366).__aenter__()
+    with pytest.raises(KeyError, match="ours"):
+        await publish_for_ever(history)

@@ -111,9 +111,8 @@ async def test_nothing_is_written_while_the_broker_takes_what_comes(path):
         for number in range(50):
             outbox.put(message(number))
             [waiting] = await outbox.take(9)
-            looks = outbox._looks
             outbox.sent(waiting.number)
-            await until(lambda looks=looks: outbox._looks > looks)
+            await until(lambda number=number: number + 1 in outbox._seen)
     assert database.calls == 1, "the look at what an earlier run left"
     assert on_disk(path) == []
 
@@ -196,6 +195,26 @@ async def test_a_database_that_is_deleted_costs_only_what_was_on_disk_alone_and_
         await until(lambda: outbox.dropped == 500)
         assert [*await taken(outbox, 1000), *await taken(outbox, 1000)] == [*range(1000), 1500]
         await until(lambda: len(on_disk(path)) == 1001)
+
+
+class Faulty(Database):
+    """One with a fault of ours."""
+
+    async def call(self, _: Callable[[sqlite3.Connection], Any]) -> Any:
+        raise KeyError("ours")
+
+
+async def put_for_ever(outbox: Outbox) -> None:
+    async with asyncio.timeout(LONG_S):
+        while True:
+            outbox.put(message(0))
+            await asyncio.sleep(0)
+
+
+async def test_a_fault_of_ours_is_seen_and_does_not_end_the_writing_in_silence(path):
+    outbox = await Outbox(Faulty(path), most=100).__aenter__()
+    with pytest.raises(KeyError, match="ours"):
+        await put_for_ever(outbox)
 
 
 KILLED = """
