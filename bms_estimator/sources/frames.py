@@ -55,7 +55,7 @@ class FrameCounters:
     duplicates: int = 0
     out_of_order: int = 0
     before_hello: int = 0
-    """Samples that came before their scaling was known."""
+    """Samples that came before their scaling was known, or while another board may have been there."""
     overruns: int = 0
     """Samples before which the board had no room on the line."""
     implausible: int = 0
@@ -93,7 +93,7 @@ class FrameDecoder:
 
     @property
     def hello(self) -> Hello | None:
-        """The board's last; None before it, and after a reset whose hello was lost."""
+        """The board's last; None before it, after a reset whose hello was lost, and where another board may be there."""
         return self._hello if self._state["boot_id"][0] >= 0 else None
 
     @property

@@ -121,7 +121,7 @@ def test_a_clock_that_jumps_is_not_believed(board_us: Callable[[int, int], int],
 def test_a_host_that_was_held_up_for_a_minute_believes_the_board() -> None:
     """What waited in the buffer comes at once, then what the buffer had no room for is missing."""
     decoder = FrameDecoder()
-    decoder.feed(START_S, HELLO)
+    decoder.feed(START_S, dataclasses.replace(Hello.decode(unseal(HELLO)), period_ns=100_000_000).encode())
     frames = {i: SampleMessage(i, 100_000 * (i + 1), 34_571, 21_405, 38, 225, 1, 16).encode() for i in range(1200)}
     for i in range(300):
         decoder.feed(START_S + 0.1 * (i + 1), frames[i])

@@ -46,8 +46,11 @@ DECODER = np.dtype(
         ("in_step", "i8"),  # 1 once a delimiter was seen: what came before may be half a frame
         ("started", "i8"),  # a sample was taken
         ("expected", "i8"),  # sequence of the next sample
-        ("boot_id", "i8"),  # of the last hello; -1: none since the reset
+        ("boot_id", "i8"),  # of the last hello; -1: none since a reset, or since another board may be there
         ("serial", "i8"),  # of the last hello
+        ("period_us", "f8"),  # of the last hello: from sample to sample
+        ("doubted_s", "f8"),  # arrival at which boot_id became -1
+        ("withheld", "i8"),  # status bits of samples that were dropped since then
         ("reset_pending", "i8"),  # a hello told of a reset
         ("board_us", "i8"),  # of the last sample, 32 bit
         ("elapsed_us", "i8"),  # board clock since the first sample or the reset
@@ -88,6 +91,9 @@ EARLY_S = 2.0
 SLOWEST = 0.01
 """No board's clock is slower than the host's by more than this, relative."""
 _REORDER_WINDOW = 64  # a sample further behind comes from a board that counts anew
+_MOST_APART = 0.1  # sequence and clock of one board, relative; beyond this it is another, or has another rate
+LONGEST_DOUBT_S = 5.0
+"""So long samples wait for the hello that tells whose they are; where none comes they are taken as before [s]."""
 _US = 1e-6
 _WRAP_S = MODULUS * _US
 
@@ -199,6 +205,7 @@ def take_hello(d: Record, s: Record) -> None:
     if anew:
         forget_readings(s)
     d.boot_id, d.serial = boot_id, serial
+    d.period_us = take(p, 22, 4) * 1e-3
     s.full_scale = float(1 << min(take(p, 26, 1), 24))
     channels = take(p, 27, 1)
     s.ntc_fitted = channels & 1
@@ -247,6 +254,20 @@ def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
 
 
 @njit(cache=True)
+def doubt(d: Record, arrival_s: float) -> None:
+    """Another board may have been wired to the open port, with another scaling: only a hello tells."""
+    d.boot_id = -1
+    d.doubted_s = arrival_s
+
+
+@njit(cache=True)
+def agree(d: Record, samples: int, step_us: int) -> bool:
+    """Whether one board can have taken so many samples in that time of its clock."""
+    apart_us = abs(samples * d.period_us - step_us)
+    return apart_us <= max(_MOST_APART * step_us, _REORDER_WINDOW * d.period_us)
+
+
+@njit(cache=True)
 def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -> int:
     """Place a sample in the stream. Returns bits of SampleStatus, -1 for a sample to be dropped."""
     status = 0
@@ -258,7 +279,7 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
         behind = MODULUS - ahead if ahead >= _HALF else 0
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
-                d.boot_id = -1  # its hello was lost: the next one is no further reset
+                doubt(d, arrival_s)  # its hello was lost: the next one is no further reset
             restart_clock(d, arrival_s, board_us * _US)  # the board has run since its reset
             d.reset_pending = 0
             d.resets += 1
@@ -270,16 +291,19 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
             d.out_of_order += 1
             return -1
         else:
+            before_us = d.elapsed_us
             if not follow_clock(d, board_us, arrival_s, ahead):
                 restart_clock(d, arrival_s, 0.0)
                 d.clock_jumps += 1
+                doubt(d, arrival_s)
+            elif ahead > 0 and not agree(d, ahead + 1, d.elapsed_us - before_us):
+                doubt(d, arrival_s)
             d.frames_lost += ahead
             status = _GAP if ahead else 0
     d.expected = (sequence + 1) & _MASK
     d.board_us = board_us
     d.arrival_s = arrival_s
     take_arrival(d, arrival_s)
-    d.frames_received += 1
     return status
 
 
@@ -293,6 +317,13 @@ def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     place = follow_sequence(d, take(p, 2, 4), take(p, 6, 4), arrival_s)
     if place < 0:
         return 0
+    if d.boot_id < 0 and arrival_s - d.doubted_s < LONGEST_DOUBT_S:
+        d.withheld |= place
+        d.before_hello += 1
+        return 0
+    place |= d.withheld
+    d.withheld = 0
+    d.frames_received += 1
     bits = int(p[21])
     aux_count = float(p[20])
     if aux_count > 0.0:
