@@ -9,7 +9,6 @@ import io
 import math
 import os
 import re
-import stat
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from bms_estimator.model.settings import Settings
 from bms_estimator.service.moment import Moment, moment
 from bms_estimator.snapshot.totals import new_totals
 from bms_estimator.store.disk_thread import DiskThread
-from bms_estimator.store.private_file import write_private
+from bms_estimator.store.private_file import NotOursError, read_private, write_private
 
 FORMAT = 6
 """Raise it when a field of an old name gets another meaning, and tell ``_MIGRATIONS`` how to read those before."""
@@ -167,11 +166,11 @@ class CheckpointFile:
         try:
             if not self.path.exists() and before.exists():
                 before.replace(self.path)
-            with np.load(io.BytesIO(_read(self.path)), allow_pickle=False) as file:
+            with np.load(io.BytesIO(read_private(self.path, LONGEST_FILE)), allow_pickle=False) as file:
                 return self._checked(_migrated(dict(file)))
         except FileNotFoundError:
             return Restored({}, 0.0, new, "none found")
-        except _RefusedError as error:
+        except (_RefusedError, NotOursError) as error:
             return Restored({}, 0.0, new, f"{REFUSED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
             return Restored({}, 0.0, new, f"{REFUSED}unreadable ({type(error).__name__}: {error})")
@@ -253,18 +252,3 @@ def _migrated(file: File) -> File:
     for step in range(version, FORMAT):
         file = _MIGRATIONS[step](file)
     return file
-
-
-def _read(path: Path) -> bytes:
-    """A whole file, but not through a link nor from what is no file.
-
-    Raises:
-        _RefusedError: It is too long or no file.
-        OSError: It cannot be read.
-    """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    with open(descriptor, "rb") as file:  # noqa: PTH123 - a descriptor has no Path
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode) or found.st_size > LONGEST_FILE:
-            raise _RefusedError("no file, or too long")
-        return file.read()

@@ -1,14 +1,13 @@
 """The board that a pack's service remembers from one start to the next: its serial number and its calibration."""
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 
 import structlog
 
-from bms_estimator.store.private_file import write_private
+from bms_estimator.store.private_file import NotOursError, read_private, write_private
 
 REMEMBERED = ("serial", "divider", "volts_per_ampere", "bandgap_v")
 """Of what a board says of itself."""
@@ -38,12 +37,10 @@ class BoardMemory:
     def load(self) -> Mapping[str, str]:
         """What was kept last; empty where nothing was, or nothing that can be used, which is logged."""
         try:
-            descriptor = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-            with open(descriptor, "rb") as file:  # noqa: PTH123 - a descriptor has no Path
-                return _checked(json.loads(file.read(LONGEST_FILE)))
+            return _checked(json.loads(read_private(self.path, LONGEST_FILE)))
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError, RecursionError) as error:
+        except (OSError, NotOursError, ValueError, RecursionError) as error:
             log.warning("the board of the last run is not known", file=str(self.path), reason=str(error))
             return {}
 

@@ -1,7 +1,31 @@
-"""A file for its owner alone, written so that after a power cut there is the old one or the new one."""
+"""Files for their owner alone, each written so that after a power cut there is the old one or the new one."""
 
 import os
+import stat
 from pathlib import Path
+
+
+class NotOursError(Exception):
+    """What has the name of a private file is none of ours."""
+
+
+def read_private(path: Path, longest: int) -> bytes:
+    """A whole file, but not through a link nor from what is no file.
+
+    Args:
+        path: The file.
+        longest: A longer one is none of ours [bytes].
+
+    Raises:
+        NotOursError: It is too long or no file.
+        OSError: It cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    with open(descriptor, "rb") as file:  # noqa: PTH123 - a descriptor has no Path
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or found.st_size > longest:
+            raise NotOursError("no file, or too long")
+        return file.read()
 
 
 def write_private(path: Path, content: bytes | memoryview) -> None:

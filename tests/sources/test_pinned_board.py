@@ -332,6 +332,15 @@ def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memo
     assert linked.load() == {}
 
 
+def test_a_memory_that_is_a_pipe_is_none(memory: BoardMemory) -> None:
+    os.mkfifo(memory.path)
+    writer = os.open(memory.path, os.O_RDWR)
+    try:
+        assert memory.load() == {}
+    finally:
+        os.close(writer)
+
+
 @pytest.mark.parametrize(
     "text", ["", "[]", "{", "[" * 4000, '{"serial": 1}', json.dumps({"serial": "x" * 3000}), "\xff", "null"]
 )
