@@ -40,7 +40,7 @@ class Doorkeeper:
         self._make, self._told, self._memory = make, serial, memory
         self._known: Mapping[str, str] = memory.load() if memory else {}
         self._kept = self._known  # on disk
-        self._nameless = self._looking = self._keeping = self._failed = False
+        self._nameless = self._looking = self._keeping = self._failed = self._refused = False
         self._tried_s = -math.inf
         self.stranger: Dialect | None = None
         """What hears a board that is not known yet."""
@@ -54,6 +54,7 @@ class Doorkeeper:
     def opened(self) -> None:
         """The port was opened anew."""
         self.stranger = self._make() if self.serial else None
+        self._refused = False
         self._held.clear()
 
     def look_again(self) -> None:
@@ -74,8 +75,10 @@ class Doorkeeper:
         """The reads that ``dialect``, which hears the pack's board, may be fed now.
 
         Raises:
-            OtherBoardError: Neither this one nor those after it.
+            OtherBoardError: Neither this one nor those after it, until the port is opened anew.
         """
+        if self._refused:
+            return ()
         if self.stranger is None:
             if self.serial and (swapped := dialect.serial_in(read[1])) is not None:
                 self._check(swapped)
@@ -143,6 +146,7 @@ class Doorkeeper:
         """
         if found == self.serial:
             return
+        self._refused = True
         accept = (
             "or set sensor.serial to its number"
             if self._told

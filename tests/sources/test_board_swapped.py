@@ -9,6 +9,8 @@ from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading
+from bms_estimator.sources.dialects.board import BoardDialect
+from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.protocol import Hello, hello_command
 from bms_estimator.sources.serial_board import SerialBoard
@@ -125,3 +127,16 @@ async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(lin
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(np.full(10, PACK_V), abs=0.1)
+
+
+def test_nothing_of_a_board_that_was_refused_passes_before_the_port_is_opened_anew() -> None:
+    """Reads that wait behind the one with its hello have none."""
+    own, other = Running(1, 6.1), Running(2, 9.0)
+    dialect, door = BoardDialect(), Doorkeeper(BoardDialect)
+    dialect.feed(BEGIN_S, own.hello())
+    door.know(dialect.board, 0.0)
+    with pytest.raises(OtherBoardError):
+        door.admit((BEGIN_S, other.hello()), dialect)
+    assert door.admit((BEGIN_S, other.frames(1)[0]), dialect) == ()
+    door.opened()
+    assert len(door.admit((BEGIN_S, own.hello()), dialect)) == 1
