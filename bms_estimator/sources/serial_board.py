@@ -61,7 +61,7 @@ class SerialBoard:
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
-        memory: Remembers the pack's board; None: it is known for this run only.
+        memory: Remembers the pack's board, if it can tell its serial number; None: it is known for this run only.
         tap: Gets the same (arrival time, bytes) as the dialect.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
@@ -84,7 +84,8 @@ class SerialBoard:
         self._monotonic, self._silent_s = monotonic, silent_s
         make_dialect(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
         self._dialect = make_dialect(settings)
-        self._door = Doorkeeper(lambda: make_dialect(settings), settings.serial or "", memory)
+        tells_serial = settings.protocol == "binary"  # what prints text could never be told from another
+        self._door = Doorkeeper(lambda: make_dialect(settings), settings.serial or "", memory if tells_serial else None)
         self._where = Whereabouts(settings.port, monotonic)
         self._line = Line(
             self._open_next,

@@ -303,6 +303,15 @@ async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_
     assert told.health.samples["samples"] <= 1  # that of the checkpoint
 
 
+async def test_a_board_that_prints_text_is_taken_whatever_board_was_remembered(
+    folder: Path, memory: BoardMemory
+) -> None:
+    port = folder / "ttyUSB0"
+    memory.keep({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
+    async with source(port, memory, protocol="text") as taken, board(port, mode="text"):
+        await until(lambda: taken.blocks)
+
+
 async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_it_does(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
