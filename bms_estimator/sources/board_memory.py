@@ -44,12 +44,25 @@ class BoardMemory:
             log.warning("the board of the last run is not known", file=str(self.path), reason=str(error))
             return {}
 
+    def is_gone(self) -> bool:
+        """Whether nothing at all has the file's name.
+
+        Raises:
+            OSError: The disk does not tell.
+        """
+        try:
+            self.path.lstat()
+        except FileNotFoundError:
+            return True
+        return False
+
     def keep(self, board: Mapping[str, str]) -> None:
-        """Write atomically.
+        """Write atomically. A folder that is gone is made anew.
 
         Raises:
             OSError: The disk does not take it.
         """
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_private(self.path, json.dumps(dict(board)).encode() + b"\n")
 
 

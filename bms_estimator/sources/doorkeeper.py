@@ -17,8 +17,8 @@ from bms_estimator.sources.line import Read
 HELD_READS = 4096
 """So many reads are kept for a board that has not told its serial number yet: seconds at any rate."""
 
-RETRY_S = 10.0
-"""A disk that did not take the board is tried again so often [s]."""
+RETRY_S = 60.0
+"""So often is looked whether the disk has the board, and it is written where it has not [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -106,8 +106,8 @@ class Doorkeeper:
         before, self._known = self._known, {name: board.get(name, "") for name in REMEMBERED}
         if self._known != before:
             self._say_new(before)
-        if self._known != self._kept:
-            self._remember(now_s)
+            self._tried_s = -math.inf
+        self._remember(now_s)
 
     def _say_new(self, before: Mapping[str, str]) -> None:
         changes = [name for name in REMEMBERED if before.get(name) and before[name] != self._known[name]]
@@ -120,8 +120,8 @@ class Doorkeeper:
             log.info("this is the pack's board from now on", **self._known)
 
     def _remember(self, now_s: float) -> None:
-        """A disk that hangs holds up nothing; one that failed is tried again while samples come."""
-        if self._memory is None or self._keeping or (self._failed and now_s - self._tried_s < RETRY_S):
+        """A disk that hangs holds up nothing; one that failed, or lost the file, is tried again while samples come."""
+        if self._memory is None or self._keeping or now_s - self._tried_s < RETRY_S:
             return
         self._keeping, self._tried_s = True, now_s
         Thread(target=self._keep, args=(self._memory, self._known), daemon=True).start()
@@ -129,7 +129,8 @@ class Doorkeeper:
     def _keep(self, memory: BoardMemory, board: Mapping[str, str]) -> None:
         """In a thread of its own."""
         try:
-            memory.keep(board)
+            if board != self._kept or memory.is_gone():
+                memory.keep(board)
             self._kept, self._failed = board, False
         except OSError as error:
             if not self._failed:

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import os
+import shutil
 import stat
 import tty
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -24,7 +25,7 @@ from bms_estimator.service.serve import serve
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading
 from bms_estimator.sources import doorkeeper, ports, serial_board
-from bms_estimator.sources.board_memory import BoardMemory
+from bms_estimator.sources.board_memory import NO_BOARD, BoardMemory
 from bms_estimator.sources.serial_board import SerialBoard
 from tests.collector import Collector
 from tests.command_line import run
@@ -317,14 +318,39 @@ async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_i
 ) -> None:
     monkeypatch.setattr(doorkeeper, "RETRY_S", 0.05, raising=False)
     memory, said = BoardMemory(tmp_path / "gone", "house"), "the board cannot be remembered"
+    memory.path.parent.touch()  # a file where the folder should be
     with capture_logs() as logs:
         async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
             await until(lambda: [line for line in logs if said in line["event"]])
             seen = len(taken.blocks)
             await until(lambda: len(taken.blocks) > seen + 3)
-            memory.path.parent.mkdir()
+            memory.path.parent.unlink()
             await remembered(memory, "00000001")
     assert len([line for line in logs if said in line["event"]]) == 1
+    assert stat.S_IMODE(memory.path.parent.stat().st_mode) == 0o700
+
+
+async def test_a_folder_that_is_deleted_comes_back_with_the_board(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doorkeeper, "RETRY_S", 0.05)
+    memory = BoardMemory(tmp_path / "state", "house")
+    async with source(folder / "ttyUSB0", memory), board(folder / "ttyUSB0"):
+        await remembered(memory, "00000001")
+        shutil.rmtree(memory.path.parent)
+        await remembered(memory, "00000001")
+
+
+async def test_a_board_that_is_to_be_forgotten_is_not_written_down_again(
+    folder: Path, memory: BoardMemory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doorkeeper, "RETRY_S", 0.0)
+    async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
+        await remembered(memory, "00000001")
+        memory.keep(NO_BOARD)
+        seen = len(taken.blocks)
+        await until(lambda: len(taken.blocks) > seen + 30)
+        assert memory.load() == NO_BOARD
 
 
 def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memory: BoardMemory) -> None:
