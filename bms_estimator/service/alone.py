@@ -1,10 +1,12 @@
 """A pack is served by one process at a time."""
 
 import contextlib
+import errno
 import hashlib
 import os
 import socket
 import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +15,8 @@ import structlog
 from bms_estimator.model.errors import UserError
 
 ROOT = 0
+ATTEMPTS, PAUSE_S = 20, 0.01
+"""So often is tried to take a name that is held and does not listen, and how long between [s]."""
 _CREDENTIALS = struct.Struct("3i")
 """``struct ucred``: process, user, group."""
 
@@ -25,8 +29,8 @@ def alone(folder: Path, pack: str) -> Iterator[None]:
 
     Held is an abstract socket named after folder and pack. It is gone with the process however that ends, is no file that
     could be planted, deleted or left over, and does not depend on a disk. Whoever is on the machine could take the name
-    first; so a holder counts only where it may write the folder anyway. A container with a network of its own has
-    names of its own.
+    first; so a holder that may not write the folder anyway does not count. One of whom nothing can be told counts: two
+    services are worse than none. A container with a network of its own has names of its own.
 
     Args:
         folder: Where the pack's state is kept.
@@ -36,16 +40,43 @@ def alone(folder: Path, pack: str) -> Iterator[None]:
         UserError: Another process serves it.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as held:
-        name = _name(folder, pack)
+        try:
+            _hold(held, folder, pack)
+        except OSError as error:
+            log.warning("cannot make sure that this pack is served once", reason=error.strerror)
+        yield
+
+
+def _hold(held: socket.socket, folder: Path, pack: str) -> None:
+    """Take the name, unless a service has it.
+
+    Raises:
+        UserError: One has it.
+        OSError: The system gives nobody such a name.
+    """
+    name, told = _name(folder, pack), None
+    for _ in range(ATTEMPTS):
         try:
             held.bind(name)
             held.listen(1)
         except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+        else:
+            return
+        try:
             process, user = _holder(name)
-            if user in _writers(folder):
-                raise UserError(f"{pack}: this pack is served already, by process {process}") from None
-            log.warning("cannot make sure that this pack is served once", reason=error.strerror, user=user)
-        yield
+        except ConnectionRefusedError:  # it is about to listen, or has just ended
+            time.sleep(PAUSE_S)
+            continue
+        except BlockingIOError:
+            break
+        if user not in _writers(folder):
+            log.warning("a stranger has this pack's name: cannot make sure that it is served once", user=user)
+            return
+        told = process
+        break
+    raise UserError(f"{pack}: this pack is served already, by {f'process {told}' if told else 'another process'}")
 
 
 def _name(folder: Path, pack: str) -> str:
@@ -55,14 +86,17 @@ def _name(folder: Path, pack: str) -> str:
 
 
 def _holder(name: str) -> tuple[int, int]:
-    """Process and user that hold a name, as the system has it; -1 where it does not say."""
+    """Process and user that hold a name, as the system has it.
+
+    Raises:
+        ConnectionRefusedError: Nobody holds it, or does not listen.
+        BlockingIOError: Others have asked before. A holder answers nobody: the system tells whose it is to so many as
+            may wait for an answer, even once they are gone.
+    """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
-        try:
-            asking.connect(name)
-            told = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-        except OSError:
-            return -1, -1
+        asking.connect(name)
+        told = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     process, user, _ = _CREDENTIALS.unpack(told)
     return process, user
 

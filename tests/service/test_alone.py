@@ -2,8 +2,10 @@
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -25,13 +27,30 @@ sys.stdin.read()
 """Holds the name of its first argument as the user of its second until its input ends."""
 
 
-def test_a_pack_is_served_once_at_a_time(tmp_path: Path) -> None:
-    served = pytest.raises(UserError, match=f"^pack: this pack is served already, by process {os.getpid()}$")
+def test_a_pack_is_served_once_at_a_time_however_often_a_second_service_is_tried(tmp_path: Path) -> None:
+    served = "^pack: this pack is served already, by "
     for _ in range(2):
-        with alone(tmp_path, "pack"), served, alone(tmp_path, "pack"):
-            pass
+        with alone(tmp_path, "pack"):
+            with pytest.raises(UserError, match=f"{served}process {os.getpid()}$"), alone(tmp_path, "pack"):
+                pass
+            for _ in range(5):  # the system tells the first ones only whose the name is
+                with pytest.raises(UserError, match=served), alone(tmp_path, "pack"):
+                    pass
     with alone(tmp_path, "pack"), alone(tmp_path, "other"), alone(tmp_path / "elsewhere", "pack"):
         pass
+
+
+def test_a_service_that_does_not_listen_yet_counts_and_one_that_has_just_ended_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket(socket.AF_UNIX) as starting:
+        starting.bind(_name(tmp_path, "pack"))
+        with pytest.raises(UserError, match=r"served already, by another process$"), alone(tmp_path, "pack"):
+            pass
+        monkeypatch.setattr(time, "sleep", lambda _: starting.close())
+        with capture_logs() as lines, alone(tmp_path, "pack"):
+            pass
+        assert not lines
 
 
 def test_a_folder_that_is_deleted_and_made_anew_lets_no_second_service_in(tmp_path: Path) -> None:
@@ -61,5 +80,7 @@ def test_a_stranger_who_takes_the_name_first_does_not_keep_the_service_from_star
         os.chown(tmp_path, NOBODY, NOBODY)  # one who may write the folder is a service
         with pytest.raises(UserError, match=f"by process {stranger.pid}"), alone(tmp_path, "pack"):
             pass
+        with pytest.raises(UserError, match="served already"), alone(tmp_path, "pack"):
+            pass  # whose it is is told to nobody any more: rather no service than two
         assert stranger.stdin
         stranger.stdin.close()
