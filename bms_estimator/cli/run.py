@@ -17,8 +17,9 @@ from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.service.interrupt import starting
 from bms_estimator.service.logs import configure_logs, drained
-from bms_estimator.service.reload import Reload, reload_on_hangup
+from bms_estimator.service.reload import Reload, ask_all, reload_on_hangup
 from bms_estimator.service.serve import serve, state_folder
 from bms_estimator.service.several import serve_several
 from bms_estimator.service.warm_up import load_kernels
@@ -52,15 +53,13 @@ def run(
     loaded = [(told(settings), cell) for settings, cell in map(load_pack, paths)]
     reads = [lambda path=path: told(load_settings(path)) for path in paths]
     reloads = [Reload(settings, read) for (settings, _), read in zip(loaded, reads, strict=True)]
-    if len(loaded) == 1:
-        _run_one(*loaded[0], reloads[0], record, view=sys.stdout.isatty() if view is None else view)
-        return
-    if port or record or view:
-        raise UserError("--port, --record and --view are for one pack")
-    configure_logs()
-    _load_kernels()
-    with drained():
-        asyncio.run(_reloading(serve_several(loaded, reloads), reloads))
+    with starting(None if _on_terminal() else partial(ask_all, reloads)):
+        if len(loaded) == 1:
+            _run_one(*loaded[0], reloads[0], record, view=sys.stdout.isatty() if view is None else view)
+        else:
+            if port or record or view:
+                raise UserError("--port, --record and --view are for one pack")
+            _run_several(loaded, reloads)
 
 
 def _told(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
@@ -70,11 +69,22 @@ def _told(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
     return with_sensor(settings, port=port)
 
 
+def _on_terminal() -> bool:
+    return bool(sys.stdin and sys.stdin.isatty())
+
+
 async def _reloading(service: Coroutine[Any, Any, object], reloads: Sequence[Reload]) -> None:
     """Serve, and read the settings anew on SIGHUP; where there is a terminal it says that this is gone, and ends us."""
-    if not (sys.stdin and sys.stdin.isatty()):
+    if not _on_terminal():
         reload_on_hangup(reloads)
     await service
+
+
+def _run_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[Reload]) -> None:
+    configure_logs()
+    with drained():
+        _load_kernels()
+        asyncio.run(_reloading(serve_several(packs, reloads), reloads))
 
 
 def _run_one(settings: Settings, cell: PackModel, reload: Reload, record: Path | None, *, view: bool) -> None:

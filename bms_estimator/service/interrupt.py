@@ -1,9 +1,18 @@
 """How what runs long ends: by a signal, or by the first of their tasks."""
 
 import asyncio
+import contextlib
+import os
 import signal
-from collections.abc import Coroutine
+import threading
+from collections.abc import Callable, Coroutine, Iterator
 from typing import Any
+
+import structlog
+
+from bms_estimator.service.stderr import stderr
+
+log = structlog.get_logger(__name__)
 
 
 def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
@@ -16,6 +25,34 @@ def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
     for number in (signal.SIGINT, signal.SIGTERM, *unheard):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     return stop
+
+
+@contextlib.contextmanager
+def starting(reload: Callable[[], None] | None) -> Iterator[None]:
+    """What signals do until an event loop takes them: SIGTERM ends the process with exit code 0, there is nothing to save.
+
+    Args:
+        reload: What SIGHUP asks for; None: it ends the process, as when a terminal is closed.
+    """
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, _end)}
+    if reload:
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, lambda *_: reload())
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end(*_: object) -> None:
+    """Not by an exception, which the compiler would lose; in a thread, as the log may be held by what was interrupted."""
+
+    def end() -> None:
+        log.info("asked to end before samples were taken")
+        stderr.drain()
+        os._exit(0)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:

@@ -62,11 +62,12 @@ def _flat(settings: Settings) -> dict[str, Any]:
     return {f"{section}.{key}": value for section, table in sections if table for key, value in table.items()}
 
 
+def ask_all(packs: Sequence[Reload]) -> None:
+    """Have the settings of all packs of this process read."""
+    for pack in packs:
+        pack.asked.set()
+
+
 def reload_on_hangup(packs: Sequence[Reload]) -> None:
     """Have SIGHUP reload the settings of all packs of this process."""
-
-    def ask() -> None:
-        for pack in packs:
-            pack.asked.set()
-
-    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, ask)
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, ask_all, packs)

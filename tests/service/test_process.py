@@ -54,6 +54,21 @@ main()
 """The program on a disk that never answers once something is to be on it."""
 
 
+STARTING = """
+import os, signal
+from bms_estimator.cli import run
+from bms_estimator.cli.main import main
+def load_kernels():
+    os.kill(os.getpid(), signal.SIGHUP)
+    os.kill(os.getpid(), signal.SIGTERM)
+    while True:
+        signal.pause()
+run.load_kernels = load_kernels
+main()
+"""
+"""The program that gets both signals before it serves, and does not come that far."""
+
+
 @contextlib.asynccontextmanager
 async def service(
     *packs: Path, stderr: int | IO[str] = asyncio.subprocess.PIPE, program: Sequence[str] = (str(PROGRAM),)
@@ -219,6 +234,17 @@ async def test_a_hangup_reloads_the_settings_of_all_packs_and_ends_nothing(
     said = {line["pack"]: line for line in log if line["event"].startswith("settings")}
     assert said["house"]["changed"] == ["publish.rate_hz", "mqtt.commands"]
     assert "pack.series" in said["shed"]["reason"]
+
+
+async def test_a_service_that_has_not_begun_is_not_ended_by_a_hangup_and_says_that_it_was_asked_to_end(
+    tmp_path: Path, line: Line, broker: Broker
+) -> None:
+    program = [sys.executable, "-c", STARTING]
+    async with service(pack_file(tmp_path, line, broker), program=program) as process:
+        assert process.stderr
+        log = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
+        assert await process.wait() == 0
+    assert json.loads(log)["event"] == "asked to end before samples were taken"
 
 
 async def asked(live: Listener, request: str) -> str:

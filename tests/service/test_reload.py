@@ -7,8 +7,10 @@ import socket
 from pathlib import Path
 from typing import Any
 
+import pytest
 from structlog.testing import capture_logs
 
+from bms_estimator.cli.main import main
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import CheckpointFile
@@ -91,6 +93,22 @@ async def test_a_running_service_takes_another_rate_at_a_signal_and_tells_system
         source.finish()
         await asyncio.wait_for(task, LONG_S)
         asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
+
+
+def test_a_hangup_before_samples_are_taken_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    async def serve(*_: Any, reload: Reload, **__: Any) -> None:
+        asked.append(reload.asked.is_set())
+
+    monkeypatch.setattr("bms_estimator.cli.run.load_kernels", lambda: os.kill(os.getpid(), signal.SIGHUP))
+    monkeypatch.setattr("bms_estimator.cli.run.serve", serve)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    (tmp_path / "pack.toml").write_text('[pack]\ncell = "chen_mora"\n')
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(tmp_path / "pack.toml")])
+    assert not ended.value.code
+    assert asked == [True]
 
 
 async def test_without_settings_to_read_a_hangup_is_a_clean_end() -> None:
