@@ -11,6 +11,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings
 from bms_estimator.store.disk_thread import DiskThread
 
+HUNG_S = 10.0
+"""Settings that cannot be read in so long are left as they are [s]."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -37,10 +40,18 @@ class Reload:
 
     async def reload(self) -> list[str]:
         """Read once. Returns the keys that have changed and need a restart."""
+        said = "settings not reloaded, those before stay in effect"
+        future = asyncio.get_running_loop().run_in_executor(self._thread, self._read)
+        await asyncio.wait({future}, timeout=HUNG_S)
+        if not future.done():
+            future.cancel()
+            self._thread = DiskThread("settings")  # the one before waits still
+            log.warning(said, reason=f"nothing could be read in {HUNG_S:g} s: does the disk hang, or is it a pipe?")
+            return []
         try:
-            new = await asyncio.get_running_loop().run_in_executor(self._thread, self._read)
+            new = future.result()
         except UserError as error:
-            log.warning("settings not reloaded, those before stay in effect", reason=str(error))
+            log.warning(said, reason=str(error))
             return []
         values = _flat(new)
         changed = [key for key in values | self._values if values.get(key) != self._values.get(key)]

@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.cli.main import main
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.settings import Settings, load_settings
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import run_live
@@ -59,6 +59,20 @@ async def test_a_file_that_is_wrong_changes_nothing() -> None:
         assert await reload.reload() == []
     (line,) = lines
     assert line["reason"] == "pack.toml: pack.series = 0"
+
+
+async def test_a_file_that_hangs_ends_no_reload_after_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bms_estimator.service.reload.HUNG_S", 0.1)
+    file = tmp_path / "pack.toml"
+    os.mkfifo(file)  # whoever opens it for reading waits for a writer
+    reload = Reload(SETTINGS, lambda: load_settings(file))
+    with capture_logs() as lines:
+        assert await asyncio.wait_for(reload.reload(), LONG_S) == []
+    assert "nothing could be read in 0.1 s" in lines[0]["reason"]
+    monkeypatch.undo()
+    file.unlink()
+    file.write_text("[pack]\nseries = 2\n")
+    assert "pack.series" in await asyncio.wait_for(reload.reload(), LONG_S)
 
 
 def test_commands_that_are_allowed_may_change() -> None:
