@@ -6,15 +6,18 @@ edited, and versions that know other fields may come, without what was learned b
 
 import hashlib
 import io
+import json
 import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import structlog
 from numpy.typing import NDArray
 
 from bms_estimator.model.cell import ChenMoraOcv
@@ -35,6 +38,12 @@ KEPT = 8
 """So many files of one pack are kept, those saved last."""
 REFUSED = "refused: "
 """A reason that begins so tells why a file that was found is not taken up."""
+LATER = 4
+"""So many files of a later format are kept for who goes back to the version that wrote them."""
+MOST = 1e15
+"""No counter comes so far, nor do seconds: 30,000 years of 1,000 samples a second."""
+
+log = structlog.get_logger(__name__)
 
 
 def pack_identity(settings: Settings, cell: PackModel) -> str:
@@ -92,7 +101,7 @@ class Restored:
     unseen_s: float
     """Since it was saved [s]; infinite when nobody knows."""
     ledger: Ledger
-    """With this start counted; of nothing when it was refused."""
+    """With this start counted; of nothing when it was not of this pack, or could not be read."""
     reason: str
     """Why it is not taken up; empty when it may be."""
 
@@ -113,6 +122,7 @@ class CheckpointFile:
         self._range_v = cell.cell.voltage_min_v, cell.cell.voltage_max_v
         self._longest_days = settings.state.longest_days
         self._content: dict[str, Any] = {}  # of the file, as far as it is no ledger
+        self._later = False  # the file is of a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
         self.disk_free_mib: float | None = None
         """Where the file is, when it was written last [MiB]."""
@@ -167,17 +177,25 @@ class CheckpointFile:
             if not self.path.exists() and before.exists():
                 before.replace(self.path)
             with np.load(io.BytesIO(read_private(self.path, LONGEST_FILE)), allow_pickle=False) as file:
-                return self._checked(_migrated(dict(file)))
+                return self._checked(file)
         except FileNotFoundError:
             return Restored({}, 0.0, new, "none found")
-        except (_RefusedError, NotOursError) as error:
+        except _RefusedError as error:
+            return Restored({}, 0.0, error.ledger or new, f"{REFUSED}{error}")
+        except NotOursError as error:
             return Restored({}, 0.0, new, f"{REFUSED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
             return Restored({}, 0.0, new, f"{REFUSED}unreadable ({type(error).__name__}: {error})")
 
     def set_aside(self) -> str:
-        """Keep a file that was refused out of the way of the next save. Returns what was done, for people."""
+        """Keep a file that was refused out of the way of the next save. Returns what was done, for people.
+
+        One of a later format is good, and in place of none: who goes back to a version and forth has each of them.
+        """
         aside = self.path.with_name(f"{self._name}.refused.npz")
+        if self._later:
+            places = [self.path.with_name(f"{self._name}.later-{n}.npz") for n in range(1, LATER + 1)]
+            aside = next((place for place in places if not place.exists()), places[-1])
         self._content = {}
         try:
             self.path.replace(aside)
@@ -185,7 +203,13 @@ class CheckpointFile:
             return f"it cannot be set aside: {error}"
         return f"set aside as {aside.name}"
 
-    def _checked(self, file: Mapping[str, NDArray[Any]]) -> Restored:
+    def _checked(self, found: Mapping[str, NDArray[Any]]) -> Restored:
+        now_s, version = self._now().wall_s, int(found["format"])
+        self._later = version > FORMAT
+        if self._later:
+            ours = str(found.get("identity", "")) == self._identity
+            raise _RefusedError(_unknown(version), _ledger(found, now_s) if ours else None)
+        file = _migrated(dict(found))
         state = {name.removeprefix("state."): file[name] for name in file if name.startswith("state.")}
         if not str(file["identity"]):  # a format that had another one: what its voltage tells
             low, high = self._range_v
@@ -194,18 +218,16 @@ class CheckpointFile:
         elif str(file["identity"]) != self._identity:
             raise _RefusedError("it belongs to another pack or cell")
         saved = Moment(float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"]))
-        unseen_s = self._now().since(saved)
+        unseen_s, ledger = self._now().since(saved), _ledger(file, now_s)
         if self._longest_days is not None and self._longest_days * DAY_S < unseen_s < math.inf:
             days = f"{unseen_s / DAY_S:.1f} days old"
-            raise _RefusedError(f"it is {days}, state.longest_days is {self._longest_days:g}")
-        total = Totals.model_validate_json(str(file["total"]))
-        crashed = total.model_copy(update={"crashes": total.crashes + (not file["clean"])})
+            raise _RefusedError(f"it is {days}, state.longest_days is {self._longest_days:g}", ledger)
         self._content = {name: v for name, v in file.items() if name not in ("format", "restarts", "total", "clean")}
         self._content |= {"identity": self._identity}
         if str(file["observer"]) != self._observer:
             kept, dropped = ("observer.soc", "observer.soc_coulomb", "observer.started"), ("observer.", "learning.")
             state = {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}
-        return Restored(state, unseen_s, Ledger(int(file["restarts"]) + 1, crashed), "")
+        return Restored(state, unseen_s, ledger, "")
 
     def _remove_oldest(self) -> None:
         """Of the pack's files leave those saved last: whoever tries settings leaves one for each."""
@@ -217,7 +239,37 @@ class CheckpointFile:
 
 
 class _RefusedError(Exception):
-    """Why a checkpoint is not taken up."""
+    """Why a checkpoint is not taken up, and what is counted on nevertheless."""
+
+    def __init__(self, reason: str, ledger: Ledger | None = None) -> None:
+        super().__init__(reason)
+        self.ledger = ledger
+
+
+def _ledger(file: Mapping[str, NDArray[Any]], now_s: float) -> Ledger:
+    """What a file tells of its runs, with this start. What cannot be is not believed: counting begins anew at ``now_s``."""
+    try:
+        return _believable(file)
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        log.warning("the checkpoint's counters cannot be: counting begins anew", reason=str(error))
+        return Ledger(1, new_totals(now_s))
+
+
+def _believable(file: Mapping[str, NDArray[Any]]) -> Ledger:
+    """The same, of any format that tells it, with what this version knows of.
+
+    Raises:
+        ArithmeticError, LookupError, TypeError, ValueError: It is damaged, or no counter can be so.
+    """
+    told = json.loads(str(file["total"]))
+    total = Totals.model_validate({name: told[name] for name in Totals.model_fields})
+    datetime.fromisoformat(total.since)
+    restarts, crashes = int(file["restarts"]) + 1, total.crashes + (not file["clean"])
+    counted = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
+    wrong = [f"{name} = {value}" for name, value in counted.items() if not 0 <= value <= MOST]
+    if wrong:
+        raise ValueError(", ".join(wrong))
+    return Ledger(restarts, total.model_copy(update={"crashes": crashes}))
 
 
 File = dict[str, Any]
@@ -248,7 +300,11 @@ def _migrated(file: File) -> File:
     """
     version = int(file["format"])
     if version != FORMAT and version not in _MIGRATIONS:
-        raise _RefusedError(f"format {version}, this version reads {min(_MIGRATIONS)} to {FORMAT}")
+        raise _RefusedError(_unknown(version))
     for step in range(version, FORMAT):
         file = _MIGRATIONS[step](file)
     return file
+
+
+def _unknown(version: int) -> str:
+    return f"format {version}, this version reads {min(_MIGRATIONS)} to {FORMAT}"

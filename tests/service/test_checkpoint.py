@@ -225,7 +225,16 @@ async def test_a_checkpoint_of_the_format_before_of_another_voltage_is_refused(t
     assert (tmp_path / "pack.refused.npz").read_bytes() == OLD_FILE.read_bytes()
 
 
-@pytest.mark.parametrize("damage", ["other cell", "nan", "range", "truncated", "garbage", "format", "pipe"])
+def saved_as(
+    version: int, file: CheckpointFile, estimator: Estimator, monkeypatch: pytest.MonkeyPatch, ledger: Ledger = NEW
+) -> None:
+    """A checkpoint of another format."""
+    with monkeypatch.context() as patch:
+        patch.setattr("bms_estimator.service.checkpoint.FORMAT", version)
+        file.save(estimator.record, ledger)
+
+
+@pytest.mark.parametrize("damage", ["other cell", "nan", "range", "truncated", "garbage", "earlier", "pipe"])
 async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason(
     tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,11 +255,9 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
         reason = "refused: it belongs to another pack or cell"
     if damage in ("truncated", "garbage"):
         file.path.write_bytes(file.path.read_bytes()[:500] if damage == "truncated" else bytes(range(256)) * 8)
-    if damage == "format":
-        monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", FORMAT + 1)
-        file.save(estimator.record, NEW)
-        monkeypatch.undo()
-        reason = f"refused: format {FORMAT + 1}, this version reads 4 to {FORMAT}"
+    if damage == "earlier":
+        saved_as(3, file, estimator, monkeypatch)
+        reason = f"refused: format 3, this version reads 4 to {FORMAT}"
     if damage == "pipe":  # whoever opens it for reading waits for a writer
         file.path.unlink()
         os.mkfifo(file.path)

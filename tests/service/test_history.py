@@ -1,6 +1,7 @@
 """What a pack's runs leave to the next: counters, crashes, unseen time, files of all formats, an SOC that a rest corrects."""
 
 import asyncio
+import dataclasses
 import shutil
 import threading
 from pathlib import Path
@@ -8,17 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
+from bms_estimator.model.estimate import Totals
 from bms_estimator.model.settings import Settings
 from bms_estimator.service import saving
-from bms_estimator.service.checkpoint import FORMAT, CheckpointFile, Ledger
+from bms_estimator.service.checkpoint import FORMAT, LATER, CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.moment import Moment
 from bms_estimator.snapshot.totals import gap_lengths
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
-from tests.service.test_checkpoint import CELL, NEW, SETTINGS, a_used_pack, edited, often, ran
+from tests.service.test_checkpoint import CELL, NEW, SETTINGS, a_used_pack, edited, often, ran, saved_as
 
 OLD_FILES = {4: 0.5762, 5: 0.4149}
 """SOC by format: 4 is that of 0.1.0."""
@@ -111,6 +114,61 @@ async def test_a_checkpoint_that_is_older_than_configured_is_refused_and_without
         (49.0, edited("state", longest_days=2.0), "refused: it is 2.0 days old, state.longest_days is 2"),
     ):
         assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: at(hours)).load().reason == reason
+
+
+COUNTED = Ledger(6, Totals(since="2023-11-14T22:13:20Z", crashes=2, samples={"samples": 70}, unseen_s=30.0), clean=True)
+
+
+async def test_what_is_counted_goes_on_over_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
+    file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0))
+    file.save(a_used_pack().record, COUNTED)
+    _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edited("state", longest_days=2.0))
+    assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
+
+
+async def test_checkpoints_of_later_versions_are_each_kept_and_what_they_have_counted_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A version is tried, and left again, more often than files are kept; the first are those that have learned most."""
+    file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
+    (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
+    for attempt in range(LATER + 1):
+        counted = dataclasses.replace(COUNTED, restarts=6 + attempt)
+        saved_as(FORMAT + 1, file, a_used_pack(), monkeypatch, counted)
+        inodes.append(file.path.stat().st_ino)
+        health = (await ran(tmp_path, samples=1)).health
+        kept = min(attempt + 1, LATER)
+        assert health.checkpoint.endswith(f"reads 4 to {FORMAT}; set aside as pack.later-{kept}.npz")
+        assert (health.restarts, health.total.crashes, health.total.unseen_s) == (7 + attempt, 2, 30.0)
+    kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, LATER + 1)]
+    assert kept_inodes == [*inodes[: LATER - 1], inodes[LATER]]
+    assert (tmp_path / "pack.refused.npz").read_bytes() == b"an older one"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"crashes": -3},
+        {"samples": {"samples": 10**30}},
+        {"unseen_s": float("nan")},
+        {"unseen_s": -1.0},
+        {"since": "yesterday"},
+    ],
+    ids=str,
+)
+async def test_counters_that_cannot_be_are_not_believed_and_cost_nothing_else(
+    tmp_path: Path, wrong: dict[str, Any]
+) -> None:
+    learned = a_used_pack()
+    total = COUNTED.total.model_copy(update=wrong)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTED, total=total))
+    with capture_logs() as lines:
+        health = (await ran(tmp_path, samples=1)).health
+    assert "counting begins anew" in lines[0]["event"]
+    assert health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
+    assert (health.restarts, health.total.crashes) == (1, 0)
+    assert 0 <= health.total.samples["samples"] <= 1
+    assert 0.0 <= health.total.unseen_s < LONG_S
 
 
 async def test_a_state_folder_that_is_deleted_is_made_anew_for_its_owner_alone(tmp_path: Path) -> None:
