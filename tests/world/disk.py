@@ -5,6 +5,7 @@ its fsync, a name with the fsync of its folder. All else is lost or torn by a po
 """
 
 import errno
+import math
 import os
 import random
 import shutil
@@ -133,7 +134,9 @@ class Disk:
                 sizes = self._logs.get(path.name, deque())
                 least = max((size for at_s, size in sizes if at_s < now_s - SYNC_S), default=0)
                 least = min(least, len(content))
-                path.write_bytes(content[: self._dice.randint(least, len(content))])
+                left = self._dice.randint(least, len(content))
+                path.write_bytes(content[:left])
+                self._logs[path.name] = deque([(-math.inf, left)])  # what is there after a power cut is on the platter
             else:
                 path.write_bytes(content)
 

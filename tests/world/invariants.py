@@ -1,8 +1,9 @@
 """What must hold, whatever happens. Each number that bounds something stands here."""
 
-import json
 from dataclasses import dataclass, field
 from typing import NamedTuple
+
+from pydantic_core import from_json
 
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.sources.protocol import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
@@ -84,8 +85,8 @@ class Said:
         """A process has ended."""
         self.ends[process] = End(now_s, forgotten_s)
 
-    def take(self, packet: Packet, connection: Connection | None) -> str:
-        """The broker has received a state. Returns what is wrong with that."""
+    def take(self, packet: Packet, connection: Connection | None, *, in_order: bool) -> str:
+        """The broker has received a state; ``in_order``: not before one that came already. Returns what is wrong with that."""
         number = self.payloads.get(packet.payload)
         if number is None:
             return "a state that nobody said"
@@ -99,7 +100,7 @@ class Said:
                 return f"state {number} came again though its acknowledgement had come"
         if earlier:
             self.doubled += 1
-        elif number < self.last:
+        elif number < self.last and (in_order or self.states[number].process == self.states[self.last].process):
             return f"state {number} came after state {self.last}"
         earlier.append((connection, packet.mid))
         self.last = max(self.last, number)
@@ -188,11 +189,7 @@ def text(payload: bytes | None) -> str | None:
 def is_json(payload: bytes) -> bool:
     """Whether a payload is strict JSON: no NaN, no infinity."""
     try:
-        json.loads(payload, parse_constant=_refuse)
+        from_json(payload, allow_inf_nan=False)
     except ValueError:
         return False
     return True
-
-
-def _refuse(token: str) -> float:
-    raise ValueError(token)

@@ -10,6 +10,7 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,6 +28,8 @@ from bms_estimator.model.settings import (
 from bms_estimator.service import serve as service
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile
 from bms_estimator.simulation.virtual_converter import BoardParts
+from bms_estimator.sources.board_memory import BoardMemory
+from bms_estimator.sources.doorkeeper import HELD_READS, Doorkeeper
 from tests.world import invariants
 from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError
@@ -213,6 +216,7 @@ class World:
         self.start_process()
         for fault in self.faults:
             self.timeline.at(fault.at_s, lambda fault=fault: self._befall(fault))
+        self.timeline.at(self.seconds - CALM_S, self._calm)
         while self.timeline.now_s < self.seconds:
             process = self.process
             if process is not None and process.loop.busy:
@@ -220,6 +224,10 @@ class World:
             else:
                 self.timeline.step()
         self._check_end()
+
+    def _calm(self) -> None:
+        """What waits to befall the next write or handle does not any more."""
+        self.disk.arm = self.kill_after = None
 
     def _step(self, process: Process) -> None:
         """One handle of the service, unless it is killed before."""
@@ -249,7 +257,7 @@ class World:
 
     def _forgotten_s(self, *, clean: bool, silently: bool) -> float:
         """What the service had heard or said for longer outlives its end [s]."""
-        if self.disk.bad or self.timeline.now_s < self.disk_good_s:
+        if self.disk.bad or self.timeline.now_s < self.disk_good_s + (POWER_S if silently else 0.0):
             return math.inf
         return POWER_S if silently else 0.0 if clean else KILL_S
 
@@ -299,7 +307,7 @@ class World:
         self.kill_after = None
         self.disk.arm = None
         self.broker.loop = None
-        known = any(c.loop is process.loop and c.broker_open for c in self.broker.connections)
+        known = any(c.loop is process.loop and c.broker_open and c.accepted for c in self.broker.connections)
         self.will_certain = known or self.broker.retained.get(f"{ROOT}/availability") != b"online"
         process.loop.kill()
         self.disk.end_process()
@@ -370,8 +378,12 @@ class World:
             self.note(f"broker: {packet.topic} {packet.payload[:60]!r}")
         if connection is not None and packet.payload[:1] == b"{" and not invariants.is_json(packet.payload):
             self.fail(f"{packet.topic} is no strict JSON: {packet.payload[:200]!r}")
-        if packet.topic == f"{ROOT}/state" and (wrong := self.said.take(packet, connection)):
+        if packet.topic == f"{ROOT}/state" and (wrong := self._take_state(packet, connection)):
             self.fail(wrong)
+
+    def _take_state(self, packet: Packet, connection: Connection | None) -> str:
+        disk_fails = self.disk.bad or self.timeline.now_s < self.disk_good_s
+        return self.said.take(packet, connection, in_order=not disk_fails)
 
     # what must hold
 
@@ -393,12 +405,21 @@ class World:
         """Each valid sample that came was taken, or dropped and counted."""
         if process.board is None or self.settings.sensor.protocol != "binary":
             return
-        counters = process.board.counters
+        door, counters = process.board._door, process.board.counters
+        held = door.stranger is not None
+        process.foreign |= held and len(door._held) == HELD_READS  # what no longer finds room is not counted
         if self.timeline.now_s - process.delivered_s > 0.05 and not process.foreign and self._reads(process) == 0:
             taken = sum(counters[name] for name in ("frames_received", "duplicates", "out_of_order", "before_hello"))
-            held = process.board._door.stranger is not None
             if taken != process.reference.samples and not held:
                 self.fail(f"{process.reference.samples} samples came, {taken} are counted: {counters}")
+
+    def _reopened(self, process: Process, door: Doorkeeper, opened: Callable[[], None]) -> None:
+        """A port that was lost before its board was known: what it said is nobody's."""
+        if door.stranger is not None:
+            nobodys = Reference()
+            nobodys.feed(b"".join(data for _, data in door._held))
+            process.reference.samples -= nobodys.samples
+        opened()
 
     def _check_board(self, process: Process) -> None:
         """The samples that are taken are the pack's own board's."""
@@ -454,6 +475,10 @@ class World:
         process = self.process
         if process is None:
             self.fail("the service does not run")
+        if process is not None and process.board is not None and (serial := process.board.board.get("serial")):
+            remembered = BoardMemory(self.disk.folder, NAME).load().get("serial")
+            if remembered != serial:
+                self.fail(f"board {serial} is not remembered, but {remembered}")
         if lost := self.said.lost(self.timeline.now_s):
             self.fail(f"the broker never got the states {lost}")
 
@@ -502,6 +527,7 @@ class World:
             board = made(*arguments, **named)
             if self.process is not None:
                 self.process.board = board
+                board._door.opened = partial(self._reopened, self.process, board._door, board._door.opened)
             return board
 
         service.SerialBoard = make
