@@ -20,7 +20,10 @@ HANG_S = 10.0
 RETRY_S = 10.0
 """A disk that failed is tried again no more often than this [s]."""
 SYNC_S = 30.0
-"""So much at most is lost with the power: transactions between reach the system at once, and the disk when it likes [s]."""
+"""The first transaction after so long waits for the platter; those between reach the system at once, the platter when it likes [s].
+
+So much is lost with the power while transactions go on: where none follows, nothing syncs those before.
+"""
 LOCKED_S = 5.0
 """How long somebody else may hold the file [s]."""
 LOG_BYTES = 4 << 20

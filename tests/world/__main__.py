@@ -9,6 +9,7 @@ import argparse
 import gc
 import multiprocessing
 import os
+import resource
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -63,20 +64,22 @@ def _say(line: str) -> None:
 
 
 def _many(options: argparse.Namespace) -> int:
-    begun_s, failed, stds, errors = time.monotonic(), [], [], []
+    begun_s, failed, bands = time.monotonic(), [], []
     seeds = range(options.first, options.first + options.seeds)
     context = multiprocessing.get_context("fork")  # with what is compiled
     with ProcessPoolExecutor(options.processes, context) as pool:
         for result in pool.map(partial(run, seconds=options.hours * HOUR_S), seeds):
-            stds.append(result.band.worst_stds)
-            errors.append(result.band.worst_error)
+            bands.append(result.band)
             if result.wrong:
                 failed.append(result.seed)
                 _say(f"make simulate SEED={result.seed}: {result.wrong}")
-    seconds = time.monotonic() - begun_s
+    seconds, cpu = time.monotonic() - begun_s, resource.getrusage(resource.RUSAGE_CHILDREN)
+    inside = sum(band.inside for band in bands) / max(sum(band.states for band in bands), 1)
     _say(
-        f"{len(seeds)} worlds of {options.hours:g} h in {seconds:.0f} s, {seconds / len(seeds):.2f} s each on "
-        f"{options.processes} processors; SOC off by {100.0 * max(errors):.1f} % and {max(stds):.1f} std at most; "
+        f"{len(seeds)} worlds of {options.hours:g} h in {seconds:.0f} s, on {options.processes} processors, "
+        f"{(cpu.ru_utime + cpu.ru_stime) / len(seeds):.2f} s of processor each; SOC off by "
+        f"{100.0 * max(band.worst_error for band in bands):.1f} % and {max(band.worst_stds for band in bands):.1f} std at "
+        f"most, {100.0 * inside:.1f} % of {sum(band.states for band in bands)} states within 2 std; "
         f"{len(failed)} failed"
     )
     return int(bool(failed))

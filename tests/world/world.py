@@ -18,6 +18,7 @@ import structlog
 
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.model.settings import (
+    IdentifierSettings,
     MqttSettings,
     PackSettings,
     PublishSettings,
@@ -48,6 +49,8 @@ RESOLUTION_V, NOISE_V = 5.0 / 1024, 0.001
 """Of a board whose converter sees the cell without a divider."""
 CALM_S = 420.0
 """At the end nothing happens, and all must be as it should [s]."""
+KNOWN, KNOWN_STD = 0.5, (0.005, 0.02)
+"""So many worlds begin with a SOC that is known, with a standard deviation between these: their bands are narrow."""
 SHARED = Path("/dev/shm")
 LAST_LINES = 60
 FORGOTTEN_BY_AIOMQTT = "Future exception was never retrieved: MqttCodeError('Unexpected disconnection')"
@@ -118,6 +121,7 @@ class World:
         self.seed, self.seconds = seed, seconds
         self.timeline = Timeline(self.dice["time"])
         self.clocks = Clocks(lambda: self.timeline.now_s)
+        self.pack = new_pack(self.dice["pack"])
         self.settings = self._draw_settings(dice)
         self.folder = Path(tempfile.mkdtemp(prefix="bms-world-", dir=SHARED if SHARED.is_dir() else None))
         self._path = str(self.folder).encode()
@@ -126,7 +130,6 @@ class World:
         self.cable.delivered = self._delivered
         self.broker = Broker(self.timeline, self.dice["broker"], self._received)
         self.broker.knows_five = dice.random() < 0.8
-        self.pack = new_pack(self.dice["pack"])
         text = self.settings.sensor.protocol == "text"
         first_rate_hz = dice.choice((1, 10, 100))
         self.board = Board(
@@ -163,8 +166,15 @@ class World:
         text = dice.random() < 0.2
         rate_hz = 10 if dice.random() < 0.03 else 1
         self.auto = dice.random() < 0.5
+        pack, identifier = PackSettings(name=NAME, cell="chen_mora"), IdentifierSettings()
+        known = random.Random(f"{self.seed} known")
+        if known.random() < KNOWN:
+            std = known.uniform(*KNOWN_STD)
+            told = min(max(known.gauss(self.pack.soc, std), 0.0), 1.0)
+            pack, identifier = pack.model_copy(update={"initial_soc": told}), IdentifierSettings(soc_std=std)
         return Settings(
-            pack=PackSettings(name=NAME, cell="chen_mora"),
+            pack=pack,
+            identifier=identifier,
             sensor=SensorSettings(
                 port="auto", protocol="text" if text else "binary", sample_rate_hz=rate_hz,
                 voltage_resolution_v=RESOLUTION_V, voltage_noise_v=NOISE_V,
