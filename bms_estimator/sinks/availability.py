@@ -8,7 +8,7 @@ import structlog
 
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.messages import Message
-from bms_estimator.sinks.refusals import name_refused
+from bms_estimator.sinks.refusals import Refusals
 
 CORRECTION_S = 5.0
 """An availability that somebody else wrote is put right no more often than this [s]."""
@@ -25,7 +25,8 @@ class Availability:
 
     Args:
         own: What the availabilities must hold now; the service's own first.
-        delivery: Corrections are counted there, and an ``online`` that does not come back is named.
+        delivery: Corrections are counted there.
+        refusals: An ``online`` that does not come back is named there.
         wake: Called when it is time to ``correct``.
         echo_s: Until a broker has given back ``online`` [s].
     """
@@ -34,10 +35,12 @@ class Availability:
         self,
         own: Callable[[], Sequence[Message]],
         delivery: Delivery,
+        refusals: Refusals,
         wake: Callable[[], object],
         echo_s: float = ECHO_S,
     ) -> None:
-        self._own, self._delivery, self._wake, self._echo_s = own, delivery, wake, echo_s
+        self._own, self._delivery, self._refusals = own, delivery, refusals
+        self._wake, self._echo_s = wake, echo_s
         self._echoed = asyncio.Event()
         self._forged = False  # somebody else wrote there
         self._corrected_s = -math.inf
@@ -87,6 +90,6 @@ class Availability:
         except TimeoutError:
             if topic in self._delivery.refused_topics:
                 return
-            name_refused(self._delivery, topic, "it does not come back: not allowed to read it, or the broker is slow")
+            self._refusals.deny(topic, "it does not come back: not allowed to read it, or the broker is slow")
             await self._echoed.wait()
-            self._delivery.refused_topics.remove(topic)
+            self._refusals.allow(topic)

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.connection import Connection
 from bms_estimator.sinks.messages import Message
-from bms_estimator.sinks.refusals import name_refused
+from bms_estimator.sinks.pauses import Pauses
+from bms_estimator.sinks.refusals import Refusals
 from bms_estimator.store.outbox import Outbox, Waiting
 
 WINDOW = 16
@@ -20,10 +21,13 @@ class Backlog:
     Args:
         outbox: The outbox.
         delivery: It is counted there what waits and what never arrives.
+        refusals: Hears how the broker answers.
+        first_delay_s: Before what is refused for now is tried again; doubles with each time [s].
     """
 
-    def __init__(self, outbox: Outbox, delivery: Delivery) -> None:
-        self._outbox, self._delivery = outbox, delivery
+    def __init__(self, outbox: Outbox, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
+        self._outbox, self._delivery, self._refusals = outbox, delivery, refusals
+        self._pauses = Pauses(first_delay_s)
         self._refused = 0
         self._moved = asyncio.Event()
 
@@ -39,19 +43,12 @@ class Backlog:
         Raises:
             LinkError: It is, alone or in a group.
         """
-        room = asyncio.Semaphore(WINDOW)
-
-        async def carry(waiting: Waiting) -> None:
-            await self._carry(connection, waiting)
-            room.release()
-
         self._outbox.connected = True
+        self._pauses.reset()
         try:
-            async with asyncio.TaskGroup() as on_their_way:
-                while True:
-                    for waiting in await self._outbox.take(WINDOW):
-                        await room.acquire()
-                        on_their_way.create_task(carry(waiting))  # tasks begin in the order in which they are made
+            while True:
+                await self._stream(connection)
+                await self._try_oldest(connection)
         finally:
             self._outbox.connected = False
             self._outbox.rewind()
@@ -62,16 +59,49 @@ class Backlog:
             self._moved.clear()
             await self._moved.wait()
 
-    async def _carry(self, connection: Connection, waiting: Waiting) -> None:
-        """Send one message. What the broker refuses is counted and given up: else it would hold up all the rest."""
-        topic = waiting.message.topic
+    async def _stream(self, connection: Connection) -> None:
+        """Send until the broker refuses one for now; then none is on its way any more, nor handed out."""
+        room = asyncio.Semaphore(WINDOW)
+
+        async def carry(waiting: Waiting) -> None:
+            if not await self._carry(connection, waiting):
+                feeding.cancel()
+            room.release()
+
+        async def feed() -> None:
+            while True:
+                for waiting in await self._outbox.take(WINDOW):
+                    await room.acquire()
+                    on_their_way.create_task(carry(waiting))  # tasks begin in the order in which they are made
+
+        async with asyncio.TaskGroup() as on_their_way:
+            feeding = on_their_way.create_task(feed())
+        self._outbox.rewind()
+
+    async def _try_oldest(self, connection: Connection) -> None:
+        """Try the oldest alone, so that nothing overtakes it, until the broker takes one or refuses it for good."""
+        while True:
+            await asyncio.sleep(self._pauses.next_s())
+            for oldest in await self._outbox.take(1):
+                if await self._carry(connection, oldest):
+                    self._pauses.reset()
+                    return
+            self._outbox.rewind()
+
+    async def _carry(self, connection: Connection, waiting: Waiting) -> bool:
+        """Send one message; False: to be tried again.
+
+        What is refused for good is counted and given up: else it would hold up all the rest.
+        """
         refusal = await connection.publish(waiting.message)
-        if refusal is not None:
-            self._refused += 1
-            name_refused(self._delivery, topic, f"not allowed to write it: {refusal}")
+        self._refusals.answered(waiting.message, refusal)
+        if refusal is not None and refusal.for_now:
+            return False
+        self._refused += refusal is not None
         self._outbox.sent(waiting.number)
         self._count()
         self._moved.set()
+        return True
 
     def _count(self) -> None:
         self._delivery.drops = self._outbox.dropped + self._refused

@@ -18,10 +18,10 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from bms_estimator.sinks.connection import Hello, LinkError, Received
+from bms_estimator.sinks.connection import Hello, LinkError, Received, Refusal
 from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING, Inbox
 from bms_estimator.sinks.messages import Message
-from bms_estimator.sinks.reasons import UNSUPPORTED_VERSION, words
+from bms_estimator.sinks.reasons import UNSUPPORTED_VERSION, is_final, words
 
 PARTING_S = 1.0
 """A connection that broke cannot be ended in good order [s]."""
@@ -98,21 +98,22 @@ class Client(aiomqtt.Client):
         self._acknowledged_s = patience.acknowledged_s
         self._client.on_log = self._on_log
         self.protocol = "MQTT 5" if self._is_5 else "MQTT 3.1.1"
-        self._answers: dict[int, asyncio.Future[str | None]] = {}
+        self._answers: dict[int, asyncio.Future[Refusal | None]] = {}
         self._in_flight = asyncio.Semaphore(self._client.max_inflight_messages)
         self._most_bytes: int | None = None
         self._abandoned = False
         self._why = "the connection broke"
 
-    async def publish(self, message: Message) -> str | None:  # type: ignore[override]
+    async def publish(self, message: Message) -> Refusal | None:  # type: ignore[override]
         """As ``Connection`` has it."""
         if self._most_bytes is not None and HEAD_BYTES + len(message.topic) + len(message.payload) > self._most_bytes:
-            return f"longer than the {self._most_bytes} bytes that the broker takes"  # it would end the connection
+            # it would end the connection
+            return Refusal(f"longer than the {self._most_bytes} bytes that the broker takes", for_now=False)
         async with self._in_flight:
             info = self._client.publish(*message)
             if info.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
                 raise LinkError(f"a message cannot be sent: {error_string(info.rc)}")
-            answer: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
+            answer: asyncio.Future[Refusal | None] = asyncio.get_running_loop().create_future()
             self._answers[info.mid] = answer
             try:
                 async with asyncio.timeout(self._acknowledged_s):
@@ -210,7 +211,9 @@ class Client(aiomqtt.Client):
     def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Any) -> None:  # noqa: ARG002
         answer = self._answers.get(mid)
         if answer is not None and not answer.done():
-            answer.set_result(words(reason_code) if reason_code.is_failure else None)
+            answer.set_result(
+                Refusal(words(reason_code), not is_final(reason_code)) if reason_code.is_failure else None
+            )
 
 
 @contextlib.asynccontextmanager

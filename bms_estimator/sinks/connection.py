@@ -20,6 +20,14 @@ class Received(NamedTuple):
     retain: bool
 
 
+class Refusal(NamedTuple):
+    """The broker's no to a message."""
+
+    why: str
+    for_now: bool
+    """It may take the same message later."""
+
+
 class Hello(NamedTuple):
     """How each connection of a client begins."""
 
@@ -47,13 +55,13 @@ class Connection(Protocol):
             The topics that the broker refuses, and why.
         """
 
-    async def publish(self, message: Message) -> str | None:
+    async def publish(self, message: Message) -> Refusal | None:
         """Hand over a message and wait until the broker has acknowledged it.
 
         What is published by several tasks goes out in the order in which they called.
 
         Returns:
-            Why the broker refuses it, where it does and says so.
+            The broker's refusal, where it does and says so.
         """
 
     async def receive(self) -> Received:

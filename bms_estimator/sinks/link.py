@@ -2,7 +2,6 @@
 
 import asyncio
 import itertools
-import random
 from collections.abc import Awaitable, Callable, Sequence
 
 import structlog
@@ -10,11 +9,8 @@ import structlog
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.brokers import Broker
 from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError
+from bms_estimator.sinks.pauses import FIRST_DELAY_S, Pauses
 
-FIRST_DELAY_S = 2.0
-"""Before all brokers are tried once more; doubles with each time [s]."""
-LONGEST_DELAY_S = 30.0
-"""A broker in the house is back before long [s]."""
 LASTING_S = 10.0
 """A connection that ends sooner is taken as an attempt that failed [s]."""
 LOG_S = 600.0
@@ -26,8 +22,7 @@ log = structlog.get_logger(__name__)
 class Link:
     """Connects, serves, and connects again until it is closed.
 
-    The next broker is tried at once. When all were tried there is a pause, shortened by chance so that not all clients
-    of a broker come back together.
+    The next broker is tried at once. When all were tried there is a pause.
 
     Args:
         brokers: In the order in which they are tried.
@@ -49,7 +44,7 @@ class Link:
     ) -> None:
         self._brokers, self._hello, self._connect, self._serve = brokers, hello, connect, serve
         self._delivery = delivery
-        self._first_delay_s = self._delay_s = first_delay_s
+        self._pauses = Pauses(first_delay_s)
         self._said: dict[str, tuple[str, float]] = {}  # by URL: the last reason and when it was logged
         self.closing = asyncio.Event()
 
@@ -60,11 +55,11 @@ class Link:
             if self.closing.is_set():
                 return
             if await self._attempt(broker):
-                tried, self._delay_s = 0, self._first_delay_s
+                tried = 0
+                self._pauses.reset()
             tried += 1
             if tried % len(self._brokers) == 0:
-                await self._pause(self._delay_s * random.uniform(0.5, 1.0))
-                self._delay_s = min(2.0 * self._delay_s, LONGEST_DELAY_S)
+                await self._pause(self._pauses.next_s())
 
     async def _attempt(self, broker: Broker) -> bool:
         """One broker; True when it was worth the name of a connection."""

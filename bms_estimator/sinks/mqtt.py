@@ -22,9 +22,10 @@ from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError, Received
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.home_assistant import BIRTH_TOPIC
-from bms_estimator.sinks.link import FIRST_DELAY_S, Link
+from bms_estimator.sinks.link import Link
 from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY, Message, Messages, Sent
-from bms_estimator.sinks.refusals import name_refused
+from bms_estimator.sinks.pauses import FIRST_DELAY_S
+from bms_estimator.sinks.refusals import Refusals
 from bms_estimator.sinks.requests import MOST_SHOWN, Requests
 from bms_estimator.store.outbox import Outbox
 
@@ -49,7 +50,7 @@ class MqttSink:
         outbox: What must reach the broker.
         connect: Makes a connection; over TCP when left out.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
-        first_delay_s: Before a lost broker is tried once more [s].
+        first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
         birth_delay_s: From Home Assistant's birth message to the retained messages [s].
         echo_s: Until a broker has given back ``online`` [s].
 
@@ -71,7 +72,9 @@ class MqttSink:
         birth_delay_s: float = BIRTH_DELAY_S,
         echo_s: float = ECHO_S,
     ) -> None:
-        self._requests, self._delivery, self._backlog = requests, delivery, Backlog(outbox, delivery)
+        self._requests, self._delivery = requests, delivery
+        self._refusals = Refusals(delivery, self._say_again, first_delay_s)
+        self._backlog = Backlog(outbox, delivery, self._refusals, first_delay_s)
         self._birth_delay_s = birth_delay_s
         self._messages = Messages(settings.base_topic, device, sample_period_s)
         identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.farewell()[-1]
@@ -85,7 +88,7 @@ class MqttSink:
         self._again = True  # the broker may hold nothing: send all of it
         self._wake = asyncio.Event()
         self._availability = Availability(
-            lambda: self._messages.availability(self._sent), delivery, self._wake.set, echo_s
+            lambda: self._messages.availability(self._sent), delivery, self._refusals, self._wake.set, echo_s
         )
         self._task: asyncio.Task[None] | None = None
 
@@ -117,6 +120,7 @@ class MqttSink:
     async def _serve(self, connection: Connection) -> None:
         """Send and receive until the connection is lost or the sink closes."""
         self._again = True
+        self._refusals.begin()
         self._availability.begin()
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -135,6 +139,8 @@ class MqttSink:
             with contextlib.suppress(LinkError):
                 await self._publish(connection, self._messages.farewell())
             raise
+        finally:
+            self._refusals.end()
 
     async def _subscribe(self, connection: Connection) -> None:
         """Subscribe, and say what the broker refuses.
@@ -143,16 +149,13 @@ class MqttSink:
         """
         availabilities = [self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)]
         refused = await connection.subscribe(self._topic("request/+"), [*availabilities, BIRTH_TOPIC])
-        self._delivery.refused_topics = []
         for topic, why in refused.items():
-            name_refused(self._delivery, topic, f"not allowed to read it: {why}")
+            self._refusals.deny(topic, f"not allowed to read it: {why}")
 
     async def _publish(self, connection: Connection, messages: Sequence[Message]) -> None:
         """Publish one after the other."""
         for message in messages:
-            refusal = await connection.publish(message)
-            if refusal is not None:
-                name_refused(self._delivery, message.topic, f"not allowed to write it: {refusal}")
+            self._refusals.answered(message, await connection.publish(message))
 
     async def _send(self, connection: Connection) -> None:
         """Send what is live until the sink closes, then say goodbye."""

@@ -22,6 +22,19 @@ HINTS = {
 }
 """By code: what it comes from, or what to do."""
 
+FINAL = {
+    135,  # not authorised
+    144,  # topic name invalid
+    149,  # too large
+    153,  # payload format invalid
+}
+"""What makes a broker refuse a message however often it comes; all else (busy, quota, unspecified) may pass."""
+
+
+def is_final(reason: ReasonCode) -> bool:
+    """Whether a message that is refused so will always be."""
+    return reason.value in FINAL
+
 
 def words(reason: ReasonCode) -> str:
     """A reason code as text: name, number, hint."""

@@ -1,4 +1,5 @@
-"""What stands between a client and its broker: a network that fails in silence, or a broker of the older MQTT."""
+"""What stands between a client and its broker: a network that fails in silence, or a broker of the older MQTT, or one
+that takes nothing."""
 
 import asyncio
 import contextlib
@@ -6,6 +7,24 @@ from typing import Self
 
 REFUSED = b"\x20\x02\x00\x01"
 """CONNACK of a broker that does not know the client's version of MQTT."""
+
+
+async def read_packet(reader: asyncio.StreamReader) -> bytes:
+    """One packet of MQTT."""
+    head = await reader.readexactly(2)
+    while head[-1] & 0x80:
+        head += await reader.readexactly(1)
+    length = sum((byte & 0x7F) << 7 * i for i, byte in enumerate(head[1:]))
+    return head + await reader.readexactly(length)
+
+
+def published(packet: bytes) -> tuple[str, bytes] | None:
+    """Topic and identifier of a message at QoS 1; None of all else."""
+    if packet[0] & 0xF6 != 0x32:
+        return None
+    start = next(i for i, byte in enumerate(packet[1:], 2) if not byte & 0x80)
+    end = start + 2 + int.from_bytes(packet[start : start + 2])
+    return packet[start + 2 : end].decode(), packet[end : end + 2]
 
 
 class Proxy:
@@ -19,6 +38,8 @@ class Proxy:
         port: Where it listens.
         swallows: All that comes from either side is lost, and nobody hears of it; for connections of that time for good.
         away: Who comes is turned away.
+        refuses: The reason code by which messages at QoS 1 are refused in place of the broker; 0: none is.
+        refused: Their topics.
         half_open_ended: Set when the broker has ended a connection that was left half-open.
     """
 
@@ -27,6 +48,8 @@ class Proxy:
         self._clients: list[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._half_open = self.swallows = self.away = False
+        self.refuses = 0
+        self.refused: list[str] = []
         self.half_open_ended = asyncio.Event()
 
     @property
@@ -77,8 +100,8 @@ class Proxy:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self.away:
             return
-        start = await reader.readuntil(b"MQTT") + await reader.readexactly(1)
-        if start.endswith(b"\x05") and not self._knows_5:
+        start = await read_packet(reader)
+        if b"MQTT\x05" in start and not self._knows_5:
             writer.write(REFUSED)
             await writer.drain()
             return
@@ -88,7 +111,7 @@ class Proxy:
         from_broker, to_broker = await asyncio.open_connection("127.0.0.1", self._broker_port)
         to_broker.write(start)
         self._clients.append((writer, to_broker))
-        up = asyncio.create_task(self._pump(reader, to_broker))
+        up = asyncio.create_task(self._hand_up(reader, to_broker, writer))
         try:
             await self._pump(from_broker, writer)
             while await from_broker.read(4096):  # the client is gone, the broker does not know
@@ -100,6 +123,23 @@ class Proxy:
         finally:
             up.cancel()
             to_broker.transport.abort()
+
+    async def _hand_up(
+        self, reader: asyncio.StreamReader, to_broker: asyncio.StreamWriter, to_client: asyncio.StreamWriter
+    ) -> None:
+        """What the client says, until either end is gone."""
+        lost = False
+        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
+            while not to_broker.transport.is_closing():
+                packet = await read_packet(reader)
+                lost |= self.swallows
+                message = published(packet) if self.refuses else None
+                if message and not lost:
+                    self.refused.append(message[0])
+                    to_client.write(bytes([0x40, 3, *message[1], self.refuses]))
+                elif not lost:
+                    to_broker.write(packet)
+                    await to_broker.drain()
 
     async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Hand on until either end is gone."""

@@ -19,9 +19,10 @@ from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connection, Hello
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING, Inbox
-from bms_estimator.sinks.link import LONGEST_DELAY_S, Link
+from bms_estimator.sinks.link import Link
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.sinks.pauses import LONGEST_DELAY_S
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener

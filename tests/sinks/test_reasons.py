@@ -1,17 +1,21 @@
 """What a broker means is said in words, in log and health."""
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import structlog
 
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.backlog import WINDOW
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.patience import LONG_S
 from tests.sinks.proxy import Proxy
 from tests.sinks.service import STATE, Sink, assert_all_in_order, numbers, state, until
 from tests.sinks.snapshots import ONE, snapshot
@@ -96,6 +100,76 @@ async def test_what_is_longer_than_the_broker_takes_is_named_and_does_not_end_th
     assert {line["reason"] for line in logs if "topic" in line} == {
         "not allowed to write it: longer than the 4000 bytes that the broker takes"
     }
+
+
+QUICK: Any = {"most_kept": 1000, "first_delay_s": 0.02}
+RETAINED = {
+    "bms/pack/availability",
+    "bms/pack/schema",
+    "bms/pack/sensor/availability",
+    "bms/pack/health",
+    "bms/pack/info",
+    "homeassistant/device/bms_pack/config",
+}
+
+
+@pytest.mark.parametrize("code", [131, 151])
+async def test_what_is_refused_for_now_comes_later_in_order(broker: Broker, code: int) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, **QUICK) as sink:
+            for number in range(50):
+                sink.mqtt.publish(state(number))
+            await until(lambda: sink.delivery.waiting == 0)
+            network.refuses = code
+            for number in range(50, 100):
+                sink.mqtt.publish(state(number))
+            await until(lambda: network.refused.count(STATE) > WINDOW + 2)  # so the oldest alone is tried
+            assert STATE in sink.delivery.refused_topics
+            network.refuses = 0
+            await until(lambda: sink.delivery.waiting == 0)
+    assert_all_in_order(numbers(live), 100)
+    assert (sink.delivery.drops, sink.delivery.losses) == (0, 0)
+    assert len([line for line in logs if line.get("topic") == STATE]) == 1
+
+
+async def test_what_is_retained_and_refused_for_now_is_said_again_after_a_pause(broker: Broker) -> None:
+    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
+        network.refuses = 151
+        sink.mqtt.publish(ONE)
+        await until(lambda: set(network.refused) >= RETAINED)
+        assert set(sink.delivery.refused_topics) >= RETAINED
+        network.refuses = 0
+        async with asyncio.timeout(LONG_S):
+            while sink.delivery.refused_topics:
+                sink.mqtt.publish(ONE)
+                await asyncio.sleep(0.01)
+        for topic in RETAINED:
+            await live.wait(topic)
+
+
+async def test_what_is_retained_and_refused_for_long_is_not_said_with_each_snapshot(broker: Broker) -> None:
+    async with Proxy(broker.port) as network, Sink(network.url, first_delay_s=LONG_S) as sink:
+        network.refuses = 151
+        for _ in range(20):
+            before = network.refused.count("bms/pack/health")
+            sink.mqtt.publish(snapshot())
+            await until(lambda: network.refused.count("bms/pack/health") > before)  # noqa: B023 - at once
+        assert network.refused.count("bms/pack/info") == network.refused.count("bms/pack/schema") == 1
+        network.leave()  # or what waits for the pause holds the end up
+        await until(lambda: sink.delivery.losses)
+
+
+@pytest.mark.parametrize("code", [135, 153])
+async def test_what_is_refused_for_good_is_given_up(broker: Broker, code: int) -> None:
+    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
+        await live.wait("bms/pack/schema")
+        network.refuses = code
+        for number in range(50):
+            sink.mqtt.publish(state(number))
+        await until(lambda: sink.delivery.waiting == 0)
+        assert network.refused.count(STATE) == 50
+        assert sink.delivery.drops == 50 + network.refused.count("bms/pack/event")
+        assert STATE in sink.delivery.refused_topics
 
 
 async def test_nothing_but_our_lines_is_said_of_a_broken_line(

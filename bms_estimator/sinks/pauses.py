@@ -1,0 +1,29 @@
+"""How long to wait before something is tried once more."""
+
+import random
+
+FIRST_DELAY_S = 2.0
+"""The first pause; doubles with each [s]."""
+LONGEST_DELAY_S = 30.0
+"""A broker in the house is back before long [s]."""
+
+
+class Pauses:
+    """Pauses that grow, each shortened by chance so that not all clients of a broker come back together.
+
+    Args:
+        first_s: The first [s].
+    """
+
+    def __init__(self, first_s: float = FIRST_DELAY_S) -> None:
+        self._first_s = self._next_s = first_s
+
+    def next_s(self) -> float:
+        """The next one [s]."""
+        delay_s = self._next_s
+        self._next_s = min(2.0 * delay_s, LONGEST_DELAY_S)
+        return delay_s * random.uniform(0.5, 1.0)
+
+    def reset(self) -> None:
+        """It went well: the first comes next."""
+        self._next_s = self._first_s
