@@ -172,6 +172,7 @@ class _File:
             os.close(descriptor)
         self._inode = _inode(self._path)
         self._connection = sqlite3.connect(self._path, timeout=LOCKED_S, isolation_level=None)
+        self._connection.text_factory = lambda raw: raw.decode(errors="surrogateescape")  # a damaged row must not fail
         self._prepare(self._connection)
         self.opened += 1
         return self._connection

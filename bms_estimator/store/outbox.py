@@ -127,12 +127,13 @@ class Outbox:
         try:
             if self._offset is None:
                 found = await self._database.call(look)
-                self._offset = found.first - queue.found(found.messages, found.span)
+                self._offset = queue.found(found.runs)
+                queue.dropped += found.damaged
                 self._known = self._database.opened
             work = self._due(self._offset, write=write)
             if work:
                 queue.writing(work.rows)
-                self._done(work, await self._database.call(work))
+                self._done(await self._database.call(work))
             queue.sure, queue.passing = self._known == self._database.opened, False
             self._known = self._database.opened
         except StoreError:
@@ -142,24 +143,22 @@ class Outbox:
 
     def _due(self, offset: int, *, write: bool) -> Work:
         queue, stored = self._queue, self._queue.stored
+        gaps = queue.gaps() if queue.stale or not queue.sure else []
+        queue.stale = False
         return Work(
             offset=offset,
-            first=stored.first,
-            end=stored.end,
-            drops=stored.drops,
-            gone=list(queue.gone),
+            first=stored.first if stored else queue.next,
+            end=stored.end if stored else queue.next,
+            gaps=gaps,
             rows=queue.unwritten() if write or not queue.sure else [],
             page=PAGE if queue.hungry else 0,
             recount=not queue.sure,
         )
 
-    def _done(self, work: Work, outcome: Outcome) -> None:
+    def _done(self, outcome: Outcome) -> None:
         """A transaction is on disk."""
         queue = self._queue
         if outcome.stored is not None:
             queue.left(outcome.stored)
-        queue.stored.drops -= work.drops
-        del queue.gone[: len(work.gone)]
-        if work.page:
-            queue.loaded(outcome.page, work.page)
+        queue.loaded(outcome.page, outcome.page_end)
         queue.wrote()

@@ -1,7 +1,7 @@
 """The order of what waits for the broker, in memory and on disk. Pure: no disk, no clock, no task.
 
 From the oldest to the newest a message is on its way (``handed``), ready to be handed out, on disk alone
-(``Stored``), or in the tail of what came last. While the broker takes what comes, nothing goes beyond ready.
+(``stored``), or in the tail of what came last. While the broker takes what comes, nothing goes beyond ready.
 """
 
 from collections import deque
@@ -11,11 +11,16 @@ from itertools import chain
 from typing import NamedTuple
 
 from bms_estimator.sinks.messages import Message
+from bms_estimator.store.runs import Runs
 
 MEMORY_MOST = 4096
 """Messages of the tail: some megabytes, and an hour of states for a disk that cannot be written."""
 PAGE = 1000
 """Messages that are ready; the next ones are read from disk once half of them are gone."""
+
+
+LOWEST = -(1 << 62)
+"""Below all numbers, here and on disk."""
 
 
 class Waiting(NamedTuple):
@@ -27,17 +32,6 @@ class Waiting(NamedTuple):
 
 
 @dataclass
-class Stored:
-    """What is on disk alone: numbers from ``first`` to before ``end``."""
-
-    first: int = 0
-    end: int = 0
-    count: int = 0
-    drops: int = 0
-    """The oldest of them, to be removed."""
-
-
-@dataclass
 class Queue:
     """Messages in order.
 
@@ -46,8 +40,9 @@ class Queue:
         dropped: Messages that found no room.
         next: The number of the next message.
         handed: On their way, not yet acknowledged.
-        gone: Numbers that may be on disk and need not be any more.
+        stale: Whether something may be on disk that is not kept any more.
         sure: Whether it is known what is on disk; if not, what is in memory is written again.
+        stored: What is on disk alone.
         passing: Hand out what came last though older ones are on disk, which cannot be read.
     """
 
@@ -55,10 +50,10 @@ class Queue:
     dropped: int = 0
     next: int = 0
     handed: dict[int, Waiting] = field(default_factory=dict)
-    gone: list[int] = field(default_factory=list)
+    stale: bool = False
     sure: bool = True
     passing: bool = False
-    stored: Stored = field(default_factory=Stored)
+    stored: Runs = field(default_factory=Runs)
     _ready: deque[Waiting] = field(default_factory=deque)
     _tail: deque[Waiting] = field(default_factory=deque)
     _written: set[int] = field(default_factory=set)  # in memory, and on disk as well
@@ -66,24 +61,24 @@ class Queue:
     @property
     def waiting(self) -> int:
         """Messages that are not acknowledged."""
-        return len(self.handed) + len(self._ready) + self.stored.count + len(self._tail)
+        return len(self.handed) + len(self._ready) + len(self.stored) + len(self._tail)
 
     @property
     def oldest(self) -> int | None:
         """The lowest number that waits."""
-        if self.stored.count and not self.handed and not self._ready:
+        if self.stored and not self.handed and not self._ready:
             return self.stored.first
         return next((waiting.number for waiting in self._in_memory()), None)
 
     @property
     def can_hand_out(self) -> bool:
         """Whether ``hand_out`` gives something."""
-        return bool(self._ready or (self._tail and (self.passing or not self.stored.count)))
+        return bool(self._ready or (self._tail and (self.passing or not self.stored)))
 
     @property
     def hungry(self) -> bool:
         """Whether it is time to read from disk."""
-        return self.stored.count > 0 and len(self._ready) < PAGE // 2
+        return bool(self.stored) and len(self._ready) < PAGE // 2
 
     def put(self, message: Message) -> None:
         """Take the newest message."""
@@ -125,54 +120,55 @@ class Queue:
         """What was to be written is on disk: of the tail, memory keeps what is ready."""
         while self._tail and self._tail[0].number in self._written:
             newest = self._tail.popleft()
-            if not self.stored.count and len(self._ready) < PAGE:
+            if not self.stored and len(self._ready) < PAGE:
                 self._ready.append(newest)
             else:
                 self._written.discard(newest.number)
-                first = self.stored.first if self.stored.count else newest.number
-                self.stored = Stored(first, newest.number + 1, self.stored.count + 1, self.stored.drops)
+                self.stored.add(newest.number)
 
-    def loaded(self, rows: list[Waiting], asked: int) -> None:
-        """The oldest of what is on disk alone were read."""
-        stored = self.stored
-        if rows:
-            stored.first = rows[-1].number + 1
-        self._written.update(waiting.number for waiting in rows)
-        dropped = max(len(rows) - stored.count, 0)  # meanwhile; what was to be removed of them is here now
-        for waiting in rows[:dropped]:
-            self._forget(waiting.number)
-        stored.drops -= dropped
-        known = {waiting.number for waiting in self._in_memory()}
-        self._ready.extend(waiting for waiting in rows[dropped:] if waiting.number not in known)
-        stored.count -= len(rows) - dropped
-        if len(rows) < asked:  # what else was there is lost
-            self.dropped += stored.count
-            stored.count = 0
+    def loaded(self, rows: Iterable[Waiting], end: int) -> None:
+        """Of what is on disk alone these were read; all that is before ``end`` and not among them is lost."""
+        wanted = self.stored.take_before(end)
+        read = {waiting.number: waiting for waiting in rows if waiting.number in wanted}  # some were dropped meanwhile
+        self._ready.extend(read.values())
+        self._written.update(read)
+        self._lose(len(wanted) - len(read))
 
-    def found(self, count: int, span: int) -> int:
+    def found(self, runs: Runs) -> int:
         """An earlier run left messages on disk: they go before all that was not handed out.
 
         Args:
-            count: How many.
-            span: From the number of the first to that of the last, and one.
+            runs: Their numbers on disk.
 
         Returns:
-            The number that the first of them gets.
+            What makes numbers on disk of ours.
         """
         first = self._tail[0].number if self._tail else self.next
+        if not runs:
+            return -first
+        span = runs.end - runs.first
         self._tail = deque(Waiting(waiting.number + span, waiting.message) for waiting in self._tail)
         self.next += span
-        self.stored = Stored(first, first + span, count)
+        self.stored = runs.moved(first - runs.first)
         for _ in range(self.waiting - self.most):
             self._drop_oldest()
-        return first
+        return runs.first - first
 
-    def left(self, count: int) -> None:
-        """So many of what was on disk alone are still there."""
-        lost = self.stored.count + self.stored.drops - count
-        if lost > 0:
-            self.dropped += lost
-            self.stored.count = max(self.stored.count - lost, 0)
+    def left(self, runs: Runs) -> None:
+        """So much of what was on disk alone is still there."""
+        before = len(self.stored)
+        self.stored = self.stored.both(runs)
+        self._lose(before - len(self.stored))
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """What is not kept: from each number to before the other. It never comes to be kept again."""
+        kept = [range(waiting.number, waiting.number + 1) for waiting in self._in_memory()]
+        gaps, begin = [], LOWEST
+        for run in sorted([*kept, *self.stored], key=lambda run: run.start):
+            if begin < run.start:
+                gaps.append((begin, run.start))
+            begin = run.stop
+        return [*gaps, (begin, self.next)] if begin < self.next else gaps
 
     def _in_memory(self) -> Iterator[Waiting]:
         return chain(self.handed.values(), self._ready, self._tail)
@@ -181,14 +177,20 @@ class Queue:
         """What may be on disk need not be any more."""
         if number in self._written:
             self._written.discard(number)
-            self.gone.append(number)
+            self.stale = True
+
+    def _lose(self, count: int) -> None:
+        """What was on disk alone cannot be read: what may be there of it need not be any more."""
+        if count:
+            self.dropped += count
+            self.stale = True
 
     def _drop_oldest(self) -> None:
         if self._ready:
             self._forget(self._ready.popleft().number)
-        elif self.stored.count:
-            self.stored.count -= 1
-            self.stored.drops += 1
+        elif self.stored:
+            self.stored.pop()
+            self.stale = True
         elif self._tail:
             self._forget(self._tail.popleft().number)
         else:

@@ -188,7 +188,7 @@ async def test_a_database_that_is_deleted_costs_only_what_was_on_disk_alone_and_
     async with Database(path) as database, Outbox(database, most=10_000) as outbox:
         for number in range(1500):
             outbox.put(message(number))
-        await until(lambda: outbox._queue.stored.count == 500)
+        await until(lambda: len(outbox._queue.stored) == 500)
         for file in path.parent.iterdir():
             file.unlink()
         outbox.put(message(1500))
@@ -215,6 +215,58 @@ async def test_a_fault_of_ours_is_seen_and_does_not_end_the_writing_in_silence(p
     outbox = await Outbox(Faulty(path), most=100).__aenter__()
     with pytest.raises(KeyError, match="ours"):
         await put_for_ever(outbox)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("topic", "'bms/+/state'"),
+        ("topic", "'bms/pack/#'"),
+        ("topic", "CAST(x'626d73ff' AS TEXT)"),
+        ("topic", "CAST(x'626d7300' AS TEXT)"),
+        ("topic", "'bms' || char(7)"),
+        ("topic", "''"),
+        ("topic", "hex(zeroblob(40000))"),
+        ("topic", "x'626d73'"),
+        ("payload", "'text'"),
+        ("qos", "5"),
+        ("retain", "'no'"),
+        ("number", "1 << 62"),
+        ("number", "-9223372036854775807 - 1"),
+    ],
+)
+async def test_a_row_that_is_damaged_is_left_out_and_counted(path, column, value):
+    async with Database(path) as database, Outbox(database, most=100) as outbox:
+        for number in range(3):
+            outbox.put(message(number))
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(f"UPDATE outbox SET {column} = {value} WHERE payload = CAST('1' AS BLOB)")
+    async with Database(path) as database, Outbox(database, most=100) as outbox:
+        outbox.put(message(3))
+        got: list[int] = []
+        while len(got) < 3:
+            got += await taken(outbox, 9)
+        assert (got, outbox.dropped, database.reason) == ([0, 2, 3], 1, "")
+    assert on_disk(path) == [0, 2, 3]
+
+
+async def test_a_disk_that_fails_for_long_costs_no_memory(path):
+    async with Database(path, retry_s=0.0) as database:
+        outbox = Outbox(database, most=100_000)
+        await outbox._settle(write=False)
+        path.unlink()
+        path.mkdir()
+        (path / "file").touch()
+        database._file._refuse_planted = lambda _: None  # type: ignore[method-assign]
+        for number in range(3 * MEMORY_MOST):
+            outbox.put(message(number))
+            if number % 1000 == 0:
+                await outbox._settle(write=True)
+        assert outbox.dropped == 2 * MEMORY_MOST
+        assert len(outbox._queue._written) <= MEMORY_MOST
+        assert len(outbox._queue.gaps()) == 1
+        (path / "file").unlink()
+        path.rmdir()
 
 
 KILLED = """

@@ -4,6 +4,7 @@ import asyncio
 import sqlite3
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,22 @@ from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
 
 PAGE = 4
+MEANWHILE = st.lists(st.sampled_from(["put", "take", "first", "last", "rewind"]), max_size=5)
 
 
 class FaultyDatabase(Database):
-    """One that can be told to fail, before or after it has written."""
+    """One that can be told to fail, before or after it has written, and at which something happens meanwhile."""
 
     fails: str | None = None
+    before: Callable[[], None] = staticmethod(lambda: None)
+    after: Callable[[], None] = staticmethod(lambda: None)
 
     async def call(self, work: Callable[[sqlite3.Connection], Any]) -> Any:
+        self.before()
         if self.fails == "before":
             raise StoreError("full")
         result = await super().call(work)
+        self.after()
         if self.fails == "after":
             raise StoreError("nobody knows")
         return result
@@ -81,10 +87,13 @@ class Promises(RuleBasedStateMachine):
     @rule(most=st.integers(1, 3))
     def take(self, most: int) -> None:
         self.settle(write=False)  # the page that it may wait for
+        assert self.outbox._queue.can_hand_out or not self.strict
+        self.hand_out(most)
+
+    def hand_out(self, most: int) -> None:
         if not self.outbox._queue.can_hand_out:
-            assert not self.strict
             return
-        taken = self.loop.run_until_complete(self.outbox.take(most))
+        taken = self.outbox._queue.hand_out(most)
         numbers = [int(waiting.message.payload) for waiting in taken]
         ahead = [number for number in self.pending if number not in self.out]
         assert numbers
@@ -96,7 +105,9 @@ class Promises(RuleBasedStateMachine):
     @precondition(lambda self: self.out)
     @rule(data=st.data())
     def sent(self, data: st.DataObject) -> None:
-        number = data.draw(st.sampled_from(sorted(self.out)))
+        self.acknowledge(data.draw(st.sampled_from(sorted(self.out))))
+
+    def acknowledge(self, number: int) -> None:
         self.outbox.sent(self.out.pop(number))
         self.pending.remove(number)
         self.acknowledged.add(number)
@@ -111,6 +122,28 @@ class Promises(RuleBasedStateMachine):
         self.settle(write=True)
         if self.database.fails is None:
             self.safe = set(self.pending)
+
+    @rule(before=MEANWHILE, after=MEANWHILE, write=st.booleans())
+    def meanwhile(self, before: list[str], after: list[str], *, write: bool) -> None:
+        """While the disk is at work all else goes on."""
+        safe = set(self.pending)
+        self.database.before, self.database.after = partial(self.go_on, before), partial(self.go_on, after)
+        self.settle(write=write)
+        del self.database.before, self.database.after
+        if write and self.database.fails is None:
+            self.safe = safe
+
+    def go_on(self, steps: list[str]) -> None:
+        for step in steps:
+            if step == "put":
+                self.put(3)
+            elif step == "take" and len(self.out) < 5:
+                self.hand_out(2)
+            elif step in ("first", "last") and self.out:
+                self.acknowledge(min(self.out) if step == "first" else max(self.out))
+            elif step == "rewind":
+                self.rewind()
+            self.counted()
 
     @precondition(lambda self: self.most == 10_000)
     @rule(fails=st.sampled_from(["before", "after"]))
@@ -172,4 +205,4 @@ class Promises(RuleBasedStateMachine):
 
 
 TestPromises = Promises.TestCase
-TestPromises.settings = settings(max_examples=15, stateful_step_count=40, deadline=None)
+TestPromises.settings = settings(max_examples=20, stateful_step_count=40, deadline=None)

@@ -1,7 +1,7 @@
 """The order of what waits, without a disk."""
 
 from bms_estimator.sinks.messages import Message
-from bms_estimator.store.queue import PAGE, Queue
+from bms_estimator.store.queue import LOWEST, PAGE, Queue
 
 
 def filled(count: int) -> Queue:
@@ -27,7 +27,7 @@ def test_after_a_lost_connection_what_was_on_its_way_goes_before_what_was_ready(
 
 def test_memory_keeps_a_page_of_what_is_written_and_nothing_newer_passes_what_is_on_disk():
     queue = filled(PAGE + 7)
-    assert (queue.stored.first, queue.stored.end, queue.stored.count) == (PAGE, PAGE + 7, 7)
+    assert list(queue.stored) == [range(PAGE, PAGE + 7)]
     queue.put(Message("t", b"9999", 1, retain=False))
     assert numbers(queue, 2 * PAGE) == list(range(PAGE))
     assert not queue.can_hand_out
@@ -39,6 +39,9 @@ def test_memory_keeps_a_page_of_what_is_written_and_nothing_newer_passes_what_is
 def test_what_is_acknowledged_is_removed_from_disk_if_it_ever_was_there():
     queue = filled(2)
     queue.put(Message("t", b"2", 1, retain=False))
-    for waiting in queue.hand_out(3):
-        queue.sent(waiting.number)
-    assert (queue.gone, queue.waiting) == ([0, 1], 0)
+    _, second, third = queue.hand_out(3)
+    queue.sent(third.number)
+    assert not queue.stale, "it never was there"
+    queue.sent(second.number)
+    assert queue.stale
+    assert queue.gaps() == [(LOWEST, 0), (1, 3)]
