@@ -71,6 +71,10 @@ def board(
             show_default=False,
         ),
     ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="with --accept: state folder of the service, if not that of the settings or yours"),
+    ] = None,
     baud: Annotated[int, typer.Option(min=1200, help="of the board")] = BAUD,
 ) -> None:
     """Show what a board says of itself, and set what it keeps in its EEPROM: bandgap, gains and serial number.
@@ -79,8 +83,11 @@ def board(
     of divider and current sensor are.
     """
     if accept is not None:
-        _accept_next(load_settings(accept))
+        settings = load_settings(accept)
+        _accept_next(settings, folder or state_folder(settings))
         return
+    if folder is not None:
+        raise UserError(f"--folder {folder}: goes with --accept")
     try:
         with AskedBoard(resolve_port(port), baud) as asked:
             hello = asked.hello()
@@ -101,23 +108,27 @@ def board(
         raise UserError(str(error)) from None
 
 
-def _accept_next(settings: Settings) -> None:
-    """Have the pack's service forget its board.
+def _accept_next(settings: Settings, folder: Path) -> None:
+    """Have the pack's service, whose state is in ``folder``, forget its board.
 
     Raises:
-        UserError: Its settings name the board, or the file cannot be written.
+        UserError: Its settings name the board, none is known in the folder, or the file cannot be written.
     """
     if settings.sensor.serial:
         raise UserError(f"sensor.serial = {settings.sensor.serial}: the settings name the board; change it there")
-    memory = BoardMemory(state_folder(settings), settings.pack.name)
-    before = memory.load().get("serial")
+    memory = BoardMemory(folder, settings.pack.name)
+    known = memory.load()
+    if not known:
+        raise UserError(
+            f"{memory.path}: no board is known there; if the service keeps its state elsewhere, name that with --folder "
+            "(the installed unit's is /var/lib/bms-estimator, for root alone)"
+        )
     try:
         memory.keep(NO_BOARD)
     except OSError as error:
         raise UserError(f"{memory.path}: cannot be written: {error.strerror}") from error
-    typer.echo(
-        f"{f'board {before} is forgotten' if before else 'no board was known'}: the next that comes is the pack's"
-    )
+    forgotten = f"board {known['serial']} is forgotten" if known["serial"] else "no board was known"
+    typer.echo(f"{memory.path}: {forgotten}: the next that comes is the pack's")
 
 
 def _bandgap_v(asked: AskedBoard, hello: Hello, aref_v: float) -> float:

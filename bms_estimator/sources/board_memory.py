@@ -34,6 +34,11 @@ class BoardMemory:
     def __init__(self, folder: Path, pack: str) -> None:
         self.path = folder / f"{pack}.board.json"
 
+    @property
+    def how_to_forget(self) -> str:
+        """The command, for people, but for the pack's settings file at its end."""
+        return f"bms-estimator board --folder {self.path.parent} --accept"
+
     def load(self) -> Mapping[str, str]:
         """What was kept last; empty where nothing was, or nothing that can be used, which is logged."""
         try:

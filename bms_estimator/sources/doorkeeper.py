@@ -151,7 +151,7 @@ class Doorkeeper:
         accept = (
             "or set sensor.serial to its number"
             if self._told
-            else "or, if it takes its place, run `bms-estimator board --accept` with the pack's settings file"
+            else f"or, if it takes its place, run `{self._memory.how_to_forget}` with the pack's settings file"
             if self._memory
             else "or start anew"
         )

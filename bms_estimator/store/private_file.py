@@ -29,7 +29,7 @@ def read_private(path: Path, longest: int) -> bytes:
 
 
 def write_private(path: Path, content: bytes | memoryview) -> None:
-    """Write a whole file atomically, and wait until the disk has it.
+    """Write a whole file atomically, and wait until the disk has it. Root writes for the owner of the folder.
 
     Args:
         path: The file, in a folder that is there; beside it ``<stem>.new`` is written first.
@@ -41,6 +41,9 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
     new = path.with_suffix(".new")
     new.unlink(missing_ok=True)  # what a power cut has left, or somebody has planted
     with open(new, "xb", opener=_private) as file:
+        if os.geteuid() == 0:
+            folder_is = path.parent.stat()
+            os.fchown(file.fileno(), folder_is.st_uid, folder_is.st_gid)
         file.write(content)
         file.flush()
         os.fsync(file.fileno())

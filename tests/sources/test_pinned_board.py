@@ -114,7 +114,7 @@ async def test_another_board_on_the_named_port_is_refused_after_a_restart(folder
             f"{port}: refused: board 00000002 is not the pack's, 00000001: plug that in, or, if it takes its place, run"
         )
         assert said in (taken.message or "")
-        assert "`bms-estimator board --accept`" in (taken.message or "")
+        assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (taken.message or "")
         await until(lambda: taken.counters["reconnects"] >= 1)
         assert taken.blocks == []
 
@@ -260,7 +260,7 @@ async def test_a_service_that_runs_takes_another_board_once_it_is_accepted(
             await until(lambda: taken.message and "refused" in taken.message)
             code, text, _ = run(capsys, "board", "--accept", pack)
             assert code == 0
-            assert "board 00000001 is forgotten: the next that comes is the pack's\n" in text
+            assert f"{memory.path}: board 00000001 is forgotten: the next that comes is the pack's\n" in text
             await remembered(memory, "00000002")
             assert taken.voltage_v == pytest.approx(OTHERS_V, abs=0.1)
 
@@ -401,3 +401,31 @@ def test_a_board_that_the_settings_name_is_accepted_there(tmp_path: Path, capsys
     code, _, err = run(capsys, "board", "--accept", pack)
     assert code == 2
     assert "sensor.serial = 0000002a: the settings name the board; change it there" in err
+
+
+def test_a_board_is_accepted_in_the_folder_that_is_named_and_only_where_one_is_known(
+    tmp_path: Path, memory: BoardMemory, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "mine"))
+    pack = tmp_path / "pack.toml"
+    pack.write_text('[pack]\nname = "house"\n')
+    memory.keep({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
+    code, _, err = run(capsys, "board", "--accept", pack)
+    assert code == 2
+    assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is known there" in err
+    assert run(capsys, "board", "--folder", memory.path.parent, "--accept", pack)[0] == 0
+    assert memory.load() == NO_BOARD
+    code, _, err = run(capsys, "board", "--folder", tmp_path)
+    assert code == 2
+    assert "goes with --accept" in err
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for others")
+def test_what_root_writes_is_for_the_owner_of_the_folder(tmp_path: Path) -> None:
+    theirs = tmp_path / "theirs"
+    theirs.mkdir(mode=0o700)
+    os.chown(theirs, 65534, 65533)
+    memory = BoardMemory(theirs, "house")
+    memory.keep(NO_BOARD)
+    found = memory.path.stat()
+    assert (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == (65534, 65533, 0o600)
