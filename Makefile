@@ -40,7 +40,7 @@ demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--
 	@$(BIN)/bms-estimator demo $(ARGS)
 
 nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
-	ALL_NODES=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)
+	CLUSTER=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)
 
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)

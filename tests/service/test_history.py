@@ -198,14 +198,21 @@ async def test_a_disk_that_hangs_stops_neither_the_estimate_nor_the_end(
         def save(self, *_: Any) -> None:
             release.wait()
 
-    async with often(Hung(tmp_path, SETTINGS, CELL)) as (source, sink, task):
+    with capture_logs() as lines:
+        await stopped_by_nothing(Hung(tmp_path, SETTINGS, CELL))
+    assert "the disk hangs: the last checkpoint is not written" in {line["event"] for line in lines}
+    release.set()
+
+
+async def stopped_by_nothing(hung: CheckpointFile) -> None:
+    """A run on a disk that hangs."""
+    async with often(hung) as (source, sink, task):
         source.give((0.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs")
         source.give((1.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.samples["samples"] == 2)
         source.finish()
         await asyncio.wait_for(task, LONG_S)
-    release.set()
 
 
 async def test_after_a_long_rest_the_soc_is_that_of_the_voltage_again(tmp_path: Path) -> None:

@@ -117,6 +117,7 @@ def test_a_hangup_before_samples_are_taken_is_not_lost(tmp_path: Path, monkeypat
 
     monkeypatch.setattr("bms_estimator.cli.run.load_kernels", lambda: os.kill(os.getpid(), signal.SIGHUP))
     monkeypatch.setattr("bms_estimator.cli.run.serve", serve)
+    monkeypatch.setattr("bms_estimator.cli.run.configure_logs", lambda *_: None)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     (tmp_path / "pack.toml").write_text('[pack]\ncell = "chen_mora"\n')
     with pytest.raises(SystemExit) as ended:

@@ -1,13 +1,19 @@
 """``serve``: what its log says before the first sample, and where the state goes."""
 
 import asyncio
+import re
+from pathlib import Path
 
 import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import PackSettings, SensorSettings, Settings
+from bms_estimator.service.reload import Reload
 from bms_estimator.service.serve import serve, state_folder
+from bms_estimator.service.several import serve_several
+from tests.patience import LONG_S
 
 
 async def test_the_log_says_what_of_the_settings_cannot_be():
@@ -20,6 +26,31 @@ async def test_the_log_says_what_of_the_settings_cannot_be():
     assert len(said) == 2
     assert "14 in series of 3 Ah" in said[0]
     assert "the board's range ends at 25.0 V" in said[1]
+
+
+@pytest.mark.parametrize(
+    ("names", "ports", "mqtt", "said"),
+    [
+        (("a", "a"), ("/dev/one", "/dev/two"), {}, "pack.name = a: 2 of the packs have it; give each its own"),
+        (("a", "b"), ("/dev/one", "/dev/one"), {}, "sensor.port = /dev/one: 2 of the packs have it; give each its own"),
+        (
+            ("a", "b"),
+            ("/dev/one", "/dev/two"),
+            {"username": "b", "password_file": "/none"},
+            "b: mqtt.password_file = /none: cannot be read",
+        ),
+    ],
+)
+async def test_one_of_several_packs_that_cannot_be_served_is_named(
+    names: tuple[str, str], ports: tuple[str, str], mqtt: dict[str, str], said: str, state_home: Path
+) -> None:
+    cell, packs = load_cell("chen_mora"), []
+    for name, port in zip(names, ports, strict=True):
+        tables = {"pack": {"name": name}, "sensor": {"port": port}} | ({"mqtt": mqtt} if mqtt and name == "b" else {})
+        packs.append((Settings.model_validate(tables), cell))
+    reloads = [Reload(settings, lambda settings=settings: settings) for settings, _ in packs]
+    with pytest.raises(UserError, match=f"^{re.escape(said)}"):
+        await asyncio.wait_for(serve_several(packs, reloads), LONG_S)
 
 
 def test_a_user_without_a_home_is_served_and_told_that_the_state_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
