@@ -113,14 +113,14 @@ def learned_ocv(
     """
     f, p = record["filter"], settings["filter"]
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]][NODE:, NODE:]
-    correction_v, std_v = np.zeros(soc.size), np.zeros(soc.size)
+    rows, own_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
     for n, x in enumerate(soc):
         i, t = place(x)
-        row = np.zeros(NODES)
-        row[i : i + 2] = per_node_v(p, x, t) * np.array([1.0 - t, t])
-        own_v2 = (1.0 - p["learned"]) * on_grid(x, p["curve_error_v"]) ** 2
-        correction_v[n], std_v[n] = row @ mean[NODE:], math.sqrt(row @ covariance @ row + own_v2)
-    return correction_v, std_v
+        volts = per_node_v(p, x, t)
+        rows[n, i], rows[n, i + 1] = volts * (1.0 - t), volts * t
+        own_v[n] = on_grid(x, p["curve_error_v"])
+    variance_v2 = ((rows @ covariance) * rows).sum(axis=1) + (1.0 - p["learned"]) * own_v**2
+    return rows @ mean[NODE:], np.sqrt(variance_v2)
 
 
 def learned_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
