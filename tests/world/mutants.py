@@ -9,6 +9,7 @@ import pytest
 
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.sinks.messages import Messages
+from bms_estimator.sources.doorkeeper import Doorkeeper
 from bms_estimator.store.queue import Queue
 
 
@@ -47,4 +48,18 @@ def no_sensor_availability() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Messages, "_sensor", sensor)
+        yield
+
+
+@contextlib.contextmanager
+def no_second_try() -> Iterator[None]:
+    """A disk that did not take the board once is not asked again."""
+    asked = Doorkeeper._remember
+
+    def remember(self: Doorkeeper, now_s: float) -> None:
+        if not self._failed:
+            asked(self, now_s)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Doorkeeper, "_remember", remember)
         yield

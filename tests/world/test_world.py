@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 import pytest
 
 from tests.world.faults import Fault
-from tests.world.mutants import no_fsync, no_rewind, no_sensor_availability
+from tests.world.mutants import no_fsync, no_rewind, no_second_try, no_sensor_availability
 from tests.world.world import World
 
 SEEDS = range(3)
@@ -32,13 +32,14 @@ def test_a_seed_gives_the_same_bits_each_time() -> None:
         (no_rewind, [Fault(60.0, "connections half open", 60.0, 0.5)], "the broker never got"),
         (no_fsync, [Fault(60.0 + 7.0 * n, "power cut", 2.0, 0.5) for n in range(1, 40)], "the checkpoint is refused"),
         (no_sensor_availability, [Fault(60.0, "port gone", 120.0, 0.5)], "sensor availability"),
+        (no_second_try, [Fault(0.05, "disk full", 60.0, 0.5)], "is not remembered"),
     ],
 )
 def test_a_fault_that_is_built_in_is_found(
     mutant: Callable[[], AbstractContextManager[None]], faults: list[Fault], found: str
 ) -> None:
     with mutant():
-        result = World(1, 700.0, faults).run()
+        result = World(2, 600.0, faults).run()
     assert found in result.wrong
 
 
