@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 import structlog
 
 from bms_estimator.store.disk_thread import DiskThread
-from bms_estimator.store.tables import NewerVersionError, migrate
+from bms_estimator.store.tables import NewerVersionError, OtherTablesError, migrate
 
 HANG_S = 10.0
 """A disk that has not answered by then is taken to hang [s]."""
@@ -32,7 +32,10 @@ FREE_PAGES = 1024
 """Of 4 KiB; so many that are free are kept for what comes."""
 TRIMMED_PAGES = 4096
 """So many after one transaction: those that are not the file's last are moved."""
-UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT)
+"""What SQLite says of a damaged file, at any time."""
+UNUSABLE_AT_OPEN = (*UNUSABLE, sqlite3.SQLITE_ERROR)
+"""The same while tables are looked for and made: they are others than we make."""
 
 Result = TypeVar("Result")
 
@@ -118,6 +121,7 @@ class _File:
         self._path = path
         self._connection: sqlite3.Connection | None = None
         self._inode = (0, 0)
+        self._ready = False  # tables are as they must be
         self._synced_s = 0.0
         self.opened = 0
 
@@ -125,10 +129,13 @@ class _File:
         """One transaction; in a new file where the one that is there cannot be used."""
         try:
             return self._run(work)
-        except NewerVersionError as error:
+        except (NewerVersionError, OtherTablesError) as error:
             self._set_aside(str(error))
         except sqlite3.DatabaseError as error:
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF not in UNUSABLE:
+            code = getattr(error, "sqlite_errorcode", 0)
+            # READONLY in full is no matter of rights: we have just opened the file to write
+            unusable = code == sqlite3.SQLITE_READONLY or code & 0xFF in (UNUSABLE if self._ready else UNUSABLE_AT_OPEN)
+            if not unusable:
                 raise
             self._set_aside(str(error))
         return self._run(work)
@@ -170,10 +177,11 @@ class _File:
             os.fchmod(descriptor, 0o600)  # SQLite gives its log the same
         finally:
             os.close(descriptor)
-        self._inode = _inode(self._path)
+        self._inode, self._ready = _inode(self._path), False
         self._connection = sqlite3.connect(self._path, timeout=LOCKED_S, isolation_level=None)
         self._connection.text_factory = lambda raw: raw.decode(errors="surrogateescape")  # a damaged row must not fail
         self._prepare(self._connection)
+        self._ready = True
         self.opened += 1
         return self._connection
 

@@ -1,5 +1,7 @@
 """The tables of a pack's database, and how older ones become them."""
 
+import contextlib
+import functools
 import sqlite3
 
 MIGRATIONS = (
@@ -38,11 +40,16 @@ class NewerVersionError(Exception):
     """A later version wrote this database."""
 
 
+class OtherTablesError(Exception):
+    """The tables are not those that were made."""
+
+
 def migrate(connection: sqlite3.Connection) -> None:
     """Bring a database to this version; a new one is empty.
 
     Raises:
         NewerVersionError: It is beyond this version.
+        OtherTablesError: Its tables were changed.
         sqlite3.Error: It cannot be read or written.
     """
     (version,) = connection.execute("PRAGMA user_version").fetchone()
@@ -50,3 +57,16 @@ def migrate(connection: sqlite3.Connection) -> None:
         raise NewerVersionError(f"version {version}, this program knows {len(MIGRATIONS)}")
     for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
         connection.executescript(f"BEGIN IMMEDIATE; {script} PRAGMA user_version = {number}; COMMIT;")
+    if not _wanted() <= _tables(connection):
+        raise OtherTablesError("its tables are not those that were made")
+
+
+def _tables(connection: sqlite3.Connection) -> frozenset[tuple[str, str]]:
+    return frozenset(connection.execute("SELECT name, sql FROM sqlite_master"))
+
+
+@functools.cache
+def _wanted() -> frozenset[tuple[str, str]]:
+    with contextlib.closing(sqlite3.connect(":memory:")) as connection:
+        connection.executescript("".join(MIGRATIONS))
+        return _tables(connection)

@@ -101,6 +101,34 @@ async def test_a_database_of_a_later_version_is_kept_aside_whole(path):
     connection.close()
 
 
+def made_otherwise(path: Path, script: str) -> None:
+    with sqlite3.connect(path) as connection:
+        connection.executescript(script)
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: made_otherwise(path, "PRAGMA user_version = 0"),
+        lambda path: made_otherwise(path, "ALTER TABLE outbox RENAME COLUMN topic TO tooic"),
+        lambda path: made_otherwise(path, "DROP TABLE minute"),
+        lambda path: path.write_bytes(path.read_bytes()[:18] + b"\x42" + path.read_bytes()[19:]),  # nobody may write
+        lambda path: path.write_bytes(
+            path.read_bytes()[:47] + b"\x44" + path.read_bytes()[48:]
+        ),  # format of the schema
+    ],
+)
+async def test_a_database_that_is_not_as_it_was_made_is_set_aside(path, damage):
+    async with Database(path) as database:
+        await database.call(put(1))
+    damage(path)
+    async with Database(path) as database:
+        await database.call(put(2))
+        assert await database.call(numbers) == [2]
+    assert path.with_name("pack.refused.sqlite").exists()
+
+
 async def test_a_full_disk_is_said_once_and_used_again_when_it_has_room(full_disk):
     with structlog.testing.capture_logs() as logs:
         async with Database(full_disk / "pack.sqlite", retry_s=0.0) as database:
