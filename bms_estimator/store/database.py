@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import os
 import sqlite3
 import stat
@@ -17,6 +18,8 @@ from bms_estimator.store.tables import NewerVersionError, OtherTablesError, migr
 
 HANG_S = 10.0
 """A disk that has not answered by then is taken to hang [s]."""
+ENDING_S = 5.0
+"""How long all of what is written at the end may take [s]."""
 RETRY_S = 10.0
 """A disk that failed is tried again no more often than this [s]."""
 SYNC_S = 30.0
@@ -64,6 +67,8 @@ class Database:
         self._thread = DiskThread("database")
         self._stuck: asyncio.Future[Any] | None = None
         self._failed_s = -retry_s
+        self._end_s = math.inf
+        self._waits: set[asyncio.Timeout] = set()
         self._file = _File(path)
 
     async def __aenter__(self) -> Self:
@@ -72,8 +77,28 @@ class Database:
 
     async def __aexit__(self, *_error: object) -> None:
         """Close the file, unless the disk hangs."""
-        closing = self._thread.submit(self._file.close)
-        await asyncio.wait([asyncio.wrap_future(closing)], timeout=self._hang_s)
+        self.hurry()
+        await self._wait(asyncio.wrap_future(self._thread.submit(self._file.close)))
+
+    def hurry(self) -> None:
+        """The end has begun: all that is still written may take ``ENDING_S``, and what is waited for no longer."""
+        self._end_s = min(self._end_s, asyncio.get_running_loop().time() + ENDING_S)
+        for wait in self._waits:
+            if not wait.expired():
+                wait.reschedule(min(wait.when() or self._end_s, self._end_s))
+
+    async def _wait(self, waiter: asyncio.Future[Any]) -> bool:
+        """Whether the disk answered in time."""
+        due_s = min(asyncio.get_running_loop().time() + self._hang_s, self._end_s)
+        try:
+            async with asyncio.timeout_at(due_s) as wait:
+                self._waits.add(wait)
+                await asyncio.wait([waiter])
+        except TimeoutError:
+            return waiter.done()
+        finally:
+            self._waits.discard(wait)
+        return True
 
     @property
     def opened(self) -> int:
@@ -91,12 +116,13 @@ class Database:
             raise StoreError(self.reason)
         running = self._thread.submit(self._file.run, work)
         waiter = asyncio.wrap_future(running)
-        done, _ = await asyncio.wait([waiter], timeout=self._hang_s)
-        if not done:
+        began_s = asyncio.get_running_loop().time()
+        if not await self._wait(waiter):
             waiter.add_done_callback(lambda late: late.cancelled() or late.exception())
             if not running.cancel():
                 self._stuck = waiter
-            raise self._failure(f"the disk has not answered for {self._hang_s:g} s")
+            waited_s = asyncio.get_running_loop().time() - began_s
+            raise self._failure(f"the disk has not answered for {waited_s:.2g} s")
         try:
             result = waiter.result()
         except (sqlite3.Error, OSError) as error:

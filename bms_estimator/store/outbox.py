@@ -62,9 +62,10 @@ class Outbox:
 
     async def __aexit__(self, *_error: object) -> None:
         """Write what is left."""
-        if self._task is None:
+        if self._task is None or self._database is None:
             return
         self._closing = True
+        self._database.hurry()
         self._wanted.set()
         await self._task
 

@@ -15,9 +15,14 @@ from typing import Any
 import pytest
 import structlog
 
+from bms_estimator.sinks.messages import Message
+from bms_estimator.store import database as database_module
 from bms_estimator.store.database import FREE_PAGES, Database, StoreError
+from bms_estimator.store.history import History
+from bms_estimator.store.outbox import Outbox
 from tests.full_disk import full_disk
 from tests.patience import LONG_S
+from tests.sinks.snapshots import ONE
 
 __all__ = ["full_disk"]
 
@@ -182,6 +187,20 @@ async def test_a_disk_that_hangs_stops_nothing_and_is_used_again(path):
                     await database.call(numbers)
                 except StoreError:
                     await asyncio.sleep(0.01)
+
+
+async def test_a_disk_that_hangs_at_the_end_has_one_deadline_for_all_that_is_written(path, monkeypatch):
+    monkeypatch.setattr(database_module, "ENDING_S", 0.05)
+    gate = threading.Event()
+    async with asyncio.timeout(LONG_S):
+        async with Database(path, hang_s=10 * LONG_S) as database:
+            async with Outbox(database, most=10) as outbox, History(database, days=1) as history:
+                hung = asyncio.create_task(database.call(lambda _: gate.wait(2 * LONG_S)))
+                history.publish(ONE)
+                outbox.put(Message("t", b"", 1, retain=False))
+            with pytest.raises(StoreError, match="has not answered"):
+                await hung
+    gate.set()
 
 
 async def test_a_fault_of_ours_is_raised(path):
