@@ -135,7 +135,8 @@ class History:
         def write(connection: sqlite3.Connection) -> None:
             (there,) = connection.execute("SELECT max(number) FROM history_mark WHERE run = ?", (self._run,)).fetchone()
             after = there or 0
-            connection.executemany(_INSERT, [row for number, row in minutes if number > after])
+            for row in [row for number, row in minutes if number > after]:
+                connection.execute(_INSERT, row._replace(time_s=_second(connection, row)))
             rows = [(epoch_s(event.time), event.name, event.text) for number, event in happened if number > after]
             connection.executemany("INSERT INTO event (time_s, name, text) VALUES (?, ?, ?)", rows)
             connection.execute("DELETE FROM history_mark")
@@ -150,6 +151,15 @@ class History:
         _remove(self._minutes, last)
         _remove(self._events, last)
         self._unpruned = 0 if prune else self._unpruned + len(minutes)
+
+
+def _second(connection: sqlite3.Connection, row: Minute) -> int:
+    """Where a row stands: with its minute, or by a second later where the clock went through that already."""
+    for second in range(row.time_s, row.time_s + MINUTE_S):
+        there = connection.execute("SELECT seen_s FROM minute WHERE time_s = ?", (second,)).fetchone()
+        if there is None or there[0] + row.seen_s <= MINUTE_S:
+            break
+    return second
 
 
 def _remove(waiting: deque[tuple[int, Row]], last: int) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.store.minute import Minute
+from bms_estimator.store.minute import MINUTE_S, Minute
 from bms_estimator.store.tables import MIGRATIONS
 
 _SUMMED = "sum(charge_out_ah), sum(charge_in_ah), sum(energy_out_wh), sum(energy_in_wh), sum(seen_s), sum(publications)"
@@ -38,17 +38,16 @@ class HistoryFile:
         Args:
             since_s: From [s since 1970].
             until_s: To before [s since 1970].
-            step_s: A row for each so many [s], whole minutes.
+            step_s: A row for each so many [s], whole minutes; for one minute two where the clock went through it twice.
 
         Raises:
             UserError: It cannot be read.
         """
-        columns = (
-            f"time_s / :step * :step, {_mean('voltage', 'v')}, {_mean('current', 'a')}, {_mean('temperature', 'c')}"
-        )
+        begin = "time_s" if step_s == MINUTE_S else "time_s / :step * :step"  # rows of one minute stay apart
+        columns = f"{begin}, {_mean('voltage', 'v')}, {_mean('current', 'a')}, {_mean('temperature', 'c')}"
         grouped = (
             f"SELECT {columns}, {_SUMMED}, max(time_s) AS last_s FROM minute "  # noqa: S608 - names of ours
-            "WHERE time_s >= :since AND time_s < :until GROUP BY time_s / :step"
+            f"WHERE time_s >= :since AND time_s < :until GROUP BY {begin}"
         )
         query = f"SELECT g.*, m.soc, m.soc_std FROM ({grouped}) AS g JOIN minute AS m ON m.time_s = g.last_s ORDER BY 1"  # noqa: S608
         with self._reading() as connection:
