@@ -157,6 +157,10 @@ class _File:
             return self._run(work)
         except (NewerVersionError, OtherTablesError) as error:
             self._set_aside(str(error))
+        except UnicodeDecodeError as error:  # of what SQLite says of damaged tables
+            if self._ready:
+                raise
+            self._set_aside(str(error))
         except sqlite3.DatabaseError as error:
             code = getattr(error, "sqlite_errorcode", 0)
             # READONLY in full is no matter of rights: we have just opened the file to write

@@ -118,6 +118,7 @@ def made_otherwise(path: Path, script: str) -> None:
         lambda path: made_otherwise(path, "PRAGMA user_version = 0"),
         lambda path: made_otherwise(path, "ALTER TABLE outbox RENAME COLUMN topic TO tooic"),
         lambda path: made_otherwise(path, "DROP TABLE minute"),
+        lambda path: path.write_bytes(path.read_bytes().replace(b"TABLE minute", b"TABLE\xffminute")),
         lambda path: path.write_bytes(path.read_bytes()[:18] + b"\x42" + path.read_bytes()[19:]),  # nobody may write
         lambda path: path.write_bytes(
             path.read_bytes()[:47] + b"\x44" + path.read_bytes()[48:]
