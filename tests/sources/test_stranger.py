@@ -101,8 +101,10 @@ def auto(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
 @contextlib.contextmanager
 def linked(path: Path, target: str):
     path.symlink_to(target)
-    yield
-    path.unlink()
+    try:
+        yield
+    finally:
+        path.unlink()
 
 
 @contextlib.asynccontextmanager
@@ -110,9 +112,11 @@ async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
     """A board on ``path`` that runs."""
     with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial) as board, linked(path, board.path):
         task = asyncio.create_task(board.run())
-        yield
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+        try:
+            yield
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -> None:
