@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings, load_settings
 from bms_estimator.service.serve import state_folder
@@ -33,19 +34,22 @@ def board(
     port: Annotated[str, typer.Argument(help="serial port; auto: the only one that is there")] = "auto",
     aref_v: Annotated[
         float | None,
-        typer.Option(help="measured between AREF and GND [V]: sets the board's bandgap", show_default=False),
+        typer.Option(
+            parser=decimal(), help="measured between AREF and GND [V]: sets the board's bandgap", show_default=False
+        ),
     ] = None,
     divider: Annotated[
         float | None,
         typer.Option(
-            min=LEAST_DIVIDER, max=MOST_DIVIDER, help="sets how many times A0 the pack's voltage is", show_default=False
+            parser=decimal(LEAST_DIVIDER, MOST_DIVIDER),
+            help="sets how many times A0 the pack's voltage is",
+            show_default=False,
         ),
     ] = None,
     volts_per_ampere: Annotated[
         float | None,
         typer.Option(
-            min=LEAST_VOLTS_PER_AMPERE,
-            max=MOST_VOLTS_PER_AMPERE,
+            parser=decimal(LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE),
             help="sets the slope of the current sensor [V/A]; of a ratiometric one at 5 V",
             show_default=False,
         ),

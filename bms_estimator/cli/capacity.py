@@ -13,6 +13,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.capacity import Anchor, Capacity, measure_capacity
 from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, SignOfCurrent
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.sources.replay import load_capture
 
@@ -57,7 +58,7 @@ def capacity(
     current_offset_std_a: Annotated[
         float | None,
         typer.Option(
-            min=0.0,
+            parser=decimal(0.0),
             help="how wrong the sensor's zero may be [A]; else as `identifier.current_offset_std_a` has it",
             show_default=False,
         ),

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.frames import CurrentSign
 
@@ -15,7 +16,9 @@ OR_FUEL_CELL_HELP = f"{CELL_HELP}; pem_30w or a fuel cell's file"
 CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
 CapacityAh = Annotated[
     float | None,
-    typer.Option(help="what the cell holds; a generic one needs it, else the cell file's", show_default=False),
+    typer.Option(
+        parser=decimal(), help="what the cell holds; a generic one needs it, else the cell file's", show_default=False
+    ),
 ]
 NewCellFile = Annotated[Path, typer.Option(help="cell file to write", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="replace the file of --out")]

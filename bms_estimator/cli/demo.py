@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.compiling import compiling_shown
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.run import LOG_LINES
 from bms_estimator.demo.board import find_build
 from bms_estimator.demo.demo import run_demo
@@ -17,13 +18,15 @@ from bms_estimator.service.warm_up import load_kernels
 
 
 def demo(
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="else until Ctrl-C", show_default=False)] = None,
+    seconds: Annotated[
+        float | None, typer.Option(parser=decimal(0.1), help="else until Ctrl-C", show_default=False)
+    ] = None,
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="of the broker; else 1883, or a free one", show_default=False)
     ] = None,
     rate_hz: Annotated[int, typer.Option(min=1, max=1000, help="samples per second")] = 100,
     speed: Annotated[
-        float, typer.Option(min=0.1, max=10.0, help="of the board's time, as far as the machine keeps up")
+        float, typer.Option(parser=decimal(0.1, 10.0), help="of the board's time, as far as the machine keeps up")
     ] = 1.0,
     firmware: Annotated[
         Path | None, typer.Option(help="folder of the built firmware and its simulator", show_default=False)

@@ -23,6 +23,7 @@ from bms_estimator.cli.captures import (
     check_out,
     name_of,
 )
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.identify_fuel_cell import identify_fuel_cell
 from bms_estimator.model.cell import is_fuel_cell, load_cell
 from bms_estimator.model.cell_file import write_cell
@@ -39,10 +40,15 @@ def identify_command(
     capacity_ah: CapacityAh = None,
     soc: Annotated[
         float | None,
-        typer.Option(min=0.0, max=1.0, help="at the first sample of each capture; else from the first rest's voltage"),
+        typer.Option(
+            parser=decimal(0.0, 1.0), help="at the first sample of each capture; else from the first rest's voltage"
+        ),
     ] = None,
     temperature_c: Annotated[
-        float | None, typer.Option(help="of captures without the column temperature_c; else 25", show_default=False)
+        float | None,
+        typer.Option(
+            parser=decimal(), help="of captures without the column temperature_c; else 25", show_default=False
+        ),
     ] = None,
     keep_ocv: Annotated[bool, typer.Option(help="leave the open-circuit voltage as it is")] = False,
     current_sign: SignOfCurrent = None,

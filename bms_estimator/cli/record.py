@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.pack import load_pack, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import SensorSettings, Settings
@@ -34,7 +35,8 @@ def record(
     rate_hz: Annotated[int | None, typer.Option(min=1, max=1000, help="in place of sensor.sample_rate_hz")] = None,
     text: Annotated[bool, typer.Option("--text", help="the board prints text lines")] = False,
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="from the first bytes; else until Ctrl-C", show_default=False)
+        float | None,
+        typer.Option(parser=decimal(0.0), help="from the first bytes; else until Ctrl-C", show_default=False),
     ] = None,
 ) -> None:
     """Record a board's raw bytes with their arrival times, until Ctrl-C.

@@ -18,6 +18,7 @@ from rich.table import Table
 
 from bms_estimator.cli.captures import OR_FUEL_CELL_HELP, AsJson, CapacityAh, Force, SignOfCurrent, check_out
 from bms_estimator.cli.compiling import compiling_shown
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.pack import pack_or_cell, refuse_soc, with_broker, with_pack
 from bms_estimator.cli.summary import Result, Summary
 from bms_estimator.estimator import Estimator
@@ -45,7 +46,7 @@ def replay(
     capacity_ah: CapacityAh = None,
     pack: Annotated[Path | None, typer.Option(help="settings of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
-        float | None, typer.Option(min=0.0, max=1.0, help="SOC at the first sample; else from the OCV")
+        float | None, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample; else from the OCV")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="estimates sample by sample: .csv, .csv.gz, .parquet", show_default=False)
@@ -55,7 +56,7 @@ def replay(
     as_json: AsJson = False,
     mqtt: Annotated[str | None, typer.Option(help="publish to this broker, mqtt://host:port")] = None,
     speed: Annotated[
-        float | None, typer.Option(min=1e-3, help="times as fast as recorded; else as fast as it goes")
+        float | None, typer.Option(parser=decimal(1e-3), help="times as fast as recorded; else as fast as it goes")
     ] = None,
 ) -> None:
     """Estimate from a recorded capture or a table.

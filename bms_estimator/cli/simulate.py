@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.captures import CELL_HELP, CapacityAh
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.cell import load_cell
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
@@ -16,13 +17,6 @@ DEFAULT_LOAD_C = 3.0
 """A load of so many times the capacity per hour moves SOC while one looks."""
 
 
-def _finite(value: float | None) -> float | None:
-    """Neither nan nor inf, which the options' limits let pass."""
-    if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"{value} is not a finite number")
-    return value
-
-
 def simulate(
     cell: Annotated[str, typer.Option(help=CELL_HELP)] = "chen_mora",
     capacity_ah: CapacityAh = None,
@@ -30,17 +24,17 @@ def simulate(
     load: Annotated[LoadName, typer.Option(help="what it is under")] = LoadName.RANDOM,
     current_a: Annotated[
         float | None,
-        typer.Option(callback=_finite, help="of the load, positive on discharge; else 3C", show_default=False),
+        typer.Option(parser=decimal(), help="of the load, positive on discharge; else 3C", show_default=False),
     ] = None,
-    soc: Annotated[float, typer.Option(min=0.0, max=1.0, callback=_finite, help="at the start")] = 0.9,
+    soc: Annotated[float, typer.Option(parser=decimal(0.0, 1.0), help="at the start")] = 0.9,
     rate_hz: Annotated[
         int, typer.Option(min=1, max=1000, help="samples per second until the host asks for others")
     ] = RATE_HZ_AT_RESET,
     text: Annotated[bool, typer.Option("--text", help="print text lines, as hobby sketches do")] = False,
-    noise_lsb: Annotated[float, typer.Option(min=0.0, callback=_finite, help="of its converter, in steps")] = 0.5,
-    speed: Annotated[float, typer.Option(min=1e-3, callback=_finite, help="its seconds per second")] = 1.0,
+    noise_lsb: Annotated[float, typer.Option(parser=decimal(0.0), help="of its converter, in steps")] = 0.5,
+    speed: Annotated[float, typer.Option(parser=decimal(1e-3), help="its seconds per second")] = 1.0,
     seconds: Annotated[
-        float, typer.Option(min=0.0, help="of its time; else until Ctrl-C", show_default=False)
+        float, typer.Option(parser=decimal(0.0), help="of its time; else until Ctrl-C", show_default=False)
     ] = math.inf,
     seed: Annotated[int, typer.Option(help="of load and noise")] = 0,
 ) -> None:

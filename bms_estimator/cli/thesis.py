@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from bms_estimator.cli.captures import CELL_HELP, CapacityAh, SignOfCurrent, name_of
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.pack import TABLE_RESOLUTION_V
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
@@ -36,7 +37,7 @@ def thesis(
     cell: Annotated[str | None, typer.Option(help=f"of the captures: {CELL_HELP}", show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     resolution_v: Annotated[
-        float, typer.Option(min=1e-9, help="one step of the captures' voltage [V]")
+        float, typer.Option(parser=decimal(1e-9), help="one step of the captures' voltage [V]")
     ] = TABLE_RESOLUTION_V,
     current_sign: SignOfCurrent = None,
     out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.validate import Errors, Validation, validate
 from bms_estimator.cli.captures import AsJson, CapacityAh, CellName, SignOfCurrent
+from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.replay import load_capture
 
@@ -22,7 +23,8 @@ def validate_command(
     cell: CellName,
     capacity_ah: CapacityAh = None,
     soc: Annotated[
-        float | None, typer.Option(min=0.0, max=1.0, help="SOC at the first sample; else from the first rest's voltage")
+        float | None,
+        typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample; else from the first rest's voltage"),
     ] = None,
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,

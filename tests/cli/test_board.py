@@ -79,7 +79,7 @@ def test_the_voltage_at_aref_sets_the_bandgap_and_with_it_the_reference(capsys):
 
 
 @pytest.mark.usefixtures("patient")
-@pytest.mark.parametrize("aref_v", ["3.3", "6", "0", "-5", "nan", "inf"])
+@pytest.mark.parametrize("aref_v", ["3.3", "6", "0", "-5"])
 def test_a_voltage_that_cannot_be_at_aref_changes_nothing(capsys, monkeypatch, aref_v):
     monkeypatch.setattr(probe, "REFERENCE_SAMPLES", 10)
     with virtual() as path:

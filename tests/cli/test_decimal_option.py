@@ -1,0 +1,36 @@
+"""What an option takes as a number."""
+
+import pytest
+
+from tests.command_line import run
+
+
+@pytest.mark.parametrize("text", ["3_9", "٣", "nan", "inf", "-inf", "0x3", "3,9", "", "1e999"])
+def test_only_decimal_numbers_are_numbers(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "board", "/dev/null", f"--divider={text}")
+    assert code == 2
+    assert "--divider" in err
+    assert "no decimal number" in err
+
+
+@pytest.mark.parametrize("text", ["0.5", "200"])
+def test_a_number_outside_its_limits_is_refused_with_them(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "board", "/dev/null", "--divider", text)
+    assert code == 2
+    assert f"{text}: must be at least 1 and at most 100" in " ".join(err.replace("│", "").split())
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        *("board --aref-v", "board --divider", "board --volts-per-ampere", "capacity --current-offset-std-a"),
+        *("capacity --capacity-ah", "demo --seconds", "demo --speed", "identify --soc", "identify --temperature-c"),
+        *("ocv --capacity-ah", "ocv --soc", "record --seconds", "replay --soc", "replay --speed"),
+        *("simulate --current-a", "simulate --soc", "simulate --noise-lsb", "simulate --speed", "simulate --seconds"),
+        *("thesis --resolution-v", "validate --soc"),
+    ],
+)
+def test_no_option_takes_what_python_would(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, *f"{option}=0_1".split())
+    assert code == 2
+    assert "no decimal number" in err
