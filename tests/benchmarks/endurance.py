@@ -135,30 +135,37 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
     async with Listener(broker) as live:
         with (folder / "log").open("w") as log:
             service = await asyncio.create_subprocess_exec(program, "run", "--no-view", pack, stdout=log, stderr=log)
-        await live.wait_json("bms/load/health", lambda h: "no frame yet" in (h["sensor_message"] or ""))
-        os.write(master, b"\0" + hello(BOARD_RATE_HZ))
-        spawn = mp.get_context("spawn")
-        told: mp.Queue[tuple[int, int, int]] = spawn.Queue()
-        sender = spawn.Process(target=_send_over, args=(mp.reduction.DupFd(master), rate_hz, seconds, told))
-        sender.start()
-        await live.wait_json("bms/load/state")
-        process = psutil.Process(service.pid)
-        rss, begin_s, before_s = list[float](), 0.0, 0.0
-        started_s = time.monotonic()
-        while sender.is_alive() and service.returncode is None:
-            await asyncio.sleep(1.0)
-            live.messages.clear()
-            if time.monotonic() - started_s < min(WARM_S, 0.2 * seconds):
-                begin_s, before_s = time.monotonic(), sum(process.cpu_times()[:2])
-                continue
-            rss.append(process.memory_info().rss / 2**20)
-        cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
-        frames, no_room, taken = told.get(timeout=LONG_S)
-        end = await live.wait_json("bms/load/health", lambda h: h["line"]["bytes_received"] >= taken)
-        service.send_signal(signal.SIGINT)
-        await service.wait()
-        os.close(slave)
-        os.close(master)
+        try:
+            await live.wait_json("bms/load/health", lambda h: "no frame yet" in (h["sensor_message"] or ""))
+            os.write(master, b"\0" + hello(BOARD_RATE_HZ))
+            spawn = mp.get_context("spawn")
+            told: mp.Queue[tuple[int, int, int]] = spawn.Queue()
+            sender = spawn.Process(
+                target=_send_over, args=(mp.reduction.DupFd(master), rate_hz, seconds, told), daemon=True
+            )
+            sender.start()
+            await live.wait_json("bms/load/state")
+            process = psutil.Process(service.pid)
+            rss, begin_s, before_s = list[float](), 0.0, 0.0
+            started_s = time.monotonic()
+            while sender.is_alive() and service.returncode is None:
+                await asyncio.sleep(1.0)
+                live.messages.clear()
+                if time.monotonic() - started_s < min(WARM_S, 0.2 * seconds):
+                    begin_s, before_s = time.monotonic(), sum(process.cpu_times()[:2])
+                    continue
+                rss.append(process.memory_info().rss / 2**20)
+            cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
+            frames, no_room, taken = told.get(timeout=LONG_S)
+            end = await live.wait_json("bms/load/health", lambda h: h["line"]["bytes_received"] >= taken)
+            service.send_signal(signal.SIGINT)
+            await service.wait()
+        finally:
+            if service.returncode is None:  # something has failed: nothing is left running
+                service.kill()
+                await service.wait()
+            os.close(slave)
+            os.close(master)
     half = len(rss) // 2
     means = float(np.mean(rss[:half])), float(np.mean(rss[half:]))
     return Run(frames, no_room, end["line"], end["samples"], cpu, means)
