@@ -38,7 +38,6 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
             *last,
         ],
         logger_factory=lambda *_: _Lines(stderr.take if lines is None else lines.append),
-        cache_logger_on_first_use=True,
     )
 
 

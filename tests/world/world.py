@@ -522,7 +522,7 @@ class World:
             self.note(f"  {level}: {event.get('event')} {text}"[:300])
             raise structlog.DropEvent
 
-        structlog.configure(processors=[keep], cache_logger_on_first_use=False)
+        structlog.configure(processors=[keep])
         try:
             yield
         finally:
