@@ -1,6 +1,6 @@
 """A simulated pack under a load: what a simulated board has at its sensors.
 
-The cell of Chen and Mora (2.1)-(2.4) under a load that never ends: an empty pack is charged, a full one loaded again.
+The cell of Chen and Mora (2.1)-(2.4) under a load that never ends: an empty pack is charged, a full one is not.
 """
 
 import math
@@ -14,7 +14,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.simulation.virtual_converter import Reading
 
 EMPTY_SOC, FULL_SOC = 0.05, 0.95
-"""The load stops at the one and begins again at the other; in between the pack is charged."""
+"""The load stops at the one and begins again at the other; in between the pack is charged. Above the other no load charges it."""
 ROOM_C = 25.0
 PULSE_S = 10.0
 SHORTEST_STEP_S, LONGEST_STEP_S = 1.0, 5.0
@@ -105,4 +105,4 @@ class SimulatedPack:
         while self._left_s <= 0.0:
             seconds, self._load_a = next(self._load)
             self._left_s += seconds
-        return self._load_a
+        return max(self._load_a, 0.0) if self.soc >= FULL_SOC else self._load_a

@@ -127,6 +127,7 @@ class Disk:
 
     def cut(self, now_s: float) -> None:
         """The power is cut: leave what is on the platter, and of the rest what chance leaves."""
+        self.arm = None  # what was to befall the next write has none to befall
         databases = {path: path.read_bytes() for path in self._databases()}
         self._cut_files()
         for path, content in databases.items():

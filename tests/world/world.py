@@ -206,6 +206,8 @@ class World:
                 self._live()
             except InvariantError as error:
                 wrong = f"at {self.timeline.now_s:.3f} s: {error}"
+            except (Exception, KilledError, PowerCutError) as error:  # noqa: BLE001 - one line to run again, too
+                wrong = f"at {self.timeline.now_s:.3f} s: the simulation: {error!r}"
         return self._result(wrong)
 
     def _result(self, wrong: str) -> Result:

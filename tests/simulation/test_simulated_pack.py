@@ -1,0 +1,13 @@
+"""The pack that simulated boards measure."""
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.simulation.simulated_pack import FULL_SOC, SimulatedPack, constant
+
+
+def test_a_full_pack_is_not_charged_by_its_load_and_gives_what_it_asks_for():
+    cell = load_cell("chen_mora")
+    charged = SimulatedPack(cell, constant(-cell.cell.capacity_ah), soc=FULL_SOC - 0.01)
+    currents = [charged(second).current_a for second in range(1, 601)]
+    assert currents[0] < 0.0 == currents[-1]
+    assert FULL_SOC <= charged.soc < FULL_SOC + 0.001
+    assert SimulatedPack(cell, constant(0.1), soc=1.0)(1.0).current_a == 0.1
