@@ -116,12 +116,10 @@ class Client(aiomqtt.Client):
             answer: asyncio.Future[Refusal | None] = asyncio.get_running_loop().create_future()
             self._answers[info.mid] = answer
             try:
-                async with asyncio.timeout(self._acknowledged_s):
-                    return await answer
-            except TimeoutError:
-                if answer.done() and not answer.cancelled():  # both came while the process stood still
-                    return answer.result()
-                raise LinkError(f"the broker has not acknowledged a message for {self._acknowledged_s:g} s") from None
+                await asyncio.wait([answer], timeout=self._acknowledged_s)
+                if not answer.done():  # it may be, though the time is up: both came while the process stood still
+                    raise LinkError(f"the broker has not acknowledged a message for {self._acknowledged_s:g} s")
+                return answer.result()
             finally:
                 self._answers.pop(info.mid, None)
 

@@ -51,6 +51,7 @@ class End(NamedTuple):
     """How a process has ended."""
 
     at_s: float
+    """When it last ran: a process that is frozen saves nothing."""
     forgotten_s: float
     """What it had said or heard for longer outlives it."""
 

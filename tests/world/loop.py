@@ -65,7 +65,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         self._tasks: list[asyncio.Task[Any]] = []
         self._made = 0
         self.alive = True
-        self.frozen_until_s = 0.0
+        self.frozen_until_s = self._frozen_s = 0.0
         self.handles = 0
         """So many have run."""
         self.faults: list[str] = []
@@ -157,6 +157,11 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         return self.alive and bool(self._ready) and self._timeline.now_s >= self.frozen_until_s
 
     @property
+    def ran_until_s(self) -> float:
+        """When it last had a processor: now, or when it was frozen [s]."""
+        return self._frozen_s if self._timeline.now_s < self.frozen_until_s else self._timeline.now_s
+
+    @property
     def waiting(self) -> int:
         """Handles that are ready."""
         return len(self._ready)
@@ -181,7 +186,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
     def freeze(self, until_s: float) -> None:
         """The process gets no processor for a while."""
-        self.frozen_until_s = until_s
+        self._frozen_s, self.frozen_until_s = self.ran_until_s, until_s
         self._timeline.at(until_s, lambda: None)
 
     def kill(self) -> None:

@@ -314,7 +314,7 @@ class World:
         if process is None:
             return
         clean = process.main is not None and process.main.done()
-        self.said.end(process.number, self.timeline.now_s, self._forgotten_s(clean=clean, silently=silently))
+        self.said.end(process.number, process.loop.ran_until_s, self._forgotten_s(clean=clean, silently=silently))
         self.figures["handles"] += process.loop.handles
         self.kill_after = None
         self.disk.arm = None
