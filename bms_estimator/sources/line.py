@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import structlog
 
 from bms_estimator.model.clock import since_boot
-from bms_estimator.sources.ports import NoPortError
+from bms_estimator.sources.ports import HeldPortError, NoPortError
 
 if TYPE_CHECKING:
     import serial
@@ -84,14 +84,18 @@ class Line:
             self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
             try:
                 path, self._port = self._open_next()
+            except HeldPortError as error:  # who holds it is looked for: samples of other packs must not wait
+                reason = await asyncio.to_thread(str, error)
             except (NoPortError, OSError) as error:
-                self._say(f"waiting for {error}")
-                continue
-            self.openings += 1
-            self.lost.clear()
-            self._reads.put_nowait((self.now_s, b""))
-            asyncio.get_running_loop().add_reader(self._port.fileno(), self._read, self._port.fileno())
-            return path
+                reason = str(error)
+            else:
+                break
+            self._say(f"waiting for {reason}")
+        self.openings += 1
+        self.lost.clear()
+        self._reads.put_nowait((self.now_s, b""))
+        asyncio.get_running_loop().add_reader(self._port.fileno(), self._read, self._port.fileno())
+        return path
 
     def good(self) -> None:
         """What is on the line is what was looked for: when it is lost it is looked for at once."""

@@ -35,6 +35,20 @@ class NoPortError(Exception):
     """The board's port cannot be told or opened; the message is the port and why. It may come yet."""
 
 
+class HeldPortError(NoPortError):
+    """Somebody has the port at ``path`` open.
+
+    Its text names who: that is looked for in all processes, 10 ms and more, whenever the text is asked for.
+    """
+
+    def __init__(self, path: str) -> None:
+        super().__init__(path)
+        self.path = path
+
+    def __str__(self) -> str:
+        return f"{self.path}: held by {holder(self.path) or 'another process, or another pack of this one'}"
+
+
 def stable_names() -> list[Path]:
     """Names under /dev/serial/by-id; none where no USB serial port is there."""
     try:
@@ -86,15 +100,14 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
         timeout_s: How long a read waits [s].
 
     Raises:
-        NoPortError: It cannot be opened; the message says who holds it if that is why and can be seen.
+        HeldPortError: Somebody has it open.
+        NoPortError: It cannot be opened.
     """
     try:
         return serial.Serial(path, baud, timeout=timeout_s, exclusive=True)
     except (OSError, termios.error, ValueError, OverflowError) as error:  # a port may die while it is opened
         if isinstance(error, OSError) and error.errno in (errno.EBUSY, errno.EAGAIN):
-            raise NoPortError(
-                f"{path}: held by {holder(path) or 'another process, or another pack of this one'}"
-            ) from None
+            raise HeldPortError(path) from None
         raise NoPortError(f"{path}: cannot be opened: {error}") from None
 
 

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import termios
+import threading
 from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
 from typing import Any
@@ -105,7 +106,15 @@ async def test_a_board_unplugged_in_mid_run_is_taken_up_again(line: Line) -> Non
     assert source.counters["reconnects"] == 1
 
 
-async def test_a_port_held_by_another_process_names_the_process(line: Line) -> None:
+async def test_a_port_held_by_another_process_names_the_process_which_the_loop_does_not_look_for(
+    line: Line, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def holder(port: str) -> str | None:
+        looked_in.add(threading.current_thread())
+        return look(port)
+
+    looked_in, look = set[threading.Thread](), ports.holder
+    monkeypatch.setattr(ports, "holder", holder)
     line.plug()
     script = (
         "import serial,sys; s = serial.Serial(sys.argv[1], exclusive=True); print('open', flush=True); sys.stdin.read()"
@@ -118,6 +127,8 @@ async def test_a_port_held_by_another_process_names_the_process(line: Line) -> N
         await asyncio.to_thread(other.stdout.readline)
         async with board(line) as source:
             await until(lambda: source.message and f"(pid {other.pid})" in source.message)
+            assert looked_in
+            assert threading.current_thread() not in looked_in
             other.communicate()
             await until(lambda: source.message and "no frame yet" in source.message)
     finally:
