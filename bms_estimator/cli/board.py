@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.decimal_option import decimal
+from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import Settings, load_settings
 from bms_estimator.service.serve import state_folder
@@ -79,7 +79,7 @@ def board(
         Path | None,
         typer.Option(help="with --accept: state folder of the service, if not that of the settings or yours"),
     ] = None,
-    baud: Annotated[int, typer.Option(min=1200, help="of the board")] = BAUD,
+    baud: Annotated[int, typer.Option(parser=whole(1200), help="of the board")] = BAUD,
 ) -> None:
     """Show what a board says of itself, and set what it keeps in its EEPROM: bandgap, gains and serial number.
 

@@ -1,26 +1,49 @@
-"""Decimal numbers among the options: what the settings take as a number, and nothing else."""
+"""Numbers among the options: what the settings take as a number, and nothing else. Python's own takes ``3_9`` for 39."""
 
 import math
+import re
 from collections.abc import Callable
+from typing import TypeVar
 
 import typer
 
 from bms_estimator.sources.number import number
 
+Number = TypeVar("Number", int, float)
+
 
 def decimal(least: float = -math.inf, most: float = math.inf) -> Callable[[str | float], float]:
-    """Parser of an option. Python's own takes ``3_9`` for 39, ``nan`` and ``inf``.
+    """Parser of an option.
 
     Args:
         least: The option must not be less.
         most: Nor more.
     """
+    return _within(number, least, most)
 
-    def parse(text: str | float) -> float:
-        if isinstance(text, float):  # a default
+
+def whole(least: float = -math.inf, most: float = math.inf) -> Callable[[str | int], int]:
+    """The same of one without a fraction."""
+    return _within(_whole, least, most)
+
+
+def _whole(text: str) -> int:
+    """The whole number that ``text`` is.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if not re.fullmatch("[-+]?[0-9]+", text):
+        raise ValueError(f"{text[:40]!r}: no whole number")
+    return int(text)
+
+
+def _within(parse: Callable[[str], Number], least: float, most: float) -> Callable[[str | Number], Number]:
+    def parse_and_check(text: str | Number) -> Number:
+        if not isinstance(text, str):  # a default
             return text
         try:
-            value = number(text)
+            value = parse(text)
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
         if not least <= value <= most:
@@ -29,4 +52,4 @@ def decimal(least: float = -math.inf, most: float = math.inf) -> Callable[[str |
             raise typer.BadParameter(f"{text}: must be {' and '.join(limits)}")
         return value
 
-    return parse
+    return parse_and_check

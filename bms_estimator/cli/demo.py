@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.compiling import compiling_shown
-from bms_estimator.cli.decimal_option import decimal
+from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.cli.run import LOG_LINES
 from bms_estimator.demo.board import find_build
 from bms_estimator.demo.demo import run_demo
@@ -22,9 +22,10 @@ def demo(
         float | None, typer.Option(parser=decimal(0.1), help="else until Ctrl-C", show_default=False)
     ] = None,
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="of the broker; else 1883, or a free one", show_default=False)
+        int | None,
+        typer.Option(parser=whole(1, 65535), help="of the broker; else 1883, or a free one", show_default=False),
     ] = None,
-    rate_hz: Annotated[int, typer.Option(min=1, max=1000, help="samples per second")] = 100,
+    rate_hz: Annotated[int, typer.Option(parser=whole(1, 1000), help="samples per second")] = 100,
     speed: Annotated[
         float, typer.Option(parser=decimal(0.1, 10.0), help="of the board's time, as far as the machine keeps up")
     ] = 1.0,

@@ -12,6 +12,7 @@ from typing import IO, Annotated
 import typer
 
 from bms_estimator.cli.captures import Force, check_out
+from bms_estimator.cli.decimal_option import whole
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import load_settings
@@ -26,7 +27,9 @@ def history(
     pack: Annotated[Path, typer.Argument(help="settings of the pack, pack.toml")],
     since: Annotated[datetime | None, typer.Option(formats=FORMATS, help="from, UTC; else all there is")] = None,
     until: Annotated[datetime | None, typer.Option(formats=FORMATS, help="to before, UTC; else now")] = None,
-    step: Annotated[int, typer.Option(min=MINUTE_S, help="a row for each so many seconds, whole minutes")] = MINUTE_S,
+    step: Annotated[
+        int, typer.Option(parser=whole(MINUTE_S), help="a row for each so many seconds, whole minutes")
+    ] = MINUTE_S,
     events: Annotated[bool, typer.Option("--events", help="what happened, in place of what was measured")] = False,
     folder: Annotated[
         Path | None, typer.Option(help="state folder of the service, if not that of the settings or yours")

@@ -21,7 +21,7 @@ from bms_estimator.calibration.ocv_table import TableFit, fit_table
 from bms_estimator.calibration.relaxation import RelaxationTest, without_glitches
 from bms_estimator.calibration.rest_elements import rest_elements, typical_elements
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
-from bms_estimator.cli.decimal_option import decimal
+from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.estimator.filter_settings import typical_ladder
 from bms_estimator.model.cell import Cell, CellModel
 from bms_estimator.model.cell_file import write_cell
@@ -108,7 +108,7 @@ def ocv(
         float, typer.Option(parser=decimal(0.0, 1.0), help="at the first sample of the fullest captures")
     ] = 1.0,
     series: Annotated[
-        int | None, typer.Option(min=1, help="cells in series; else by 3.7 V each", show_default=False)
+        int | None, typer.Option(parser=whole(1), help="cells in series; else by 3.7 V each", show_default=False)
     ] = None,
     current_sign: SignOfCurrent = None,
     force: Force = False,

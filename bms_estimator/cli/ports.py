@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from serial.tools import list_ports
 
+from bms_estimator.cli.decimal_option import whole
 from bms_estimator.sources.ports import holder, stable_names
 from bms_estimator.sources.probe import probe as ask
 from bms_estimator.sources.protocol import BAUD
@@ -18,7 +19,7 @@ def ports(
     probe: Annotated[
         bool, typer.Option("--probe", help="ask each for a board; opening a port may reset its board")
     ] = False,
-    baud: Annotated[int, typer.Option(min=1200, help="to ask at")] = BAUD,
+    baud: Annotated[int, typer.Option(parser=whole(1200), help="to ask at")] = BAUD,
 ) -> None:
     """List serial ports under their stable names, and ask them for a board.
 

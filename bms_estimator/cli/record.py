@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from bms_estimator.cli.decimal_option import decimal
+from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.cli.pack import load_pack, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import SensorSettings, Settings
@@ -31,8 +31,10 @@ def record(
         Path | None, typer.Option(help="settings of the pack, for its [sensor]", show_default=False)
     ] = None,
     port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
-    baud: Annotated[int | None, typer.Option(min=1200, help="in place of sensor.baud")] = None,
-    rate_hz: Annotated[int | None, typer.Option(min=1, max=1000, help="in place of sensor.sample_rate_hz")] = None,
+    baud: Annotated[int | None, typer.Option(parser=whole(1200), help="in place of sensor.baud")] = None,
+    rate_hz: Annotated[
+        int | None, typer.Option(parser=whole(1, 1000), help="in place of sensor.sample_rate_hz")
+    ] = None,
     text: Annotated[bool, typer.Option("--text", help="the board prints text lines")] = False,
     seconds: Annotated[
         float | None,

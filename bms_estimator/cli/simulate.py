@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.captures import CELL_HELP, CapacityAh
-from bms_estimator.cli.decimal_option import decimal
+from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.model.cell import load_cell
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
@@ -20,7 +20,7 @@ DEFAULT_LOAD_C = 3.0
 def simulate(
     cell: Annotated[str, typer.Option(help=CELL_HELP)] = "chen_mora",
     capacity_ah: CapacityAh = None,
-    series: Annotated[int, typer.Option(min=1, help="of them in series")] = 1,
+    series: Annotated[int, typer.Option(parser=whole(1), help="of them in series")] = 1,
     load: Annotated[LoadName, typer.Option(help="what it is under")] = LoadName.RANDOM,
     current_a: Annotated[
         float | None,
@@ -28,7 +28,7 @@ def simulate(
     ] = None,
     soc: Annotated[float, typer.Option(parser=decimal(0.0, 1.0), help="at the start")] = 0.9,
     rate_hz: Annotated[
-        int, typer.Option(min=1, max=1000, help="samples per second until the host asks for others")
+        int, typer.Option(parser=whole(1, 1000), help="samples per second until the host asks for others")
     ] = RATE_HZ_AT_RESET,
     text: Annotated[bool, typer.Option("--text", help="print text lines, as hobby sketches do")] = False,
     noise_lsb: Annotated[float, typer.Option(parser=decimal(0.0), help="of its converter, in steps")] = 0.5,
@@ -36,7 +36,7 @@ def simulate(
     seconds: Annotated[
         float, typer.Option(parser=decimal(0.0), help="of its time; else until Ctrl-C", show_default=False)
     ] = math.inf,
-    seed: Annotated[int, typer.Option(help="of load and noise")] = 0,
+    seed: Annotated[int, typer.Option(parser=whole(), help="of load and noise")] = 0,
 ) -> None:
     """Serve a simulated board on a pseudo-terminal, until Ctrl-C.
 

@@ -34,3 +34,24 @@ def test_no_option_takes_what_python_would(option: str, capsys: pytest.CaptureFi
     code, _, err = run(capsys, *f"{option}=0_1".split())
     assert code == 2
     assert "no decimal number" in err
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        *("board --baud", "demo --port", "demo --rate-hz", "history --step", "ocv --series", "ports --baud"),
+        *("record --baud", "record --rate-hz", "simulate --series", "simulate --rate-hz", "simulate --seed"),
+    ],
+)
+@pytest.mark.parametrize("text", ["1_200", "٣", "0x3", "3.0", "1e3", ""])
+def test_only_digits_are_a_whole_number(option: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, *f"{option}={text}".split(" "))
+    assert code == 2
+    assert "no whole number" in err
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "65536"])
+def test_a_whole_number_outside_its_limits_is_refused_with_them(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "demo", f"--port={text}")
+    assert code == 2
+    assert f"{text}: must be at least 1 and at most 65535" in " ".join(err.replace("│", "").split())
