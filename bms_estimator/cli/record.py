@@ -51,8 +51,8 @@ def record(
     sensor = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol).sensor
     with drained(), Recording(out, header_of(sensor)) as recording:
         progress = asyncio.run(_record(sensor, recording, seconds))
-    if isinstance(error := recording.ended.exception(), OSError):
-        raise UserError(f"recording ended: {error.strerror}")
+    if recording.fault:
+        raise UserError(f"recording ended: {recording.fault}")
     typer.echo(progress.summary(), err=True)
 
 

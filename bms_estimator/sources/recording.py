@@ -3,18 +3,22 @@
 import errno
 import queue
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Self
 
 import structlog
 
 from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
+from bms_estimator.store.disk_thread import DiskThread
 
 SYNC_S = 5.0
 """The disk has all but the last seconds, even when the power fails [s]."""
 WAITING_READS = 1 << 16
 """So many reads wait for the disk: a minute at a thousand samples a second."""
+
+END_S = 5.0
+"""So long the end waits for the disk to take what waits [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -23,6 +27,7 @@ class Recording:
     """A tap that writes a capture in a thread of its own; a context manager, whose end writes what waits.
 
     A disk that fails, or stays behind for too long, ends the recording and nothing else. What is in the file is whole.
+    One that hangs does not hold up the end, either.
 
     Args:
         path: A file that does not exist yet.
@@ -46,13 +51,20 @@ class Recording:
         self._waiting: queue.SimpleQueue[tuple[float, bytes] | OSError | None] = queue.SimpleQueue()
         self._behind = False
         self._reads = self._written = self.bytes = 0
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="recording")
-        self.ended: Future[None] = self._thread.submit(self._run)
+        self.ended: Future[None] = DiskThread("recording").submit(self._run)
 
     @property
     def missed_reads(self) -> int:
         """Reads that are not in the file, once the recording has ended."""
         return self._reads - self._written if self.ended.done() else 0
+
+    @property
+    def fault(self) -> str:
+        """Why the file has not all that was taken; empty when it has. For after the end."""
+        if not self.ended.done():
+            return f"the disk has not answered for {END_S:g} s"
+        error = self.ended.exception()
+        return str(error.strerror) if isinstance(error, OSError) else ""
 
     def write(self, arrival_s: float, data: bytes) -> None:
         """Take one read of the line; after the end of the recording it is only counted."""
@@ -71,9 +83,11 @@ class Recording:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Have the disk take all that waits, and close."""
+        """Have the disk take all that waits, and close; one that hangs is left alone."""
         self._waiting.put(None)
-        self._thread.shutdown()
+        wait([self.ended], END_S)
+        if not self.ended.done():
+            log.warning("recording not ended", file=str(self._path), reason=self.fault)
 
     def _run(self) -> None:
         """Write until told to end; the writer's close waits for the disk."""

@@ -4,6 +4,8 @@ import asyncio
 import errno
 import os
 import queue
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -122,3 +124,21 @@ def test_a_disk_that_does_not_take_it_ends_the_recording(tmp_path: Path, monkeyp
         give(recording)
         assert isinstance(error := recording.ended.exception(LONG_S), OSError)
     assert error.errno == errno.EIO
+
+
+def test_a_disk_that_hangs_does_not_hold_up_the_end_of_the_process(tmp_path: Path) -> None:
+    script = """
+import sys, threading
+from pathlib import Path
+from bms_estimator.sources import raw_capture, recording
+
+recording.END_S = 0.01
+raw_capture.CaptureWriter.write = lambda *_: threading.Event().wait()
+with recording.Recording(Path(sys.argv[1]), raw_capture.CaptureHeader()) as recorded:
+    recorded.write(0.0, b"3.7,0.1\\n")
+print(recorded.fault)
+"""
+    command = [sys.executable, "-c", script, tmp_path / "line.bms"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=True)
+    assert "recording not ended" in ended.stdout
+    assert ended.stdout.endswith("the disk has not answered for 0.01 s\n")
