@@ -5,7 +5,7 @@ Another board has another divider: its voltages would be wrong by several percen
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from threading import Thread
 
 import structlog
@@ -44,7 +44,9 @@ class Doorkeeper:
         self._tried_s = -math.inf
         self.stranger: Dialect | None = None
         """What hears a board that is not known yet."""
-        self._held = deque[Read](maxlen=HELD_READS)
+        self._held = deque[Read]()
+        self.unadmitted_bytes = 0
+        """Of boards that were refused, of ports lost before their board was known, and of reads that found no room."""
 
     @property
     def serial(self) -> str:
@@ -55,6 +57,7 @@ class Doorkeeper:
         """The port was opened anew."""
         self.stranger = self._make() if self.serial else None
         self._refused = False
+        self._drop(self._held)
         self._held.clear()
 
     def look_again(self) -> None:
@@ -78,18 +81,23 @@ class Doorkeeper:
             OtherBoardError: Neither this one nor those after it, until the port is opened anew.
         """
         if self._refused:
+            self._drop((read,))
             return ()
         if self.stranger is None:
             if self.serial and (swapped := dialect.serial_in(read[1])) is not None:
-                self._check(swapped)
+                self._check(swapped, (read,))
             return (read,)
+        if len(self._held) == HELD_READS:
+            self._drop((self._held.popleft(),))
         self._held.append(read)
         self.stranger.feed(*read)
         if not self.stranger.board:
             return ()
-        self._check(self.stranger.board.get("serial", ""))
+        held = list(self._held)
+        self._held.clear()
+        self._check(self.stranger.board.get("serial", ""), held)
         self.stranger = None
-        return list(self._held)
+        return held
 
     def know(self, board: Mapping[str, str], now_s: float) -> None:
         """Samples of ``board`` are taken: it is the pack's from now on. What has changed is said, and remembered.
@@ -139,8 +147,11 @@ class Doorkeeper:
         finally:
             self._keeping = False
 
-    def _check(self, found: str) -> None:
-        """Let a board in.
+    def _drop(self, reads: Iterable[Read]) -> None:
+        self.unadmitted_bytes += sum(len(data) for _, data in reads)
+
+    def _check(self, found: str, reads: Sequence[Read]) -> None:
+        """Let the board that has sent ``reads`` in.
 
         Raises:
             OtherBoardError: It is another.
@@ -148,6 +159,7 @@ class Doorkeeper:
         if found == self.serial:
             return
         self._refused = True
+        self._drop(reads)
         accept = (
             "or set sensor.serial to its number"
             if self._told

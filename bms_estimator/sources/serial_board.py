@@ -36,8 +36,8 @@ JUNK_LOG_S = 30.0
 ANSWER_S = 4.0
 """A board measures for a second before it answers a command [s]."""
 
-_NO_FAULTS = ("bytes_received", "frames_received", "before_hello")
-"""Samples before the hello are usual where opening the port does not reset the board."""
+_NO_FAULTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello")
+"""Bytes and samples before the hello are usual where opening the port does not reset the board."""
 
 log = structlog.get_logger(__name__)
 
@@ -107,8 +107,12 @@ class SerialBoard:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The dialect's, ``reconnects``, and of a tap ``missed_reads``."""
-        counters = {**self._dialect.counters, "reconnects": max(self._line.openings - 1, 0)}
+        """The dialect's, ``unadmitted_bytes`` of the doorkeeper, ``reconnects``, and of a tap ``missed_reads``."""
+        counters = {
+            **self._dialect.counters,
+            "unadmitted_bytes": self._door.unadmitted_bytes,
+            "reconnects": max(self._line.openings - 1, 0),
+        }
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
 
     @property

@@ -10,7 +10,7 @@ from bms_estimator.model.settings import SensorSettings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading
 from bms_estimator.sources.dialects.board import BoardDialect
-from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
+from bms_estimator.sources.doorkeeper import HELD_READS, Doorkeeper, OtherBoardError
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.protocol import Hello, hello_command
 from bms_estimator.sources.serial_board import SerialBoard
@@ -129,14 +129,37 @@ async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(lin
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(np.full(10, PACK_V), abs=0.1)
 
 
+def door_of_ours() -> tuple[Doorkeeper, BoardDialect]:
+    """It knows our board."""
+    dialect, door = BoardDialect(), Doorkeeper(BoardDialect)
+    dialect.feed(BEGIN_S, Running(1, 6.1).hello())
+    door.know(dialect.board, 0.0)
+    return door, dialect
+
+
 def test_nothing_of_a_board_that_was_refused_passes_before_the_port_is_opened_anew() -> None:
     """Reads that wait behind the one with its hello have none."""
     own, other = Running(1, 6.1), Running(2, 9.0)
-    dialect, door = BoardDialect(), Doorkeeper(BoardDialect)
-    dialect.feed(BEGIN_S, own.hello())
-    door.know(dialect.board, 0.0)
+    door, dialect = door_of_ours()
     with pytest.raises(OtherBoardError):
         door.admit((BEGIN_S, other.hello()), dialect)
-    assert door.admit((BEGIN_S, other.frames(1)[0]), dialect) == ()
+    frame = other.frames(1)[0]
+    assert door.admit((BEGIN_S, frame), dialect) == ()
+    assert door.unadmitted_bytes == len(other.hello() + frame)
     door.opened()
     assert len(door.admit((BEGIN_S, own.hello()), dialect)) == 1
+
+
+def test_each_byte_of_a_board_that_is_not_known_yet_passes_once_or_is_counted() -> None:
+    board = Running(1, 6.1)
+    door, dialect = door_of_ours()
+    reads = [(BEGIN_S, frame) for frame in board.frames(HELD_READS + 5)]
+    door.opened()
+    assert not any(door.admit(read, dialect) for read in reads[:7])
+    door.opened()  # the port was lost
+    assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7])
+    assert not any(door.admit(read, dialect) for read in reads)
+    hello = BEGIN_S, board.hello()
+    assert door.admit(hello, dialect) == [*reads[6:], hello]
+    door.opened()
+    assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])

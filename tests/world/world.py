@@ -99,6 +99,7 @@ class Process:
     snapshot: Snapshot | None = None
     reference: Reference = field(default_factory=Reference)
     delivered_s: float = 0.0
+    delivered_bytes: int = 0
     foreign: bool = False
     """It was given bytes of another board."""
 
@@ -369,6 +370,7 @@ class World:
         if self.process is not None:
             self.process.reference.feed(data)
             self.process.delivered_s = self.timeline.now_s
+            self.process.delivered_bytes += len(data)
 
     # what the service says
 
@@ -414,13 +416,18 @@ class World:
         self.timeline.after(1.0, self._look)
 
     def _check_counts(self, process: Process) -> None:
-        """Each valid sample that came was taken, or dropped and counted."""
-        if process.board is None or self.settings.sensor.protocol != "binary":
+        """Each byte that came was given to the decoder or is counted; each valid sample was taken, or dropped and counted."""
+        if process.board is None:
             return
         door, counters = process.board._door, process.board.counters
         held = door.stranger is not None
-        process.foreign |= held and len(door._held) == HELD_READS  # what no longer finds room is not counted
-        if self.timeline.now_s - process.delivered_s > 0.05 and not process.foreign and self._reads(process) == 0:
+        process.foreign |= held and len(door._held) == HELD_READS  # samples that no longer find room are not counted
+        if self.timeline.now_s - process.delivered_s <= 0.05 or self._reads(process):
+            return
+        given = counters["bytes_received"] + counters["unadmitted_bytes"] + sum(len(data) for _, data in door._held)
+        if given != process.delivered_bytes:
+            self.fail(f"{process.delivered_bytes} bytes came, {given} are counted: {counters}")
+        if self.settings.sensor.protocol == "binary" and not process.foreign:
             taken = sum(counters[name] for name in ("frames_received", "duplicates", "out_of_order", "before_hello"))
             if taken != process.reference.samples and not held:
                 self.fail(f"{process.reference.samples} samples came, {taken} are counted: {counters}")
