@@ -1,7 +1,7 @@
 """The pack's history: a row for each minute, and what happened, for as long as is set.
 
-Written each minute in one transaction, off the event loop. ``kill -9`` costs the minute that was open, and the one that
-was not yet written.
+Written each minute, and when something happens, in one transaction, off the event loop. ``kill -9`` costs the minute that
+was open, and what the disk had not yet taken.
 """
 
 import asyncio
@@ -90,7 +90,9 @@ class History:
         """Take a snapshot; returns at once."""
         if self._task is not None and self._task.done():
             self._task.result()  # only a fault of ours ends it: let it be seen
-        self._events.extend((self._next(), event) for event in events(self._before, snapshot))
+        if happened := events(self._before, snapshot):
+            self._events.extend((self._next(), event) for event in happened)
+            self._due.set()
         self._before = snapshot
         if snapshot.estimate is not None:
             self._add(snapshot.estimate)
@@ -115,9 +117,9 @@ class History:
         return self._number
 
     async def _stay_written(self) -> None:
-        """Each minute; what the disk does not take is tried with the next."""
+        """Each minute and each event; what the disk does not take is tried with the next, or in a minute."""
         while not self._closing:
-            with contextlib.suppress(TimeoutError):  # without samples no minute ends, but something may happen
+            with contextlib.suppress(TimeoutError):  # without samples no minute ends
                 async with asyncio.timeout(MINUTE_S):
                     await self._due.wait()
             self._due.clear()

@@ -13,10 +13,11 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.store import database as database_module
+from bms_estimator.store import history as history_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.history import History
 from bms_estimator.store.minute import Minute
-from bms_estimator.store.reading import HistoryFile
+from bms_estimator.store.reading import HistoryFile, PastEvent
 from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE
 
@@ -50,6 +51,10 @@ def path(tmp_path: Path) -> Path:
 
 def rows(path: Path, step_s: int = 60) -> list[Minute]:
     return HistoryFile(path).rows(0.0, 2e10, step_s)
+
+
+def past_events(path: Path) -> list[PastEvent]:
+    return HistoryFile(path).events(0.0, 2e10)
 
 
 async def test_a_minute_has_means_extremes_and_sums_of_what_was_published(path):
@@ -124,8 +129,18 @@ async def test_only_the_newest_days_are_kept_and_a_clock_that_jumps_ahead_costs_
 async def test_events_are_kept_and_read_in_order(path):
     lost = at(1.0)._replace(health=ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "no board"}))
     await keep(path, [at(0.0), lost])
-    names = [event.name for event in HistoryFile(path).events(0.0, 2e10)]
+    names = [event.name for event in past_events(path)]
     assert names == ["start", "sensor_online", "sensor_offline"]
+
+
+async def test_an_event_is_written_at_once(path, monkeypatch):
+    monkeypatch.setattr(history_module, "MINUTE_S", 3600)  # no minute ends
+    async with Database(path) as database, History(database, days=366) as history:
+        history.publish(at(0.0))
+        async with asyncio.timeout(LONG_S):
+            while not await asyncio.to_thread(read_or_nothing, lambda: past_events(path)):  # noqa: ASYNC110 - of a file
+                await asyncio.sleep(0.01)
+        assert rows(path) == []
 
 
 async def test_history_is_read_while_the_service_writes_it(path):
@@ -133,13 +148,13 @@ async def test_history_is_read_while_the_service_writes_it(path):
         history.publish(at(0.0))
         history.publish(at(60.0))  # ends the minute
         async with asyncio.timeout(LONG_S):
-            while not path.exists() or not await asyncio.to_thread(read_or_nothing, path):  # noqa: ASYNC110
+            while not path.exists() or not await asyncio.to_thread(read_or_nothing, lambda: rows(path)):  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
 
 
-def read_or_nothing(path: Path) -> list[Minute]:
+def read_or_nothing(read: Callable[[], list[Any]]) -> list[Any]:
     try:
-        return rows(path)
+        return read()
     except UserError:
         return []  # the table is being made
 
@@ -198,7 +213,7 @@ async def test_what_was_written_though_nobody_heard_is_not_written_again(path):
                 while database.unheard > max(2 - second // 60, 0):  # noqa: ASYNC110 - it has no event
                     await asyncio.sleep(0.001)
     assert [(row.publications, row.seen_s) for row in rows(path)] == [(6, 50.0), (6, 60.0), (6, 60.0), (1, 10.0)]
-    assert len(HistoryFile(path).events(0.0, 2e10)) == 2
+    assert len(past_events(path)) == 2
 
 
 async def test_an_end_while_a_minute_is_being_written_writes_it_once(path):
