@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -190,7 +191,8 @@ class CheckpointFile:
     def set_aside(self) -> str:
         """Keep a file that was refused out of the way of the next save. Returns what was done, for people.
 
-        One of a later format is good, and in place of none: who goes back to a version and forth has each of them.
+        One of a later format is good, and in place of none: who goes back to a version and forth has each of them. It is
+        not taken up unasked: what this version saves meanwhile is newer, though it may have learned less.
         """
         aside = self.path.with_name(f"{self._name}.refused.npz")
         if self._later:
@@ -201,7 +203,11 @@ class CheckpointFile:
             self.path.replace(aside)
         except OSError as error:
             return f"it cannot be set aside: {error}"
-        return f"set aside as {aside.name}"
+        back = shlex.join(["mv", str(aside), str(self.path)])
+        later = (
+            f"; once the version that wrote it is installed again, stop the service and `{back}`" if self._later else ""
+        )
+        return f"set aside as {aside.name}{later}"
 
     def _checked(self, found: Mapping[str, NDArray[Any]]) -> Restored:
         now_s, version = self._now().wall_s, int(found["format"])

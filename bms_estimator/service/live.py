@@ -211,9 +211,10 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clo
     if not outcome:
         wrong = resume(estimator, found.state, found.unseen_s)
         outcome = f"{REFUSED}{wrong}" if wrong else f"restored{_soc_text(estimator)}"
-    if outcome.startswith(REFUSED):
+    if refused := outcome.startswith(REFUSED):
         outcome = f"{outcome}; {checkpoint.set_aside()}"
-    log.info("checkpoint", file=str(checkpoint.path), outcome=outcome)
+    say = log.warning if refused else log.info
+    say("checkpoint", file=str(checkpoint.path), outcome=outcome)
     return found.ledger, outcome
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import dataclasses
 import shutil
+import subprocess
 import threading
 from pathlib import Path
 from typing import Any
@@ -138,11 +139,28 @@ async def test_checkpoints_of_later_versions_are_each_kept_and_what_they_have_co
         inodes.append(file.path.stat().st_ino)
         health = (await ran(tmp_path, samples=1)).health
         kept = min(attempt + 1, LATER)
-        assert health.checkpoint.endswith(f"reads 4 to {FORMAT}; set aside as pack.later-{kept}.npz")
+        assert f"reads 4 to {FORMAT}; set aside as pack.later-{kept}.npz; once the version" in health.checkpoint
         assert (health.restarts, health.total.crashes, health.total.unseen_s) == (7 + attempt, 2, 30.0)
     kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, LATER + 1)]
     assert kept_inodes == [*inodes[: LATER - 1], inodes[LATER]]
     assert (tmp_path / "pack.refused.npz").read_bytes() == b"an older one"
+
+
+async def test_a_checkpoint_of_a_later_version_is_taken_up_by_that_version_once_what_was_said_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, learned = tmp_path / "a folder", a_used_pack()
+    folder.mkdir()
+    saved_as(FORMAT + 1, CheckpointFile(folder, SETTINGS, CELL), learned, monkeypatch)
+    with capture_logs() as lines:
+        said = (await ran(folder, samples=1)).health.checkpoint
+    assert [line["log_level"] for line in lines if line.get("outcome") == said] == ["warning"]
+    before, command, _ = said.split("`")
+    assert before.endswith("is installed again, stop the service and ")
+    subprocess.run(command, shell=True, check=True)  # noqa: ASYNC221 - as a person would
+    monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", FORMAT + 1)
+    restored = (await ran(folder, samples=1)).health.checkpoint
+    assert restored == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
 
 @pytest.mark.parametrize(
