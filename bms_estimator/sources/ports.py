@@ -38,7 +38,7 @@ class NoPortError(Exception):
 class HeldPortError(NoPortError):
     """Somebody has the port at ``path`` open.
 
-    Its text names who: that is looked for in all processes, 10 ms and more, whenever the text is asked for.
+    Its text names who: that is looked for in all processes, milliseconds long, whenever the text is asked for.
     """
 
     def __init__(self, path: str) -> None:
