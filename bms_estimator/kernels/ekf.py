@@ -37,6 +37,9 @@ MINUTE_S, TEN_MINUTES_S = 60.0, 600.0
 """Over which a mean innovation shows an error that stays."""
 INFLATION_OVER = 5.0, 3.0
 """It is averaged over so many times as long."""
+NEAR, MOST_TIMES = 0.01, 4
+"""An update is linearised about where it brings the SOC, to how well it is known then, until it comes so near that; so often
+at most."""
 LOWEST, HIGHEST = -0.05, 1.05
 """Where the SOC of a filter may be."""
 MOST_STDS = 3.0
@@ -103,7 +106,10 @@ def couple(cov: Floats, f: Floats, by_offset: float, moved: float) -> None:
 
 @njit(cache=True)
 def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, float]:
-    """Take the mean voltage of the window in.
+    """Take the mean voltage of the window in: the EKF's update, linear over what is known of the SOC afterwards.
+
+    On a bend of the OCV the secant over what was known before may be many times too steep (posterior linearisation:
+    Garcia-Fernandez et al., IEEE Trans. Signal Process. 63, 2015).
 
     Args:
         s: Record of EKF_STATE.
@@ -114,19 +120,16 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
     Returns:
         The innovation [V] and its variance S [V^2].
     """
-    x, cov, h, ph = s.mean[q], s.covariance[q], s.h, s.ph
-    predicted_v, curved_v = linearise(s, p, q)
-    innovation_v = s.window.sum_v / s.window.samples - predicted_v
-    total_v2 = variance_v2 + curved_v * curved_v
-    for j in range(STATES):
-        ph[j] = 0.0
-    for k in range(STATES):
-        if h[k] != 0.0:  # of the nodes two
-            for j in range(STATES):
-                ph[j] += cov[k, j] * h[k]
-    for j in range(STATES):
-        total_v2 += h[j] * ph[j]
-    total_v2 = max(total_v2, (innovation_v / HUBER) ** 2)
+    x, cov, ph = s.mean[q], s.covariance[q], s.ph
+    soc, variance = x[SOC], cov[SOC, SOC]
+    innovation_v, total_v2 = innovate(s, p, q, variance_v2, soc, variance)
+    for _ in range(MOST_TIMES):
+        to_soc = min(max(x[SOC] + ph[SOC] * innovation_v / total_v2, LOWEST), HIGHEST)
+        to_variance = cov[SOC, SOC] - ph[SOC] * ph[SOC] / total_v2
+        if max(abs(to_soc - soc), abs(secant_reach(to_variance) - secant_reach(variance))) < NEAR:
+            break
+        soc, variance = to_soc, to_variance
+        innovation_v, total_v2 = innovate(s, p, q, variance_v2, soc, variance)
     scale = 1.0 / math.sqrt(total_v2)
     for j in range(STATES):
         ph[j] *= scale
@@ -143,17 +146,42 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
 
 
 @njit(cache=True)
-def linearise(s: Record, p: Record, q: int) -> tuple[float, float]:
+def innovate(
+    s: Record, p: Record, q: int, variance_v2: float, about_soc: float, about_variance: float
+) -> tuple[float, float]:
+    """Innovation [V] and its variance S [V^2], linear about an SOC to a variance; P H' into ``s.ph``."""
+    cov, h, ph = s.covariance[q], s.h, s.ph
+    predicted_v, curved_v = linearise(s, p, q, about_soc, about_variance)
+    innovation_v = s.window.sum_v / s.window.samples - predicted_v
+    total_v2 = variance_v2 + curved_v * curved_v
+    for j in range(STATES):
+        ph[j] = 0.0
+    for k in range(STATES):
+        if h[k] != 0.0:  # of the nodes two
+            for j in range(STATES):
+                ph[j] += cov[k, j] * h[k]
+    for j in range(STATES):
+        total_v2 += h[j] * ph[j]
+    return innovation_v, max(total_v2, (innovation_v / HUBER) ** 2)
+
+
+@njit(cache=True)
+def secant_reach(variance: float) -> float:
+    """How far to both sides the OCV is taken for straight, by the variance of the SOC."""
+    return min(max(math.sqrt(variance), NARROWEST), WIDEST)
+
+
+@njit(cache=True)
+def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: float) -> tuple[float, float]:
     """Predicted mean voltage of the window [V], H into ``s.h``, and what the secant of the OCV leaves out [V].
 
     v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. How the resistances,
     and what was learned of the OCV, change with SOC is no part of H: it would take an error of theirs for one of the SOC.
     """
     x, h, ohm, w = s.mean[q], s.h, s.ohm, s.window
-    soc = x[SOC] + (w.charge_as - w.sum_as / w.samples) / p.capacity_as  # in the middle of the samples
+    soc = about_soc + (w.charge_as - w.sum_as / w.samples) / p.capacity_as  # in the middle of the samples
     resistances(soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, ohm)
-    variance = s.covariance[q, SOC, SOC]
-    reach = min(max(math.sqrt(variance), NARROWEST), WIDEST)
+    reach = secant_reach(about_variance)
     e_o, above, below = (
         ocv(soc, p.ocv_v, p.ocv_slope_v),
         ocv(soc + reach, p.ocv_v, p.ocv_slope_v),
@@ -175,7 +203,8 @@ def linearise(s: Record, p: Record, q: int) -> tuple[float, float]:
     h[NODE + i], h[NODE + i + 1] = (1.0 - t) * node_v, t * node_v
     voltage_v = e_o + h[HYST] * x[HYST] + h[CURVE] * x[CURVE] + h[LN_R0] + h[LN_R] + x[B_SLOW] + x[B_FAST]
     voltage_v += learned_v(p, x, soc) + (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
-    return voltage_v, 0.5 * (above + below - 2.0 * e_o) * min(variance / (reach * reach), 1.0)
+    voltage_v += h[SOC] * (x[SOC] - about_soc)
+    return voltage_v, 0.5 * (above + below - 2.0 * e_o) * min(about_variance / (reach * reach), 1.0)
 
 
 @njit(cache=True)

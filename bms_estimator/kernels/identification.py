@@ -76,6 +76,8 @@ def identify(
     """Take one sample, after a ``gap`` or not: SOC for the observer, elements for the map, now and then a fit for (3.18)."""
     f, c = s.filter, s.checks
     change_a = current_a - f.current_a
+    if gap and f.window.samples > 0:
+        take_window(s, p)  # what was measured before tells nothing of what flowed in the gap
     count_on(f, p.filter, dt_s, gap, current_a, temperature_c)
     unknown = f.window.unknown_as / p.filter.capacity_as
     if gap and unknown > ONE_STD and not c.suspects & SIGN_OF_CURRENT:

@@ -29,11 +29,13 @@ def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleB
     return measured(np.repeat(rng.choice([0.0, 0.0, 0.75, 1.5, 3.0, -0.5], seconds // 60), 60), soc, rng)
 
 
-def measured(current_a: np.ndarray, soc: float, rng: np.random.Generator) -> tuple[SampleBlock, np.ndarray]:
-    """What a sensor sees of the true cell, from rest at ``soc``, under a current at 1 Hz [A], and its true SOC."""
+def measured(
+    current_a: np.ndarray, soc: float, rng: np.random.Generator, *, step_s: float = 1.0
+) -> tuple[SampleBlock, np.ndarray]:
+    """What a sensor sees of the true cell, from rest at ``soc``, under a current each ``step_s`` [A], and its true SOC."""
     block = np.zeros(current_a.size, dtype=SAMPLE)
     block["temperature_c"] = 25.0
-    block["time_s"] = np.arange(block.size)
+    block["time_s"] = step_s * np.arange(block.size)
     block["current_a"] = current_a
     ocv_v, slope_v = ocv_grid(TRUTH)
     a, capacity_as = TRUTH.a, TRUTH.cell.capacity_ah * 3600.0
@@ -41,6 +43,6 @@ def measured(current_a: np.ndarray, soc: float, rng: np.random.Generator) -> tup
     for n, i in enumerate(current_a):
         block["voltage_v"][n] = chen_mora.ocv(x[0], ocv_v, slope_v) - x[1] - x[2] - i * chen_mora.r_s(x[0], a)
         true_soc[n] = x[0]
-        x = chen_mora.cell_step(x, i, 1.0, capacity_as, a)
+        x = chen_mora.cell_step(x, i, step_s, capacity_as, a)
     block["voltage_v"] = np.round((block["voltage_v"] + rng.normal(0, NOISE_V, block.size)) / 1e-3) * 1e-3
     return block, true_soc

@@ -5,6 +5,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import IdentifierSettings
 from bms_estimator.model.suspect import Suspect
 from tests.estimator.simulated_cell import TRUTH, measured, pulses
 
@@ -72,6 +73,22 @@ def test_a_load_in_a_gap_is_inside_the_band(unseen_s: int, restart: bool) -> Non
     error = np.abs(after["soc"] - true_soc[3600 + unseen_s :])
     assert (error < 2.0 * after["soc_std"]).all()
     assert error[-1] < 0.02
+
+
+def test_what_was_measured_before_a_gap_tells_nothing_of_what_flowed_in_it() -> None:
+    """At 10 Hz a second's samples are one update: it is no matter after how many of them the gap begins."""
+    load_a = np.repeat([0.3, 1.0, 0.3], [3000, 1000, 100]) * TRUTH.cell.capacity_ah
+    block, true_soc = measured(load_a, 0.5, np.random.default_rng(8), step_s=0.1)
+    found = []
+    for begin in range(3000, 3010):
+        estimator = Estimator(TRUTH, initial_soc=0.5, identifier=IdentifierSettings(soc_std=0.02))
+        estimator.run(block[:begin])
+        after = estimator.run(block[4000:])[0]
+        found.append((after["soc"], after["soc_std"]))
+        assert abs(after["soc"] - true_soc[4000]) < 2.0 * after["soc_std"]
+    soc, std = np.transpose(found)
+    assert np.ptp(soc) < 0.1 * std.mean()
+    assert np.ptp(std) < 0.1 * std.mean()
 
 
 @pytest.mark.parametrize("period_s", [60, 120, 600, 1800])

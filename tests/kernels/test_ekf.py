@@ -45,16 +45,20 @@ def somewhere(p, seed=1, time_s=1.0):
     return s
 
 
+def linearised(s, p):
+    return ekf.linearise(s, p, 0, s["mean"][0, SOC], s["covariance"][0, SOC, SOC])
+
+
 def predicted(s, p, mean):
     s["mean"][0] = mean
-    return ekf.linearise(s, p, 0)[0]
+    return linearised(s, p)[0]
 
 
 def test_h_is_the_derivative_of_the_voltage_by_every_state_but_the_soc() -> None:
     p = settings()
     s = somewhere(p)
     mean = s["mean"][0].copy()
-    ekf.linearise(s, p, 0)
+    linearised(s, p)
     h = s["h"].copy()
     for j in range(STATES):
         if j == SOC:
@@ -69,7 +73,7 @@ def test_by_the_soc_it_is_the_secant_of_the_ocv_over_one_std_and_nothing_of_the_
     p = settings(sensor_v2=0.0)
     s = somewhere(p)
     s["covariance"][0, SOC, SOC] = 0.1**2
-    ekf.linearise(s, p, 0)
+    linearised(s, p)
     w, grid = s["window"], np.linspace(0.0, 1.0, p["ocv_v"].size)
     middle = s["mean"][0, SOC] + (w["charge_as"] - w["sum_as"] / w["samples"]) / p["capacity_as"]
     below, above = np.interp([middle - 0.1, middle + 0.1], grid, p["ocv_v"])
@@ -110,11 +114,11 @@ def test_p_goes_by_the_derivative_of_the_mean() -> None:
 def test_the_update_is_that_of_the_textbook() -> None:
     p = settings()
     s = somewhere(p)
-    _, curved_v = ekf.linearise(s, p, 0)
+    _, curved_v = linearised(s, p)
     mean, covariance, h = (np.array(x) for x in (s["mean"][0], s["covariance"][0], s["h"]))
     r = 0.05**2
     total = h @ covariance @ h + r + curved_v**2
-    s["window"]["sum_v"] = s["window"]["samples"] * (ekf.linearise(s, p, 0)[0] + 0.3 * np.sqrt(total))
+    s["window"]["sum_v"] = s["window"]["samples"] * (linearised(s, p)[0] + 0.3 * np.sqrt(total))
     innovation_v, variance_v2 = ekf.update(s, p, 0, r)
     gain = covariance @ h / total
     assert (innovation_v, variance_v2) == pytest.approx((0.3 * np.sqrt(total), total))
@@ -122,15 +126,39 @@ def test_the_update_is_that_of_the_textbook() -> None:
     assert s["covariance"][0] == pytest.approx(covariance - np.outer(gain, h @ covariance), rel=1e-9, abs=1e-15)
 
 
+@pytest.mark.parametrize("true_soc", [0.06, 0.08, 0.1, 0.13])
+def test_an_update_over_the_bend_near_empty_is_that_of_bayes(true_soc: float) -> None:
+    """Of the SOC alone, against the posterior on a grid: the OCV is ten times as steep where the filter begins."""
+    cell = load_cell("chen_mora")
+    p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(), 1e-3, None)[0]
+    before, std, noise_v = 0.045, 0.035, 0.03
+    s = np.zeros(1, EKF_STATE)[0]
+    hypotheses.start(s, p, before, 0.0, 25.0)
+    s["count"], s["best"] = 1, 0
+    s["mean"][0], s["covariance"][0] = 0.0, 0.0
+    s["mean"][0, SOC], s["covariance"][0, SOC, SOC] = before, std**2
+    grid = np.linspace(-0.05, 0.3, 4000)
+    ocv_v = np.interp(grid, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
+    voltage_v = np.interp(true_soc, grid, ocv_v)
+    hypotheses.gather(s, 0.0, voltage_v)
+    ekf.update(s, p, 0, noise_v**2)
+    weight = np.exp(-0.5 * ((grid - before) / std) ** 2 - 0.5 * ((ocv_v - voltage_v) / noise_v) ** 2)
+    mean = np.average(grid, weights=weight)
+    exact_std = np.sqrt(np.average((grid - mean) ** 2, weights=weight))
+    assert abs(s["mean"][0, SOC] - mean) < exact_std
+    assert 0.6 < np.sqrt(s["covariance"][0, SOC, SOC]) / exact_std < 1.6
+
+
 def test_an_innovation_of_many_std_counts_as_one_of_two() -> None:
     p = settings()
     moved = []
     for stds in (2.0, 8.0):
         s = somewhere(p)
-        _, curved_v = ekf.linearise(s, p, 0)
+        s["covariance"][0][SOC] = s["covariance"][0][:, SOC] = 0.0  # by the SOC's own move it would be linear about another
+        _, curved_v = linearised(s, p)
         h, covariance, before = (np.array(x) for x in (s["h"], s["covariance"][0], s["mean"][0]))
         std = np.sqrt(h @ covariance @ h + 0.05**2 + curved_v**2)
-        s["window"]["sum_v"] = s["window"]["samples"] * (ekf.linearise(s, p, 0)[0] + stds * std)
+        s["window"]["sum_v"] = s["window"]["samples"] * (linearised(s, p)[0] + stds * std)
         ekf.update(s, p, 0, 0.05**2)
         moved.append(s["mean"][0, B_SLOW] - before[B_SLOW])
     assert moved[1] == pytest.approx(moved[0] * 2.0 / 8.0)
