@@ -380,6 +380,13 @@ async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monke
             super().save(state, ledger)
             loop.call_soon_threadsafe(saved.put_nowait, float(state["observer"]["soc"][0]))
 
+    class Looking(saving.Saving):
+        async def _save(self, *, clean: bool = False) -> bool:
+            looked.set()
+            return await super()._save(clean=clean)
+
+    looked = asyncio.Event()
+    monkeypatch.setattr(live, "Saving", Looking)
     tables = {"state": {"checkpoint_s": 1e6}, "identifier": {"enabled": False}}
     settings = Settings.model_validate(SETTINGS.model_dump(by_alias=True, exclude_none=True) | tables)
     source = ScriptedSource()
@@ -393,6 +400,9 @@ async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monke
             checkpoint=Noting(tmp_path, settings, CELL),
         )
     )
+    await asyncio.wait_for(
+        looked.wait(), LONG_S
+    )  # else the first sample may be there when it is looked for the first time
     for i in range(4):
         source.give((i * 10.0, 0.275, 3.8))  # 0.28 % of the capacity in 10 s
         soc = await asyncio.wait_for(saved.get(), LONG_S)
