@@ -67,6 +67,16 @@ def test_a_folder_that_is_deleted_and_made_anew_lets_no_second_service_in(tmp_pa
         assert not list(folder.iterdir())
 
 
+def test_a_link_that_was_planted_where_a_lock_file_would_be_leads_to_nothing(tmp_path: Path) -> None:
+    victim, link = tmp_path / "victim", tmp_path / "pack.lock"
+    victim.write_text("precious")
+    link.symlink_to(victim)
+    with alone(tmp_path, "pack"):
+        assert victim.read_text() == "precious"
+    assert link.is_symlink()
+    assert victim.read_text() == "precious"
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
 def test_a_stranger_who_takes_the_name_first_does_not_keep_the_service_from_starting(tmp_path: Path) -> None:
     command = [sys.executable, "-c", SQUAT, _name(tmp_path, "pack")[1:], str(NOBODY)]
