@@ -1,5 +1,6 @@
 """Brokers that go, stand still or fall silent: no state is lost, none comes out of order, and another broker serves."""
 
+import asyncio
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks.client import Patience
 from bms_estimator.sinks.dial import Dial
 from tests.mosquitto import MOSQUITTO, Broker, Listener
-from tests.sinks.proxy import Proxy
+from tests.patience import LONG_S
+from tests.sinks.proxy import Proxy, read_packet
 from tests.sinks.service import STATE, Sink, assert_all_in_order, numbers, state, until
 from tests.sinks.snapshots import ONE
 
@@ -114,6 +116,22 @@ async def test_a_line_that_falls_silent_while_nothing_is_to_be_said_is_found_out
                 async with Listener(broker) as late:
                     assert await late.wait("bms/pack/availability") == b"online"
     assert next(line["reason"] for line in logs if line["event"] == "broker lost") == "the broker gave no sign of life"
+
+
+async def test_a_broker_is_told_to_expect_a_sign_of_life_each_10_s() -> None:
+    """One that hears none says our will after one and a half times that."""
+    first = asyncio.get_running_loop().create_future()
+
+    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        packet = await read_packet(reader)
+        if not first.done():
+            first.set_result(packet)
+        writer.close()
+
+    server = await asyncio.start_server(accept, "127.0.0.1", 0)
+    async with server, Sink(f"mqtt://127.0.0.1:{server.sockets[0].getsockname()[1]}"):
+        _, behind = (await asyncio.wait_for(first, LONG_S)).split(b"MQTT", 1)
+    assert int.from_bytes(behind[2:4]) == 10  # after version and flags
 
 
 async def test_a_broker_that_stands_still_gets_its_states_when_it_goes_on(broker: Broker) -> None:

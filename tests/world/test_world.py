@@ -12,6 +12,8 @@ from tests.world.world import World
 SEEDS = range(3)
 WORLD_S = 1000.0
 """The last seven minutes of them are calm."""
+SILENCE_S = 21.0
+"""So long silence is borne, as docs/mqtt.md has it."""
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -47,3 +49,12 @@ def test_a_broker_that_does_not_answer_a_connection_in_time_leaves_no_fault_in_t
     result = World(1, 600.0, [Fault(60.0, "broker frozen", 60.0, 0.5)]).run()
     assert not result.wrong
     assert any("no answer within" in line for line in result.log)
+
+
+@pytest.mark.parametrize("kind", ["connections half open", "broker frozen"])
+def test_a_line_or_a_broker_that_falls_silent_is_given_up_in_time(kind: str) -> None:
+    begin_s = 60.0
+    result = World(1, 600.0, [Fault(begin_s, kind, 100.0, 0.5)]).run()
+    lost_s = next(float(line.split()[0]) for line in result.log if "broker lost" in line)
+    assert lost_s - begin_s <= SILENCE_S
+    assert not result.wrong
