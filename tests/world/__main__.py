@@ -39,6 +39,7 @@ def main() -> int:
     options = parser.parse_args()
     load_kernels()
     gc.disable()  # nothing is collected in the middle of a world
+    gc.freeze()  # nor is what all worlds share looked at after each
     if options.seed is not None:
         return _show(run(options.seed, options.hours * HOUR_S), log=True)
     return _many(options)

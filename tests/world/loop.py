@@ -5,6 +5,7 @@ Nothing runs at the same time as anything else, and nothing waits: when nobody h
 
 import asyncio
 import contextlib
+import contextvars
 import heapq
 import random
 import sys
@@ -51,6 +52,26 @@ class Timeline:
         event()
 
 
+class Handle(asyncio.TimerHandle):
+    """A call that is to come, as asyncio's own handles are, which ask three times whether somebody debugs.
+
+    Args:
+        callback: What is called.
+        args: With what.
+        context: In which; None: a copy of the present one.
+    """
+
+    __slots__ = ()
+
+    def __init__(self, callback: Any, args: tuple[Any, ...], context: contextvars.Context | None) -> None:
+        self._callback, self._args, self._cancelled = callback, args, False
+        self._context = contextvars.copy_context() if context is None else context
+
+    def cancel(self) -> None:
+        self._cancelled = True
+        self._callback = self._args = None
+
+
 class ProcessLoop(asyncio.AbstractEventLoop):
     """The event loop of one process. It ends as a process does: at any handle, and nothing of it runs any more.
 
@@ -60,8 +81,8 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
     def __init__(self, timeline: Timeline) -> None:
         self._timeline = timeline
-        self._ready: deque[asyncio.Handle] = deque()
-        self._readers: dict[int, asyncio.Handle] = {}
+        self._ready: deque[Handle] = deque()
+        self._readers: dict[int, Handle] = {}
         self._tasks: list[asyncio.Task[Any]] = []
         self._made = 0
         self.alive = True
@@ -78,25 +99,22 @@ class ProcessLoop(asyncio.AbstractEventLoop):
     def time(self) -> float:
         return self._timeline.now_s
 
-    def call_soon(self, callback: Any, *args: Any, context: Any = None) -> asyncio.Handle:
-        handle = asyncio.Handle(callback, args, self, context)
+    def call_soon(self, callback: Any, *args: Any, context: Any = None) -> Handle:
+        handle = Handle(callback, args, context)
         if self.alive:
             self._ready.append(handle)
         return handle
 
     call_soon_threadsafe = call_soon
 
-    def call_at(self, when: float, callback: Any, *args: Any, context: Any = None) -> asyncio.TimerHandle:
-        handle = asyncio.TimerHandle(when, callback, args, self, context)
+    def call_at(self, when: float, callback: Any, *args: Any, context: Any = None) -> Handle:
+        handle = Handle(callback, args, context)
         if self.alive:
             self._timeline.at(max(when, self.frozen_until_s), lambda: self._fall_due(handle))
         return handle
 
-    def call_later(self, delay: float, callback: Any, *args: Any, context: Any = None) -> asyncio.TimerHandle:
+    def call_later(self, delay: float, callback: Any, *args: Any, context: Any = None) -> Handle:
         return self.call_at(self.time() + delay, callback, *args, context=context)
-
-    def _timer_handle_cancelled(self, handle: asyncio.TimerHandle) -> None:
-        pass
 
     def create_future(self) -> asyncio.Future[Any]:
         if not self.alive:
@@ -119,7 +137,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         return asyncio.wrap_future((executor or self.threads).submit(func, *args), loop=self)
 
     def add_reader(self, fd: int, callback: Any, *args: Any) -> None:
-        self._readers[fd] = asyncio.Handle(callback, args, self, None)
+        self._readers[fd] = Handle(callback, args, None)
 
     def remove_reader(self, fd: int) -> bool:
         reader = self._readers.pop(fd, None)
@@ -154,7 +172,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
     @property
     def busy(self) -> bool:
         """Whether it has something to do now."""
-        return self.alive and bool(self._ready) and self._timeline.now_s >= self.frozen_until_s
+        return bool(self._ready) and self.alive and self._timeline.now_s >= self.frozen_until_s
 
     @property
     def ran_until_s(self) -> float:
@@ -175,12 +193,16 @@ class ProcessLoop(asyncio.AbstractEventLoop):
     def step(self) -> None:
         """Run one handle."""
         handle = self._ready.popleft()
-        if handle.cancelled():
+        if handle._cancelled:
             return
         self.handles += 1
         asyncio._set_running_loop(self)
         try:
-            handle._run()
+            handle._context.run(handle._callback, *handle._args)
+        except (SystemExit, KeyboardInterrupt):
+            raise
+        except BaseException as error:  # noqa: BLE001 - as asyncio's own loop does
+            self.call_exception_handler({"message": f"Exception in callback {handle._callback}", "exception": error})
         finally:
             asyncio._set_running_loop(None)
 
@@ -213,8 +235,8 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         with self._running():
             return self.create_task(main, name="main")
 
-    def _fall_due(self, handle: asyncio.TimerHandle) -> None:
-        if self.alive and not handle.cancelled():
+    def _fall_due(self, handle: Handle) -> None:
+        if self.alive and not handle._cancelled:
             self._ready.append(handle)
 
     @contextlib.contextmanager

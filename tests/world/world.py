@@ -27,7 +27,7 @@ from bms_estimator.model.settings import (
     StateSettings,
 )
 from bms_estimator.service import serve as service
-from bms_estimator.service.checkpoint import REFUSED, CheckpointFile
+from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Restored
 from bms_estimator.simulation.virtual_converter import BoardParts
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.doorkeeper import HELD_READS, Doorkeeper
@@ -202,6 +202,7 @@ class World:
             stack.enter_context(self.broker.installed())
             stack.enter_context(self._log_kept())
             stack.enter_context(self._board_seen())
+            stack.enter_context(self._checkpoint_seen())
             stack.callback(self.end_process, silently=False)
             try:
                 self._live()
@@ -252,8 +253,7 @@ class World:
                 self.end_process(silently=False)
                 return
         process.loop.step()
-        faults = [fault for fault in process.loop.faults if fault != FORGOTTEN_BY_AIOMQTT]
-        if faults:
+        if process.loop.faults and (faults := [one for one in process.loop.faults if one != FORGOTTEN_BY_AIOMQTT]):
             self.fail(f"nobody caught: {faults[0]}")
         if process.main is not None and process.main.done():
             self._ended(process)
@@ -298,7 +298,6 @@ class World:
         self.process = process
         self.broker.loop = loop
         self.note(f"start {self.runs}")
-        self._check_files()
         process.main = loop.start(
             service.serve(
                 self.settings,
@@ -483,12 +482,6 @@ class World:
         if wrong := self.sensor_online.check(None if noisy else truth, told, now_s):
             self.fail(f"sensor availability: {wrong}")
 
-    def _check_files(self) -> None:
-        """What is on the disk is whole."""
-        found = CheckpointFile(self.disk.folder, self.settings, CELL, now=self.clocks.moment).load()
-        if found.reason.startswith(REFUSED):
-            self.fail(f"the checkpoint is {found.reason}")
-
     def _check_end(self) -> None:
         """After a time without faults all is as it should be."""
         process = self.process
@@ -536,6 +529,23 @@ class World:
             yield
         finally:
             structlog.configure(**kept)
+
+    @contextlib.contextmanager
+    def _checkpoint_seen(self) -> Iterator[None]:
+        """What the service finds on the disk when it starts is whole."""
+        load = CheckpointFile.load
+
+        def loaded(file: CheckpointFile) -> Restored:
+            found = load(file)
+            if found.reason.startswith(REFUSED):
+                self.fail(f"the checkpoint is {found.reason}")
+            return found
+
+        CheckpointFile.load = loaded
+        try:
+            yield
+        finally:
+            CheckpointFile.load = load
 
     @contextlib.contextmanager
     def _board_seen(self) -> Iterator[None]:
