@@ -271,18 +271,18 @@ class Broker:
     def _send_to_broker(self, connection: Connection, packet: Callable[[], None]) -> None:
         connection.said_by_client_s = now_s = self._timeline.now_s
         connection.to_broker_s = max(connection.to_broker_s, now_s) + self._dice.uniform(0.0005, LATE_S)
+        self._timeline.at(connection.to_broker_s, lambda: self._arrive(connection, packet))
 
-        def arrive() -> None:
-            if connection.half_open or not connection.broker_open:
-                return
-            if self._timeline.now_s < self.frozen_until_s:
-                connection.to_broker_s = max(connection.to_broker_s, self.frozen_until_s) + 1e-6
-                self._timeline.at(connection.to_broker_s, arrive)
-                return
-            connection.heard_by_broker_s = self._timeline.now_s
-            packet()
-
-        self._timeline.at(connection.to_broker_s, arrive)
+    def _arrive(self, connection: Connection, packet: Callable[[], None]) -> None:
+        """A packet has come to the broker."""
+        if connection.half_open or not connection.broker_open:
+            return
+        if self._timeline.now_s < self.frozen_until_s:
+            connection.to_broker_s = max(connection.to_broker_s, self.frozen_until_s) + 1e-6
+            self._timeline.at(connection.to_broker_s, lambda: self._arrive(connection, packet))
+            return
+        connection.heard_by_broker_s = self._timeline.now_s
+        packet()
 
     def _send_to_client(self, connection: Connection, packet: Callable[[], None]) -> None:
         connection.to_client_s = max(connection.to_client_s, self._timeline.now_s) + self._dice.uniform(0.0005, LATE_S)

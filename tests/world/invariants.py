@@ -1,6 +1,7 @@
 """What must hold, whatever happens. Each number that bounds something stands here."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 from pydantic_core import from_json
@@ -187,8 +188,9 @@ def text(payload: bytes | None) -> str | None:
     return None if payload is None else payload.decode(errors="replace")
 
 
+@lru_cache(maxsize=64)
 def is_json(payload: bytes) -> bool:
-    """Whether a payload is strict JSON: no NaN, no infinity."""
+    """Whether a payload is strict JSON: no NaN, no infinity. The longest come again with each connection."""
     try:
         from_json(payload, allow_inf_nan=False)
     except ValueError:

@@ -367,7 +367,8 @@ class World:
 
     def _delivered(self, data: bytes) -> None:
         if self.process is not None:
-            self.process.reference.feed(data)
+            if not self.board.text:
+                self.process.reference.feed(data)
             self.process.delivered_s = self.timeline.now_s
             self.process.delivered_bytes += len(data)
 
