@@ -1,6 +1,7 @@
 """What the filter has learned, read from the estimator's records."""
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell import emf
-from bms_estimator.kernels.ekf_state import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
+from bms_estimator.kernels.ekf_state import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
 from bms_estimator.kernels.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
 from bms_estimator.kernels.identification import LEAST_BINS
@@ -113,14 +114,27 @@ def learned_ocv(
     """
     f, p = record["filter"], settings["filter"]
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]][NODE:, NODE:]
+    rows, own_v = _on_nodes(p.tobytes(), soc.tobytes())
+    variance_v2 = ((rows @ covariance) * rows).sum(axis=1) + (1.0 - p["learned"]) * own_v**2
+    return rows @ mean[NODE:], np.sqrt(variance_v2)
+
+
+@lru_cache(maxsize=16)
+def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What each node of the correction is worth at each SOC, and the error of the curve there [V]: of settings alone.
+
+    Args:
+        settings: Of a record of EKF_SETTINGS, as all that it depends on.
+        socs: Of float64.
+    """
+    p, soc = np.frombuffer(bytearray(settings), EKF_SETTINGS)[0], np.frombuffer(socs)
     rows, own_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
     for n, x in enumerate(soc):
         i, t = place(x)
         volts = per_node_v(p, x, t)
         rows[n, i], rows[n, i + 1] = volts * (1.0 - t), volts * t
         own_v[n] = on_grid(x, p["curve_error_v"])
-    variance_v2 = ((rows @ covariance) * rows).sum(axis=1) + (1.0 - p["learned"]) * own_v**2
-    return rows @ mean[NODE:], np.sqrt(variance_v2)
+    return rows, own_v
 
 
 def learned_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 from bms_estimator.model.estimate import Estimate, Health, Info, ParameterReport, Report, Snapshot
@@ -41,7 +42,7 @@ class Messages:
     def __init__(self, base_topic: str, device: str, sample_period_s: float = 0.0) -> None:
         self.root = f"{base_topic}/{device}"
         self._device, self._sample_period_s = device, sample_period_s
-        self._schema = _json(schema())  # takes milliseconds, and here nothing waits yet
+        self._schema = _schema()  # takes milliseconds, and here nothing waits yet
 
     def greeting(self) -> list[Message]:
         """What a broker is told first."""
@@ -129,6 +130,12 @@ def schema() -> dict[str, Any]:
         "info": Info,
     }
     return {topic: model.model_json_schema() for topic, model in topics.items()}
+
+
+@cache
+def _schema() -> bytes:
+    """The same for all packs."""
+    return _json(schema())
 
 
 def _report(report: Report) -> bytes:

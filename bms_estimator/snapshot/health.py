@@ -7,13 +7,18 @@ from pathlib import Path
 import numpy as np
 
 from bms_estimator.kernels.input_checks import COUNTERS
+from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Health, LoopHealth, RecordingHealth, Totals
 from bms_estimator.model.suspect import Suspect
 from bms_estimator.sinks import Delivery
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
-_SAMPLE_COUNTERS = ("samples", "gaps", "time_steps_back")
+_SAMPLE_COUNTERS = [
+    name
+    for name in OBSERVER_STATE.names or ()
+    if name.startswith("dropped_") or name in ("samples", "gaps", "time_steps_back")
+]
 
 
 def resident_mib() -> float | None:
@@ -26,8 +31,7 @@ def resident_mib() -> float | None:
 
 def sample_counters(state: np.void) -> dict[str, int]:
     """Samples accepted and dropped by kind, of a record of OBSERVER_STATE."""
-    names = [name for name in state.dtype.names or () if name.startswith("dropped_") or name in _SAMPLE_COUNTERS]
-    return {name: int(state[name]) for name in names}
+    return dict(zip(_SAMPLE_COUNTERS, state[_SAMPLE_COUNTERS].item(), strict=True))
 
 
 def dropped_text(dropped: Mapping[str, int]) -> str:
@@ -38,8 +42,8 @@ def dropped_text(dropped: Mapping[str, int]) -> str:
 
 def identifier_counters(record: np.void) -> dict[str, int]:
     """How often the filter did not believe its input or itself, of a record of ESTIMATOR_STATE."""
-    counts = {name: int(record["counters"][name]) for name in COUNTERS.names or ()}
-    return counts | {"searched": int(record["filter"]["reopened"])}
+    counts = zip(COUNTERS.names or (), record["counters"].item(), strict=True)
+    return dict(counts) | {"searched": int(record["filter"]["reopened"])}
 
 
 def suspicions(record: np.void, settings: np.void) -> list[str]:

@@ -1,8 +1,10 @@
 """Topic ``parameters``: a1..a21 and the elements, each with its error, where it comes from, and why it is not valid."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import (
@@ -110,8 +112,15 @@ def _ocv(estimator: Estimator) -> OcvCurve:
     record, settings = estimator.record[0], estimator.settings_record[0]
     p = settings["filter"]
     correction_v, std_v = learned_ocv(record, settings, OCV_SOC)
-    given_v = np.array([chen_mora.ocv(soc, p["ocv_v"], p["ocv_slope_v"]) for soc in OCV_SOC])
+    given_v = _given_v(p["ocv_v"].tobytes(), p["ocv_slope_v"].tobytes())
     return OcvCurve(soc=OCV_SOC.tolist(), ocv_v=(given_v + correction_v).tolist(), std_v=std_v.tolist())
+
+
+@lru_cache(maxsize=16)
+def _given_v(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
+    """The cell file's OCV at ``OCV_SOC`` [V], of what the filter has of it."""
+    curve, slope = np.frombuffer(bytearray(ocv_v)), np.frombuffer(bytearray(ocv_slope_v))
+    return np.array([chen_mora.ocv(soc, curve, slope) for soc in OCV_SOC])
 
 
 def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:

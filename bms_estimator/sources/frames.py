@@ -128,8 +128,8 @@ class FrameDecoder:
     @property
     def counters(self) -> FrameCounters:
         """Since start."""
-        state = self._state[0]
-        return FrameCounters(**{name: int(state[name]) for name in _COUNTERS})
+        counts = self._state[_COUNTERS].item()
+        return FrameCounters(**dict(zip(_COUNTERS, counts, strict=True)))
 
     @property
     def heard_at(self) -> int:

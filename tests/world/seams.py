@@ -65,7 +65,7 @@ class _Instead:
 
 SLOWER = (("service.live", "LAG_STEP_S", 2.0), ("sources.serial_board", "TALK_S", 0.5))
 """What looks around all the time does so less often: module, name, seconds. It is what an idle hour would cost most."""
-REMEMBERED = (("estimator.records", "decay_table"), ("sinks.messages", "schema"))
+REMEMBERED = (("estimator.records", "decay_table"),)
 """Pure functions whose values are worth keeping from start to start."""
 
 
