@@ -180,7 +180,8 @@ def _parameter(held: Parameter, fit: Learned | None, now_s: float) -> Parameter:
     """a_i as the observer holds it, with the error that the fit has."""
     if fit is None or held.source == "configured":
         return held
-    return _identified(fit, held, VALID_FIT_STD, now_s).model_copy(update={"value": held.value})
+    known = _identified(fit, held, VALID_FIT_STD, now_s)
+    return known.model_copy(update={"value": held.value}) if known.valid else known
 
 
 def _identified(learned: Learned, held: Parameter, limit: float, now_s: float) -> Parameter:

@@ -123,7 +123,7 @@ class Disk:
                 sizes.append((now_s, size))
 
     def _databases(self) -> list[Path]:
-        return sorted(path for path in self.folder.iterdir() if ".sqlite" in path.name)
+        return [self.folder / name for name in sorted(os.listdir(self.folder)) if ".sqlite" in name]  # noqa: PTH208 - quicker
 
     def cut(self, now_s: float) -> None:
         """The power is cut: leave what is on the platter, and of the rest what chance leaves."""

@@ -192,7 +192,7 @@ def text(payload: bytes | None) -> str | None:
 def is_json(payload: bytes) -> bool:
     """Whether a payload is strict JSON: no NaN, no infinity. The longest come again with each connection."""
     try:
-        from_json(payload, allow_inf_nan=False)
+        from_json(payload, allow_inf_nan=False, cache_strings="none")
     except ValueError:
         return False
     return True
