@@ -154,7 +154,9 @@ def test_an_innovation_of_many_std_counts_as_one_of_two() -> None:
     moved = []
     for stds in (2.0, 8.0):
         s = somewhere(p)
-        s["covariance"][0][SOC] = s["covariance"][0][:, SOC] = 0.0  # by the SOC's own move it would be linear about another
+        s["covariance"][0][SOC] = s["covariance"][0][:, SOC] = (
+            0.0  # by the SOC's own move it would be linear about another
+        )
         _, curved_v = linearised(s, p)
         h, covariance, before = (np.array(x) for x in (s["h"], s["covariance"][0], s["mean"][0]))
         std = np.sqrt(h @ covariance @ h + 0.05**2 + curved_v**2)

@@ -187,7 +187,7 @@ async def test_a_service_that_is_asked_to_end_saves_first_though_its_broker_stan
     (kept,) = checkpoints(state_home)
     with np.load(kept) as saved:
         assert saved["clean"]
-        assert saved["state.observer.samples"][0] >= told["frames_received"]
+        assert saved["state"]["observer"]["samples"][0] >= told["frames_received"]
 
 
 async def test_a_disk_that_never_answers_and_a_log_that_nobody_reads_stop_neither_the_estimate_nor_the_end(
