@@ -118,6 +118,29 @@ def test_a_clock_that_jumps_is_not_believed(board_us: Callable[[int, int], int],
     assert least <= decoder.counters.clock_jumps <= most
 
 
+def test_a_clock_that_is_wrong_from_a_reset_on_is_not_believed() -> None:
+    decoder = stamped(lambda _, us: us)
+    decoder.feed(START_S + 70.0, dataclasses.replace(Hello.decode(unseal(HELLO)), boot_id=99).encode())
+    ((time_s, *_),) = decoder.feed(
+        START_S + 70.0, SampleMessage(0, 2_400_000_000, 34_571, 21_405, 38, 225, 1, 16).encode()
+    )
+    assert time_s == pytest.approx(69.9)
+    assert decoder.counters.clock_jumps == 1
+
+
+def test_a_clock_that_is_set_back_while_nothing_comes_is_not_believed() -> None:
+    """For 100 s nothing came, and so many samples are lost, though the board says 20 s; no hello tells whose they are."""
+    decoder = FrameDecoder()
+    decoder.feed(START_S, dataclasses.replace(Hello.decode(unseal(HELLO)), period_ns=100_000_000).encode())
+    times_s: list[float] = []
+    for i in (*range(300), *range(1300, 1400)):
+        board_us = 100_000 * (i + 1) - (80_000_000 if i >= 1300 else 0)
+        message = SampleMessage(i, board_us, 34_571, 21_405, 38, 225, 1, 16)
+        times_s.extend(decoder.feed(START_S + 0.1 * (i + 1), message.encode())["time_s"])
+    assert times_s[-1] == pytest.approx(139.9)  # the first sample came at 0.1 s
+    assert decoder.counters.clock_jumps == 1
+
+
 def test_a_host_that_was_held_up_for_a_minute_believes_the_board() -> None:
     """What waited in the buffer comes at once, then what the buffer had no room for is missing."""
     decoder = FrameDecoder()

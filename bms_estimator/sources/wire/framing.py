@@ -223,23 +223,36 @@ def take_hello(d: Record, s: Record) -> None:
 
 
 @njit(cache=True)
+def is_early(d: Record, arrival_s: float, time_s: float) -> bool:
+    """Whether a sample of ``time_s`` would have come long before it was taken, by how late those before it came."""
+    return bool(arrival_s - time_s < d.least_late_s - EARLY_S)
+
+
+@njit(cache=True)
+def agree(d: Record, samples: int, step_us: int) -> bool:
+    """Whether one board can have taken so many samples in that time of its clock."""
+    apart_us = abs(samples * d.period_us - step_us)
+    return apart_us <= max(_MOST_APART * step_us, _REORDER_WINDOW * d.period_us)
+
+
+@njit(cache=True)
 def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
     """Go on by the board's clock. Whole turns of its 32 bits, which only an outage can hide, are told by arrival.
 
     Returns:
-        Whether the step can be right: a sample may come late, but not before it was taken. A clock that runs steadily too
-        fast, as a simulated one does, is told by its rate, not here.
+        Whether the step can be right: a sample may come late, but not before it was taken, and as many samples are lost as fit
+        it. A clock that runs steadily too fast, as a simulated one does, is told by its rate, not here.
     """
     step_us = (board_us - d.board_us) & _MASK
     if lost > 0:
         turns = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
         step_us += max(turns, 0) * MODULUS
-    late_s = arrival_s - d.origin_s - (d.elapsed_us + step_us) * _US
-    if late_s < d.least_late_s - EARLY_S:
+    time_s = d.origin_s + (d.elapsed_us + step_us) * _US
+    if is_early(d, arrival_s, time_s) or (lost > 0 and not agree(d, lost + 1, step_us)):
         return False
-    d.least_late_s = min(d.least_late_s + SLOWEST * step_us * _US, late_s)
+    d.least_late_s = min(d.least_late_s + SLOWEST * step_us * _US, arrival_s - time_s)
     d.elapsed_us += step_us
-    d.time_s = d.origin_s + d.elapsed_us * _US
+    d.time_s = time_s
     return True
 
 
@@ -261,13 +274,6 @@ def doubt(d: Record, arrival_s: float) -> None:
 
 
 @njit(cache=True)
-def agree(d: Record, samples: int, step_us: int) -> bool:
-    """Whether one board can have taken so many samples in that time of its clock."""
-    apart_us = abs(samples * d.period_us - step_us)
-    return apart_us <= max(_MOST_APART * step_us, _REORDER_WINDOW * d.period_us)
-
-
-@njit(cache=True)
 def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -> int:
     """Place a sample in the stream. Returns bits of SampleStatus, -1 for a sample to be dropped."""
     status = 0
@@ -280,7 +286,11 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
                 doubt(d, arrival_s)  # its hello was lost: the next one is no further reset
-            restart_clock(d, arrival_s, board_us * _US)  # the board has run since its reset
+            run_s = board_us * _US  # since its reset
+            if is_early(d, arrival_s, d.time_s + run_s):
+                run_s = 0.0
+                d.clock_jumps += 1
+            restart_clock(d, arrival_s, run_s)
             d.reset_pending = 0
             d.resets += 1
             status = _RESET
@@ -291,12 +301,9 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
             d.out_of_order += 1
             return -1
         else:
-            before_us = d.elapsed_us
             if not follow_clock(d, board_us, arrival_s, ahead):
                 restart_clock(d, arrival_s, 0.0)
                 d.clock_jumps += 1
-                doubt(d, arrival_s)
-            elif ahead > 0 and not agree(d, ahead + 1, d.elapsed_us - before_us):
                 doubt(d, arrival_s)
             d.frames_lost += ahead
             status = _GAP if ahead else 0
