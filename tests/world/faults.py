@@ -1,10 +1,12 @@
 """What may befall the world, and when."""
 
+import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from bms_estimator.sources.protocol import MODULUS
 from tests.world.disk import Arm, PowerCutError
 from tests.world.line import Noise
 from tests.world.loop import KilledError
@@ -16,6 +18,12 @@ SHORTEST_PAUSE_S, LONGEST_PAUSE_S = 5.0, 300.0
 FIRST_S = 20.0
 STOP_S = 90.0
 """Systemd kills what has not ended by then [s]."""
+
+
+LEAST_JUMP_S, MOST_JUMP_S = 3.0, 3600.0
+"""Of the board's clock: the service believes a sample that is less than 2 s early."""
+MOST_RANDOM_S = 5.0
+"""So long the board's clock may run at random."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +45,17 @@ class Fault:
         return f"{self.kind} for {self.seconds:.1f} s, share {self.share:.3f}"
 
 
-def schedule(dice: random.Random, until_s: float, *, auto: bool, text: bool) -> list[Fault]:
-    """What befalls a world, drawn."""
-    kinds = [
-        kind for kind in KINDS if not (kind == "boards swapped" and text) and not (kind == "port renamed" and not auto)
+def usual(*, auto: bool, text: bool) -> list[str]:
+    """Kinds that may befall each world."""
+    return [
+        kind
+        for kind in KINDS
+        if kind not in CLOCK and not (kind == "boards swapped" and text) and not (kind == "port renamed" and not auto)
     ]
+
+
+def schedule(dice: random.Random, until_s: float, kinds: Sequence[str]) -> list[Fault]:
+    """What befalls a world, drawn from some kinds."""
     likely = dice.sample(kinds, k=dice.randint(2, len(kinds)))
     faults = []
     at_s = FIRST_S * dice.random()
@@ -94,6 +108,26 @@ def _swap(world: "World", fault: Fault) -> None:
 def _reset_board(world: "World", fault: Fault) -> None:
     if world.cable.board is not None:
         world.cable.send(world.cable.board.reset())
+
+
+def _jump_s(fault: Fault) -> float:
+    """Of a clock: seconds to an hour, ahead or back."""
+    size = abs(2.0 * fault.share - 1.0)
+    return math.copysign(LEAST_JUMP_S * (MOST_JUMP_S / LEAST_JUMP_S) ** size, fault.share - 0.5)
+
+
+def _clock_stepped(world: "World", fault: Fault) -> None:
+    world.board.step_clock(_jump_s(fault))
+
+
+def _stamp_wrong(world: "World", fault: Fault) -> None:
+    world.board.stamps_off_us.append(round(_jump_s(fault) * 1e6))
+
+
+def _clock_at_random(world: "World", fault: Fault) -> None:
+    board, dice = world.board, world.dice["faults"]
+    samples = math.ceil(min(fault.seconds, MOST_RANDOM_S) / board.period_s)
+    board.stamps_off_us.extend(dice.randrange(MODULUS) for _ in range(samples))
 
 
 def _broker_down(world: "World", fault: Fault) -> None:
@@ -225,4 +259,9 @@ KINDS: dict[str, Callable[["World", Fault], None]] = {
     "hostile requests": _hostile,
     "availability forged": _forged,
     "birth message": _birth,
+    "board's clock stepped": _clock_stepped,
+    "one stamp wrong": _stamp_wrong,
+    "board's clock at random": _clock_at_random,
 }
+CLOCK = ("board's clock stepped", "one stamp wrong", "board's clock at random")
+"""Lines of text carry no clock. They are drawn for themselves: what else befalls a seed is as it was before there were any."""

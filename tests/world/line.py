@@ -9,6 +9,7 @@ import os
 import random
 import socket
 import struct
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,6 +66,8 @@ class Board:
         self.serial_number, self._parts, self._dice, self.text = serial_number, parts, dice, text
         self._first_rate_hz = first_rate_hz
         self._inbox = b""
+        self.stamps_off_us = deque[int]()
+        """By so much the stamps of the next samples are wrong."""
         self._boot_id = dice.randrange(1 << 16)
         self.boots = 0
         self.reset(ResetCause.POWER_ON)
@@ -74,6 +77,7 @@ class Board:
         self._boot_id = (self._boot_id + 1) % (1 << 16)
         self.boots += 1
         self._cause, self._sequence, self._ns, self._ntc_next, self._inbox = cause, 0, 0, False, b""
+        self.stamps_off_us.clear()
         self._set_rate(self._first_rate_hz)
         return b"" if self.text else self._hello().encode()
 
@@ -81,6 +85,10 @@ class Board:
     def period_s(self) -> float:
         """Between two samples."""
         return self._period_ns * 1e-9
+
+    def step_clock(self, step_s: float) -> None:
+        """From now on its clock is ahead by so much, or behind; until it is reset."""
+        self._ns += round(step_s * 1e9)
 
     def sample(self, reading: Reading) -> bytes:
         """What it sends of a window with ``reading`` at its sensors."""
@@ -96,7 +104,8 @@ class Board:
         status = BoardStatus.AUX_IS_NTC * self._ntc_next | (self._cause << 4)
         self._ntc_next = not self._ntc_next
         n = self._aux_count
-        board_us = self._ns // 1000 % MODULUS
+        off_us = self.stamps_off_us.popleft() if self.stamps_off_us else 0
+        board_us = (self._ns // 1000 + off_us) % MODULUS
         message = SampleMessage(self._sequence, board_us, voltage, current, count, self._sum(aux, n), n, int(status))
         self._sequence = (self._sequence + 1) % MODULUS
         return message.encode()

@@ -1,6 +1,7 @@
 """The service with a fault built in: what a simulation that finds nothing must still find."""
 
 import contextlib
+import math
 import os
 from collections.abc import Iterator
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.sinks.messages import Messages
 from bms_estimator.sources.doorkeeper import Doorkeeper
+from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.store.queue import Queue
 
 
@@ -62,4 +64,18 @@ def no_second_try() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Doorkeeper, "_remember", remember)
+        yield
+
+
+@contextlib.contextmanager
+def board_clock_believed() -> Iterator[None]:
+    """A board's clock that runs ahead of the arrivals is right."""
+    decoded = FrameDecoder._decode
+
+    def decode(self: FrameDecoder, *arguments: Any) -> Any:
+        self._state["least_late_s"] = -math.inf  # so that no sample is ever early
+        return decoded(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FrameDecoder, "_decode", decode)
         yield

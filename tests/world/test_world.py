@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 import pytest
 
 from tests.world.faults import Fault
-from tests.world.mutants import no_fsync, no_rewind, no_second_try, no_sensor_availability
+from tests.world.mutants import board_clock_believed, no_fsync, no_rewind, no_second_try, no_sensor_availability
 from tests.world.world import World
 
 SEEDS = range(3)
@@ -35,6 +35,7 @@ def test_a_seed_gives_the_same_bits_each_time() -> None:
         (no_fsync, [Fault(60.0 + 7.0 * n, "power cut", 2.0, 0.5) for n in range(1, 40)], "the checkpoint is refused"),
         (no_sensor_availability, [Fault(60.0, "port gone", 120.0, 0.5)], "sensor availability"),
         (no_second_try, [Fault(0.05, "disk full", 60.0, 0.5)], "is not remembered"),
+        (board_clock_believed, [Fault(60.0, "board's clock stepped", 0.0, 0.9)], "s are counted that were none"),
     ],
 )
 def test_a_fault_that_is_built_in_is_found(

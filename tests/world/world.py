@@ -34,7 +34,7 @@ from bms_estimator.sources.doorkeeper import HELD_READS, Doorkeeper
 from tests.world import invariants
 from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError
-from tests.world.faults import Fault, schedule
+from tests.world.faults import CLOCK, Fault, schedule, usual
 from tests.world.invariants import Band, InvariantError, Reference, Said, Truth
 from tests.world.line import Board, Cable
 from tests.world.loop import KilledError, ProcessLoop, Timeline
@@ -51,6 +51,8 @@ CALM_S = 420.0
 """At the end nothing happens, and all must be as it should [s]."""
 KNOWN, KNOWN_STD = 0.5, (0.005, 0.02)
 """So many worlds begin with a SOC that is known, with a standard deviation between these: their bands are narrow."""
+WRONG_CLOCK = 0.5
+"""In so many worlds with a board that has a clock it jumps."""
 SHARED = Path("/dev/shm")
 LAST_LINES = 60
 FORGOTTEN_BY_AIOMQTT = "Future exception was never retrieved: MqttCodeError('Unexpected disconnection')"
@@ -100,6 +102,8 @@ class Process:
     reference: Reference = field(default_factory=Reference)
     delivered_s: float = 0.0
     delivered_bytes: int = 0
+    most_ahead_s: float = -math.inf
+    """By so much the samples' time was ahead of the true one at most; it begins anywhere."""
     foreign: bool = False
     """It was given bytes of another board."""
 
@@ -158,10 +162,15 @@ class World:
         self._digest = hashlib.sha256()
         self.log: deque[str] = deque(maxlen=LAST_LINES)
         self.figures: dict[str, float] = {"handles": 0, "runs": 0, "states": 0}
-        self.faults = (
-            schedule(self.dice["drawn"], seconds - CALM_S, auto=self.auto, text=text) if faults is None else faults
-        )
+        self.faults = self._draw_faults(seconds - CALM_S, text=text) if faults is None else faults
         self.say_lines = False
+
+    def _draw_faults(self, until_s: float, *, text: bool) -> list[Fault]:
+        """What befalls it; in a part of the worlds the board's clock, too."""
+        drawn = schedule(self.dice["drawn"], until_s, usual(auto=self.auto, text=text))
+        clock = random.Random(f"{self.seed} clock")
+        wrong = not text and clock.random() < WRONG_CLOCK
+        return drawn + schedule(clock, until_s, CLOCK) if wrong else drawn
 
     def _draw_settings(self, dice: random.Random) -> Settings:
         text = dice.random() < 0.2
@@ -381,8 +390,10 @@ class World:
             return
         self.said.say(snapshot.estimate.model_dump_json().encode(), process.number, self.timeline.now_s)
         self.figures["states"] += 1
-        if wrong := self.band.take(snapshot, self.seen_soc):
+        behind = self._reads(process) > 0  # it was frozen: the state is of a sample before those that wait
+        if not behind and (wrong := self.band.take(snapshot, self.seen_soc)):
             self.fail(wrong)
+        self._check_time(process, snapshot.estimate.board_time_s)
 
     def _received(self, packet: Packet, connection: Connection | None) -> None:
         """The broker has a message."""
@@ -447,6 +458,14 @@ class World:
         taken = process.board.board.get("serial")
         if taken == f"{self.foreigner.serial_number:08x}":
             self.fail(f"board {taken} is taken for the pack's")
+
+    def _check_time(self, process: Process, time_s: float) -> None:
+        """No time is counted that was none."""
+        ahead_s = time_s - self.sampled_s
+        thawed_s = self.timeline.now_s - process.loop.frozen_until_s
+        if math.isfinite(process.most_ahead_s) and thawed_s > THAW_S and ahead_s > process.most_ahead_s + AHEAD_S:
+            self.fail(f"{ahead_s - process.most_ahead_s:.1f} s are counted that were none")
+        process.most_ahead_s = max(process.most_ahead_s, ahead_s)
 
     def _reads(self, process: Process) -> int:
         return int(process.board._line._reads.qsize())
@@ -572,6 +591,11 @@ KILL_S = 6.0
 seems to be there only after three."""
 POWER_S = 37.0
 """The same of a power cut: a commit reaches the platter within half a minute."""
+AHEAD_S = 5.0
+"""So much at most the samples' time gets ahead between two states: a jump of the board's clock by less than 2 s is believed."""
+THAW_S = 15.0
+"""So long after a process was frozen its states may be old, and a reset of the board meanwhile has come too late to be told from
+an outage."""
 RETRY_S = 25.0
 """So long after a disk has been at fault it is used again: a hung call is given 10 s, and 10 s pass until the next."""
 ONLINE_S = 45.0
