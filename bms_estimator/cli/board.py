@@ -65,7 +65,7 @@ def board(
     serial: Annotated[
         int | None,
         typer.Option(
-            min=1, max=2**32 - 1, help="sets the board's serial number; shown in hexadecimal", show_default=False
+            parser=whole(1, 2**32 - 1), help="sets the board's serial number; shown in hexadecimal", show_default=False
         ),
     ] = None,
     accept: Annotated[

@@ -48,7 +48,7 @@ def _within(parse: Callable[[str], Number], least: float, most: float) -> Callab
             raise typer.BadParameter(str(error)) from None
         if not least <= value <= most:
             bounds = {"at least": least, "at most": most}
-            limits = [f"{name} {bound:g}" for name, bound in bounds.items() if math.isfinite(bound)]
+            limits = [f"{name} {bound:.12g}" for name, bound in bounds.items() if math.isfinite(bound)]
             raise typer.BadParameter(f"{text}: must be {' and '.join(limits)}")
         return value
 

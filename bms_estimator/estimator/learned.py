@@ -119,7 +119,7 @@ def learned_ocv(
     return rows @ mean[NODE:], np.sqrt(variance_v2)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What each node of the correction is worth at each SOC, and the error of the curve there [V]: of settings alone.
 

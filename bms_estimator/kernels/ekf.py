@@ -37,7 +37,7 @@ MINUTE_S, TEN_MINUTES_S = 60.0, 600.0
 """Over which a mean innovation shows an error that stays."""
 INFLATION_OVER = 5.0, 3.0
 """It is averaged over so many times as long."""
-NEAR, MOST_TIMES = 0.01, 4
+NEAR, MOST_TIMES = 0.01, 8
 """An update is linearised about where it brings the SOC, to how well it is known then, until it comes so near that; so often
 at most."""
 LOWEST, HIGHEST = -0.05, 1.05
@@ -118,7 +118,7 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
         variance_v2: R [V^2].
 
     Returns:
-        The innovation [V] and its variance S [V^2].
+        The innovation [V] and its variance S [V^2], of the last linearisation.
     """
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     soc, variance = x[SOC], cov[SOC, SOC]
@@ -174,6 +174,8 @@ def secant_reach(variance: float) -> float:
 @njit(cache=True)
 def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: float) -> tuple[float, float]:
     """Predicted mean voltage of the window [V], H into ``s.h``, and what the secant of the OCV leaves out [V].
+
+    All of it linear about ``about_soc``, known to ``about_variance``: the voltage is what that line has at the filter's SOC.
 
     v = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast, (2.4) with the ladder. How the resistances,
     and what was learned of the OCV, change with SOC is no part of H: it would take an error of theirs for one of the SOC.

@@ -202,7 +202,7 @@ class CheckpointFile:
             self.path.replace(aside)
         except OSError as error:
             return f"it cannot be set aside: {error}"
-        back = shlex.join(["mv", str(aside), str(self.path)])
+        back = shlex.join(["mv", str(aside.resolve()), str(self.path.resolve())])
         later = (
             f"; once the version that wrote it is installed again, stop the service and `{back}`" if self._later else ""
         )
@@ -295,15 +295,11 @@ def _counted(file: File) -> File:
 
 def _in_one(file: File) -> File:
     """From format 6: each field of the state was an array of its own, and a file took five times as long to write."""
-    named = {name: file.pop(f"state.{name}") for name in _names_of_state(file)}
+    named = {name.removeprefix("state."): file.pop(name) for name in list(file) if name.startswith("state.")}
     state = np.zeros((), [(name, field.dtype, field.shape) for name, field in named.items()])
     for name, field in named.items():
         state[name] = field
     return file | {"state": state}
-
-
-def _names_of_state(file: File) -> list[str]:
-    return [name.removeprefix("state.") for name in file if name.startswith("state.")]
 
 
 _MIGRATIONS = {4: _named, 5: _counted, 6: _in_one}

@@ -116,7 +116,7 @@ def _ocv(estimator: Estimator) -> OcvCurve:
     return OcvCurve(soc=OCV_SOC.tolist(), ocv_v=(given_v + correction_v).tolist(), std_v=std_v.tolist())
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _given_v(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
     """The cell file's OCV at ``OCV_SOC`` [V], of what the filter has of it."""
     curve, slope = np.frombuffer(bytearray(ocv_v)), np.frombuffer(bytearray(ocv_slope_v))

@@ -62,8 +62,8 @@ class FrameCounters:
     """Temperatures that no pack has: handed on as not measured."""
     resets: int = 0
     clock_jumps: int = 0
-    """Samples that came long before their time stamp, or after a gap that does not fit the samples lost in it: from then on
-    the board's clock counts anew, by arrival."""
+    """Samples that came long before their time stamp, so long after the one before as neither arrival nor the samples between
+    say, or after a gap that does not fit the samples lost in it: from then on the board's clock counts anew, by arrival."""
 
     def as_dict(self) -> dict[str, int]:
         """By name."""

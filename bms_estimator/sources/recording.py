@@ -18,7 +18,7 @@ WAITING_READS = 1 << 16
 """So many reads wait for the disk: a minute at a thousand samples a second."""
 
 END_S = 5.0
-"""So long the end waits for the disk to take what waits [s]."""
+"""So long the end waits for the disk to take more of what waits [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -64,7 +64,7 @@ class Recording:
         if not self.ended.done():
             return f"the disk has not answered for {END_S:g} s"
         error = self.ended.exception()
-        return str(error.strerror) if isinstance(error, OSError) else ""
+        return "" if error is None else getattr(error, "strerror", None) or str(error)
 
     def write(self, arrival_s: float, data: bytes) -> None:
         """Take one read of the line; after the end of the recording it is only counted."""
@@ -83,9 +83,12 @@ class Recording:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Have the disk take all that waits, and close; one that hangs is left alone."""
+        """Have the disk take all that waits, and close; one that takes nothing for ``END_S`` is left alone."""
         self._waiting.put(None)
-        wait([self.ended], END_S)
+        before = -1
+        while not self.ended.done() and self._written > before:
+            before = self._written
+            wait([self.ended], END_S)
         if not self.ended.done():
             log.warning("recording not ended", file=str(self._path), reason=self.fault)
 

@@ -87,7 +87,7 @@ def test_a_replacement_that_starts_from_it_is_better(capsys, pack, exported):
         )
     (rmse, std, cover), (rmse_generic, std_generic, _) = results
     assert rmse < rmse_generic
-    assert std < 0.9 * std_generic
+    assert std < 0.9 * std_generic  # it was 0.8 of it before the band of the generic cell narrowed by itself
     assert cover > 0.95
 
 

@@ -39,7 +39,15 @@ def test_no_option_takes_what_python_would(option: str, capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     "option",
     [
-        *("board --baud", "demo --port", "demo --rate-hz", "history --step", "ocv --series", "ports --baud"),
+        *(
+            "board --baud",
+            "board --serial",
+            "demo --port",
+            "demo --rate-hz",
+            "history --step",
+            "ocv --series",
+            "ports --baud",
+        ),
         *("record --baud", "record --rate-hz", "simulate --series", "simulate --rate-hz", "simulate --seed"),
     ],
 )

@@ -126,18 +126,22 @@ def test_the_update_is_that_of_the_textbook() -> None:
     assert s["covariance"][0] == pytest.approx(covariance - np.outer(gain, h @ covariance), rel=1e-9, abs=1e-15)
 
 
-@pytest.mark.parametrize("true_soc", [0.06, 0.08, 0.1, 0.13])
-def test_an_update_over_the_bend_near_empty_is_that_of_bayes(true_soc: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "before", "std", "true_soc"),
+    [*(("chen_mora", 0.045, 0.035, true) for true in (0.06, 0.08, 0.1, 0.13)), ("lfp", 0.037, 0.1, 0.21)],
+)
+def test_an_update_over_the_bend_near_empty_is_that_of_bayes(
+    name: str, before: float, std: float, true_soc: float
+) -> None:
     """Of the SOC alone, against the posterior on a grid: the OCV is ten times as steep where the filter begins."""
-    cell = load_cell("chen_mora")
+    cell, noise_v = load_cell(name, None if name == "chen_mora" else 3.0), 0.03
     p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(), 1e-3, None)[0]
-    before, std, noise_v = 0.045, 0.035, 0.03
     s = np.zeros(1, EKF_STATE)[0]
     hypotheses.start(s, p, before, 0.0, 25.0)
     s["count"], s["best"] = 1, 0
     s["mean"][0], s["covariance"][0] = 0.0, 0.0
     s["mean"][0, SOC], s["covariance"][0, SOC, SOC] = before, std**2
-    grid = np.linspace(-0.05, 0.3, 4000)
+    grid = np.linspace(-0.05, 0.6, 4000)
     ocv_v = np.interp(grid, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
     voltage_v = np.interp(true_soc, grid, ocv_v)
     hypotheses.gather(s, 0.0, voltage_v)

@@ -118,6 +118,14 @@ def test_a_clock_that_jumps_is_not_believed(board_us: Callable[[int, int], int],
     assert least <= decoder.counters.clock_jumps <= most
 
 
+def test_a_clock_at_random_by_less_than_is_refused_adds_nothing_up() -> None:
+    """Each step ahead is believed, each back is not: what was believed is taken back."""
+    decoder = stamped(lambda i, us: us + (400_000 * (i * 7919 % 5) if 100 <= i < 500 else 0))
+    last = decoder.feed(START_S + 60.1, SampleMessage(600, 60_100_000, 34_571, 21_405, 38, 225, 1, 16).encode())
+    assert decoder.counters.clock_jumps > 50
+    assert last["time_s"][0] == pytest.approx(60.0, abs=2.0)
+
+
 def test_a_clock_that_is_wrong_from_a_reset_on_is_not_believed() -> None:
     decoder = stamped(lambda _, us: us)
     decoder.feed(START_S + 70.0, dataclasses.replace(Hello.decode(unseal(HELLO)), boot_id=99).encode())

@@ -35,7 +35,9 @@ def samples(count: int, rate_hz: int, bandgap: float, first: int = 0, *, ntc: bo
 @pytest.mark.parametrize("rate_hz", [1, 2, 10, 50, 100, 500, 1000])
 def test_a_new_supply_is_followed_within_the_same_seconds_at_every_rate(rate_hz: int, ntc: bool) -> None:
     decoder, before = FrameDecoder(), 60 * rate_hz
-    decoder.feed(0.0, hello(channels=int(ntc)) + samples(before, rate_hz, BANDGAP_AT_5_V, ntc=ntc))
+    decoder.feed(
+        0.0, hello(channels=int(ntc), period_ns=10**9 // rate_hz) + samples(before, rate_hz, BANDGAP_AT_5_V, ntc=ntc)
+    )
     was_v, after_s = decoder.reference_v, 10 if ntc else 5
     decoder.feed(60.0, samples(after_s * rate_hz, rate_hz, BANDGAP_AT_4_V, before, ntc=ntc))
     assert was_v == pytest.approx(5.0, rel=2e-3)

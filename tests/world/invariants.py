@@ -31,7 +31,9 @@ class Reference:
         self._rest = b""
         self.samples = 0
 
-    def feed(self, data: bytes) -> None:
+    def feed(self, data: bytes) -> bool:
+        """Returns whether samples have come."""
+        before = self.samples
         *frames, self._rest = (self._rest + data).split(DELIMITER)
         for frame in frames:
             try:
@@ -39,6 +41,7 @@ class Reference:
             except ProtocolError:
                 continue
             self.samples += len(packet) == 22 and packet[:2] == bytes((PROTOCOL_VERSION, MessageType.SAMPLE))
+        return self.samples > before
 
 
 class State(NamedTuple):

@@ -78,6 +78,7 @@ class Board:
         self.boots += 1
         self._cause, self._sequence, self._ns, self._ntc_next, self._inbox = cause, 0, 0, False, b""
         self.stamps_off_us.clear()
+        self._window_ns = 0
         self._set_rate(self._first_rate_hz)
         return b"" if self.text else self._hello().encode()
 
@@ -86,13 +87,22 @@ class Board:
         """Between two samples."""
         return self._period_ns * 1e-9
 
+    def begin_window(self) -> None:
+        """At a beat, which neither a reset nor another rate shifts."""
+        self._window_ns = self._period_ns
+
+    @property
+    def has_measured(self) -> bool:
+        """Whether a window has ended at this beat: it was not reset meanwhile."""
+        return self._window_ns > 0
+
     def step_clock(self, step_s: float) -> None:
         """From now on its clock is ahead by so much, or behind; until it is reset."""
         self._ns += round(step_s * 1e9)
 
     def sample(self, reading: Reading) -> bytes:
         """What it sends of a window with ``reading`` at its sensors."""
-        self._ns += self._period_ns
+        self._ns += self._window_ns
         parts, count = self._parts, self._count
         voltage = self._sum(reading.voltage_v / parts.divider / parts.supply_v, count)
         current = self._sum(parts.current_zero + reading.current_a * parts.part_per_ampere, count)

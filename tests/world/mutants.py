@@ -73,7 +73,7 @@ def board_clock_believed() -> Iterator[None]:
     decoded = FrameDecoder._decode
 
     def decode(self: FrameDecoder, *arguments: Any) -> Any:
-        self._state["least_late_s"] = -math.inf  # so that no sample is ever early
+        self._state["least_late_s"], self._state["period_us"] = -math.inf, 1e12  # no sample is ever early, or in haste
         return decoded(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -102,8 +102,13 @@ class Process:
     reference: Reference = field(default_factory=Reference)
     delivered_s: float = 0.0
     delivered_bytes: int = 0
-    most_ahead_s: float = -math.inf
-    """By so much the samples' time was ahead of the true one at most; it begins anywhere."""
+    heard_s: float = 0.0
+    """When the last valid sample was sent that it was given."""
+    withheld: int = 0
+    first_ahead_s: float | None = None
+    """By so much the samples' time was ahead of the true one first, it begins anywhere; after ..."""
+    thawed_s: float = 0.0
+    """... it was frozen the last time: what came meanwhile came late."""
     foreign: bool = False
     """It was given bytes of another board."""
 
@@ -329,7 +334,7 @@ class World:
         self.disk.arm = None
         self.broker.loop = None
         known = any(c.loop is process.loop and c.broker_open and c.accepted for c in self.broker.connections)
-        self.will_certain = known or self.broker.retained.get(f"{ROOT}/availability") != b"online"
+        self.will_certain = known or self.broker.retained.get(f"{ROOT}/availability") in (None, b"offline")
         process.loop.kill()
         self.disk.end_process()
         self.cable.forget()
@@ -360,7 +365,7 @@ class World:
         board = self.cable.board or self.board
         now_s = self.timeline.now_s
         reading = self.pack(now_s)
-        if self.powered:
+        if self.powered and board.has_measured:
             sent = board.sample(reading)
             if self.cable.board is not None and self.cable.opening is not None and not self.cable.noise.mute:
                 if board is self.board:
@@ -368,6 +373,7 @@ class World:
                 elif self.process is not None:
                     self.process.foreign = True
                 self.cable.send(sent)
+        board.begin_window()
         self.timeline.after(board.period_s, self._tick_board)
 
     def _readable(self, descriptor: int) -> None:
@@ -376,8 +382,8 @@ class World:
 
     def _delivered(self, data: bytes) -> None:
         if self.process is not None:
-            if not self.board.text:
-                self.process.reference.feed(data)
+            if not self.board.text and self.process.reference.feed(data):
+                self.process.heard_s = self.sampled_s
             self.process.delivered_s = self.timeline.now_s
             self.process.delivered_bytes += len(data)
 
@@ -460,12 +466,18 @@ class World:
             self.fail(f"board {taken} is taken for the pack's")
 
     def _check_time(self, process: Process, time_s: float) -> None:
-        """No time is counted that was none."""
-        ahead_s = time_s - self.sampled_s
-        thawed_s = self.timeline.now_s - process.loop.frozen_until_s
-        if math.isfinite(process.most_ahead_s) and thawed_s > THAW_S and ahead_s > process.most_ahead_s + AHEAD_S:
-            self.fail(f"{ahead_s - process.most_ahead_s:.1f} s are counted that were none")
-        process.most_ahead_s = max(process.most_ahead_s, ahead_s)
+        """No time is counted that was none. Not where the last samples were withheld: the state is of an older one."""
+        before, process.withheld = process.withheld, process.board.counters.get("before_hello", 0)
+        if process.withheld != before:
+            return
+        ahead_s = time_s - (self.sampled_s if self.board.text else process.heard_s)
+        thawed_s = process.loop.frozen_until_s
+        if self.timeline.now_s - thawed_s <= THAW_S:
+            return
+        if process.first_ahead_s is None or process.thawed_s != thawed_s:
+            process.first_ahead_s, process.thawed_s = ahead_s, thawed_s
+        if ahead_s > process.first_ahead_s + AHEAD_S:
+            self.fail(f"{ahead_s - process.first_ahead_s:.1f} s are counted that were none")
 
     def _reads(self, process: Process) -> int:
         return int(process.board._line._reads.qsize())
@@ -591,7 +603,7 @@ KILL_S = 6.0
 seems to be there only after three."""
 POWER_S = 37.0
 """The same of a power cut: a commit reaches the platter within half a minute."""
-AHEAD_S = 5.0
+AHEAD_S = 3.0
 """So much at most the samples' time gets ahead between two states: a jump of the board's clock by less than 2 s is believed."""
 THAW_S = 15.0
 """So long after a process was frozen its states may be old, and a reset of the board meanwhile has come too late to be told from

@@ -88,6 +88,8 @@ _MASK = MODULUS - 1
 _HALF = MODULUS >> 1
 EARLY_S = 2.0
 """A sample that came so much before the others would have the board's clock wrong [s]."""
+HASTE_S = 0.3
+"""So much more than host and samples say may pass by the board's clock from one sample to the next [s]."""
 SLOWEST = 0.01
 """No board's clock is slower than the host's by more than this, relative."""
 _REORDER_WINDOW = 64  # a sample further behind comes from a board that counts anew
@@ -241,14 +243,16 @@ def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
 
     Returns:
         Whether the step can be right: a sample may come late, but not before it was taken, and as many samples are lost as fit
-        it. A clock that runs steadily too fast, as a simulated one does, is told by its rate, not here.
+        it. Samples that waited come at once, and no longer apart by the board's clock than one takes. A clock that runs
+        steadily too fast, as a simulated one does, is told by its rate, not here.
     """
     step_us = (board_us - d.board_us) & _MASK
     if lost > 0:
         turns = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
         step_us += max(turns, 0) * MODULUS
     time_s = d.origin_s + (d.elapsed_us + step_us) * _US
-    if is_early(d, arrival_s, time_s) or (lost > 0 and not agree(d, lost + 1, step_us)):
+    haste_s = (step_us - (lost + 1) * d.period_us) * _US - (arrival_s - d.arrival_s)
+    if haste_s > HASTE_S or is_early(d, arrival_s, time_s) or (lost > 0 and not agree(d, lost + 1, step_us)):
         return False
     d.least_late_s = min(d.least_late_s + SLOWEST * step_us * _US, arrival_s - time_s)
     d.elapsed_us += step_us

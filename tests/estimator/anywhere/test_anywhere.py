@@ -26,7 +26,7 @@ LIMITS = {
     "knows 25C at -20C": (None, 95, 12.0),
     "rising 5..25C": (2.0, 90, 1.5),
     "no sensor at 15C": (3.0, 90, 2.0),
-    "LFP full 25C": (1.2, 95, 2.3),
+    "LFP full 25C": (1.3, 95, 2.3),
     "LFP full -10C": (None, 95, 13.0),
     "LFP cut 25C": (2.0, 95, 4.0),
     "LFP cut 0C": (None, 95, 11.0),
