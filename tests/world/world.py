@@ -370,8 +370,6 @@ class World:
             if self.cable.board is not None and self.cable.opening is not None and not self.cable.noise.mute:
                 if board is self.board:
                     self.seen_soc, self.sampled_s = self.pack.soc, now_s
-                elif self.process is not None:
-                    self.process.foreign = True
                 self.cable.send(sent)
         board.begin_window()
         self.timeline.after(board.period_s, self._tick_board)
@@ -382,6 +380,11 @@ class World:
 
     def _delivered(self, data: bytes) -> None:
         if self.process is not None:
+            board = self.process.board
+            no_room = (
+                board is not None and len(board._door._held) == HELD_READS
+            )  # samples that find none are not counted
+            self.process.foreign |= no_room or self.cable.board is self.foreigner
             if not self.board.text and self.process.reference.feed(data):
                 self.process.heard_s = self.sampled_s
             self.process.delivered_s = self.timeline.now_s
@@ -438,7 +441,6 @@ class World:
             return
         door, counters = process.board._door, process.board.counters
         held = door.stranger is not None
-        process.foreign |= held and len(door._held) == HELD_READS  # samples that no longer find room are not counted
         if self.timeline.now_s - process.delivered_s <= 0.05 or self._reads(process):
             return
         given = counters["bytes_received"] + counters["unadmitted_bytes"] + sum(len(data) for _, data in door._held)
