@@ -153,6 +153,13 @@ class Client(aiomqtt.Client):
         self._abandoned = True
         self._client.disconnect()
 
+    def break_off(self) -> None:
+        """Close the line without a word: once the broker has read what is on it, it publishes the will."""
+        line: Any = self._client.socket()  # of a protocol of paho's, which leaves out what all sockets have
+        if line is not None:
+            with contextlib.suppress(OSError):
+                line.shutdown(socket.SHUT_RDWR)
+
     async def part(self) -> None:
         """End the connection, in good order where that is possible."""
         with contextlib.suppress(TimeoutError, aiomqtt.MqttError):
@@ -218,7 +225,7 @@ class Client(aiomqtt.Client):
 async def connected(
     arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello, patience: Patience
 ) -> AsyncIterator[Client]:
-    """A connection while the context lasts.
+    """A connection while the context lasts; whoever leaves it by an exception has the broker publish the will.
 
     Raises:
         aiomqtt.MqttError: The broker cannot be reached, or refuses.
@@ -231,6 +238,9 @@ async def connected(
         raise
     try:
         yield client
+    except BaseException:
+        client.break_off()
+        raise
     finally:
         await client.part()
 

@@ -19,7 +19,7 @@ from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import ECHO_S, Availability
 from bms_estimator.sinks.backlog import Backlog
 from bms_estimator.sinks.brokers import brokers, check
-from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError, Received
+from bms_estimator.sinks.connection import Connect, Connection, Hello, Received
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.home_assistant import BIRTH_TOPIC
 from bms_estimator.sinks.link import Link
@@ -106,7 +106,7 @@ class MqttSink:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Publish what is pending and ``offline``, then part from the broker."""
+        """Publish what is pending and ``offline``, then part from the broker; one that does not take it publishes the will."""
         if self._task is None:
             return
         self._link.closing.set()
@@ -133,12 +133,6 @@ class MqttSink:
                 await self._send(connection)
                 for task in others:
                     task.cancel()
-        except* LinkError:
-            raise  # the broker publishes the will
-        except* Exception:  # a fault of ours: the client parts in good order, which withholds the will
-            with contextlib.suppress(LinkError):
-                await self._publish(connection, self._messages.farewell())
-            raise
         finally:
             self._refusals.end()
 

@@ -182,7 +182,9 @@ async def test_a_service_that_is_asked_to_end_saves_first_though_its_broker_stan
         told = await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 50)
         broker.freeze()
         await ended(process)
+        heard = len(live.messages)
         broker.thaw()
+        await live.wait("bms/pack/availability", lambda said: said == b"offline", skip=heard)
     board.cancel()
     (kept,) = checkpoints(state_home)
     with np.load(kept) as saved:

@@ -344,8 +344,8 @@ class VirtualPaho:
             self._broker._send_to_broker(connection, lambda: self._broker._end(connection, says_will=True))
             self.on_disconnect(self, None, NO_FLAGS, code, None)
 
-    def socket(self) -> None:
-        return None
+    def socket(self) -> Any:
+        return SimpleNamespace(shutdown=lambda _: self.lost(LOST))
 
     def publish(self, topic: str, payload: bytes, qos: int, retain: bool, *_: Any) -> Any:
         self._mid += 1
