@@ -49,6 +49,8 @@ class State(NamedTuple):
 
     process: int
     said_s: float
+    disk_failed: bool
+    """It may never have been on disk, where older ones still wait."""
 
 
 class End(NamedTuple):
@@ -81,10 +83,10 @@ class Said:
     forgotten: int = 0
     """States that a kill or a power cut has cost."""
 
-    def say(self, payload: bytes, process: int, now_s: float) -> None:
+    def say(self, payload: bytes, process: int, now_s: float, *, disk_failed: bool) -> None:
         """The service gives one away."""
         self.payloads[payload] = len(self.states)
-        self.states.append(State(process, now_s))
+        self.states.append(State(process, now_s, disk_failed))
 
     def end(self, process: int, now_s: float, forgotten_s: float) -> None:
         """A process has ended."""
@@ -105,8 +107,10 @@ class Said:
                 return f"state {number} came again though its acknowledgement had come"
         if earlier:
             self.doubled += 1
-        elif number < self.last and (in_order or self.states[number].process == self.states[self.last].process):
-            return f"state {number} came after state {self.last}"
+        elif number < self.last:
+            last = self.states[self.last]
+            if self.states[number].process == last.process or (in_order and not last.disk_failed):
+                return f"state {number} came after state {self.last}"
         earlier.append((connection, packet.mid))
         self.last = max(self.last, number)
         return ""

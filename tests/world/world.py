@@ -397,7 +397,8 @@ class World:
         process.snapshot = snapshot
         if snapshot.estimate is None:
             return
-        self.said.say(snapshot.estimate.model_dump_json().encode(), process.number, self.timeline.now_s)
+        said = snapshot.estimate.model_dump_json().encode()
+        self.said.say(said, process.number, self.timeline.now_s, disk_failed=self._disk_fails)
         self.figures["states"] += 1
         behind = self._reads(process) > 0  # it was frozen: the state is of a sample before those that wait
         if not behind and (wrong := self.band.take(snapshot, self.seen_soc)):
@@ -416,8 +417,12 @@ class World:
             self.fail(wrong)
 
     def _take_state(self, packet: Packet, connection: Connection | None) -> str:
-        disk_fails = self.disk.bad or self.timeline.now_s < self.disk_good_s
-        return self.said.take(packet, connection, in_order=not disk_fails)
+        return self.said.take(packet, connection, in_order=not self._disk_fails)
+
+    @property
+    def _disk_fails(self) -> bool:
+        """Or has done so a moment ago."""
+        return self.disk.bad or self.timeline.now_s < self.disk_good_s
 
     # what must hold
 
