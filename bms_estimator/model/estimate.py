@@ -182,6 +182,22 @@ class Info(Report):
     board: dict[str, str] = Field(description="what the board said of itself; empty until it did")
 
 
+class Alarm(Report):
+    """Topic ``alarm/<name>``, retained: one alarm of a pack, raised or not."""
+
+    name: str = Field(description="as in the topic and in [alarms]")
+    severity: Literal["warning", "critical"]
+    active: bool = Field(description="raised, and neither cleared nor, where it latches, acknowledged")
+    latched: bool = Field(description="the cause is gone, but it stays until it is acknowledged")
+    since: str | None = Field(description="when it was raised, ISO 8601, UTC; null unless active")
+    value: float | None = Field(
+        description="what was measured when it was raised, in unit; null where there is no number"
+    )
+    limit: float | None = Field(description="what it may reach, in unit; null where there is no number")
+    unit: str | None = Field(description="of value and limit")
+    text: str = Field(description="for people: what is wrong, and what to do; empty unless active")
+
+
 class Snapshot(NamedTuple):
     """All that a sink may want at one publish time."""
 
@@ -190,3 +206,5 @@ class Snapshot(NamedTuple):
     parameters: ParameterReport
     health: Health
     info: Info
+    alarms: tuple[Alarm, ...] = ()
+    """Of all limits that are watched, raised or not."""
