@@ -78,7 +78,7 @@ class Messages:
         Returns:
             The messages, and what the broker has got after them.
         """
-        _, parameters, health, info = snapshot
+        _, parameters, health, info, _ = snapshot
         before, messages = sent.snapshot, []
         known = bool(parameters.elements)  # not before the first sample
         if known and (before is None or before.parameters is not parameters):

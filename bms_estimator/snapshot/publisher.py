@@ -170,7 +170,7 @@ class Publisher:
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
         """The estimate of this window; of the rest, what is old enough to be made anew."""
-        _, parameters, health, info = self.snapshot
+        _, parameters, health, info, _ = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
         estimate = self._estimate(summary, wall_s) if summary else None
         message = self._sensor_message(now_s)
