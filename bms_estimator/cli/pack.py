@@ -85,7 +85,7 @@ def with_pack(settings: Settings, **changes: object) -> Settings:
 def with_sensor(settings: Settings, **changes: object) -> Settings:
     """Settings with some of ``[sensor]`` changed; None leaves a value as it is."""
     given = {name: value for name, value in changes.items() if value is not None}
-    sensor = SensorSettings.model_validate(settings.sensor.model_dump() | given)
+    sensor = SensorSettings.model_validate(settings.sensor.model_dump(exclude_unset=True) | given)
     return settings.model_copy(update={"sensor": sensor})
 
 
