@@ -68,3 +68,9 @@ log-enabled = false
             for series in result.get("series", [])
             for row in series["values"]
         ]
+
+    def write(self, lines: list[str]) -> None:
+        """Lines with times in milliseconds."""
+        body = "\n".join(lines).encode()
+        with urllib.request.urlopen(f"{self.url}/write?db=bms&precision=ms", body, timeout=LONG_S) as response:
+            assert response.status == 204
