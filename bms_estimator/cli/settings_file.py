@@ -41,6 +41,9 @@ def _settings(section: type[BaseModel]) -> Iterator[str]:
 def _value(field: FieldInfo) -> str:
     """The default as TOML; nothing where there is none."""
     default = field.get_default(call_default_factory=True)
+    if isinstance(default, BaseModel):
+        default = tomlkit.inline_table()
+        default.update(field.default.model_dump(exclude_none=True))
     return "" if default is None else tomlkit.item(default).as_string()
 
 

@@ -6,12 +6,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
+from bms_estimator.model.alarm_settings import AlarmSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Command = Literal["set_soc", "current_zero"]
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm"]
 """A request that changes something."""
 LogLevel = Literal["info", "warning", "error"]
 DeviceName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
@@ -248,6 +249,7 @@ class Settings(Strict):
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()
+    alarms: AlarmSettings = AlarmSettings()
 
     @model_validator(mode="before")
     @classmethod

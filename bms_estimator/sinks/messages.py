@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
-from bms_estimator.model.estimate import Estimate, Health, Info, ParameterReport, Report, Snapshot
+from bms_estimator.model.estimate import Alarm, Estimate, Health, Info, ParameterReport, Report, Snapshot
 from bms_estimator.model.event import Event, events
 from bms_estimator.sinks.home_assistant import PROBLEMS, VALUES, discovery, discovery_topic
 from bms_estimator.sinks.home_assistant_values import Shown, next_problems, next_values
@@ -78,7 +78,7 @@ class Messages:
         Returns:
             The messages, and what the broker has got after them.
         """
-        _, parameters, health, info, _ = snapshot
+        _, parameters, health, info, alarms = snapshot
         before, messages = sent.snapshot, []
         known = bool(parameters.elements)  # not before the first sample
         if known and (before is None or before.parameters is not parameters):
@@ -91,6 +91,8 @@ class Messages:
             messages.append(self._retained("info", _report(info)))
             if before is None or self._discovery(before.info) != self._discovery(info):
                 messages.append(Message(discovery_topic(self._device), _json(self._discovery(info)), 1, retain=True))
+        known_alarms = before.alarms if before else ()
+        messages += [self._retained(f"alarm/{a.name}", _report(a)) for a in alarms if a not in known_alarms]
         told, shown = self._home_assistant(sent.shown, snapshot, now_s)
         return messages + told, Sent(snapshot, shown)
 
@@ -128,6 +130,7 @@ def schema() -> dict[str, Any]:
         "parameters": ParameterReport,
         "health": Health,
         "info": Info,
+        "alarm": Alarm,
     }
     return {topic: model.model_json_schema() for topic, model in topics.items()}
 
