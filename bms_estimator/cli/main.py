@@ -47,6 +47,7 @@ COMMANDS = {
     "history": Entry("bms_estimator.cli.history:history", "What the service kept of a pack, by the minute, as CSV."),
     "validate": Entry("bms_estimator.cli.validate:validate_command", "A cell's model against a capture, open loop."),
     "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
+    "asyncapi": Entry("bms_estimator.cli.asyncapi:asyncapi", "What is published, as an AsyncAPI document."),
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
 }
 

@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
-from bms_estimator.model.estimate import Alarm, Estimate, Health, Info, ParameterReport, Report, Snapshot
-from bms_estimator.model.event import Event, events
+from bms_estimator.model.estimate import Health, Info, Report, Snapshot
+from bms_estimator.model.event import events
 from bms_estimator.sinks.home_assistant import PROBLEMS, VALUES, discovery, discovery_topic
 from bms_estimator.sinks.home_assistant_values import Shown, next_problems, next_values
+from bms_estimator.sinks.payloads import schema
 
 AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
 """Topics below the device's."""
@@ -120,19 +121,6 @@ class Messages:
 
     def _retained(self, topic: str, payload: bytes) -> Message:
         return Message(f"{self.root}/{topic}", payload, 1, retain=True)
-
-
-def schema() -> dict[str, Any]:
-    """JSON schema of each topic's payload."""
-    topics: dict[str, type[Report]] = {
-        "state": Estimate,
-        "event": Event,
-        "parameters": ParameterReport,
-        "health": Health,
-        "info": Info,
-        "alarm": Alarm,
-    }
-    return {topic: model.model_json_schema() for topic, model in topics.items()}
 
 
 @cache
