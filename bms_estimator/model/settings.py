@@ -15,7 +15,8 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Command = Literal["set_soc", "current_zero"]
 """A request that changes something."""
 LogLevel = Literal["info", "warning", "error"]
-DeviceName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
+DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
 
 
 class PackSettings(Strict):
