@@ -29,6 +29,7 @@ class Entry(NamedTuple):
 
 COMMANDS = {
     "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
+    "top": Entry("bms_estimator.cli.top:top", "All packs of a broker at a glance."),
     "replay": Entry("bms_estimator.cli.replay:replay", "Estimate from a recorded capture or a table."),
     "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),
     "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
