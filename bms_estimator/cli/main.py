@@ -51,7 +51,16 @@ COMMANDS = {
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
 }
 
-EXTRAS = {"pyarrow": "parquet", "amqtt": "demo", "matplotlib": "report"}
+EXTRAS = {
+    "pyarrow": "parquet",
+    "amqtt": "demo",
+    "matplotlib": "report",
+    "pymodbus": "modbus",
+    "can": "can",
+    "cantools": "can",
+    "aiobmsble": "ble",
+    "bleak": "ble",
+}
 """Optional package -> the extra that brings it."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """What a disk that is full or broken says. It may have room again: systemd is to start a service anew that ends so."""
