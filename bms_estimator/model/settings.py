@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
+from bms_estimator.model.serial_devices import SERIAL_DEVICES
 from bms_estimator.model.toml_file import Strict, read_toml
 
 Positive = Annotated[float, Field(gt=0)]
@@ -33,10 +34,6 @@ class PackSettings(Strict):
     initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
 
 
-_OWN_PACE_S = {"text": 1.0}
-"""By protocol: boards that print at their own pace are taken to do so at this [s]."""
-
-
 class SensorSettings(Strict):
     """The board, what it resolves, and its sign of current."""
 
@@ -48,27 +45,51 @@ class SensorSettings(Strict):
         description='the only board that is taken, as `bms-estimator board` shows its number, such as "0000002a"; '
         "the first that came, which is remembered, when left out",
     )
-    protocol: Literal["binary", "text"] = Field(default="binary", description="frames of the firmware, or text lines")
-    baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(default=500_000)
+    protocol: Literal["binary", "text", "jbd", "daly", "jk"] = Field(
+        default="binary", description="frames of the firmware, text lines, or a BMS by its maker's protocol"
+    )
+    address: Annotated[int, Field(ge=0, le=255)] | None = Field(
+        default=None,
+        description="of several packs on one RS485 line, the one that is taken; the first that answers when left out",
+    )
+    baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
+        default=500_000, description="when left out as the protocol has it: 9600 of jbd and daly, 115200 of jk"
+    )
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
-        default="discharge_positive", description="what the board, or a table, calls positive; inside, discharge is"
+        default="discharge_positive",
+        description="what the board, or a table, calls positive; inside, discharge is; "
+        "when left out charge of jbd and jk, as their makers say",
     )
-    voltage_resolution_v: Positive = Field(default=25.0 / 1024, description="one step of the voltage converter")
+    voltage_resolution_v: Positive = Field(
+        default=25.0 / 1024,
+        description="one step of the voltage converter; when left out 0.01 of jbd and jk, 0.1 of daly",
+    )
     voltage_noise_v: NotNegative | None = Field(
         default=None, description="standard deviation of one voltage sample; half a step when left out"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _as_the_device_does(cls, table: object) -> object:
+        """What is left out is as the protocol has it."""
+        if not isinstance(table, dict) or not isinstance(protocol := table.get("protocol", "binary"), str):
+            return table
+        device = SERIAL_DEVICES.get(protocol)
+        return device.fill(table) if device else table
+
     @model_validator(mode="after")
-    def _text_has_no_serial(self) -> Self:
-        if self.serial and self.protocol == "text":
-            raise ValueError("serial: a board that prints text tells no serial number; leave it out")
+    def _only_boards_have_serials(self) -> Self:
+        if self.serial and self.protocol != "binary":
+            raise ValueError(
+                f"serial: only a binary board tells its number, and protocol is {self.protocol}; leave it out"
+            )
         return self
 
     @property
     def sample_period_s(self) -> float:
         """Between two samples [s]."""
-        return _OWN_PACE_S.get(self.protocol, 1.0 / self.sample_rate_hz)
+        return SERIAL_DEVICES[self.protocol].pace_s or 1.0 / self.sample_rate_hz
 
 
 class ObserverSettings(Strict):

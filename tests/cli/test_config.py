@@ -52,7 +52,7 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ("[pack]\nseries = 0\n", ["pack.series = 0", "greater than or equal to 1"]),
         ("[pack]\nsereis = 2\n", ["pack.sereis", "unknown key"]),
         ("[wrong]\na = 1\n", ["wrong", "unknown key"]),
-        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary' or 'text'"]),
+        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary', 'text'"]),
         ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "number, without quotes"]),
         ("[observer]\nlambda = -1\n", ["observer.lambda = -1", "greater than 0"]),
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.model.sample import LEAST_C, LEAST_CELL_V, MOST_C, MOST_CELL_V, SAMPLE, SampleBlock, forget_beyond
 from bms_estimator.sources.dialects import Dialect, cell_block
+from bms_estimator.sources.dialects.arrivals import ArrivalTimes
 from bms_estimator.sources.frames import PRINTABLE, CurrentSign
 from bms_estimator.sources.text_line import Reading, read_line
 
@@ -31,7 +31,7 @@ class TextDialect(Dialect):
         self._rest = b""
         self._overlong = False  # the line is too long, its rest is skipped
         self._in_step = False  # once a line has ended: what came before may be half a line
-        self._first_s = self._last_s = float("nan")
+        self._times = ArrivalTimes()
         self._bytes = self._samples = self._errors = self._too_long = self._implausible = 0
         self._bad: bytes | None = None  # the first line since the last good one that said nothing
         self._good: Reading | None = None
@@ -86,18 +86,8 @@ class TextDialect(Dialect):
             block["temperature_c"] = [reading.temperature_c for reading in readings]
             self._implausible += forget_beyond(block["temperature_c"], LEAST_C, MOST_C)
             block["status"] = 0
-            block["time_s"] = self._times(arrival_s, len(readings))
+            block["time_s"] = self._times.of(arrival_s, len(readings))
         return block
-
-    def _times(self, arrival_s: float, count: int) -> NDArray[np.float64]:
-        """Times of ``count`` samples that came together, evenly over the time since those before [s]."""
-        if self._samples == count:
-            self._first_s = self._last_s = arrival_s
-            return np.zeros(count)
-        steps = np.arange(1, count + 1) / count
-        times = self._last_s + (arrival_s - self._last_s) * steps - self._first_s
-        self._last_s = arrival_s
-        return times
 
     def _end_line(self, line: bytes) -> Reading | None:
         """What a line says. Half a line at the start is no fault."""
