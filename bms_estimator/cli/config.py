@@ -117,7 +117,8 @@ def _in_short(settings: Settings, cell: PackModel) -> str:
     c = cell.cell
     broker = ", ".join(settings.mqtt.urls) if settings.mqtt else "no broker"
     holds = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
+    board = f"{settings.sensor.protocol} board on {settings.sensor.port}"
     return (
         f"{settings.pack.name}: {c.name}, {c.series_count} in series, {c.nominal_voltage_v:g} V, {holds}; "
-        f"{settings.sensor.protocol} board on {settings.sensor.port}; {broker}"
+        f"{settings.source.described if settings.source else board}; {broker}"
     )

@@ -90,7 +90,7 @@ def _run_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[
 def _run_one(settings: Settings, cell: PackModel, reload: Reload, record: Path | None, *, view: bool) -> None:
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if view and sys.stdout.isatty() else None)
-    recorder = Recording(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
+    recorder = Recording(record, header_of(settings.sensor, settings.source)) if record else contextlib.nullcontext()
     sinks = [ConsoleSink(log=log)] if view else []
     with drained(), recorder as tap:
         _load_kernels()

@@ -4,9 +4,10 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
 
 from bms_estimator.model.serial_devices import SERIAL_DEVICES
+from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
 Positive = Annotated[float, Field(gt=0)]
@@ -15,7 +16,8 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Command = Literal["set_soc", "current_zero"]
 """A request that changes something."""
 LogLevel = Literal["info", "warning", "error"]
-DeviceName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
+DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
 
 
 class PackSettings(Strict):
@@ -262,6 +264,9 @@ class Settings(Strict):
 
     pack: PackSettings = PackSettings()
     sensor: SensorSettings = SensorSettings()
+    source: SourceSettings | None = Field(
+        default=None, description="leave out where the board of [sensor] is the source"
+    )
     observer: ObserverSettings = ObserverSettings()
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
@@ -280,6 +285,27 @@ class Settings(Strict):
         if not isinstance(identifier, dict) or not isinstance(observer, dict) or identifier.get("enabled") is not False:
             return tables
         return tables | {"observer": {"law": "learning"} | observer}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sensor_of_the_source(cls, tables: object) -> object:
+        """What a source that is no serial line makes of ``[sensor]``: it hands on lines of text."""
+        if not isinstance(tables, dict) or tables.get("source") is None:
+            return tables
+        sensor = tables.get("sensor", {})
+        told = sensor.model_dump(exclude_unset=True) if isinstance(sensor, SensorSettings) else sensor
+        try:
+            source = SOURCE.validate_python(tables["source"])
+        except ValidationError:  # said where the section itself is read
+            return tables
+        if not isinstance(told, dict):
+            return tables
+        return tables | {"sensor": {**source.sensor, **told, "protocol": "text"}}
+
+    @property
+    def sample_period_s(self) -> float:
+        """Between two samples, as expected [s]."""
+        return self.source.period_s if self.source else self.sensor.sample_period_s
 
 
 def load_settings(path: Path) -> Settings:

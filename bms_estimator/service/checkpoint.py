@@ -26,6 +26,7 @@ from bms_estimator.model.estimate import Totals
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.moment import Moment, moment
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.totals import new_totals
 from bms_estimator.store.disk_thread import DiskThread
 from bms_estimator.store.private_file import NotOursError, read_private, write_private
@@ -261,16 +262,17 @@ def _ledger(file: Mapping[str, NDArray[Any]], now_s: float) -> Ledger:
 
 
 def _believable(file: Mapping[str, NDArray[Any]]) -> Ledger:
-    """The same, of any format that tells it, with what this version knows of.
+    """The same, of any format that tells it, with what this version knows of; what flowed before it was counted is 0.
 
     Raises:
         ArithmeticError, LookupError, TypeError, ValueError: It is damaged, or no counter can be so.
     """
     told = json.loads(str(file["total"]))
-    total = Totals.model_validate({name: told[name] for name in Totals.model_fields})
+    total = Totals.model_validate({name: told[name] for name in Totals.model_fields if name in told})
     datetime.fromisoformat(total.since)
     restarts, crashes = int(file["restarts"]) + 1, total.crashes + (not file["clean"])
     counted = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
+    counted |= Flow.of(total)._asdict()
     wrong = [f"{name} = {value}" for name, value in counted.items() if not 0 <= value <= MOST]
     if wrong:
         raise ValueError(", ".join(wrong))

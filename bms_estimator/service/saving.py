@@ -9,6 +9,7 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.service.checkpoint import CheckpointFile, Ledger
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.snapshot.totals import Tally
 
@@ -52,6 +53,7 @@ class Saving:
         self.every_s = every_s
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
         self._tally, self._restarts = tally, restarts
+        publisher.kept = tally.flow
         self._saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 
@@ -91,8 +93,9 @@ class Saving:
             return not clean or await self._write(self._mark(clean=clean))
         state, ledger = self._estimator.record.copy(), self._ledger(clean=clean)
         if not await self._write(lambda: self._checkpoint.save(state, ledger)):
+            self._publisher.kept = None
             return False
-        self._publisher.checkpoint, self._saved = "saved", taught
+        self._publisher.checkpoint, self._saved, self._publisher.kept = "saved", taught, Flow.of(ledger.total)
         return True
 
     def _mark(self, *, clean: bool) -> Callable[[], None]:

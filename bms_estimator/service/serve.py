@@ -25,9 +25,11 @@ from bms_estimator.service.reload import Reload
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
+from bms_estimator.sources import Tap
 from bms_estimator.sources.board_memory import BoardMemory
+from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.recording import Recording
-from bms_estimator.sources.serial_board import SerialBoard, Tap
+from bms_estimator.sources.serial_board import SerialBoard
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
 from bms_estimator.store.outbox import Outbox
@@ -52,7 +54,7 @@ async def serve(
         settings: The pack's settings; with ``[mqtt]`` a broker is served.
         cell: The pack as one object (``CellModel.pack``).
         sinks: Further sinks, such as the console.
-        tap: Gets all bytes of the board with their arrival times.
+        tap: Gets all that the source is decoded from, with its arrival times.
         stop: Set by someone else to end as a signal does.
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
@@ -73,7 +75,7 @@ async def serve(
     all_sinks = list(sinks)
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = BoardMemory(folder, settings.pack.name) if folder else None
-    board = SerialBoard(settings.sensor, tap=tap, memory=memory)
+    source = open_reports(settings, tap=tap) or SerialBoard(settings.sensor, tap=tap, memory=memory)
     if database and settings.store.history_days:
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
@@ -81,8 +83,8 @@ async def serve(
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
     if settings.mqtt is not None:
-        sample_period_s = settings.sensor.sample_period_s
-        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=sample_period_s)
+        period_s = settings.sample_period_s
+        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=period_s)
         all_sinks.append(mqtt)
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
@@ -94,16 +96,16 @@ async def serve(
         return await run_live(
             settings,
             cell,
-            source=board,
+            source=source,
             sinks=all_sinks,
             stop=stop,
             checkpoint=checkpoint,
             requests=requests,
             delivery=delivery,
-            current_zero=board.current_zero,
+            current_zero=source.current_zero,
             notifier=notifier,
             reload=reload,
-            pulse=board.pulse,
+            pulse=source.pulse,
             recording=partial(recording_health, tap),
         )
 

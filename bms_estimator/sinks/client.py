@@ -19,7 +19,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from bms_estimator.sinks.connection import Hello, LinkError, Received, Refusal
-from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING, Inbox
+from bms_estimator.sinks.inbox import Inbox
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sinks.reasons import UNSUPPORTED_VERSION, is_final, words
 
@@ -81,17 +81,17 @@ class Client(aiomqtt.Client):
 
     def __init__(self, arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello, patience: Patience) -> None:
         limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
-        limit.MaximumPacketSize = MOST_BYTES
+        limit.MaximumPacketSize = hello.most_bytes
         self._is_5 = protocol is ProtocolVersion.V5
         super().__init__(
             **arguments,
             protocol=protocol,
             properties=limit if self._is_5 else None,
             identifier=hello.identifier,
-            will=aiomqtt.Will(*hello.will),
+            will=aiomqtt.Will(*hello.will) if hello.will else None,
             keepalive=patience.keepalive_s,
-            max_queued_incoming_messages=MOST_WAITING,
-            queue_type=partial(Inbox, hello.lose),  # type: ignore[arg-type]  # it is only called
+            max_queued_incoming_messages=hello.most_waiting,
+            queue_type=partial(Inbox, hello.lose, hello.most_bytes),  # type: ignore[arg-type]  # it is only called
             socket_options=[NO_DELAY],
             logger=_logger,
         )

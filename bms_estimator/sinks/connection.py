@@ -5,6 +5,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import NamedTuple, Protocol
 
 from bms_estimator.sinks.brokers import Broker
+from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING
 from bms_estimator.sinks.messages import Message
 
 
@@ -33,9 +34,14 @@ class Hello(NamedTuple):
 
     identifier: str
     """The same at each: the broker ends an older one that it still holds, and its will comes first."""
-    will: Message
+    will: Message | None
+    """None of who only reads."""
     lose: Callable[[str, str], None]
     """Hears kind (``too_long``, ``overflow``) and topic of each message that came and was thrown away."""
+    most_waiting: int = MOST_WAITING
+    """Messages that wait to be read; more are lost."""
+    most_bytes: int = MOST_BYTES
+    """Of a message; longer ones are kept back by an MQTT 5 broker, and thrown away else."""
 
 
 class Connection(Protocol):

@@ -8,7 +8,7 @@ import aiomqtt
 MOST_WAITING = 100
 """Messages that wait to be read; more are lost."""
 MOST_BYTES = 16_384
-"""Nothing that comes is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
+"""Nothing that a service hears is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
 
 
 class Inbox(asyncio.Queue[aiomqtt.Message]):
@@ -16,17 +16,18 @@ class Inbox(asyncio.Queue[aiomqtt.Message]):
 
     Args:
         lose: Hears why and on which topic a message is lost.
+        most_bytes: Of a message with its topic.
         maxsize: Messages.
     """
 
-    def __init__(self, lose: Callable[[str, str], None], maxsize: int) -> None:
+    def __init__(self, lose: Callable[[str, str], None], most_bytes: int, maxsize: int) -> None:
         super().__init__(maxsize)
-        self._lose = lose
+        self._lose, self._most_bytes = lose, most_bytes
 
     def put_nowait(self, item: aiomqtt.Message) -> None:
         """Take a message, or say that it is lost."""
         topic = item.topic.value
-        if len(topic) + len(item.payload) > MOST_BYTES:
+        if len(topic) + len(item.payload) > self._most_bytes:
             self._lose("too_long", topic)
         elif self.full():
             self._lose("overflow", topic)

@@ -7,12 +7,14 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.estimate import Estimate, Health, Info, LoopHealth, RecordingHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
 from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
 from bms_estimator.snapshot.impossible import impossible_sample
 from bms_estimator.snapshot.latency import Latency
@@ -55,6 +57,7 @@ class Publisher:
         checkpoint: What became of the last checkpoint.
         disk_free_mib: Where it is [MiB].
         log_lines_lost: Since start.
+        kept: What has flowed, as the next start will find it; None: nothing will be found.
         latest: The last estimate that there was.
         snapshot: The last snapshot.
     """
@@ -84,6 +87,8 @@ class Publisher:
         self._pulse, self._recording, self._latency = pulse, recording, Latency()
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
+        self.kept: Flow | None = None
+        self._flow = Flow()  # as it was told last
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
         self._suspects = 0  # bits of ``Suspect``, as logged
@@ -100,7 +105,7 @@ class Publisher:
         publish = self._settings.publish.model_copy(update={"rate_hz": rate_hz})
         self._settings = self._settings.model_copy(update={"publish": publish})
         self.period_s = 1.0 / rate_hz
-        self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sensor.sample_period_s)
+        self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sample_period_s)
 
     @property
     def wait_s(self) -> float:
@@ -185,7 +190,10 @@ class Publisher:
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         remaining = remaining_charge(self._estimator, window.current_a)
-        return estimate_report(window, remaining, self._source.counters, wall_s)
+        # only what outlives a kill, so that the next run goes on from there
+        self._flow = self._flow.at_least(self.kept or self._tally.flow)
+        capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
+        return estimate_report(window, remaining, self._source.counters, wall_s, self._flow, capacity_ah)
 
     def _health(self, now_s: float, message: str | None) -> Health:
         lag_s, self._lag_s = self._lag_s, 0.0

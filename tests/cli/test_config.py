@@ -1,5 +1,6 @@
 """``config``: what it writes it accepts, what is wrong it names, what it shows can be read."""
 
+import re
 import tomllib
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.sources.kinds import KINDS
 from tests.command_line import run
 
 
@@ -31,11 +33,18 @@ def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, cap
     for name, field in Settings.model_fields.items():
         assert f"[{name}]" in lines or f"#[{name}]" in lines, field
     set_now = [line.removeprefix("#") for line in lines if not line.startswith("# ") and not line.endswith("= ")]
-    pack.write_text("\n".join(set_now))
-    written = tomllib.loads(pack.read_text())
-    assert written["sensor"]["baud"] == Settings().sensor.baud
-    assert set(written) == set(Settings.model_fields)
-    assert load_settings(pack).sensor == Settings().sensor
+    sections = re.split(r"^(?=\[)", "\n".join(set_now), flags=re.MULTILINE)
+    sources = [section for section in sections if section.startswith("[source]")]
+    assert len(sources) == len(KINDS)
+    for source in sources:  # one of them
+        pack.write_text("".join(section for section in sections if section not in sources or section == source))
+        written = tomllib.loads(pack.read_text())
+        assert written["sensor"]["baud"] == Settings().sensor.baud
+        assert set(written) == set(Settings.model_fields)
+        loaded = load_settings(pack)
+        assert loaded.source
+        assert loaded.source.kind in KINDS
+        assert loaded.sensor == Settings().sensor.model_copy(update={"protocol": "text"})
 
 
 def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
@@ -63,6 +72,11 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ("[identifier]\nmap_memory_h = 0.5\n", ["identifier.map_memory_h = 0.5", "greater than or equal to 1"]),
         ('[mqtt]\nbase_topic = "/bms"\n', ["mqtt.base_topic = '/bms'", "no / at either end"]),
         ('[mqtt]\nbase_topic = "home/bms/"\n', ["mqtt.base_topic = 'home/bms/'", "no / at either end"]),
+        ("[source]\nchip = 5\n", ["source.kind", "missing"]),
+        (
+            '[source]\nkind = "linux"\nshunt_ohm = 0\n',
+            ["source.shunt_ohm = 0: ", "greater than 0", "shunt that is fitted"],
+        ),
         ('[pack]\ncell = "nonsense"\n', ["nonsense", "ncr18650", "lfp"]),
         ('[pack]\ncell = "lfp"\n', ["lfp is a generic cell", "capacity_ah of [pack]"]),
         ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "holds"]),

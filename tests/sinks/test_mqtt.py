@@ -262,7 +262,7 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
 
 def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
     delivery = Delivery()
-    inbox = Inbox(Requests(delivery).refuse, MOST_WAITING)
+    inbox = Inbox(Requests(delivery).refuse, MOST_BYTES, MOST_WAITING)
     for length in (MOST_BYTES - 1, 200_000_000) * (2 * MOST_WAITING):
         payload = bytes(1) * min(length, 2 * MOST_BYTES)
         inbox.put_nowait(aiomqtt.Message("t", payload, 1, retain=False, mid=1, properties=None))

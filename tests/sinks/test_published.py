@@ -1,0 +1,78 @@
+"""What is kept of what anybody may publish."""
+
+import json
+import string
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bms_estimator.sinks.messages import Messages, Sent
+from bms_estimator.sinks.published import MOST_DEVICES, MOST_KEPT_BYTES, MOST_TOPICS, Heard, Published, parsed
+from tests.sinks.snapshots import NOW, ONE
+
+
+def test_all_that_a_pack_publishes_is_kept_by_device_and_topic():
+    published = Published("site/bms")
+    messages = Messages("site/bms", "pack")
+    for message in (*messages.greeting(), *messages.kept(None, ONE), *messages.due(Sent(), ONE, NOW)[0]):
+        published.take(message.topic, message.payload, NOW)
+    [(name, device)] = published.devices.items()
+    assert name == "pack"
+    assert ONE.estimate
+    assert device.topics["state"] == ONE.estimate.model_dump(mode="json")
+    assert device.topics["availability"] == "online"
+    assert {"health", "info", "parameters", "event", "sensor/availability", "schema"} <= set(device.topics)
+    assert not any("homeassistant/" in topic for topic in device.topics)
+    assert set(device.heard_s.values()) == {NOW}
+
+
+def test_what_is_no_json_is_text_and_no_number_is_infinite():
+    assert parsed(b"online") == "online"
+    assert parsed(b'{"a": NaN}') == '{"a": NaN}'
+    assert parsed(b'{"a": 1e999}') == '{"a": 1e999}'
+    assert parsed(b"[" * 100_000) == "[" * 100_000
+    assert parsed(b"\xff\x00") == "\ufffd\0"
+    assert parsed(b'{"a": 1.5}') == {"a": 1.5}
+
+
+def test_a_topic_that_is_emptied_is_gone_and_with_its_last_the_device():
+    published = Published("bms")
+    published.take("bms/pack/state", b"1", NOW)
+    published.take("bms/pack/info", b"2", NOW)
+    assert published.take("bms/pack/info", b"", NOW) == Heard("pack", "info", None)
+    assert published.take("bms/pack/info", b"", NOW) is None
+    assert published.devices["pack"].topics == {"state": 1}
+    published.take("bms/pack/state", b"", NOW)
+    assert published.devices == {}
+
+
+def test_what_is_of_no_device_is_not_looked_at():
+    published = Published("bms")
+    for topic in ("bms", "bms/", "bms/pack", "bms/pack/", "bms//state", "other/pack/state", "bms/a b/state"):
+        assert published.take(topic, b"1", NOW) is None, topic
+    for topic in ("bms/pack/request/set_soc", "bms/pack/response/state", "bms/\x1b[2J/state", f"bms/{'x' * 65}/state"):
+        assert published.take(topic, b"1", NOW) is None, topic
+    assert published.devices == {}
+
+
+def test_devices_topics_and_bytes_are_bounded_and_what_is_known_goes_on():
+    published = Published("bms")
+    for number in range(2 * MOST_DEVICES):
+        published.take(f"bms/d{number}/state", b"1", NOW)
+    assert len(published.devices) == MOST_DEVICES
+    for number in range(2 * MOST_TOPICS):
+        published.take(f"bms/d0/t{number}", b"1", NOW)
+    assert len(published.devices["d0"].topics) == MOST_TOPICS
+    many = json.dumps("x" * (MOST_KEPT_BYTES // 4)).encode()
+    taken = [published.take(f"bms/d{number}/state", many, NOW) for number in range(1, 10)]
+    assert sum(heard is not None for heard in taken) == 3
+    assert published.take("bms/d0/state", b"2", NOW + 1.0) == Heard("d0", "state", 2)
+    published.take("bms/d1/state", b"", NOW)
+    assert published.take("bms/d9/state", many, NOW) is not None
+
+
+@given(st.text(string.printable), st.binary(max_size=200))
+def test_nothing_that_comes_raises(topic, payload):
+    published = Published("bms")
+    for full in (topic, f"bms/{topic}", f"bms/pack/{topic}"):
+        published.take(full, payload, NOW)
