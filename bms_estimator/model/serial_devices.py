@@ -17,15 +17,6 @@ class SerialDevice:
     pace_s: float | None = None
     """Between two samples [s]; None: as ``sample_rate_hz`` asks for."""
 
-    def fill(self, sensor: Mapping[str, Any]) -> dict[str, Any]:
-        """The table ``[sensor]`` with what it leaves out."""
-        return {
-            "baud": self.baud,
-            "current_sign": self.current_sign,
-            "voltage_resolution_v": self.voltage_resolution_v,
-            **sensor,
-        }
-
 
 SERIAL_DEVICES: Mapping[str, SerialDevice] = {
     "binary": SerialDevice(),
@@ -35,3 +26,17 @@ SERIAL_DEVICES: Mapping[str, SerialDevice] = {
     "jk": SerialDevice(115_200, "charge_positive", 0.01, 1.0),
 }
 """By the protocol's name; where each comes from stands with its dialect and in docs/sources-serial-bms.md."""
+
+
+def filled(sensor: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The table ``[sensor]`` with what it leaves out, as its protocol has it."""
+    protocol = sensor.get("protocol", "binary")
+    device = SERIAL_DEVICES.get(protocol) if isinstance(protocol, str) else None
+    if device is None:
+        return sensor
+    return {
+        "baud": device.baud,
+        "current_sign": device.current_sign,
+        "voltage_resolution_v": device.voltage_resolution_v,
+        **sensor,
+    }

@@ -4,9 +4,9 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from bms_estimator.model.serial_devices import SERIAL_DEVICES
+from bms_estimator.model.serial_devices import SERIAL_DEVICES, filled
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
@@ -71,14 +71,15 @@ class SensorSettings(Strict):
         default=None, description="standard deviation of one voltage sample; half a step when left out"
     )
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _as_the_device_does(cls, table: object) -> object:
-        """What is left out is as the protocol has it."""
-        if not isinstance(table, dict) or not isinstance(protocol := table.get("protocol", "binary"), str):
-            return table
-        device = SERIAL_DEVICES.get(protocol)
-        return device.fill(table) if device else table
+    def _as_the_device_does(cls, table: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        """What is left out is as the protocol has it, and does not count as set."""
+        if not isinstance(table, dict):
+            return validate(table)
+        made = validate(filled(table))
+        made.model_fields_set.intersection_update(table)
+        return made
 
     @model_validator(mode="after")
     def _only_boards_have_serials(self) -> Self:
