@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter
 
+from bms_estimator.model.ble_settings import BleSource
+from bms_estimator.model.can_settings import CanSource
 from bms_estimator.model.modbus_settings import ModbusSource
 from bms_estimator.model.report_source import ReportSource
 
@@ -62,5 +64,5 @@ class LinuxSource(ReportSource):
         return {"voltage_resolution_v": RESOLUTION_V.get(self.chip, FINE_V) * self.voltage_scale}
 
 
-SourceSettings = Annotated[LinuxSource | ModbusSource, Field(discriminator="kind")]
+SourceSettings = Annotated[LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]
 SOURCE: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)
