@@ -8,17 +8,19 @@ import pytest
 
 from bms_estimator.calibration.fuel_cell import KEYS
 from bms_estimator.model.estimate import Snapshot
-from bms_estimator.sinks.home_assistant import discovery
+from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.sinks.home_assistant import Described, discovery
 from bms_estimator.sinks.messages import Messages, Sent
 from tests.sinks.snapshots import ONE, STACK
 
 ROOT = "bms/pack"
-COMPONENTS = discovery(ONE.info, ROOT, 0.0)["components"]
+HOME = HomeAssistantSettings()
+COMPONENTS = discovery(HOME, Described(ONE.info), ROOT, 0.0)["components"]
 SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
 MOST_ROWS_PER_MIN = 20
 
 
-OF_STACK = discovery(STACK.info, ROOT, 0.0)["components"]
+OF_STACK = discovery(HOME, Described(STACK.info), ROOT, 0.0)["components"]
 
 
 def with_values(**values: float | None) -> Snapshot:
@@ -128,7 +130,7 @@ def test_noise_alone_makes_no_rows() -> None:
 @pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.0, 4.0, 10.0])
 def test_values_never_expire_while_estimates_come(rate_hz: float) -> None:
     info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(info, ROOT, 0.0)["components"].values()
+    components = discovery(HOME, Described(info), ROOT, 0.0)["components"].values()
     expiry_s = min(c["expire_after"] for c in components if "expire_after" in c)
     rng = np.random.default_rng(3)
     late_s = [float(rng.uniform(0.0, 0.9 / rate_hz)) for _ in range(round(600 * rate_hz))]
@@ -172,25 +174,25 @@ def test_no_entity_has_more_attributes_than_the_reason() -> None:
     for component in COMPONENTS.values():
         assert not component["state_topic"].endswith(("/health", "/state", "/parameters"))
         if "json_attributes_topic" in component:
-            assert set(component["json_attributes_template"].split("'")[1::2]) == {"reason"}
+            assert set(component["json_attributes_template"].split("'")[1::2]) <= {"reason", "severity", "positive", "discharge"}
 
 
 def test_raw_observer_values_are_disabled_until_the_user_wants_them() -> None:
     raw = {"delta_1", "delta_2", "adaptive_gain_k", "nussbaum_gain", "innovation_v", "sample_rate_hz", "r_ts_ohm"}
     assert not SHOWN & raw
     assert raw < set(COMPONENTS)
-    assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_s", "r_s_ohm", "sensor_silent"} <= SHOWN
+    assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_h", "r_s_ohm", "sensor_silent"} <= SHOWN
 
 
 def test_discovery_describes_every_entity_with_both_availabilities() -> None:
-    found = discovery(ONE.info, ROOT, 0.0)
+    found = discovery(HOME, Described(ONE.info), ROOT, 0.0)
     assert (found["device"]["identifiers"], found["device"]["serial_number"]) == (["bms_pack"], "A1")
     assert found["origin"]["name"] == "bms_estimator"
     assert found["availability_mode"] == "all"
     assert [a["topic"] for a in found["availability"]] == ["bms/pack/availability", "bms/pack/sensor/availability"]
     soc, current = COMPONENTS["soc_percent"], COMPONENTS["current_a"]
     assert (soc["device_class"], soc["unit_of_measurement"], soc["expire_after"]) == ("battery", "%", 30)
-    assert "discharge positive" in current["name"]
+    assert "'positive': 'discharge'" in current["json_attributes_template"]
     assert "device_class" not in COMPONENTS["r_s_ohm"]
     assert COMPONENTS["lock_lost"]["device_class"] == "problem"
     assert len({component["unique_id"] for component in COMPONENTS.values()}) == len(COMPONENTS)
@@ -201,5 +203,5 @@ def test_a_value_expires_after_three_periods_and_half_a_minute_at_least(
     rate_hz: float, sample_period_s: float, expire_s: int
 ) -> None:
     info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(info, ROOT, sample_period_s)["components"].values()
+    components = discovery(HOME, Described(info), ROOT, sample_period_s)["components"].values()
     assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
