@@ -47,10 +47,20 @@ COMMANDS = {
     "history": Entry("bms_estimator.cli.history:history", "What the service kept of a pack, by the minute, as CSV."),
     "validate": Entry("bms_estimator.cli.validate:validate_command", "A cell's model against a capture, open loop."),
     "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
+    "asyncapi": Entry("bms_estimator.cli.asyncapi:asyncapi", "What is published, as an AsyncAPI document."),
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
 }
 
-EXTRAS = {"pyarrow": "parquet", "amqtt": "demo", "matplotlib": "report"}
+EXTRAS = {
+    "pyarrow": "parquet",
+    "amqtt": "demo",
+    "matplotlib": "report",
+    "pymodbus": "modbus",
+    "can": "can",
+    "cantools": "can",
+    "aiobmsble": "ble",
+    "bleak": "ble",
+}
 """Optional package -> the extra that brings it."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """What a disk that is full or broken says. It may have room again: systemd is to start a service anew that ends so."""

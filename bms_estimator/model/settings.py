@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
 
+from bms_estimator.model.alarm_settings import AlarmSettings
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
 from bms_estimator.model.resolution import RESOLUTIONS
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
@@ -14,7 +15,7 @@ from bms_estimator.model.toml_file import Strict, read_toml
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Command = Literal["set_soc", "current_zero", "publish_rate"]
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate"]
 """A request that changes something."""
 LEAST_RATE_HZ, MOST_RATE_HZ = 0.1, 10.0
 """Of publications."""
@@ -290,6 +291,7 @@ class Settings(Strict):
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()
+    alarms: AlarmSettings = AlarmSettings()
 
     @model_validator(mode="before")
     @classmethod

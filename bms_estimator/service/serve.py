@@ -11,6 +11,7 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
+from bms_estimator.model.alarm_limits import out_of_range
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
@@ -68,7 +69,7 @@ async def serve(
     """
     stop = stop_on_signal(stop)
     set_level(settings.pack.name, settings.log.level)
-    for line in implausible(settings, cell):
+    for line in [*implausible(settings, cell), *out_of_range(settings, cell)]:
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, get_args
 
+from bms_estimator.model.alarm_settings import ALARMS
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Info
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
@@ -11,11 +12,10 @@ from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Command
 from bms_estimator.sinks import FRESH_PERIODS
 from bms_estimator.sinks.home_assistant_entities import BATTERY, CELL, FUEL_CELL, OF_CELLS, Entity, cell_key, entities
 
-VALUES, PROBLEMS = "home_assistant", "home_assistant/problems"
-"""Topics below the device's."""
+VALUES = "home_assistant"
+"""Topic below the device's."""
 LEAST_EXPIRY_S = 30
 """Home Assistant calls no value unavailable that is younger than this [s]."""
-PROBLEM_NAMES = {"sensor_silent": "Sensor silent", "suspicion": "Input suspected", "lock_lost": "Lock lost"}
 ALARM_CLASSES = {
     "soc_low": "battery",
     "over_temperature": "heat",
@@ -23,7 +23,7 @@ ALARM_CLASSES = {
     "charging_below_freezing": "cold",
 }
 """Where it is not "problem"."""
-NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *PROBLEM_NAMES, *get_args(Command)}
+NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
 """All that ``[home_assistant.names]`` may name."""
 
 
@@ -89,7 +89,6 @@ def discovery(
             for key, entity in numbers
             if entity.signed
         },
-        **{key: _problem(key, name, root) for key, name in PROBLEM_NAMES.items()},
         **{f"alarm_{name}": _alarm(name, root) for name in described.alarms},
         **{name: _COMMANDS[name](root) for name in described.commands},
     }
@@ -150,22 +149,6 @@ def _sign(root: str, positive: str) -> dict[str, str]:
     return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
 
 
-def _problem(key: str, name: str, root: str) -> dict[str, Any]:
-    """On while there is a reason, which is its only attribute; it matters when the sensor is silent, too."""
-    topic = f"{root}/{PROBLEMS}"
-    return {
-        "platform": "binary_sensor",
-        "name": name,
-        "state_topic": topic,
-        "value_template": f"{{{{ 'ON' if value_json.{key} else 'OFF' }}}}",
-        "json_attributes_topic": topic,
-        "json_attributes_template": f"{{{{ {{'reason': value_json.{key}}} | tojson }}}}",
-        "availability": [{"topic": f"{root}/availability"}],
-        "device_class": "problem",
-        "entity_category": "diagnostic",
-    }
-
-
 def _alarm(name: str, root: str) -> dict[str, Any]:
     """On while it is active; it matters when the sensor is silent, too."""
     topic = f"{root}/alarm/{name}"
@@ -198,13 +181,17 @@ def _set_soc(root: str) -> dict[str, Any]:
 
 
 def _current_zero(root: str) -> dict[str, Any]:
-    return {
-        "platform": "button",
-        "name": "Take present current as zero",
-        "command_topic": f"{root}/request/current_zero",
-        "payload_press": "{}",
-        "entity_category": "config",
-    }
+    return _button("Take present current as zero", f"{root}/request/current_zero") | {"entity_category": "config"}
+
+
+def _acknowledge(root: str) -> dict[str, Any]:
+    """All alarms at once."""
+    availability = {"availability": [{"topic": f"{root}/availability"}]}
+    return _button("Acknowledge alarms", f"{root}/request/acknowledge_alarm") | availability
+
+
+def _button(name: str, topic: str) -> dict[str, Any]:
+    return {"platform": "button", "name": name, "command_topic": topic, "payload_press": "{}"}
 
 
 def _publish_rate(root: str) -> dict[str, Any]:
@@ -225,4 +212,9 @@ def _publish_rate(root: str) -> dict[str, Any]:
     }
 
 
-_COMMANDS = {"set_soc": _set_soc, "current_zero": _current_zero, "publish_rate": _publish_rate}
+_COMMANDS = {
+    "set_soc": _set_soc,
+    "current_zero": _current_zero,
+    "acknowledge_alarm": _acknowledge,
+    "publish_rate": _publish_rate,
+}

@@ -1,4 +1,4 @@
-"""What Home Assistant is shown and when: a value that has moved and rested long enough, a problem when it comes or goes.
+"""What Home Assistant is shown and when: a value that has moved and rested long enough.
 
 Its recorder writes a row for each. Of entities that all move all the time those that have rested longest come first.
 """
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.sinks.home_assistant import Described
-from bms_estimator.sinks.home_assistant_entities import SLOW_S, Entity, cell_key, entities
+from bms_estimator.sinks.home_assistant_entities import Entity, cell_key, entities
 
 MOST_ROWS = 18
 """Values that are shown anew in a minute, of those that are enabled by default; two are left for alarms."""
@@ -18,7 +18,6 @@ PAUSE_S = 5.0
 """Between two messages with values [s]."""
 HEARTBEAT_S = 10.0
 """Values that have not changed are said again, so that they do not expire [s]."""
-LOCK_LOST = "the observer does not follow the measured voltage"
 
 
 class Shown(NamedTuple):
@@ -29,8 +28,6 @@ class Shown(NamedTuple):
     told_s: float = -math.inf
     rows_s: tuple[float, ...] = ()
     """When a value was shown anew, in the last minute."""
-    problems: Mapping[str, str | None] = {}
-    problems_s: float = -math.inf
 
 
 def next_values(shown: Shown, snapshot: Snapshot, described: Described, now_s: float, *, sign: float = 1.0) -> Shown:
@@ -61,17 +58,6 @@ def next_values(shown: Shown, snapshot: Snapshot, described: Described, now_s: f
         told_s=now_s,
         rows_s=(*recent_s, *[now_s for key in rows if key in moved]),
     )
-
-
-def next_problems(shown: Shown, snapshot: Snapshot, now_s: float) -> Shown:
-    """What to tell of the problems; ``shown`` itself where nothing is to be told."""
-    problems = _problems(shown, snapshot)
-    if problems == shown.problems:
-        return shown
-    flipped = {key for key, reason in problems.items() if reason} != {k for k, r in shown.problems.items() if r}
-    if not flipped and now_s - shown.problems_s < SLOW_S:  # only a count within a reason has changed
-        return shown
-    return shown._replace(problems=problems, problems_s=now_s)
 
 
 def _rounded(snapshot: Snapshot, shows: Mapping[str, Entity], sign: float) -> dict[str, float | None]:
@@ -116,16 +102,3 @@ def _moved(shown: Shown, key: str, value: float | None, entity: Entity, now_s: f
     if value is None or before is None:
         return value is not before
     return round(abs(value - before), entity.decimals) >= entity.step
-
-
-def _problems(shown: Shown, snapshot: Snapshot) -> dict[str, str | None]:
-    """Why, by problem; None where there is none."""
-    lock_lost = shown.problems.get("lock_lost")
-    if snapshot.estimate is not None:
-        lock_lost = None if snapshot.estimate.lock else LOCK_LOST
-    health = snapshot.health
-    return {
-        "sensor_silent": health.sensor_message,
-        "suspicion": " ".join(health.suspects) or None,
-        "lock_lost": lock_lost,
-    }

@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
-from bms_estimator.model.estimate import Estimate, Health, Info, ParameterReport, Report, Snapshot
-from bms_estimator.model.event import Event, events
+from bms_estimator.model.estimate import Health, Report, Snapshot
+from bms_estimator.model.event import events
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
-from bms_estimator.sinks.home_assistant import PROBLEMS, VALUES, Described, check_names, discovery, discovery_topic
-from bms_estimator.sinks.home_assistant_values import Shown, next_problems, next_values
+from bms_estimator.sinks.home_assistant import VALUES, Described, check_names, discovery, discovery_topic
+from bms_estimator.sinks.home_assistant_values import Shown, next_values
+from bms_estimator.sinks.payloads import schema
 
 AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
 """Topics below the device's."""
@@ -98,7 +99,7 @@ class Messages:
         Returns:
             The messages, and what the broker has got after them.
         """
-        _, parameters, health, info, _ = snapshot
+        _, parameters, health, info, alarms = snapshot
         before, messages = sent.snapshot, []
         known = bool(parameters.elements)  # not before the first sample
         if known and (before is None or before.parameters is not parameters):
@@ -114,6 +115,8 @@ class Messages:
             payload = self._discovery(described)
             if sent.described is None or payload != self._discovery(sent.described):
                 messages.append(Message(discovery_topic(self._home, self._device), payload, 1, retain=True))
+        known_alarms = before.alarms if before else ()
+        messages += [self._retained(f"alarm/{a.name}", _report(a)) for a in alarms if a not in known_alarms]
         told, shown = self._home_assistant(sent.shown, snapshot, described, now_s)
         return messages + told, Sent(snapshot, shown, described)
 
@@ -128,15 +131,9 @@ class Messages:
     ) -> tuple[list[Message], Shown]:
         if not self._home.enabled:
             return [], before
-        messages = []
         sign = 1.0 if self._home.current_sign == "discharge_positive" else -1.0
         shown = next_values(before, snapshot, described, now_s, sign=sign)
-        if shown is not before:
-            messages.append(self._live(VALUES, _json(shown.values)))
-        after = next_problems(shown, snapshot, now_s)
-        if after is not shown:
-            messages.append(self._retained(PROBLEMS, _json(after.problems)))
-        return messages, after
+        return ([] if shown is before else [self._live(VALUES, _json(shown.values))]), shown
 
     def _sensor(self, health: Health) -> Message:
         return self._retained(SENSOR_AVAILABILITY, b"online" if health.sensor_online else b"offline")
@@ -153,18 +150,6 @@ class Messages:
 
     def _retained(self, topic: str, payload: bytes) -> Message:
         return Message(f"{self.root}/{topic}", payload, 1, retain=True)
-
-
-def schema() -> dict[str, Any]:
-    """JSON schema of each topic's payload."""
-    topics: dict[str, type[Report]] = {
-        "state": Estimate,
-        "event": Event,
-        "parameters": ParameterReport,
-        "health": Health,
-        "info": Info,
-    }
-    return {topic: model.model_json_schema() for topic, model in topics.items()}
 
 
 @cache
