@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from bms_estimator.model.alarm_settings import AlarmSettings
+from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
 from bms_estimator.model.resolution import RESOLUTIONS
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
@@ -14,8 +15,10 @@ from bms_estimator.model.toml_file import Strict, read_toml
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Command = Literal["set_soc", "current_zero", "acknowledge_alarm"]
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate"]
 """A request that changes something."""
+LEAST_RATE_HZ, MOST_RATE_HZ = 0.1, 10.0
+"""Of publications."""
 LogLevel = Literal["info", "warning", "error"]
 DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
 DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
@@ -189,7 +192,9 @@ class IdentifierSettings(Strict):
 class PublishSettings(Strict):
     """How often what is estimated goes out."""
 
-    rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="snapshots per second")
+    rate_hz: Annotated[float, Field(ge=LEAST_RATE_HZ, le=MOST_RATE_HZ)] = Field(
+        default=1.0, description="snapshots per second"
+    )
 
 
 def _of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
@@ -292,6 +297,7 @@ class Settings(Strict):
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
+    home_assistant: HomeAssistantSettings = HomeAssistantSettings()
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()

@@ -84,8 +84,15 @@ async def serve(
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
     if settings.mqtt is not None:
-        period_s = settings.sample_period_s
-        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=period_s)
+        mqtt = MqttSink(
+            settings.mqtt,
+            settings.pack.name,
+            requests,
+            delivery,
+            outbox,
+            sample_period_s=settings.sample_period_s,
+            home_assistant=settings.home_assistant,
+        )
         all_sinks.append(mqtt)
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
