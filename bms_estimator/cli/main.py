@@ -55,6 +55,7 @@ EXTRAS = {
     "pyarrow": "parquet",
     "amqtt": "demo",
     "matplotlib": "report",
+    "prometheus_client": "prometheus",
     "pymodbus": "modbus",
     "can": "can",
     "cantools": "can",

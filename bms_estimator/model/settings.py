@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from bms_estimator.model.alarm_settings import AlarmSettings
+from bms_estimator.model.export_settings import InfluxSettings, PrometheusSettings
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
 from bms_estimator.model.resolution import RESOLUTIONS
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
@@ -298,6 +299,8 @@ class Settings(Strict):
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
     home_assistant: HomeAssistantSettings = HomeAssistantSettings()
+    influx: InfluxSettings | None = Field(default=None, description="leave out to write to none")
+    prometheus: PrometheusSettings | None = Field(default=None, description="leave out to listen nowhere")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()

@@ -24,6 +24,7 @@ from bms_estimator.service.logs import set_level
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
 from bms_estimator.sinks import Delivery, Sink
+from bms_estimator.sinks.influx import InfluxSink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources import Tap
@@ -73,7 +74,7 @@ async def serve(
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
-    all_sinks = list(sinks)
+    all_sinks = [*sinks, *export_sinks(settings)]
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = BoardMemory(folder, settings.pack.name) if folder else None
     source = open_reports(settings, tap=tap) or SerialBoard(settings.sensor, tap=tap, memory=memory)
@@ -116,6 +117,21 @@ async def serve(
             pulse=source.pulse,
             recording=partial(recording_health, tap),
         )
+
+
+def export_sinks(settings: Settings) -> list[Sink]:
+    """Where values go beside the broker.
+
+    Raises:
+        UserError: A file of the settings cannot be used.
+        ModuleNotFoundError: The optional package that one needs is not installed.
+    """
+    found: list[Sink] = [InfluxSink(settings.influx)] if settings.influx else []
+    if settings.prometheus:
+        from bms_estimator.sinks.prometheus import PrometheusSink  # noqa: PLC0415 - needs an optional package
+
+        found.append(PrometheusSink(settings.prometheus))
+    return found
 
 
 def recording_health(tap: Tap | None) -> RecordingHealth | None:
