@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
+from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
 Positive = Annotated[float, Field(gt=0)]
@@ -246,6 +247,7 @@ class Settings(Strict):
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
+    page: PageSettings | None = Field(default=None, description="leave out to serve none")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()
