@@ -12,7 +12,7 @@ ARGS    ?=
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels lock
+.PHONY: help venv apt audit check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -89,6 +89,9 @@ simulate: venv ## the whole service simulated: make simulate SEED=5, or many, e.
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
 	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
+
+payloads: venv ## remember what is published now; refuses what readers would miss in the same version
+	@$(BIN)/python -m tests.sinks.payload_record
 
 kernels: venv
 	$(BIN)/python -c 'from bms_estimator.service.warm_up import load_kernels; load_kernels()'

@@ -29,6 +29,7 @@ class Entry(NamedTuple):
 
 COMMANDS = {
     "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
+    "top": Entry("bms_estimator.cli.top:top", "All packs of a broker at a glance."),
     "replay": Entry("bms_estimator.cli.replay:replay", "Estimate from a recorded capture or a table."),
     "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),
     "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
@@ -47,10 +48,20 @@ COMMANDS = {
     "history": Entry("bms_estimator.cli.history:history", "What the service kept of a pack, by the minute, as CSV."),
     "validate": Entry("bms_estimator.cli.validate:validate_command", "A cell's model against a capture, open loop."),
     "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
+    "asyncapi": Entry("bms_estimator.cli.asyncapi:asyncapi", "What is published, as an AsyncAPI document."),
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
 }
 
-EXTRAS = {"pyarrow": "parquet", "amqtt": "demo", "matplotlib": "report"}
+EXTRAS = {
+    "pyarrow": "parquet",
+    "amqtt": "demo",
+    "matplotlib": "report",
+    "pymodbus": "modbus",
+    "can": "can",
+    "cantools": "can",
+    "aiobmsble": "ble",
+    "bleak": "ble",
+}
 """Optional package -> the extra that brings it."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """What a disk that is full or broken says. It may have room again: systemd is to start a service anew that ends so."""

@@ -83,9 +83,17 @@ def with_pack(settings: Settings, **changes: object) -> Settings:
 
 
 def with_sensor(settings: Settings, **changes: object) -> Settings:
-    """Settings with some of ``[sensor]`` changed; None leaves a value as it is."""
+    """Settings with some of ``[sensor]`` changed; None leaves a value as it is.
+
+    Raises:
+        UserError: It is about a serial line, and the source is none.
+    """
     given = {name: value for name, value in changes.items() if value is not None}
-    sensor = SensorSettings.model_validate(settings.sensor.model_dump() | given)
+    if given and settings.source is not None:
+        raise UserError(
+            f"{', '.join(given)}: the settings have a [source] that is no serial line; take it away, or this"
+        )
+    sensor = SensorSettings.model_validate(settings.sensor.model_dump(exclude_unset=True) | given)
     return settings.model_copy(update={"sensor": sensor})
 
 

@@ -15,9 +15,11 @@ from rich.text import Text
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.cli.pack import load_pack, with_sensor
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import SensorSettings, Settings
+from bms_estimator.model.settings import Settings
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.sources import Source
+from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.serial_board import SerialBoard
@@ -48,33 +50,33 @@ def record(
     """
     settings = load_pack(pack)[0] if pack else Settings()
     protocol = "text" if text else None
-    sensor = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol).sensor
-    with drained(), Recording(out, header_of(sensor)) as recording:
-        progress = asyncio.run(_record(sensor, recording, seconds))
+    settings = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol)
+    with drained(), Recording(out, header_of(settings.sensor, settings.source)) as recording:
+        progress = asyncio.run(_record(settings, recording, seconds))
     if recording.fault:
         raise UserError(f"recording ended: {recording.fault}")
     typer.echo(progress.summary(), err=True)
 
 
-async def _record(sensor: SensorSettings, recording: Recording, seconds: float | None) -> "Progress":
-    """Board -> file, until a signal, the time's end or the disk's."""
+async def _record(settings: Settings, recording: Recording, seconds: float | None) -> "Progress":
+    """Source -> file, until a signal, the time's end or the disk's."""
     stop = stop_on_signal()
     console, log = Console(stderr=True), deque[str]()
     configure_logs(log if console.is_terminal else None)
-    async with SerialBoard(sensor, tap=recording) as board:
-        progress = Progress(board, recording)
+    async with open_reports(settings, tap=recording) or SerialBoard(settings.sensor, tap=recording) as source:
+        progress = Progress(source, recording)
         await until_first_ends(
             stop.wait(),
             _end(recording),
-            _drain(board),
+            _drain(source),
             _time_over(recording, seconds),
             _show(console, progress, log),
         )
     return progress
 
 
-async def _drain(board: SerialBoard) -> None:
-    async for _ in board:
+async def _drain(source: Source) -> None:
+    async for _ in source:
         pass
 
 
@@ -104,16 +106,16 @@ async def _show(console: Console, progress: "Progress", log: deque[str]) -> None
 class Progress:
     """What has been recorded so far."""
 
-    def __init__(self, board: SerialBoard, recording: Recording) -> None:
-        self._board, self._recording = board, recording
+    def __init__(self, source: Source, recording: Recording) -> None:
+        self._source, self._recording = source, recording
         self._started_s = time.monotonic()
         self._last = (self._started_s, 0)
         self._rate_hz = 0.0
 
     def line(self) -> Text:
         """For a screen that is drawn anew."""
-        why = f"  {self._board.message}" if self._board.message else ""
-        now_s, frames = time.monotonic(), self._board.counters["frames_received"]
+        why = f"  {self._source.message}" if self._source.message else ""
+        now_s, frames = time.monotonic(), self._source.counters["frames_received"]
         if now_s - self._last[0] >= 1.0:
             self._rate_hz = (frames - self._last[1]) / (now_s - self._last[0])
             self._last = now_s, frames
@@ -121,7 +123,7 @@ class Progress:
 
     def summary(self) -> str:
         """Of the whole recording."""
-        counters = self._board.counters
+        counters = self._source.counters
         faults = sum(
             counters.get(name, 0) for name in ("cobs_errors", "length_errors", "version_errors", "text_errors")
         )

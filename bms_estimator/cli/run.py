@@ -23,7 +23,7 @@ from bms_estimator.service.reload import Reload, ask_all, reload_on_hangup
 from bms_estimator.service.serve import serve, state_folder
 from bms_estimator.service.several import serve_several
 from bms_estimator.service.warm_up import load_kernels
-from bms_estimator.sinks.console import ConsoleSink
+from bms_estimator.sinks.console_sink import ConsoleSink
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 
@@ -90,7 +90,7 @@ def _run_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[
 def _run_one(settings: Settings, cell: PackModel, reload: Reload, record: Path | None, *, view: bool) -> None:
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if view and sys.stdout.isatty() else None)
-    recorder = Recording(record, header_of(settings.sensor)) if record else contextlib.nullcontext()
+    recorder = Recording(record, header_of(settings.sensor, settings.source)) if record else contextlib.nullcontext()
     sinks = [ConsoleSink(log=log)] if view else []
     with drained(), recorder as tap:
         _load_kernels()

@@ -23,11 +23,11 @@ def settings_file(model: type[BaseModel]) -> str:
     """TOML text with each section of ``model``, each setting with its meaning, unit, what is allowed, and default."""
     lines = [HEAD]
     for name, field in model.model_fields.items():
-        section = _model(field.annotation)
         optional = field.default is None
         why = f" {_sentence(field.description)}" if optional and field.description else ""
-        lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{why}")
-        lines += [f"{'#' if optional else ''}[{name}]", *_settings(section), ""]
+        for section in _models(field.annotation):  # one of them, where there are several
+            lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{why}")
+            lines += [f"{'#' if optional else ''}[{name}]", *_settings(section), ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -39,8 +39,13 @@ def _settings(section: type[BaseModel]) -> Iterator[str]:
 
 
 def _value(field: FieldInfo) -> str:
-    """The default as TOML; nothing where there is none."""
-    default = field.get_default(call_default_factory=True)
+    """The default as TOML, or what it must be; nothing where there is neither."""
+    if get_origin(field.annotation) is Literal and field.is_required():
+        return f'"{get_args(field.annotation)[0]}"'
+    default = None if field.is_required() else field.get_default(call_default_factory=True)
+    if isinstance(default, BaseModel):
+        values, default = default.model_dump(exclude_none=True), tomlkit.inline_table()
+        default.update(values)
     return "" if default is None else tomlkit.item(default).as_string()
 
 
@@ -76,10 +81,11 @@ def _limit(constraint: Any) -> str:
     return f"{words} {getattr(constraint, attribute):.10g}"
 
 
-def _model(annotation: Any) -> type[BaseModel]:
-    """The model in an annotation that may also allow None."""
-    options = [annotation, *get_args(annotation)]
-    return next(o for o in options if isinstance(o, type) and issubclass(o, BaseModel))
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """The models in an annotation that may also allow None, or have one of several."""
+    if isinstance(annotation, type):
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    return [model for option in get_args(annotation) for model in _models(option)]
 
 
 def _sentence(text: str | None) -> str:

@@ -23,7 +23,7 @@ from bms_estimator.page.sink import Pages
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.serve import serve
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
-from bms_estimator.sinks.console import ConsoleSink
+from bms_estimator.sinks.console_sink import ConsoleSink
 
 CELL = "chen_mora"
 LOAD_A = 0.5

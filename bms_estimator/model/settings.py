@@ -4,15 +4,18 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
 
+from bms_estimator.model.alarm_settings import AlarmSettings
 from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.model.resolution import RESOLUTIONS
+from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Command = Literal["set_soc", "current_zero"]
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm"]
 """A request that changes something."""
 LogLevel = Literal["info", "warning", "error"]
 DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
@@ -50,27 +53,57 @@ class SensorSettings(Strict):
         description='the only board that is taken, as `bms-estimator board` shows its number, such as "0000002a"; '
         "the first that came, which is remembered, when left out",
     )
-    protocol: Literal["binary", "text"] = Field(default="binary", description="frames of the firmware, or text lines")
-    baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(default=500_000)
+    protocol: Literal["binary", "text", "vedirect", "junctek", "pylontech"] = Field(
+        default="binary", description="frames of the firmware, text lines, or a device by its name"
+    )
+    baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
+        default=500_000, description="a device's own when left out"
+    )
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
-        default="discharge_positive", description="what the board, or a table, calls positive; inside, discharge is"
+        default="discharge_positive",
+        description="what the board, or a table, calls positive; inside, discharge is; a device's own when left out",
     )
-    voltage_resolution_v: Positive = Field(default=25.0 / 1024, description="one step of the voltage converter")
+    voltage_resolution_v: Positive = Field(
+        default=25.0 / 1024, description="one step of the voltage converter; a device's own when left out"
+    )
     voltage_noise_v: NotNegative | None = Field(
         default=None, description="standard deviation of one voltage sample; half a step when left out"
     )
+    current_resolution_a: NotNegative | None = Field(
+        default=None, description="one step of the current; a device's own when left out, of a board as good as none"
+    )
+    current_dead_band_a: NotNegative | None = Field(
+        default=None, description="smaller currents are shown as 0; a device's own when left out, else none are"
+    )
+    period_s: Positive | None = Field(
+        default=None, description="between two samples, where they come at their own pace; a device's when left out"
+    )
+    delay_s: NotNegative | None = Field(
+        default=None, description="between the moments of voltage and current of one sample; a device's when left out"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_the_device(cls, table: object) -> object:
+        """What is not said is as ``RESOLUTIONS`` has it of the device."""
+        if not isinstance(table, dict) or table.get("protocol") not in RESOLUTIONS:
+            return table
+        declared = vars(RESOLUTIONS[table["protocol"]])
+        return {name: value for name, value in declared.items() if value is not None} | table
 
     @model_validator(mode="after")
-    def _text_has_no_serial(self) -> Self:
+    def _only_boards_have_a_serial(self) -> Self:
         if self.serial and self.protocol == "text":
             raise ValueError("serial: a board that prints text tells no serial number; leave it out")
+        if self.serial and self.protocol != "binary":
+            raise ValueError(f"serial: {self.protocol} tells no serial number; leave it out")
         return self
 
     @property
     def sample_period_s(self) -> float:
         """Between two samples [s]."""
-        return _OWN_PACE_S.get(self.protocol, 1.0 / self.sample_rate_hz)
+        return self.period_s or _OWN_PACE_S.get(self.protocol, 1.0 / self.sample_rate_hz)
 
 
 class ObserverSettings(Strict):
@@ -243,6 +276,9 @@ class Settings(Strict):
 
     pack: PackSettings = PackSettings()
     sensor: SensorSettings = SensorSettings()
+    source: SourceSettings | None = Field(
+        default=None, description="leave out where the board of [sensor] is the source"
+    )
     observer: ObserverSettings = ObserverSettings()
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
@@ -251,6 +287,7 @@ class Settings(Strict):
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()
+    alarms: AlarmSettings = AlarmSettings()
 
     @model_validator(mode="before")
     @classmethod
@@ -262,6 +299,27 @@ class Settings(Strict):
         if not isinstance(identifier, dict) or not isinstance(observer, dict) or identifier.get("enabled") is not False:
             return tables
         return tables | {"observer": {"law": "learning"} | observer}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _sensor_of_the_source(cls, tables: object) -> object:
+        """What a source that is no serial line makes of ``[sensor]``: it hands on lines of text."""
+        if not isinstance(tables, dict) or tables.get("source") is None:
+            return tables
+        sensor = tables.get("sensor", {})
+        told = sensor.model_dump(exclude_unset=True) if isinstance(sensor, SensorSettings) else sensor
+        try:
+            source = SOURCE.validate_python(tables["source"])
+        except ValidationError:  # said where the section itself is read
+            return tables
+        if not isinstance(told, dict):
+            return tables
+        return tables | {"sensor": {**source.sensor, **told, "protocol": "text"}}
+
+    @property
+    def sample_period_s(self) -> float:
+        """Between two samples, as expected [s]."""
+        return self.source.period_s if self.source else self.sensor.sample_period_s
 
 
 def load_settings(path: Path) -> Settings:

@@ -72,16 +72,16 @@ def read_toml(path: Path, model: type[T]) -> T:
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        raise UserError("\n".join(_line(path, model, detail) for detail in error.errors())) from None
+        raise UserError("\n".join(_line(path, model, table, detail) for detail in error.errors())) from None
 
 
-def _line(path: Path, model: type[BaseModel], detail: Any) -> str:
+def _line(path: Path, model: type[BaseModel], table: object, detail: Any) -> str:
     """One wrong key: ``pack.toml: cell.capacity_ah = -6.6: must be above 0 (rated capacity ...)``."""
-    keys = [str(key) for key in detail["loc"]]
+    keys = _keys(table, detail)
     where = ".".join(keys)
     described = _description(model, keys)
     hint = f" ({described})" if described else ""
-    if detail["type"] == "missing":
+    if detail["type"] in ("missing", "union_tag_not_found"):
         return f"{path}: {where}: missing{hint}"
     if detail["type"] == "extra_forbidden":
         return f"{path}: {where}: unknown key"
@@ -89,6 +89,20 @@ def _line(path: Path, model: type[BaseModel], detail: Any) -> str:
     if isinstance(detail["input"], dict):
         return f"{path}: {where}: {message}"
     return f"{path}: {where} = {without_secrets(repr(detail['input']))}: {message}{hint}"
+
+
+def _keys(table: object, detail: Any) -> list[str]:
+    """The keys of the file that lead to what is wrong, without the names of models that pydantic puts between."""
+    keys, way = [], detail["loc"]
+    for key in way[:-1]:
+        if isinstance(table, dict) and key in table:
+            keys.append(str(key))
+            table = table[key]
+        elif isinstance(table, list) and isinstance(key, int):
+            keys.append(str(key))
+            table = table[key] if key < len(table) else None
+    kind = [detail["ctx"]["discriminator"].strip("'")] if detail["type"] == "union_tag_not_found" else []
+    return [*keys, *map(str, way[-1:]), *kind]
 
 
 def _description(model: type[BaseModel], keys: list[str]) -> str:

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import math
+import reprlib
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -96,6 +97,7 @@ async def run_live(
         pulse=pulse,
         recording=recording,
     )
+    _restore_alarms(publisher, ledger.alarms)
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
     every_s = settings.state.checkpoint_s
@@ -218,6 +220,13 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clo
     return found.ledger, outcome
 
 
+def _restore_alarms(publisher: Publisher, kept: str) -> None:
+    try:
+        publisher.alarms.restore(kept)
+    except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
+        log.warning("the checkpoint's alarms cannot be: none is taken up", reason=str(error))
+
+
 def _soc_text(estimator: Estimator) -> str:
     soc = float(estimator.state["soc"][0])
     return "" if math.isnan(soc) else f": SOC {soc:.4f}"
@@ -276,3 +285,14 @@ def _offer(
 
     for handler in (state, parameters, health, set_soc, current_zero):
         requests.offer(handler.__name__, handler)
+    requests.offer("acknowledge_alarm", partial(_acknowledge_alarm, publisher))
+
+
+async def _acknowledge_alarm(publisher: Publisher, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Somebody knows of the alarm ``name``, or of all."""
+    name, watched = arguments.get("name"), publisher.alarms.names()
+    if name is not None and name not in watched:
+        raise UserError(f"name = {reprlib.repr(name)}: must be one of {', '.join(watched)}, or left out for all")
+    known = publisher.acknowledge(name)
+    log.info("alarms acknowledged on request", alarms=known)
+    return {"acknowledged": known}

@@ -11,6 +11,7 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
+from bms_estimator.model.alarm_limits import out_of_range
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
@@ -26,9 +27,11 @@ from bms_estimator.service.reload import Reload
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
+from bms_estimator.sources import Tap
 from bms_estimator.sources.board_memory import BoardMemory
+from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.recording import Recording
-from bms_estimator.sources.serial_board import SerialBoard, Tap
+from bms_estimator.sources.serial_board import SerialBoard
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
 from bms_estimator.store.outbox import Outbox
@@ -54,7 +57,7 @@ async def serve(
         settings: The pack's settings; with ``[mqtt]`` a broker is served.
         cell: The pack as one object (``CellModel.pack``).
         sinks: Further sinks, such as the console.
-        tap: Gets all bytes of the board with their arrival times.
+        tap: Gets all that the source is decoded from, with its arrival times.
         stop: Set by someone else to end as a signal does.
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
@@ -69,14 +72,14 @@ async def serve(
     """
     stop = stop_on_signal(stop)
     set_level(settings.pack.name, settings.log.level)
-    for line in implausible(settings, cell):
+    for line in [*implausible(settings, cell), *out_of_range(settings, cell)]:
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
     all_sinks = list(sinks)
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = BoardMemory(folder, settings.pack.name) if folder else None
-    board = SerialBoard(settings.sensor, tap=tap, memory=memory)
+    source = open_reports(settings, tap=tap) or SerialBoard(settings.sensor, tap=tap, memory=memory)
     if database and settings.store.history_days:
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
@@ -84,8 +87,8 @@ async def serve(
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
     if settings.mqtt is not None:
-        sample_period_s = settings.sensor.sample_period_s
-        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=sample_period_s)
+        period_s = settings.sample_period_s
+        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=period_s)
         all_sinks.append(mqtt)
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None
@@ -100,16 +103,16 @@ async def serve(
         return await run_live(
             settings,
             cell,
-            source=board,
+            source=source,
             sinks=all_sinks,
             stop=stop,
             checkpoint=checkpoint,
             requests=requests,
             delivery=delivery,
-            current_zero=board.current_zero,
+            current_zero=source.current_zero,
             notifier=notifier,
             reload=reload,
-            pulse=board.pulse,
+            pulse=source.pulse,
             recording=partial(recording_health, tap),
         )
 

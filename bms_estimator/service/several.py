@@ -27,7 +27,7 @@ async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Se
     """
     names = [settings.pack.name for settings, _ in packs]
     _differ("pack.name", names)
-    sensors = [settings.sensor for settings, _ in packs]
+    sensors = [settings.sensor for settings, _ in packs if settings.source is None]
     _differ("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
     _differ("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
     stop, notifier, pages = stop_on_signal(), Notifier(names), Pages()

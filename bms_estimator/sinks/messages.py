@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
-from bms_estimator.model.estimate import Estimate, Health, Info, ParameterReport, Report, Snapshot
-from bms_estimator.model.event import Event, events
+from bms_estimator.model.estimate import Health, Info, Report, Snapshot
+from bms_estimator.model.event import events
 from bms_estimator.sinks.home_assistant import PROBLEMS, VALUES, discovery, discovery_topic
 from bms_estimator.sinks.home_assistant_values import Shown, next_problems, next_values
+from bms_estimator.sinks.payloads import schema
 
 AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
 """Topics below the device's."""
@@ -78,7 +79,7 @@ class Messages:
         Returns:
             The messages, and what the broker has got after them.
         """
-        _, parameters, health, info, _ = snapshot
+        _, parameters, health, info, alarms = snapshot
         before, messages = sent.snapshot, []
         known = bool(parameters.elements)  # not before the first sample
         if known and (before is None or before.parameters is not parameters):
@@ -91,6 +92,8 @@ class Messages:
             messages.append(self._retained("info", _report(info)))
             if before is None or self._discovery(before.info) != self._discovery(info):
                 messages.append(Message(discovery_topic(self._device), _json(self._discovery(info)), 1, retain=True))
+        known_alarms = before.alarms if before else ()
+        messages += [self._retained(f"alarm/{a.name}", _report(a)) for a in alarms if a not in known_alarms]
         told, shown = self._home_assistant(sent.shown, snapshot, now_s)
         return messages + told, Sent(snapshot, shown)
 
@@ -118,18 +121,6 @@ class Messages:
 
     def _retained(self, topic: str, payload: bytes) -> Message:
         return Message(f"{self.root}/{topic}", payload, 1, retain=True)
-
-
-def schema() -> dict[str, Any]:
-    """JSON schema of each topic's payload."""
-    topics: dict[str, type[Report]] = {
-        "state": Estimate,
-        "event": Event,
-        "parameters": ParameterReport,
-        "health": Health,
-        "info": Info,
-    }
-    return {topic: model.model_json_schema() for topic, model in topics.items()}
 
 
 @cache

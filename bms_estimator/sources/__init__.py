@@ -17,6 +17,17 @@ class Pulse(NamedTuple):
     """Reads of the line that nobody has taken yet."""
 
 
+class Tap(Protocol):
+    """Takes all that the dialect is fed, as ``Recording`` does. Does not wait, and raises nothing."""
+
+    @property
+    def missed_reads(self) -> int:
+        """Reads of the line that it could not take."""
+
+    def write(self, arrival_s: float, data: bytes) -> None:
+        """Take one read of the line."""
+
+
 class Source(Protocol):
     """An async iterator of SAMPLE blocks that knows its faults.
 

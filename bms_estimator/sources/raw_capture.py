@@ -35,6 +35,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.report_source import ReportSource
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.wire.capture_records import RECORD_OVERHEAD_BYTES, split_records
 
@@ -72,8 +73,10 @@ class CaptureHeader:
 _VERSIONED, _HEADER = TypeAdapter(_Versioned), TypeAdapter(CaptureHeader)
 
 
-def header_of(sensor: SensorSettings) -> CaptureHeader:
-    """What a capture of this board's line says of it."""
+def header_of(sensor: SensorSettings, source: ReportSource | None = None) -> CaptureHeader:
+    """What a capture of this board's line says of it, or of lines that another source has brought."""
+    if source is not None:
+        return CaptureHeader(sensor.protocol, source.described, 0, sensor.current_sign)
     return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign)
 
 

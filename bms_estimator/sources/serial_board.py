@@ -5,7 +5,7 @@ import contextlib
 import math
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import structlog
 
@@ -13,11 +13,12 @@ from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
-from bms_estimator.sources import Pulse
+from bms_estimator.sources import Pulse, Tap
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
+from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.line import FIRST_RETRY_S, Line, Read
 from bms_estimator.sources.ports import NoPortError, open_port
 from bms_estimator.sources.whereabouts import HELD_S, LEFT_S, Whereabouts
@@ -31,26 +32,10 @@ TALKS = 4
 """After so many is looked whether samples come."""
 SILENT_S = 3.0
 """Without a frame for so long the line is at fault [s]."""
-JUNK_LOG_S = 30.0
-"""Faults of the line are logged no more often than this [s]."""
 ANSWER_S = 4.0
 """A board measures for a second before it answers a command [s]."""
 
-_NO_FAULTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello")
-"""Bytes and samples before the hello are usual where opening the port does not reset the board."""
-
 log = structlog.get_logger(__name__)
-
-
-class Tap(Protocol):
-    """Takes all that the dialect is fed, as ``Recording`` does. Does not wait, and raises nothing."""
-
-    @property
-    def missed_reads(self) -> int:
-        """Reads of the line that it could not take."""
-
-    def write(self, arrival_s: float, data: bytes) -> None:
-        """Take one read of the line."""
 
 
 class SerialBoard:
@@ -100,8 +85,7 @@ class SerialBoard:
         self._path = ""  # of the port that is open
         self._tended_s = monotonic()  # when the task last turned
         self._arrived_s = math.nan  # of the last block's bytes, on the line's clock
-        self._logged_s = -math.inf
-        self._logged_faults = 0
+        self._faults = FaultLog()
         self._decoded = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
@@ -275,7 +259,7 @@ class SerialBoard:
                 self._say_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
             elif now_s - heard_s >= self._silent_s:
                 self._say_or_leave(f"{path}: open, but silent")
-            self._log_faults(counters)
+            self._faults.see(counters, now_s)
 
     def _say_or_leave(self, message: str) -> None:
         """Say why no samples come, and look elsewhere where the board only might be."""
@@ -300,12 +284,3 @@ class SerialBoard:
         if message != self._message:
             log.warning("no samples", reason=message)
         self._message, self._refused = message, False
-
-    def _log_faults(self, counters: Mapping[str, int]) -> None:
-        """Log that the line has new faults, rarely."""
-        counted = {name: n for name, n in counters.items() if name not in _NO_FAULTS and n}
-        faults = sum(counted.values())
-        now_s = self._monotonic()
-        if faults != self._logged_faults and now_s - self._logged_s >= JUNK_LOG_S:
-            self._logged_faults, self._logged_s = faults, now_s
-            log.warning("faults on the line", **counted)

@@ -17,6 +17,8 @@ class Reading(NamedTuple):
     """As the board counts it."""
     temperature_c: float = nan
     cells_v: tuple[float, ...] = ()
+    time_s: float = nan
+    """By a clock of its own, whatever that counts from."""
 
 
 _VOLT: Mapping[str, float] = {"": 1.0, "v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3}
@@ -24,12 +26,14 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
     "voltage_v": _VOLT,
     "current_a": {"": 1.0, "a": 1.0, "amp": 1.0, "amps": 1.0, "ma": 1e-3},
     "temperature_c": {"": 1.0, "c": 1.0, "degc": 1.0},
+    "time_s": {"s": 1.0},
     "cells_v": _VOLT,
 }
 _NAMES = {
     "voltage_v": ("V", "v", "U", "u", "volt", "volts", "voltage", "vbat", "vbatt", "bus_voltage", "pack_voltage"),
     "current_a": ("I", "i", "A", "amp", "amps", "current", "ibat", "ibatt"),
     "temperature_c": ("T", "temp", "temperature"),  # t may be the time
+    "time_s": ("time",),  # with its unit alone: boards print times of any kind
     "cells_v": ("cells", "cell_voltages"),
 }
 _KNOWN = {
@@ -54,7 +58,7 @@ def read_line(line: bytes) -> Reading | None:
 
     ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
     ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
-    Other names are passed over; a name that comes twice, or a unit that is none of these, makes the line say nothing.
+    ``time_s`` is when it was measured by the board's clock; a cell that is ``null`` was not. Other names are passed over; a name that comes twice, or a unit that is none of these, makes the line say nothing.
     """
     if b";" in line and b"." not in line:
         line = line.replace(b",", b".")
@@ -82,7 +86,7 @@ def _pairs(text: str) -> Iterable[Said]:
 
 def _members(line: bytes) -> Iterable[Said]:
     for name, value in json.loads(line.decode(), parse_float=number, parse_constant=number).items():
-        values = value if isinstance(value, list) else [value]
+        values = [nan if v is None else v for v in value] if isinstance(value, list) else [value]
         if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
             yield name, [float(v) for v in values], ""
 
@@ -104,5 +108,7 @@ def _told(said: Iterable[Said]) -> Reading | None:
         found[field] = [factor * value for value in values]
     if "voltage_v" not in found or "current_a" not in found:
         return None
-    (voltage_v,), (current_a,), (temperature_c,) = (found.get(field, [nan]) for field in _UNITS if field != "cells_v")
-    return Reading(voltage_v, current_a, temperature_c, tuple(found.get("cells_v", ())))
+    (voltage_v,), (current_a,), (temperature_c,), (time_s,) = (
+        found.get(field, [nan]) for field in _UNITS if field != "cells_v"
+    )
+    return Reading(voltage_v, current_a, temperature_c, tuple(found.get("cells_v", ())), time_s)

@@ -1,5 +1,6 @@
 """``config``: what it writes it accepts, what is wrong it names, what it shows can be read."""
 
+import re
 import tomllib
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.sources.kinds import KINDS
 from tests.command_line import run
 
 
@@ -25,17 +27,32 @@ def test_init_writes_a_file_of_the_defaults_that_check_accepts(pack, capsys):
     assert load_settings(pack) == Settings()
 
 
+NEEDED = {
+    "modbus": "host = 'gx'\nvoltage = { address = 259 }\ncurrent = { address = 261 }\n",
+}
+"""What a section of ``[source]`` has to say, by kind."""
+
+
 def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, capsys):
     run(capsys, "config", "init", pack)
     lines = pack.read_text().splitlines()
     for name, field in Settings.model_fields.items():
         assert f"[{name}]" in lines or f"#[{name}]" in lines, field
     set_now = [line.removeprefix("#") for line in lines if not line.startswith("# ") and not line.endswith("= ")]
-    pack.write_text("\n".join(set_now))
-    written = tomllib.loads(pack.read_text())
-    assert written["sensor"]["baud"] == Settings().sensor.baud
-    assert set(written) == set(Settings.model_fields)
-    assert load_settings(pack).sensor == Settings().sensor
+    sections = re.split(r"^(?=\[)", "\n".join(set_now), flags=re.MULTILINE)
+    sources = [section for section in sections if section.startswith("[source]")]
+    assert len(sources) == len(KINDS)
+    for source in sources:  # one of them
+        kind = tomllib.loads(source)["source"]["kind"]
+        whole = source + NEEDED.get(kind, "")
+        pack.write_text("\n".join([*(section for section in sections if section not in sources), whole]))
+        written = tomllib.loads(pack.read_text())
+        assert written["sensor"]["baud"] == Settings().sensor.baud
+        assert set(written) == set(Settings.model_fields)
+        loaded = load_settings(pack)
+        assert loaded.source
+        assert loaded.source.kind in KINDS
+        assert loaded.sensor == Settings().sensor.model_copy(update={"protocol": "text"})
 
 
 def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
@@ -52,7 +69,7 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ("[pack]\nseries = 0\n", ["pack.series = 0", "greater than or equal to 1"]),
         ("[pack]\nsereis = 2\n", ["pack.sereis", "unknown key"]),
         ("[wrong]\na = 1\n", ["wrong", "unknown key"]),
-        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary' or 'text'"]),
+        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary', 'text'"]),
         ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "number, without quotes"]),
         ("[observer]\nlambda = -1\n", ["observer.lambda = -1", "greater than 0"]),
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),
@@ -63,6 +80,11 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ("[identifier]\nmap_memory_h = 0.5\n", ["identifier.map_memory_h = 0.5", "greater than or equal to 1"]),
         ('[mqtt]\nbase_topic = "/bms"\n', ["mqtt.base_topic = '/bms'", "no / at either end"]),
         ('[mqtt]\nbase_topic = "home/bms/"\n', ["mqtt.base_topic = 'home/bms/'", "no / at either end"]),
+        ("[source]\nchip = 5\n", ["source.kind", "missing"]),
+        (
+            '[source]\nkind = "linux"\nshunt_ohm = 0\n',
+            ["source.shunt_ohm = 0: ", "greater than 0", "shunt that is fitted"],
+        ),
         ('[pack]\ncell = "nonsense"\n', ["nonsense", "ncr18650", "lfp"]),
         ('[pack]\ncell = "lfp"\n', ["lfp is a generic cell", "capacity_ah of [pack]"]),
         ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "holds"]),

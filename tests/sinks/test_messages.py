@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.sinks.messages import Message, Messages, Sent, schema
+from bms_estimator.sinks.messages import Message, Messages, Sent
+from bms_estimator.sinks.payloads import schema
 from tests.sinks.snapshots import NOTHING_YET, NOW, ONE, snapshot
 
 MESSAGES = Messages("bms", "pack")

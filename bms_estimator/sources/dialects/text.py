@@ -1,14 +1,15 @@
 """Boards that print text, as every hobby sketch does: ``text_line`` says what a line may be."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.model.sample import LEAST_C, LEAST_CELL_V, MOST_C, MOST_CELL_V, SAMPLE, SampleBlock, forget_beyond
 from bms_estimator.sources.dialects import Dialect, cell_block
 from bms_estimator.sources.frames import PRINTABLE, CurrentSign
 from bms_estimator.sources.text_line import Reading, read_line
+from bms_estimator.sources.told_clock import ToldClock
 
 LINE_BYTES = 1024
 """A longer line is noise: 96 cells of seven characters fit."""
@@ -19,8 +20,8 @@ SHOWN_BYTES = 60
 class TextDialect(Dialect):
     """Lines of a board to samples. It takes no commands.
 
-    Lines that say nothing are counted and skipped. Lines carry no clock: those of one read share the time since the
-    read before evenly. How the bytes are cut into reads changes no value but these times.
+    Lines that say nothing are counted and skipped. Lines that tell no ``time_s`` share the time since the read before
+    evenly. How the bytes are cut into reads changes no value but these times.
 
     Args:
         current_sign: What the board calls positive; samples are positive on discharge.
@@ -31,7 +32,7 @@ class TextDialect(Dialect):
         self._rest = b""
         self._overlong = False  # the line is too long, its rest is skipped
         self._in_step = False  # once a line has ended: what came before may be half a line
-        self._first_s = self._last_s = float("nan")
+        self._clock, self._last_s = ToldClock(), math.nan
         self._bytes = self._samples = self._errors = self._too_long = self._implausible = 0
         self._bad: bytes | None = None  # the first line since the last good one that said nothing
         self._good: Reading | None = None
@@ -45,6 +46,7 @@ class TextDialect(Dialect):
             "text_errors": self._errors,
             "length_errors": self._too_long,
             "implausible": self._implausible,
+            "clock_jumps": self._clock.jumps,
         }
 
     @property
@@ -67,7 +69,7 @@ class TextDialect(Dialect):
         return f"prints text, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is since the first sample, by arrival."""
+        """Decode one read of the line; ``time_s`` is since the first sample, as ``ToldClock`` has it."""
         self._bytes += len(data)
         *lines, self._rest = (self._rest + data).split(b"\n")
         readings = [reading for line in lines if (reading := self._end_line(line)) is not None]
@@ -86,18 +88,15 @@ class TextDialect(Dialect):
             block["temperature_c"] = [reading.temperature_c for reading in readings]
             self._implausible += forget_beyond(block["temperature_c"], LEAST_C, MOST_C)
             block["status"] = 0
-            block["time_s"] = self._times(arrival_s, len(readings))
+            block["time_s"] = self._times(arrival_s, readings)
         return block
 
-    def _times(self, arrival_s: float, count: int) -> NDArray[np.float64]:
-        """Times of ``count`` samples that came together, evenly over the time since those before [s]."""
-        if self._samples == count:
-            self._first_s = self._last_s = arrival_s
-            return np.zeros(count)
-        steps = np.arange(1, count + 1) / count
-        times = self._last_s + (arrival_s - self._last_s) * steps - self._first_s
-        self._last_s = arrival_s
-        return times
+    def _times(self, arrival_s: float, readings: Sequence[Reading]) -> list[float]:
+        """Times of samples that came together [s]."""
+        before_s, self._last_s = (arrival_s if math.isnan(self._last_s) else self._last_s), arrival_s
+        steps = np.arange(1, len(readings) + 1) / len(readings)
+        arrivals = (before_s + (arrival_s - before_s) * steps).tolist()
+        return [self._clock.place(at_s, reading.time_s) for at_s, reading in zip(arrivals, readings, strict=True)]
 
     def _end_line(self, line: bytes) -> Reading | None:
         """What a line says. Half a line at the start is no fault."""

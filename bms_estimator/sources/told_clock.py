@@ -1,0 +1,49 @@
+"""Times that a device tells beside its values, as far as they can be right; else those of the arrivals."""
+
+import math
+
+EARLY_S = 5.0
+"""So much earlier than its own time says no sample comes; one that does tells that the clock was set [s]."""
+STUCK_S = 10.0
+"""A time that stays the same for so long, while samples come, tells nothing [s]."""
+SLOWEST = 0.01
+"""No device's clock is slower than the host's by more than this, relative."""
+
+
+class ToldClock:
+    """Seconds since the first sample, never less than before.
+
+    Samples that waited come late, and at once: their own times place them. A time that steps back, or one that lies
+    ahead of the arrivals, is one of a clock that was set or of a device that began anew: there the arrival counts, and so
+    it does where the clock stands still.
+
+    Attributes:
+        jumps: So often were times not believed.
+    """
+
+    def __init__(self) -> None:
+        self.jumps = 0
+        self._last_s = 0.0
+        self._told_s = self._arrival_s = math.nan  # the latter when the told time was another last
+        self._least_late_s = math.inf
+
+    def place(self, arrival_s: float, told_s: float) -> float:
+        """Time of a sample [s].
+
+        Args:
+            arrival_s: When it came, on any clock that never steps back [s].
+            told_s: When it was measured by the device's clock, whatever that counts from [s]; NaN: it did not say.
+        """
+        step_s, late_s = told_s - self._told_s, arrival_s - told_s
+        passed_s = 0.0 if math.isnan(self._arrival_s) else max(arrival_s - self._arrival_s, 0.0)
+        if step_s == 0.0 and passed_s < STUCK_S:
+            return self._last_s
+        if step_s > 0.0 and late_s >= self._least_late_s - EARLY_S:
+            self._least_late_s = min(self._least_late_s + SLOWEST * step_s, late_s)
+        else:
+            self.jumps += not math.isnan(step_s)
+            self._least_late_s = math.inf if math.isnan(late_s) else late_s
+            step_s = passed_s
+        self._told_s, self._arrival_s = told_s, arrival_s
+        self._last_s += step_s
+        return self._last_s

@@ -1,0 +1,26 @@
+"""A folder that looks like /sys, for chips whose driver is in the kernel."""
+
+from pathlib import Path
+
+I2C = "devices/platform/soc/fe804000.i2c/i2c-1"
+
+
+def hwmon(root: Path, name: str = "ina226", place: str = "1-0040", number: int = 3, **files: object) -> Path:
+    """A chip of hwmon, as Documentation/hwmon/ina2xx.rst of the kernel names its files. Returns its folder."""
+    folder = root / I2C / place / "hwmon" / f"hwmon{number}"
+    return _chip(root / "class" / "hwmon" / folder.name, folder, name, files)
+
+
+def iio(root: Path, name: str = "ads1115", place: str = "1-0048", number: int = 0, **files: object) -> Path:
+    """A chip of iio, as Documentation/ABI/testing/sysfs-bus-iio of the kernel names its files. Returns its folder."""
+    folder = root / I2C / place / f"iio:device{number}"
+    return _chip(root / "bus" / "iio" / "devices" / folder.name, folder, name, files)
+
+
+def _chip(link: Path, folder: Path, name: str, files: dict[str, object]) -> Path:
+    folder.mkdir(parents=True)
+    for file, content in {"name": name, **files}.items():
+        (folder / file).write_text(f"{content}\n")
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(folder)
+    return folder
