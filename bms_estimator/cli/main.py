@@ -35,6 +35,7 @@ COMMANDS = {
     "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
     "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
     "board": Entry("bms_estimator.cli.board:board", "Show a board, set its bandgap, gains and serial number."),
+    "dashboard": Entry("bms_estimator.cli.dashboard:dashboard", "The live page of all packs of a broker."),
     "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
     "ocv": Entry(
         "bms_estimator.cli.ocv:ocv", "Open-circuit voltage from rests, slow curves or given curves, into a cell file."

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandle
 from bms_estimator.model.alarm_settings import AlarmSettings
 from bms_estimator.model.export_settings import InfluxSettings, PrometheusSettings
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.model.resolution import RESOLUTIONS
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
@@ -301,6 +302,7 @@ class Settings(Strict):
     home_assistant: HomeAssistantSettings = HomeAssistantSettings()
     influx: InfluxSettings | None = Field(default=None, description="leave out to write to none")
     prometheus: PrometheusSettings | None = Field(default=None, description="leave out to listen nowhere")
+    page: PageSettings | None = Field(default=None, description="leave out to serve none")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()

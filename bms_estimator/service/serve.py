@@ -16,6 +16,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.page.sink import Pages, PageSink
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
@@ -49,6 +50,7 @@ async def serve(
     folder: Path | None = None,
     notifier: Notifier | None = None,
     reload: Reload | None = None,
+    pages: Pages | None = None,
 ) -> Estimator:
     """Run until SIGINT or SIGTERM.
 
@@ -61,6 +63,7 @@ async def serve(
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
         reload: Where is offered what can be changed while it runs.
+        pages: The live pages of this process.
 
     Returns:
         The estimator as the last sample left it.
@@ -95,6 +98,9 @@ async def serve(
             home_assistant=settings.home_assistant,
         )
         all_sinks.append(mqtt)
+    if settings.page is not None:
+        history = database.path if database and settings.store.history_days else None
+        all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
