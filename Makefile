@@ -8,15 +8,17 @@ COMPARE := .venv-compare
 AUDIT   := .venv-audit
 NODE    := .node
 ARGS    ?=
+HOME_ASSISTANT ?= 2025.2.5
+HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 venv: $(READY) ## the environment in .venv, from the hash-locked list
 
@@ -42,6 +44,10 @@ demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--
 
 nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)
+
+home-assistant: apt venv ## tests with the real Home Assistant, which is made first, once: two minutes
+	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)"
+	HOME_ASSISTANT=$(HOME_ASSISTANT) $(BIN)/python -m pytest -n0 tests/home_assistant $(ARGS)
 
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)

@@ -11,10 +11,12 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
+from bms_estimator.model.alarm_limits import out_of_range
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.page.sink import Pages, PageSink
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
@@ -48,6 +50,7 @@ async def serve(
     folder: Path | None = None,
     notifier: Notifier | None = None,
     reload: Reload | None = None,
+    pages: Pages | None = None,
 ) -> Estimator:
     """Run until SIGINT or SIGTERM.
 
@@ -60,6 +63,7 @@ async def serve(
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
         reload: Where is offered what can be changed while it runs.
+        pages: The live pages of this process.
 
     Returns:
         The estimator as the last sample left it.
@@ -69,7 +73,7 @@ async def serve(
     """
     stop = stop_on_signal(stop)
     set_level(settings.pack.name, settings.log.level)
-    for line in implausible(settings, cell):
+    for line in [*implausible(settings, cell), *out_of_range(settings, cell)]:
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
@@ -84,9 +88,19 @@ async def serve(
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
     if settings.mqtt is not None:
-        period_s = settings.sample_period_s
-        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=period_s)
+        mqtt = MqttSink(
+            settings.mqtt,
+            settings.pack.name,
+            requests,
+            delivery,
+            outbox,
+            sample_period_s=settings.sample_period_s,
+            home_assistant=settings.home_assistant,
+        )
         all_sinks.append(mqtt)
+    if settings.page is not None:
+        history = database.path if database and settings.store.history_days else None
+        all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:

@@ -28,7 +28,6 @@ def test_a_broker_that_got_nothing_gets_everything_that_is_not_kept():
         "info",
         DISCOVERY,
         "home_assistant",
-        "home_assistant/problems",
     ]
     assert sent.snapshot is ONE
 
