@@ -6,15 +6,21 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from bms_estimator.model.serial_devices import SERIAL_DEVICES, filled
+from bms_estimator.model.alarm_settings import AlarmSettings
+from bms_estimator.model.export_settings import InfluxSettings, PrometheusSettings
+from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.model.resolution import RESOLUTIONS
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Command = Literal["set_soc", "current_zero"]
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate"]
 """A request that changes something."""
+LEAST_RATE_HZ, MOST_RATE_HZ = 0.1, 10.0
+"""Of publications."""
 LogLevel = Literal["info", "warning", "error"]
 DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
 DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
@@ -36,6 +42,15 @@ class PackSettings(Strict):
     initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
 
 
+def _filled(sensor: dict[str, object]) -> dict[str, object]:
+    """The table ``[sensor]`` with what it leaves out, as ``RESOLUTIONS`` has it of the device."""
+    protocol = sensor.get("protocol")
+    if not isinstance(protocol, str) or protocol not in RESOLUTIONS:
+        return sensor
+    declared = vars(RESOLUTIONS[protocol])
+    return {name: value for name, value in declared.items() if value is not None} | sensor
+
+
 class SensorSettings(Strict):
     """The board, what it resolves, and its sign of current."""
 
@@ -47,28 +62,38 @@ class SensorSettings(Strict):
         description='the only board that is taken, as `bms-estimator board` shows its number, such as "0000002a"; '
         "the first that came, which is remembered, when left out",
     )
-    protocol: Literal["binary", "text", "jbd", "daly", "jk"] = Field(
-        default="binary", description="frames of the firmware, text lines, or a BMS by its maker's protocol"
+    protocol: Literal["binary", "text", "jbd", "daly", "jk", "vedirect", "junctek", "pylontech"] = Field(
+        default="binary", description="frames of the firmware, text lines, or a BMS or meter by its name"
     )
     address: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
         description="of several packs on one RS485 line, the one that is taken; the first that answers when left out",
     )
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
-        default=500_000, description="when left out as the protocol has it: 9600 of jbd and daly, 115200 of jk"
+        default=500_000, description="a device's own when left out"
     )
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
         default="discharge_positive",
-        description="what the board, or a table, calls positive; inside, discharge is; "
-        "when left out charge of jbd and jk, as their makers say",
+        description="what the board, or a table, calls positive; inside, discharge is; a device's own when left out",
     )
     voltage_resolution_v: Positive = Field(
-        default=25.0 / 1024,
-        description="one step of the voltage converter; when left out 0.01 of jbd and jk, 0.1 of daly",
+        default=25.0 / 1024, description="one step of the voltage converter; a device's own when left out"
     )
     voltage_noise_v: NotNegative | None = Field(
         default=None, description="standard deviation of one voltage sample; half a step when left out"
+    )
+    current_resolution_a: NotNegative | None = Field(
+        default=None, description="one step of the current; a device's own when left out, of a board as good as none"
+    )
+    current_dead_band_a: NotNegative | None = Field(
+        default=None, description="smaller currents are shown as 0; a device's own when left out, else none are"
+    )
+    period_s: Positive | None = Field(
+        default=None, description="between two samples, where they come at their own pace; a device's when left out"
+    )
+    delay_s: NotNegative | None = Field(
+        default=None, description="between the moments of voltage and current of one sample; a device's when left out"
     )
 
     @model_validator(mode="wrap")
@@ -77,7 +102,7 @@ class SensorSettings(Strict):
         """What is left out is as the protocol has it, and does not count as set."""
         if not isinstance(table, dict):
             return validate(table)
-        made = validate(filled(table))
+        made = validate(_filled(table))
         made.model_fields_set.intersection_update(table)
         return made
 
@@ -92,7 +117,7 @@ class SensorSettings(Strict):
     @property
     def sample_period_s(self) -> float:
         """Between two samples [s]."""
-        return SERIAL_DEVICES[self.protocol].pace_s or 1.0 / self.sample_rate_hz
+        return self.period_s or 1.0 / self.sample_rate_hz
 
 
 class ObserverSettings(Strict):
@@ -169,7 +194,9 @@ class IdentifierSettings(Strict):
 class PublishSettings(Strict):
     """How often what is estimated goes out."""
 
-    rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="snapshots per second")
+    rate_hz: Annotated[float, Field(ge=LEAST_RATE_HZ, le=MOST_RATE_HZ)] = Field(
+        default=1.0, description="snapshots per second"
+    )
 
 
 def _of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
@@ -272,9 +299,14 @@ class Settings(Strict):
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
+    home_assistant: HomeAssistantSettings = HomeAssistantSettings()
+    influx: InfluxSettings | None = Field(default=None, description="leave out to write to none")
+    prometheus: PrometheusSettings | None = Field(default=None, description="leave out to listen nowhere")
+    page: PageSettings | None = Field(default=None, description="leave out to serve none")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()
+    alarms: AlarmSettings = AlarmSettings()
 
     @model_validator(mode="before")
     @classmethod
