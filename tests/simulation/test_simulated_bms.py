@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
-from bms_estimator.simulation.virtual_bms import SPREAD_V, BmsFault, VirtualBms
+from bms_estimator.simulation.simulated_bms import SPREAD_V, BmsFault, SimulatedBms
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
@@ -66,7 +66,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 @contextlib.asynccontextmanager
-async def read(bms: VirtualBms, protocol: str, tap: Recording) -> AsyncIterator[tuple[SerialBoard, Taken]]:
+async def read(bms: SimulatedBms, protocol: str, tap: Recording) -> AsyncIterator[tuple[SerialBoard, Taken]]:
     """The reader of the line of a BMS that answers."""
     with bms:
         sensor = SensorSettings.model_validate({"port": bms.path, "protocol": protocol})
@@ -88,7 +88,7 @@ async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happen
     for constant, value in FASTER.items():
         monkeypatch.setattr(f"bms_estimator.sources.{constant}", value)
     protocol, path = name.removesuffix("-pb"), tmp_path / "line.bms"
-    bms = VirtualBms(name, swinging, cells=CELLS)
+    bms = SimulatedBms(name, swinging, cells=CELLS)
     header = header_of(SensorSettings.model_validate({"protocol": protocol}))
     with Recording(path, header) as recording:
         async with read(bms, protocol, recording) as (board, taken):
@@ -123,4 +123,4 @@ async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happen
 
 def test_more_cells_than_a_bms_has_room_for_are_refused() -> None:
     with pytest.raises(ValueError, match="40 cells: a simulated BMS has 1 to 32"):
-        VirtualBms("jbd", swinging, cells=40)
+        SimulatedBms("jbd", swinging, cells=40)
