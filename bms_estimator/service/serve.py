@@ -16,6 +16,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.service.alarm_hooks import Hooks, Say, Switch
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
@@ -30,6 +31,7 @@ from bms_estimator.sources import Tap
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.recording import Recording
+from bms_estimator.sources.reports import Reports
 from bms_estimator.sources.serial_board import SerialBoard
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
@@ -83,10 +85,13 @@ async def serve(
     if reload:
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
+    say: Say | None = None
     if settings.mqtt is not None:
         period_s = settings.sample_period_s
         mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=period_s)
         all_sinks.append(mqtt)
+        say = mqtt.say
+    hooks = Hooks(settings.alarms.hook, settings.pack.name, say, _relay(settings, source))
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
@@ -108,7 +113,13 @@ async def serve(
             reload=reload,
             pulse=source.pulse,
             recording=partial(recording_health, tap),
+            hooks=hooks,
         )
+
+
+def _relay(settings: Settings, source: SerialBoard | Reports) -> Switch | None:
+    """Who switches the relay; None: no other device has a pin for one."""
+    return source.relay if settings.sensor.protocol == "binary" else None
 
 
 def recording_health(tap: Tap | None) -> RecordingHealth | None:
