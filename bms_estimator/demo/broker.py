@@ -82,7 +82,7 @@ class DemoBroker:
     """
 
     def __init__(self, port: int | None = None) -> None:
-        self.port = _choose(port)
+        self.port = choose_port(port, MQTT_PORT)
         logging.getLogger("amqtt").setLevel(logging.CRITICAL)  # it logs whole stacks when a client goes without a word
         listener = ListenerConfig(bind=f"{LOOPBACK}:{self.port}")
         self._broker = _Broker(BrokerConfig(listeners={"default": listener}, plugins=ANONYMOUS))
@@ -108,13 +108,17 @@ class DemoBroker:
         await self._broker.shutdown()
 
 
-def _choose(port: int | None) -> int:
-    """The port to listen on: as asked, else 1883, else a free one."""
+def choose_port(port: int | None, usual: int) -> int:
+    """The port to listen on: as asked, else the usual one, else a free one.
+
+    Raises:
+        UserError: The port asked for is taken.
+    """
     if port is not None:
         if not _free(port):
             raise UserError(f"port {port}: taken by another program; leave --port out to have a free one chosen")
         return port
-    return MQTT_PORT if _free(MQTT_PORT) else _any_free()
+    return usual if _free(usual) else _any_free()
 
 
 def _free(port: int) -> bool:

@@ -8,6 +8,9 @@ from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
+PAYLOAD_VERSION = 1
+"""Of all that is published; ``sinks/payloads.py`` says when it goes up."""
+
 
 class Report(BaseModel):
     """Base of all published values."""
@@ -187,6 +190,9 @@ class Info(Report):
 
     device: str
     version: str = Field(description="of bms_estimator")
+    payload_version: int = Field(
+        description="of what is published: goes up when a field vanishes or gets another type, unit or meaning"
+    )
     started: str = Field(description="ISO 8601, UTC")
     cell: str
     capacity_ah: float | None = Field(description="null of a fuel cell")

@@ -30,6 +30,14 @@ class Resolution:
 
 CHARGE = "charge_positive"
 RESOLUTIONS: Mapping[str, Resolution] = {
+    # Boards that print at their own pace are taken to do so each second.
+    "text": Resolution(period_s=1.0),
+    # Steps of 10 mV and 10 mA in one frame with both.
+    "jbd": Resolution(9600, CHARGE, 1.0, 0.01, 0.01),
+    # Steps of 0.1 V and 0.1 A in one frame with both.
+    "daly": Resolution(9600, None, 1.0, 0.1, 0.1),
+    # Steps of 10 mV and 10 mA in one frame with both.
+    "jk": Resolution(115_200, CHARGE, 1.0, 0.01, 0.01),
     # The text has steps of 1 mV and 1 mA; the data sheets of BMV and SmartShunt promise 10 mV and 10 mA.
     "vedirect": Resolution(19_200, CHARGE, 1.0, 0.01, 0.01, 0.0, 0.5),
     # Steps of 10 mV and 10 mA in the protocol; of the current the makers promise 0.1 A.

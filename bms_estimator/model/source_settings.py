@@ -5,29 +5,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter
 
-from bms_estimator.model.toml_file import Strict
+from bms_estimator.model.ble_settings import BleSource
+from bms_estimator.model.can_settings import CanSource
+from bms_estimator.model.modbus_settings import ModbusSource
+from bms_estimator.model.report_source import ReportSource
 
 Positive = Annotated[float, Field(gt=0)]
 Name = Annotated[str, Field(min_length=1)]
-
-
-class ReportSource(Strict):
-    """What all kinds have in common."""
-
-    @property
-    def period_s(self) -> float:
-        """Between two samples, as expected [s]: values are fresh for three of them."""
-        raise NotImplementedError
-
-    @property
-    def described(self) -> str:
-        """For people, in a few words."""
-        raise NotImplementedError
-
-    @property
-    def sensor(self) -> Mapping[str, object]:
-        """What follows for ``[sensor]``, where that does not say otherwise: what is resolved, the sign of the current."""
-        return {}
 
 
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
@@ -80,5 +64,5 @@ class LinuxSource(ReportSource):
         return {"voltage_resolution_v": RESOLUTION_V.get(self.chip, FINE_V) * self.voltage_scale}
 
 
-SourceSettings = LinuxSource
-SOURCE: TypeAdapter[LinuxSource] = TypeAdapter(SourceSettings)
+SourceSettings = Annotated[LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]
+SOURCE: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import shutil
 import signal
 from collections import deque
 from collections.abc import Awaitable, Callable, Collection, Sequence
@@ -14,6 +15,7 @@ import structlog
 from bms_estimator.model.alarm_settings import AlarmHook
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Alarm
+from bms_estimator.model.settings import Settings
 from bms_estimator.snapshot.alarms import Change
 from bms_estimator.sources.protocol import Relay
 
@@ -224,6 +226,30 @@ class _Switched(_Hook):
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(RETRY_S if self._trouble else RELAY_S):
                     await self._wake.wait()
+
+
+def unusable(settings: Settings) -> list[str]:
+    """One line for each hook whose program is not there.
+
+    Raises:
+        UserError: A hook needs a broker or a relay that is not there.
+    """
+    hooks = settings.alarms.hook
+    Hooks(hooks, settings.pack.name, (lambda *_: None) if settings.mqtt else None, relay_of(settings, _switch_nothing))
+    return [
+        f"alarms.hook.{i}.run = {hook.run[0]}: no such program here, or it may not be run"
+        for i, hook in enumerate(hooks)
+        if hook.run and shutil.which(hook.run[0]) is None
+    ]
+
+
+def relay_of(settings: Settings, switch: Switch | None) -> Switch | None:
+    """``switch`` where the source has a relay: no device but the firmware's board has a pin for one."""
+    return switch if settings.sensor.protocol == "binary" else None
+
+
+async def _switch_nothing(_: Relay) -> None:
+    """Of no board."""
 
 
 def _made(i: int, hook: AlarmHook, device: str, say: Say | None, switch: Switch | None) -> _Hook:

@@ -17,7 +17,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.service.alarm_hooks import Hooks
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
 from bms_estimator.service.interrupt import until_first_ends
@@ -290,7 +290,13 @@ def _offer(
         log.info("present current taken as zero on request")
         return {}
 
-    for handler in (state, parameters, health, set_soc, current_zero):
+    async def publish_rate(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        rate_hz, before = number(arguments, "rate_hz", LEAST_RATE_HZ, MOST_RATE_HZ), 1.0 / publisher.period_s
+        publisher.set_rate(rate_hz)
+        log.info("publish rate set on request", before=before, rate_hz=rate_hz)
+        return {"rate_hz": rate_hz, "before": before}
+
+    for handler in (state, parameters, health, set_soc, current_zero, publish_rate):
         requests.offer(handler.__name__, handler)
     requests.offer("acknowledge_alarm", partial(_acknowledge_alarm, publisher))
 

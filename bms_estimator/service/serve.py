@@ -16,7 +16,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.alarm_hooks import Hooks, Say, Switch
+from bms_estimator.page.sink import Pages, PageSink
+from bms_estimator.service.alarm_hooks import Hooks, Say, relay_of
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
@@ -25,13 +26,13 @@ from bms_estimator.service.logs import set_level
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
 from bms_estimator.sinks import Delivery, Sink
+from bms_estimator.sinks.influx import InfluxSink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources import Tap
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.recording import Recording
-from bms_estimator.sources.reports import Reports
 from bms_estimator.sources.serial_board import SerialBoard
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
@@ -50,6 +51,7 @@ async def serve(
     folder: Path | None = None,
     notifier: Notifier | None = None,
     reload: Reload | None = None,
+    pages: Pages | None = None,
 ) -> Estimator:
     """Run until SIGINT or SIGTERM.
 
@@ -62,6 +64,7 @@ async def serve(
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
         reload: Where is offered what can be changed while it runs.
+        pages: The live pages of this process.
 
     Returns:
         The estimator as the last sample left it.
@@ -75,7 +78,7 @@ async def serve(
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
-    all_sinks = list(sinks)
+    all_sinks = [*sinks, *export_sinks(settings)]
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = BoardMemory(folder, settings.pack.name) if folder else None
     source = open_reports(settings, tap=tap) or SerialBoard(settings.sensor, tap=tap, memory=memory)
@@ -87,11 +90,21 @@ async def serve(
         reload.offer("mqtt.commands", requests.allow)
     say: Say | None = None
     if settings.mqtt is not None:
-        period_s = settings.sample_period_s
-        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=period_s)
+        mqtt = MqttSink(
+            settings.mqtt,
+            settings.pack.name,
+            requests,
+            delivery,
+            outbox,
+            sample_period_s=settings.sample_period_s,
+            home_assistant=settings.home_assistant,
+        )
         all_sinks.append(mqtt)
         say = mqtt.say
-    hooks = Hooks(settings.alarms.hook, settings.pack.name, say, _relay(settings, source))
+    hooks = Hooks(settings.alarms.hook, settings.pack.name, say, relay_of(settings, source.relay))
+    if settings.page is not None:
+        history = database.path if database and settings.store.history_days else None
+        all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
@@ -117,9 +130,19 @@ async def serve(
         )
 
 
-def _relay(settings: Settings, source: SerialBoard | Reports) -> Switch | None:
-    """Who switches the relay; None: no other device has a pin for one."""
-    return source.relay if settings.sensor.protocol == "binary" else None
+def export_sinks(settings: Settings) -> list[Sink]:
+    """Where values go beside the broker.
+
+    Raises:
+        UserError: A file of the settings cannot be used.
+        ModuleNotFoundError: The optional package that one needs is not installed.
+    """
+    found: list[Sink] = [InfluxSink(settings.influx)] if settings.influx else []
+    if settings.prometheus:
+        from bms_estimator.sinks.prometheus import PrometheusSink  # noqa: PLC0415 - needs an optional package
+
+        found.append(PrometheusSink(settings.prometheus))
+    return found
 
 
 def recording_health(tap: Tap | None) -> RecordingHealth | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bms_estimator import __version__
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Estimate, Info
+from bms_estimator.model.estimate import PAYLOAD_VERSION, Estimate, Info
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.snapshot.flow import Flow
@@ -112,6 +112,7 @@ def info_report(
     return Info(
         device=settings.pack.name,
         version=__version__,
+        payload_version=PAYLOAD_VERSION,
         started=iso_utc(started_s),
         cell=cell.cell.name,
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,

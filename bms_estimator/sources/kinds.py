@@ -9,6 +9,9 @@ from bms_estimator.sources.reports import Bringer, Reports
 
 KINDS: Mapping[str, str] = {
     "linux": "linux_sensor",
+    "modbus": "modbus",
+    "can": "can_bus",
+    "ble": "ble",
 }
 """By ``source.kind``: a module of this package whose ``bringer(settings)`` makes what brings the values."""
 

@@ -27,6 +27,14 @@ def test_init_writes_a_file_of_the_defaults_that_check_accepts(pack, capsys):
     assert load_settings(pack) == Settings()
 
 
+NEEDED = {
+    "ble": "name = 'battery'\n",
+    "can": "voltage = { id = 0x356 }\ncurrent = { id = 0x356, start_bit = 16 }\n",
+    "modbus": "host = 'gx'\nvoltage = { address = 259 }\ncurrent = { address = 261 }\n",
+}
+"""What a section of ``[source]`` has to say, by kind."""
+
+
 def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, capsys):
     run(capsys, "config", "init", pack)
     lines = pack.read_text().splitlines()
@@ -37,14 +45,16 @@ def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, cap
     sources = [section for section in sections if section.startswith("[source]")]
     assert len(sources) == len(KINDS)
     for source in sources:  # one of them
-        pack.write_text("".join(section for section in sections if section not in sources or section == source))
+        kind = tomllib.loads(source)["source"]["kind"]
+        whole = source + NEEDED.get(kind, "")
+        pack.write_text("\n".join([*(section for section in sections if section not in sources), whole]))
         written = tomllib.loads(pack.read_text())
         assert written["sensor"]["baud"] == Settings().sensor.baud
         assert set(written) == set(Settings.model_fields)
         loaded = load_settings(pack)
         assert loaded.source
         assert loaded.source.kind in KINDS
-        assert loaded.sensor == Settings().sensor.model_copy(update={"protocol": "text"})
+        assert loaded.sensor == Settings().sensor.model_copy(update={"protocol": "text", "period_s": 1.0})
 
 
 def test_init_leaves_an_existing_file_as_it_is(pack, capsys):

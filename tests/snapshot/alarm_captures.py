@@ -75,7 +75,13 @@ def settings(alarms: dict[str, Any] | None = None, **sections: Any) -> Settings:
 
 
 async def replayed(
-    path: Path, told: Settings, cell: CellModel = PACK, kept: str = "", *, at_once: bool = False
+    path: Path,
+    told: Settings,
+    cell: CellModel = PACK,
+    kept: str = "",
+    *,
+    at_once: bool = False,
+    begin_s: float = WALL_S,
 ) -> Told:
     """The capture through estimator and publisher, whose clocks are the capture's.
 
@@ -84,12 +90,13 @@ async def replayed(
         told: The pack's settings.
         cell: The pack.
         kept: Alarms of a run before.
+        begin_s: Wall clock at its begin [s since 1970].
         at_once: As few and long blocks as the capture has; else each sample as it came.
     """
     now_s, result, sink = 0.0, Told(), Collector()
     source = Replay(open_capture(path, told.sensor), longest_s=math.inf if at_once else 0.05)
     estimator = new_estimator(told, cell)
-    clock = Clock(wall=lambda: WALL_S + now_s, monotonic=lambda: now_s)
+    clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
     publisher = Publisher(
         told, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
     )
