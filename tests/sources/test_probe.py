@@ -1,22 +1,19 @@
 """Who is on a port is found without doing harm: devices of all protocols are asked by questions alone."""
 
-import asyncio
 import os
-import threading
 import tty
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SimulatedBms
-from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
+from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources import probe
 from bms_estimator.sources.dialects import daly, jbd, jk, junctek
 from bms_estimator.sources.dialects.pylontech import PylontechDialect
 from bms_estimator.sources.probe import Found
+from tests.device_line import on_a_line
 from tests.patience import LONG_S
 
 
@@ -31,32 +28,6 @@ def steady(_: float) -> Reading:
 
 def bms(name: str) -> SimulatedBms:
     return SimulatedBms(name, steady, cells=8)
-
-
-@contextmanager
-def on_a_line(device: SimulatedMeter) -> Iterator[str]:
-    """Path of the line of a device that speaks, in a thread of its own."""
-
-    async def speak() -> None:
-        nonlocal loop, stop
-        loop, stop = asyncio.get_running_loop(), asyncio.Event()
-        speaking = asyncio.create_task(device.run())
-        ready.set()
-        await stop.wait()
-        speaking.cancel()
-        await asyncio.gather(speaking, return_exceptions=True)
-
-    loop, stop, ready = asyncio.new_event_loop(), asyncio.Event(), threading.Event()
-    loop.close()
-    with device:
-        thread = threading.Thread(target=lambda: asyncio.run(speak()))
-        thread.start()
-        assert ready.wait(LONG_S)
-        try:
-            yield device.path
-        finally:
-            loop.call_soon_threadsafe(stop.set)
-            thread.join(LONG_S)
 
 
 @pytest.mark.parametrize("name", [name for name in BMS_ANSWERS if name != "jk-pb"])
