@@ -160,7 +160,7 @@ async def test_floats_that_are_no_numbers_are_no_samples_until_they_are() -> Non
 async def test_samples_are_positive_on_discharge_and_come_again_after_the_device_was_away() -> None:
     registers, port = victron(), free_port()
     told = {"kind": "modbus", "profile": "victron-gx", "host": "127.0.0.1", "tcp_port": port, "unit": UNIT}
-    settings = Settings.model_validate({"source": told | {"poll_s": 0.02, "timeout_s": 5.0}})
+    settings = Settings.model_validate({"source": told | {"poll_s": 0.02, "timeout_s": 1.0}})
     assert settings.sensor.voltage_resolution_v == 0.01
     source = open_reports(settings)
     assert source is not None
