@@ -36,6 +36,19 @@ BO_ 2566848512 Other: 8 BMS
 """Made for these tests: big and little endian, a multiplexer, an identifier of 29 bits."""
 
 
+@pytest.fixture(scope="module")
+def named(tmp_path_factory: pytest.TempPathFactory) -> CanSource:
+    path = tmp_path_factory.mktemp("dbc") / "pack.dbc"
+    path.write_text(DBC)
+    return source(
+        dbc=str(path),
+        voltage={"signal": "PackVoltage"},
+        current={"signal": "Pack.PackCurrent"},
+        temperature={"signal": "Temp"},
+        cells=[{"signal": "Cell{}", "count": 3, "scale": 0.001}],
+    )
+
+
 def source(**told: object) -> CanSource:
     return CanSource.model_validate({"kind": "can"} | told)
 
@@ -65,6 +78,13 @@ def test_no_frames_make_it_raise(frames: list[tuple[int, bool, bytes]]) -> None:
     for identifier, extended, data in frames:
         reading = map_.feed(0.0, identifier, extended, data)
         assert (reading is not None) == ((identifier, extended) == (0x356, False) and len(data) >= 4)
+
+
+@given(st.lists(st.tuples(st.sampled_from([0x500, 0x501]), st.binary(max_size=64)), max_size=20))
+def test_no_frames_make_signals_of_a_dbc_file_raise(named: CanSource, frames: list[tuple[int, bytes]]) -> None:
+    map_ = CanMap(named)
+    for identifier, data in frames:
+        map_.feed(0.0, identifier, False, data)
 
 
 def test_a_known_bus_is_read() -> None:
@@ -128,16 +148,8 @@ def dbc(tmp_path: Path) -> Path:
     return path
 
 
-def test_signals_by_their_names_in_a_dbc_file(dbc: Path) -> None:
-    map_ = CanMap(
-        source(
-            dbc=str(dbc),
-            voltage={"signal": "PackVoltage"},
-            current={"signal": "Pack.PackCurrent"},
-            temperature={"signal": "Temp"},
-            cells=[{"signal": "Cell{}", "count": 3, "scale": 0.001}],
-        )
-    )
+def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
+    map_ = CanMap(named)
     assert set(map_.places) == {Place(0x500, False), Place(0x501, False), Place(0x18FF0000, True)}
     assert map_.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
     assert map_.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
