@@ -1,11 +1,11 @@
 """The settings of one pack: what ``pack.toml`` holds. Values are SI, the unit stands in the key."""
 
-import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
 
+from bms_estimator.model.broker_url import of_brokers
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
@@ -150,25 +150,12 @@ class PublishSettings(Strict):
     rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="snapshots per second")
 
 
-def _of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
-    """Addresses as they must be."""
-    urls = (value,) if isinstance(value, str) else value
-    if not urls:
-        raise ValueError("must name a broker")
-    for url in urls:
-        if "@" in url:
-            raise ValueError("a name goes to mqtt.username, a password to a file that mqtt.password_file names")
-        if not re.fullmatch(r"mqtts?://[^/\s]+", url):
-            raise ValueError("must be mqtt://host:port")
-    return value
-
-
 class MqttSettings(Strict):
     """The broker, and what others may have done over it."""
 
     model_config = ConfigDict(hide_input_in_errors=True)
 
-    url: Annotated[str | tuple[str, ...], AfterValidator(_of_brokers)] = Field(
+    url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] = Field(
         default="mqtt://localhost:1883",
         description="mqtt://host:port or mqtts://host:port for TLS; or a list of them, tried in turn",
     )

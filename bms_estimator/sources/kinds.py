@@ -8,6 +8,7 @@ from bms_estimator.sources import Tap
 from bms_estimator.sources.reports import Bringer, Reports
 
 KINDS: Mapping[str, str] = {
+    "mqtt": "mqtt_reports",
     "linux": "linux_sensor",
 }
 """By ``source.kind``: a module of this package whose ``bringer(settings)`` makes what brings the values."""
