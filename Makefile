@@ -7,15 +7,17 @@ READY   := $(VENV)/.ready
 COMPARE := .venv-compare
 AUDIT   := .venv-audit
 ARGS    ?=
+HOME_ASSISTANT ?= 2025.2.5
+HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels lock
+.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels payloads lock
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z0-9]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 venv: $(READY) ## the environment in .venv, from the hash-locked list
 
@@ -41,6 +43,10 @@ demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--
 
 nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)
+
+home-assistant: apt venv ## tests with the real Home Assistant, which is made first, once: two minutes
+	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)"
+	HOME_ASSISTANT=$(HOME_ASSISTANT) $(BIN)/python -m pytest -n0 tests/home_assistant $(ARGS)
 
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)
@@ -89,6 +95,9 @@ simulate: venv ## the whole service simulated: make simulate SEED=5, or many, e.
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
 	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
+
+payloads: venv ## remember what is published now; refuses what readers would miss in the same version
+	@$(BIN)/python -m tests.sinks.payload_record
 
 kernels: venv
 	$(BIN)/python -c 'from bms_estimator.service.warm_up import load_kernels; load_kernels()'

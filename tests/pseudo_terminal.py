@@ -51,6 +51,9 @@ class PseudoTerminal:
     def resize(self, columns: int, rows: int) -> None:
         fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("4H", rows, columns, 0, 0))
 
+    def press(self, keys: bytes) -> None:
+        os.write(self._master, keys)
+
     def read(self) -> None:
         """Take what has come, or wait a little for it."""
         if select.select([self._master], [], [], 0.1)[0]:

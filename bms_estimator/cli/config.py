@@ -12,6 +12,7 @@ from bms_estimator.estimator.lemma import Condition, failed
 from bms_estimator.estimator.plausible import implausible
 from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels.margins import delta
+from bms_estimator.model.alarm_limits import out_of_range, watched
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
@@ -43,7 +44,7 @@ def init(file: PackFile = Path("pack.toml")) -> None:
 def check(file: PackFile = Path("pack.toml")) -> None:
     """Check a settings file and its cell file; name what is wrong, warn of what will not work well."""
     settings, cell = load_pack(file)
-    warnings = [*implausible(settings, cell), *_lemma(cell)]
+    warnings = [*implausible(settings, cell), *out_of_range(settings, cell), *_lemma(cell)]
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
@@ -87,6 +88,8 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         follows["pack.capacity_ah"] = cell.cell.capacity_ah
         follows["observer.delta_1"] = delta(a[8], a[9], a[7])  # (2.11)
         follows["observer.delta_2"] = delta(a[11], a[12], a[10])  # (2.12)
+    for alarm in watched(settings, cell):
+        follows[f"alarms.{alarm.name}.limit"], follows[f"alarms.{alarm.name}.clear"] = alarm.limit, alarm.clear
     return follows
 
 

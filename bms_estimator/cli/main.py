@@ -29,11 +29,13 @@ class Entry(NamedTuple):
 
 COMMANDS = {
     "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
+    "top": Entry("bms_estimator.cli.top:top", "All packs of a broker at a glance."),
     "replay": Entry("bms_estimator.cli.replay:replay", "Estimate from a recorded capture or a table."),
     "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),
     "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
     "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
     "board": Entry("bms_estimator.cli.board:board", "Show a board, set its bandgap, gains and serial number."),
+    "dashboard": Entry("bms_estimator.cli.dashboard:dashboard", "The live page of all packs of a broker."),
     "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
     "ocv": Entry(
         "bms_estimator.cli.ocv:ocv", "Open-circuit voltage from rests, slow curves or given curves, into a cell file."
@@ -46,10 +48,21 @@ COMMANDS = {
     "history": Entry("bms_estimator.cli.history:history", "What the service kept of a pack, by the minute, as CSV."),
     "validate": Entry("bms_estimator.cli.validate:validate_command", "A cell's model against a capture, open loop."),
     "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
+    "asyncapi": Entry("bms_estimator.cli.asyncapi:asyncapi", "What is published, as an AsyncAPI document."),
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
 }
 
-EXTRAS = {"pyarrow": "parquet", "amqtt": "demo", "matplotlib": "report"}
+EXTRAS = {
+    "pyarrow": "parquet",
+    "amqtt": "demo",
+    "matplotlib": "report",
+    "prometheus_client": "prometheus",
+    "pymodbus": "modbus",
+    "can": "can",
+    "cantools": "can",
+    "aiobmsble": "ble",
+    "bleak": "ble",
+}
 """Optional package -> the extra that brings it."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """What a disk that is full or broken says. It may have room again: systemd is to start a service anew that ends so."""

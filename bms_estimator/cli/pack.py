@@ -93,7 +93,7 @@ def with_sensor(settings: Settings, **changes: object) -> Settings:
         raise UserError(
             f"{', '.join(given)}: the settings have a [source] that is no serial line; take it away, or this"
         )
-    sensor = SensorSettings.model_validate(settings.sensor.model_dump() | given)
+    sensor = SensorSettings.model_validate(settings.sensor.model_dump(exclude_unset=True) | given)
     return settings.model_copy(update={"sensor": sensor})
 
 

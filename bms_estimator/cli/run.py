@@ -23,7 +23,7 @@ from bms_estimator.service.reload import Reload, ask_all, reload_on_hangup
 from bms_estimator.service.serve import serve, state_folder
 from bms_estimator.service.several import serve_several
 from bms_estimator.service.warm_up import load_kernels
-from bms_estimator.sinks.console import ConsoleSink
+from bms_estimator.sinks.console_sink import ConsoleSink
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 

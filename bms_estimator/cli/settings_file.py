@@ -43,6 +43,9 @@ def _value(field: FieldInfo) -> str:
     if get_origin(field.annotation) is Literal and field.is_required():
         return f'"{get_args(field.annotation)[0]}"'
     default = None if field.is_required() else field.get_default(call_default_factory=True)
+    if isinstance(default, BaseModel):
+        values, default = default.model_dump(exclude_none=True), tomlkit.inline_table()
+        default.update(values)
     return "" if default is None else tomlkit.item(default).as_string()
 
 

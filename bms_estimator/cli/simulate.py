@@ -2,14 +2,16 @@
 
 import asyncio
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from bms_estimator.cli.captures import CELL_HELP, CapacityAh
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
+from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
@@ -31,6 +33,10 @@ def simulate(
         int, typer.Option(parser=whole(1, 1000), help="samples per second until the host asks for others")
     ] = RATE_HZ_AT_RESET,
     text: Annotated[bool, typer.Option("--text", help="print text lines, as hobby sketches do")] = False,
+    protocol: Annotated[
+        str | None,
+        typer.Option(help=f"be another device, as sensor.protocol names it: {', '.join(METERS)}", show_default=False),
+    ] = None,
     noise_lsb: Annotated[float, typer.Option(parser=decimal(0.0), help="of its converter, in steps")] = 0.5,
     speed: Annotated[float, typer.Option(parser=decimal(1e-3), help="its seconds per second")] = 1.0,
     seconds: Annotated[
@@ -46,14 +52,19 @@ def simulate(
     model = load_cell(cell, capacity_ah).pack(series, 1)
     ampere = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
     pack = SimulatedPack(model, LOADS[load](ampere, seed), soc=soc)
-    board = VirtualBoard(
-        pack, rate_hz=rate_hz, mode="text" if text else "binary", speed=speed, noise_lsb=noise_lsb, seed=seed
-    )
+    board: VirtualBoard | SimulatedMeter
+    if protocol is None:
+        mode: Literal["binary", "text"] = "text" if text else "binary"
+        board = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)
+    elif protocol in METERS:
+        board = METERS[protocol](pack, speed)
+    else:
+        raise UserError(f"--protocol {protocol}: must be one of {', '.join(METERS)}")
     asyncio.run(_serve(board, seconds))
     typer.echo(f"{board.samples:,} samples in {board.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
 
 
-async def _serve(board: VirtualBoard, seconds: float) -> None:
+async def _serve(board: VirtualBoard | SimulatedMeter, seconds: float) -> None:
     """Until ``seconds`` are over, or SIGINT or SIGTERM."""
     stop = stop_on_signal()
     with board:

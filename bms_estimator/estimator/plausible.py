@@ -90,7 +90,7 @@ def _single_row(settings: Settings, cell: CellModel) -> str | None:
 def _range(settings: Settings, highest_v: float, when: str) -> str | None:
     sensor = settings.sensor
     range_v = CONVERTER_STEPS * sensor.voltage_resolution_v
-    if sensor.protocol == "text" or highest_v <= range_v:
+    if sensor.protocol != "binary" or highest_v <= range_v:
         return None
     return (
         f"sensor.voltage_resolution_v = {sensor.voltage_resolution_v:.4g}: the board's range ends at {range_v:.1f} V, "

@@ -8,11 +8,17 @@ from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
+PAYLOAD_VERSION = 1
+"""Of all that is published; ``sinks/payloads.py`` says when it goes up."""
+
 
 class Report(BaseModel):
     """Base of all published values."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+_COUNTED = "at the terminals over all runs, up to the last checkpoint where there is one; it never decreases"
 
 
 class Estimate(Report):
@@ -27,6 +33,11 @@ class Estimate(Report):
     temperature_c: float | None = Field(description="temperature [C], mean; null without a sensor")
     cell_lowest_v: float | None = Field(description="lowest voltage of a single cell [V], last; null without any")
     cell_highest_v: float | None = Field(description="highest voltage of a single cell [V], last; null without any")
+    cell_lowest: int | None = Field(description="which cell that is, from 1")
+    cell_highest: int | None = Field(description="which cell that is, from 1")
+    cells_v: list[float | None] | None = Field(
+        description="voltages of single cells [V], last; null where one is not known, and without any"
+    )
     soc: float | None = Field(description="state of charge, 0..1; null of a fuel cell, as all that follows from it")
     soc_percent: float | None = Field(description="state of charge [%]")
     soc_std: float | None = Field(description="standard deviation of soc; null without the identifier")
@@ -36,6 +47,12 @@ class Estimate(Report):
     usable_capacity_ah: float | None = Field(description="charge down to max(delta_1, delta_2) [Ah]")
     remaining_energy_wh: float | None = Field(description="energy at the terminals down to SOC 0 at current_a [Wh]")
     time_to_empty_s: float | None = Field(description="down to SOC 0 at current_a [s]; null unless it discharges")
+    time_to_full_s: float | None = Field(description="up to SOC 1 at current_a [s]; null unless it charges")
+    charge_out_ah: float = Field(description=f"discharged {_COUNTED} [Ah]")
+    charge_in_ah: float = Field(description=f"charged {_COUNTED} [Ah]")
+    energy_out_kwh: float = Field(description=f"discharged {_COUNTED} [kWh]")
+    energy_in_kwh: float = Field(description=f"charged {_COUNTED} [kWh]")
+    equivalent_cycles: float | None = Field(description="charge_out_ah over the rated capacity; null of a fuel cell")
     voltage_estimate_v: float | None = Field(description="the observer's terminal voltage [V]")
     innovation_v: float | None = Field(description="measured less predicted voltage before the correction [V]")
     tracking_error_v: float | None = Field(description="the observer's e (3.15) [V]")
@@ -118,6 +135,10 @@ class Totals(Report):
     crashes: int = Field(description="starts after a run that had not ended cleanly: a fault, a kill, a power cut")
     samples: dict[str, int] = Field(description="samples accepted and dropped by kind")
     unseen_s: float = Field(description="in gaps and between runs, as far as its length was known [s]")
+    charge_out_ah: float = Field(default=0.0, description="discharged at the terminals [Ah]")
+    charge_in_ah: float = Field(default=0.0, description="charged [Ah]")
+    energy_out_kwh: float = Field(default=0.0, description="discharged [kWh]")
+    energy_in_kwh: float = Field(default=0.0, description="charged [kWh]")
 
 
 class Health(Report):
@@ -169,6 +190,9 @@ class Info(Report):
 
     device: str
     version: str = Field(description="of bms_estimator")
+    payload_version: int = Field(
+        description="of what is published: goes up when a field vanishes or gets another type, unit or meaning"
+    )
     started: str = Field(description="ISO 8601, UTC")
     cell: str
     capacity_ah: float | None = Field(description="null of a fuel cell")

@@ -22,6 +22,8 @@ Name = Literal[
     "suspicion_cleared",
     "checkpoint_fails",
     "checkpoint_saved",
+    "alarm_raised",
+    "alarm_cleared",
 ]
 
 
@@ -51,13 +53,29 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
         found = [started, *_unseen(health.unseen_s or 0.0), *_sensor(None, health)]
         found += [*_suspicions([], health.suspects), *_checkpoint("", health)]
     elif before.health is health:
-        return []
+        found = []
     else:
         was = before.health
         unseen = _unseen(health.total.unseen_s - was.total.unseen_s)
         found = [*unseen, *_sensor(was, health), *_suspicions(was.suspects, health.suspects)]
         found += _checkpoint(was.checkpoint, health)
-    return [Event(time=health.publish_time, name=name, text=text) for name, text in found]
+    of_health = [Event(time=health.publish_time, name=name, text=text) for name, text in found]
+    seen = snapshot.estimate.publish_time if snapshot.estimate else health.publish_time
+    return of_health + [Event(time=seen, name=name, text=text) for name, text in _alarms(before, snapshot)]
+
+
+def _alarms(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Found]:
+    """Those that were raised or ended. One that ended and came again in between has another ``since``.
+
+    What was raised before the start has been told of by the run before.
+    """
+    was = {alarm.name: alarm.since for alarm in before.alarms} if before else {}
+    for alarm in snapshot.alarms:
+        since = was.get(alarm.name)
+        if since is not None and since != alarm.since:
+            yield _Found("alarm_cleared", alarm.name)
+        if alarm.since is not None and since != alarm.since and alarm.since >= snapshot.info.started:
+            yield _Found("alarm_raised", f"{alarm.name}: {alarm.text}")
 
 
 def _unseen(unseen_s: float) -> Iterator[_Found]:

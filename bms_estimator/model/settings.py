@@ -3,17 +3,24 @@
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
+from bms_estimator.model.alarm_settings import AlarmSettings
 from bms_estimator.model.broker_url import of_brokers
+from bms_estimator.model.export_settings import InfluxSettings, PrometheusSettings
+from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.model.resolution import RESOLUTIONS
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Command = Literal["set_soc", "current_zero"]
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate"]
 """A request that changes something."""
+LEAST_RATE_HZ, MOST_RATE_HZ = 0.1, 10.0
+"""Of publications."""
 LogLevel = Literal["info", "warning", "error"]
 DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
 DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
@@ -35,8 +42,13 @@ class PackSettings(Strict):
     initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
 
 
-_OWN_PACE_S = {"text": 1.0}
-"""By protocol: boards that print at their own pace are taken to do so at this [s]."""
+def _filled(sensor: dict[str, object]) -> dict[str, object]:
+    """The table ``[sensor]`` with what it leaves out, as ``RESOLUTIONS`` has it of the device."""
+    protocol = sensor.get("protocol")
+    if not isinstance(protocol, str) or protocol not in RESOLUTIONS:
+        return sensor
+    declared = vars(RESOLUTIONS[protocol])
+    return {name: value for name, value in declared.items() if value is not None} | sensor
 
 
 class SensorSettings(Strict):
@@ -50,27 +62,62 @@ class SensorSettings(Strict):
         description='the only board that is taken, as `bms-estimator board` shows its number, such as "0000002a"; '
         "the first that came, which is remembered, when left out",
     )
-    protocol: Literal["binary", "text"] = Field(default="binary", description="frames of the firmware, or text lines")
-    baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(default=500_000)
+    protocol: Literal["binary", "text", "jbd", "daly", "jk", "vedirect", "junctek", "pylontech"] = Field(
+        default="binary", description="frames of the firmware, text lines, or a BMS or meter by its name"
+    )
+    address: Annotated[int, Field(ge=0, le=255)] | None = Field(
+        default=None,
+        description="of several packs on one RS485 line, the one that is taken; the first that answers when left out",
+    )
+    baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
+        default=500_000, description="a device's own when left out"
+    )
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(default=100, description="asked of a binary board")
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
-        default="discharge_positive", description="what the board, or a table, calls positive; inside, discharge is"
+        default="discharge_positive",
+        description="what the board, or a table, calls positive; inside, discharge is; a device's own when left out",
     )
-    voltage_resolution_v: Positive = Field(default=25.0 / 1024, description="one step of the voltage converter")
+    voltage_resolution_v: Positive = Field(
+        default=25.0 / 1024, description="one step of the voltage converter; a device's own when left out"
+    )
     voltage_noise_v: NotNegative | None = Field(
         default=None, description="standard deviation of one voltage sample; half a step when left out"
     )
+    current_resolution_a: NotNegative | None = Field(
+        default=None, description="one step of the current; a device's own when left out, of a board as good as none"
+    )
+    current_dead_band_a: NotNegative | None = Field(
+        default=None, description="smaller currents are shown as 0; a device's own when left out, else none are"
+    )
+    period_s: Positive | None = Field(
+        default=None, description="between two samples, where they come at their own pace; a device's when left out"
+    )
+    delay_s: NotNegative | None = Field(
+        default=None, description="between the moments of voltage and current of one sample; a device's when left out"
+    )
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _as_the_device_does(cls, table: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        """What is left out is as the protocol has it, and does not count as set."""
+        if not isinstance(table, dict):
+            return validate(table)
+        made = validate(_filled(table))
+        made.model_fields_set.intersection_update(table)
+        return made
 
     @model_validator(mode="after")
-    def _text_has_no_serial(self) -> Self:
-        if self.serial and self.protocol == "text":
-            raise ValueError("serial: a board that prints text tells no serial number; leave it out")
+    def _only_boards_have_serials(self) -> Self:
+        if self.serial and self.protocol != "binary":
+            raise ValueError(
+                f"serial: only a binary board tells its number, and protocol is {self.protocol}; leave it out"
+            )
         return self
 
     @property
     def sample_period_s(self) -> float:
         """Between two samples [s]."""
-        return _OWN_PACE_S.get(self.protocol, 1.0 / self.sample_rate_hz)
+        return self.period_s or 1.0 / self.sample_rate_hz
 
 
 class ObserverSettings(Strict):
@@ -147,7 +194,9 @@ class IdentifierSettings(Strict):
 class PublishSettings(Strict):
     """How often what is estimated goes out."""
 
-    rate_hz: Annotated[float, Field(ge=0.1, le=10)] = Field(default=1.0, description="snapshots per second")
+    rate_hz: Annotated[float, Field(ge=LEAST_RATE_HZ, le=MOST_RATE_HZ)] = Field(
+        default=1.0, description="snapshots per second"
+    )
 
 
 class MqttSettings(Strict):
@@ -237,9 +286,14 @@ class Settings(Strict):
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
+    home_assistant: HomeAssistantSettings = HomeAssistantSettings()
+    influx: InfluxSettings | None = Field(default=None, description="leave out to write to none")
+    prometheus: PrometheusSettings | None = Field(default=None, description="leave out to listen nowhere")
+    page: PageSettings | None = Field(default=None, description="leave out to serve none")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()
+    alarms: AlarmSettings = AlarmSettings()
 
     @model_validator(mode="before")
     @classmethod

@@ -26,6 +26,7 @@ from bms_estimator.model.estimate import Totals
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.moment import Moment, moment
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.totals import new_totals
 from bms_estimator.store.disk_thread import DiskThread
 from bms_estimator.store.private_file import NotOursError, read_private, write_private
@@ -41,6 +42,8 @@ REFUSED = "refused: "
 """A reason that begins so tells why a file that was found is not taken up."""
 LATER = 4
 """So many files of a later format are kept for who goes back to the version that wrote them."""
+_OF_LEDGER = "restarts", "total", "clean", "alarms"
+"""Names in the file of what is in the ledger."""
 MOST = 1e15
 """No counter comes so far, nor do seconds: 30,000 years of 1,000 samples a second."""
 
@@ -86,11 +89,13 @@ class Ledger:
         restarts: Starts that found a checkpoint.
         total: What is counted over restarts.
         clean: The last of them has ended by itself; False while it runs.
+        alarms: Those that outlive a restart, as ``Alarms.kept``.
     """
 
     restarts: int
     total: Totals
     clean: bool = False
+    alarms: str = ""
 
 
 @dataclass(frozen=True)
@@ -157,7 +162,13 @@ class CheckpointFile:
     def _write(self, content: dict[str, Any], ledger: Ledger) -> None:
         packed = io.BytesIO()
         total = ledger.total.model_dump_json()
-        np.savez(packed, format=FORMAT, restarts=ledger.restarts, total=total, clean=ledger.clean, **content)
+        told: dict[str, Any] = {
+            "restarts": ledger.restarts,
+            "total": total,
+            "clean": ledger.clean,
+            "alarms": ledger.alarms,
+        }
+        np.savez(packed, format=FORMAT, **told, **content)
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         disk = os.statvfs(self.path.parent)
         self.disk_free_mib = disk.f_bavail * disk.f_frsize / 2**20
@@ -227,7 +238,7 @@ class CheckpointFile:
         if self._longest_days is not None and self._longest_days * DAY_S < unseen_s < math.inf:
             days = f"{unseen_s / DAY_S:.1f} days old"
             raise _RefusedError(f"it is {days}, state.longest_days is {self._longest_days:g}", ledger)
-        self._content = {name: v for name, v in file.items() if name not in ("format", "restarts", "total", "clean")}
+        self._content = {name: v for name, v in file.items() if name not in ("format", *_OF_LEDGER)}
         self._content |= {"identity": self._identity}
         if str(file["observer"]) != self._observer:
             kept, dropped = ("observer.soc", "observer.soc_coulomb", "observer.started"), ("observer.", "learning.")
@@ -261,20 +272,21 @@ def _ledger(file: Mapping[str, NDArray[Any]], now_s: float) -> Ledger:
 
 
 def _believable(file: Mapping[str, NDArray[Any]]) -> Ledger:
-    """The same, of any format that tells it, with what this version knows of.
+    """The same, of any format that tells it, with what this version knows of; what flowed before it was counted is 0.
 
     Raises:
         ArithmeticError, LookupError, TypeError, ValueError: It is damaged, or no counter can be so.
     """
     told = json.loads(str(file["total"]))
-    total = Totals.model_validate({name: told[name] for name in Totals.model_fields})
+    total = Totals.model_validate({name: told[name] for name in Totals.model_fields if name in told})
     datetime.fromisoformat(total.since)
     restarts, crashes = int(file["restarts"]) + 1, total.crashes + (not file["clean"])
     counted = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
+    counted |= Flow.of(total)._asdict()
     wrong = [f"{name} = {value}" for name, value in counted.items() if not 0 <= value <= MOST]
     if wrong:
         raise ValueError(", ".join(wrong))
-    return Ledger(restarts, total.model_copy(update={"crashes": crashes}))
+    return Ledger(restarts, total.model_copy(update={"crashes": crashes}), alarms=str(file.get("alarms", "")))
 
 
 File = dict[str, Any]

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import math
+import reprlib
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -16,7 +17,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
@@ -96,6 +97,7 @@ async def run_live(
         pulse=pulse,
         recording=recording,
     )
+    _restore_alarms(publisher, ledger.alarms)
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
     every_s = settings.state.checkpoint_s
@@ -218,6 +220,13 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clo
     return found.ledger, outcome
 
 
+def _restore_alarms(publisher: Publisher, kept: str) -> None:
+    try:
+        publisher.alarms.restore(kept)
+    except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
+        log.warning("the checkpoint's alarms cannot be: none is taken up", reason=str(error))
+
+
 def _soc_text(estimator: Estimator) -> str:
     soc = float(estimator.state["soc"][0])
     return "" if math.isnan(soc) else f": SOC {soc:.4f}"
@@ -274,5 +283,22 @@ def _offer(
         log.info("present current taken as zero on request")
         return {}
 
-    for handler in (state, parameters, health, set_soc, current_zero):
+    async def publish_rate(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        rate_hz, before = number(arguments, "rate_hz", LEAST_RATE_HZ, MOST_RATE_HZ), 1.0 / publisher.period_s
+        publisher.set_rate(rate_hz)
+        log.info("publish rate set on request", before=before, rate_hz=rate_hz)
+        return {"rate_hz": rate_hz, "before": before}
+
+    for handler in (state, parameters, health, set_soc, current_zero, publish_rate):
         requests.offer(handler.__name__, handler)
+    requests.offer("acknowledge_alarm", partial(_acknowledge_alarm, publisher))
+
+
+async def _acknowledge_alarm(publisher: Publisher, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Somebody knows of the alarm ``name``, or of all."""
+    name, watched = arguments.get("name"), publisher.alarms.names()
+    if name is not None and name not in watched:
+        raise UserError(f"name = {reprlib.repr(name)}: must be one of {', '.join(watched)}, or left out for all")
+    known = publisher.acknowledge(name)
+    log.info("alarms acknowledged on request", alarms=known)
+    return {"acknowledged": known}

@@ -9,6 +9,7 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.service.checkpoint import CheckpointFile, Ledger
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.snapshot.totals import Tally
 
@@ -52,17 +53,20 @@ class Saving:
         self.every_s = every_s
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
         self._tally, self._restarts = tally, restarts
+        self._alarms = publisher.alarms.kept  # as the disk has them
+        publisher.kept = tally.flow
         self._saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 
     async def save_often(self) -> None:
-        """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC`` or there is a first sample."""
+        """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC``, a latching alarm turns or a first sample is there."""
         await self._write(self._mark(clean=False))  # from now on a run that leaves no word has crashed
         loop = asyncio.get_running_loop()
         saved_s, failed = -math.inf, False
         while True:
             await asyncio.sleep(min(LOOK_S, self.every_s))
             moved = self._saved is None or abs(self._estimator.state["soc"][0] - self._saved[1]) >= SAVED_SOC
+            moved = moved or self._alarms != self._publisher.alarms.kept
             if loop.time() >= saved_s + self.every_s or (moved and not failed):
                 failed = not await self._save()
                 saved_s = loop.time()
@@ -86,13 +90,16 @@ class Saving:
 
         What is saved already keeps its time: it would seem to be of now, and not of before nobody measured.
         """
-        taught = self._taught
+        taught, ledger = self._taught, self._ledger(clean=clean)
         if not taught[0] or taught == self._saved:
-            return not clean or await self._write(self._mark(clean=clean))
-        state, ledger = self._estimator.record.copy(), self._ledger(clean=clean)
-        if not await self._write(lambda: self._checkpoint.save(state, ledger)):
+            if clean or self._alarms != ledger.alarms:
+                return await self._write_with(ledger, lambda: self._checkpoint.mark(ledger))
+            return True
+        state = self._estimator.record.copy()
+        if not await self._write_with(ledger, lambda: self._checkpoint.save(state, ledger)):
+            self._publisher.kept = None
             return False
-        self._publisher.checkpoint, self._saved = "saved", taught
+        self._publisher.checkpoint, self._saved, self._publisher.kept = "saved", taught, Flow.of(ledger.total)
         return True
 
     def _mark(self, *, clean: bool) -> Callable[[], None]:
@@ -100,7 +107,14 @@ class Saving:
         return lambda: self._checkpoint.mark(ledger)
 
     def _ledger(self, *, clean: bool) -> Ledger:
-        return Ledger(self._restarts, self._tally.total, clean)
+        return Ledger(self._restarts, self._tally.total, clean, self._publisher.alarms.kept)
+
+    async def _write_with(self, ledger: Ledger, write: Callable[[], None]) -> bool:
+        """As ``_write``; then the disk has the alarms, too."""
+        written = await self._write(write)
+        if written:
+            self._alarms = ledger.alarms
+        return written
 
     async def _write(self, write: Callable[[], None]) -> bool:
         """Have the disk take something. False: it does not."""

@@ -11,10 +11,12 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
+from bms_estimator.model.alarm_limits import out_of_range
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.page.sink import Pages, PageSink
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
@@ -23,6 +25,7 @@ from bms_estimator.service.logs import set_level
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
 from bms_estimator.sinks import Delivery, Sink
+from bms_estimator.sinks.influx import InfluxSink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources import Tap
@@ -47,6 +50,7 @@ async def serve(
     folder: Path | None = None,
     notifier: Notifier | None = None,
     reload: Reload | None = None,
+    pages: Pages | None = None,
 ) -> Estimator:
     """Run until SIGINT or SIGTERM.
 
@@ -59,6 +63,7 @@ async def serve(
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
         reload: Where is offered what can be changed while it runs.
+        pages: The live pages of this process.
 
     Returns:
         The estimator as the last sample left it.
@@ -68,11 +73,11 @@ async def serve(
     """
     stop = stop_on_signal(stop)
     set_level(settings.pack.name, settings.log.level)
-    for line in implausible(settings, cell):
+    for line in [*implausible(settings, cell), *out_of_range(settings, cell)]:
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
-    all_sinks = list(sinks)
+    all_sinks = [*sinks, *export_sinks(settings)]
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = BoardMemory(folder, settings.pack.name) if folder else None
     source = open_reports(settings, tap=tap) or SerialBoard(settings.sensor, tap=tap, memory=memory)
@@ -83,9 +88,19 @@ async def serve(
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
     if settings.mqtt is not None:
-        period_s = settings.sample_period_s
-        mqtt = MqttSink(settings.mqtt, settings.pack.name, requests, delivery, outbox, sample_period_s=period_s)
+        mqtt = MqttSink(
+            settings.mqtt,
+            settings.pack.name,
+            requests,
+            delivery,
+            outbox,
+            sample_period_s=settings.sample_period_s,
+            home_assistant=settings.home_assistant,
+        )
         all_sinks.append(mqtt)
+    if settings.page is not None:
+        history = database.path if database and settings.store.history_days else None
+        all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
@@ -108,6 +123,21 @@ async def serve(
             pulse=source.pulse,
             recording=partial(recording_health, tap),
         )
+
+
+def export_sinks(settings: Settings) -> list[Sink]:
+    """Where values go beside the broker.
+
+    Raises:
+        UserError: A file of the settings cannot be used.
+        ModuleNotFoundError: The optional package that one needs is not installed.
+    """
+    found: list[Sink] = [InfluxSink(settings.influx)] if settings.influx else []
+    if settings.prometheus:
+        from bms_estimator.sinks.prometheus import PrometheusSink  # noqa: PLC0415 - needs an optional package
+
+        found.append(PrometheusSink(settings.prometheus))
+    return found
 
 
 def recording_health(tap: Tap | None) -> RecordingHealth | None:

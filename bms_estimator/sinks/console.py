@@ -1,51 +1,79 @@
-"""The live view: a screen on a terminal, one line for each publication elsewhere, drawn by a thread of its own."""
+"""The live view: a screen on a terminal, a line for each state elsewhere, drawn by a thread of its own."""
 
 import asyncio
 import io
 import os
 import sys
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterable
-from typing import IO, Self, cast
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import IO, Self, TypeVar, cast
 
 from rich.console import Console
 from rich.live import Live
 
-from bms_estimator.model.estimate import Estimate, Snapshot
-from bms_estimator.sinks.console_view import Scene, View, line
+from bms_estimator.sinks.console_line import line
+from bms_estimator.sinks.console_scene import Lost, Pack, Scene
+from bms_estimator.sinks.console_view import View
+from bms_estimator.sinks.fields import Fields
+from bms_estimator.sinks.published import Device, Heard
 
 REDRAW_S = 0.25
 """A screen is drawn no more often than this, whatever the publish rate [s]."""
 HISTORY = 256
 """Publications that the curves of voltage and current remember: the width of a very wide screen."""
 WAITING_LINES = 1000
-"""So many lines wait for a pipe that nobody reads; then the oldest goes. Of screens only the newest is worth waiting."""
+"""So many lines wait for a pipe that nobody reads; then the oldest goes."""
 END_LINES = 4
 """Below the view that stays there is room for what is said in the end, and for the prompt."""
 CLOSE_S = 2.0
 """For so long the last view waits for a terminal that takes none [s]."""
 
 
-class ConsoleSink:
-    """Shows snapshots on standard output. However long that is blocked, ``publish`` returns at once.
+T = TypeVar("T")
+
+
+@dataclass
+class Curves:
+    """Of one pack."""
+
+    voltage_v: deque[float] = field(default_factory=lambda: deque(maxlen=HISTORY))
+    current_a: deque[float] = field(default_factory=lambda: deque(maxlen=HISTORY))
+
+
+class LiveView:
+    """Shows what packs publish on standard output. However long that is blocked, no call here waits for it.
 
     Args:
+        devices: What each pack published last.
         log: Log lines to show below, the last ones; the screen hides what others write.
         hint: A line that stays at the foot of the screen.
         true_soc: The pack's SOC 0..1 at the last sample, where somebody knows it: a simulation does.
+        lost: Since when there is no broker, where one is needed.
+        first: The pack that is shown first, where it is there.
+        wall: Wall clock, seconds since 1970.
     """
 
     def __init__(
-        self, *, log: Iterable[str] = (), hint: str = "", true_soc: Callable[[], float | None] | None = None
+        self,
+        devices: Mapping[str, Device],
+        *,
+        log: Iterable[str] = (),
+        hint: str = "",
+        true_soc: Callable[[], float | None] = lambda: None,
+        lost: Callable[[], Lost | None] = lambda: None,
+        first: str = "",
+        wall: Callable[[], float] = time.time,
     ) -> None:
         self._console = Console(file=cast("IO[str]", _Stdout()))
         self._terminal = self._console.is_terminal
-        self._log, self._hint, self._true_soc = log, hint, true_soc
-        self._latest: Estimate | None = None
-        self._voltage_v: deque[float] = deque(maxlen=HISTORY)
-        self._current_a: deque[float] = deque(maxlen=HISTORY)
-        self._waiting: deque[Scene] = deque(maxlen=1 if self._terminal else WAITING_LINES)
+        self._devices, self._log, self._hint, self._wall = devices, log, hint, wall
+        self._true_soc, self._lost, self._selected = true_soc, lost, first
+        self._curves: dict[str, Curves] = {}
+        self._scene: deque[Scene] = deque(maxlen=1)  # only the newest is worth waiting
+        self._lines: deque[str] = deque(maxlen=WAITING_LINES)
         self._due, self._closing = threading.Event(), threading.Event()
         self._error: OSError | None = None
         # one that is stuck in a write must not keep the process alive
@@ -63,30 +91,65 @@ class ConsoleSink:
         self._due.set()
         await asyncio.to_thread(self._thread.join, CLOSE_S)
 
-    def publish(self, snapshot: Snapshot) -> None:
-        """Show a snapshot.
+    def hear(self, heard: Heard) -> None:
+        """Take a message of a pack, which ``devices`` holds already; without a screen it may be a line."""
+        if heard.device not in self._devices:
+            self._curves.pop(heard.device, None)
+        elif heard.topic == "state":
+            self._remember(heard)
+        if not self._terminal and (text := line(heard, self._true_soc())) is not None:
+            self._lines.append(text)
+
+    def show(self) -> None:
+        """Have drawn what there is now.
 
         Raises:
             OSError: Standard output could not be written: nobody reads it any more, or its disk is full.
         """
         if self._error is not None:
             raise self._error
-        if snapshot.estimate is not None:
-            self._latest = snapshot.estimate
-            self._voltage_v.append(snapshot.estimate.voltage_v)
-            self._current_a.append(snapshot.estimate.current_a)
-        self._waiting.append(self._scene(snapshot))
+        if self._terminal:
+            self._scene.append(self._scene_now())
         self._due.set()
 
-    def _scene(self, snapshot: Snapshot) -> Scene:
+    def select(self, step: int) -> None:
+        """Show another pack: the next (1), the one before (-1)."""
+        names = list(self._devices)
+        if names:
+            at = names.index(self._selected) if self._selected in names else 0
+            self._selected = names[(at + step) % len(names)]
+        self.show()
+
+    def _remember(self, heard: Heard) -> None:
+        curves = self._curves.setdefault(heard.device, Curves())
+        state = Fields(heard.payload)
+        voltage_v, current_a = state.number("voltage_v"), state.number("current_a")
+        if voltage_v is not None and current_a is not None:
+            curves.voltage_v.append(voltage_v)
+            curves.current_a.append(current_a)
+
+    def _scene_now(self) -> Scene:
+        """A copy: the drawing thread must not see what changes."""
+        now_s, lost = self._wall(), self._lost()
+        packs = [
+            Pack(name, dict(device.topics), max(device.heard_s.values()), now_s, lost)
+            for name, device in self._devices.items()
+        ]
+        shown = next((pack for pack in packs if pack.device == self._selected), None)
+        shown = shown or (packs[0] if packs else Pack(now_s=now_s, lost=lost))
+        curves = self._curves.get(shown.device, Curves())
         return Scene(
-            snapshot=snapshot,
-            latest=self._latest,
-            voltage_v=tuple(self._voltage_v),
-            current_a=tuple(self._current_a),
+            shown.device,
+            shown.topics,
+            shown.heard_s,
+            now_s,
+            lost,
+            packs=packs,
+            voltage_v=tuple(curves.voltage_v),
+            current_a=tuple(curves.current_a),
             log=tuple(self._log),
             hint=self._hint,
-            true_soc=self._true_soc() if self._true_soc else None,
+            true_soc=self._true_soc(),
         )
 
     def _work(self) -> None:
@@ -104,25 +167,25 @@ class ConsoleSink:
         with Live(
             console=self._console, auto_refresh=False, screen=True, redirect_stdout=False, redirect_stderr=False
         ) as live:
-            for scene in self._scenes():
+            for scene in self._taken(self._scene):
                 live.update(View(scene), refresh=True)
                 self._closing.wait(REDRAW_S)
         if scene is not None:
             self._console.print(View(scene), height=max(self._console.height - END_LINES, 1))
 
     def _write_lines(self) -> None:
-        for scene in self._scenes():
-            self._console.file.write(line(scene) + "\n")
+        for text in self._taken(self._lines):
+            self._console.file.write(text + "\n")
 
-    def _scenes(self) -> Iterable[Scene]:
+    def _taken(self, waiting: deque[T]) -> Iterable[T]:
         """What waits, until all is closed and nothing waits any more."""
         ended = False
         while not ended:
             self._due.wait()
             self._due.clear()
             ended = self._closing.is_set()
-            while self._waiting:
-                yield self._waiting.popleft()
+            while waiting:
+                yield waiting.popleft()
 
 
 class _Stdout(io.TextIOBase):

@@ -20,6 +20,10 @@ class Flow:
     def __init__(self, *texts: Text) -> None:
         self._texts = texts
 
+    def is_empty(self) -> bool:
+        """Whether there is no text at all."""
+        return not self._texts
+
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Rich's protocol."""
         row = Text()

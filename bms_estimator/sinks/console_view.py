@@ -1,11 +1,10 @@
-"""How a snapshot looks on a terminal: pure functions from values to renderables.
+"""How what a pack published looks on a terminal: pure functions from payloads to renderables.
 
 A large terminal gets two columns of panels, on a smaller one everything flows in one. On a low screen the least
-important parts are left out: SOC with its band, voltage, current and what is wrong go last.
+important parts are left out: SOC with its band, voltage, current, alarms and what is wrong go last.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 
 from rich import box
@@ -14,8 +13,10 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from bms_estimator.model.estimate import Estimate, Health, Parameter, ParameterReport, Snapshot
+from bms_estimator.model.clock import iso_utc
 from bms_estimator.sinks.console_fit import Block, Flow, fitted
+from bms_estimator.sinks.console_scene import Scene
+from bms_estimator.sinks.fields import Fields
 
 WIDE_CELLS, WIDE_LINES = 76, 18
 """Two columns of panels need so much room."""
@@ -25,6 +26,10 @@ VALUE_CELLS = 8
 """Numbers change their length; columns must not dance."""
 SPARKS = "▁▂▃▄▅▆▇█"
 LOG_LINES = 2
+MOST_ALARMS = 4
+"""So many are shown in full."""
+MOST_PACKS = 8
+"""So many packs are listed, around the one that is shown."""
 NARROW_MARGIN = 0.05
 """A stability margin below is shown as a warning."""
 LOW_SOC = 0.2
@@ -49,43 +54,8 @@ ELEMENT_UNITS = {
 """Element -> name, factor and unit on the screen."""
 WORN = {"capacity": "capacity", "r_s": "R_s"}
 """What tells of wear -> name on the screen."""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """All that is shown at one moment."""
-
-    snapshot: Snapshot
-    """What was published last."""
-    latest: Estimate | None
-    """The last estimate there was; the snapshot's may be missing."""
-    voltage_v: Sequence[float] = ()
-    """Voltages of the last publications, oldest first."""
-    current_a: Sequence[float] = ()
-    """Currents of the same."""
-    log: Sequence[str] = ()
-    """Log lines, the last ones are shown; ANSI colours allowed."""
-    hint: str = ""
-    """The last line."""
-    true_soc: float | None = None
-    """SOC 0..1 of a simulated pack at the last sample."""
-
-
-def line(scene: Scene) -> str:
-    """One line for a file or a pipe."""
-    snapshot = scene.snapshot
-    e, device = snapshot.estimate, snapshot.info.device
-    if e is None:
-        return f"{snapshot.health.publish_time} {device}: {snapshot.health.sensor_message or 'no sample'}"
-    truth = "" if scene.true_soc is None else f"  true {100.0 * scene.true_soc:.2f} %"
-    return (
-        f"{e.time} {device}: soc {_number(e.soc_percent, '.2f')}{_band_text(e)} %{truth}  "
-        f"{e.voltage_v:.3f} V  {e.current_a:+.3f} A  {e.power_w:+.2f} W  margin {_number(e.stability_margin, '.4f')}  "
-        f"delta1 {_number(e.delta_1, '.4f')}  delta2 {_number(e.delta_2, '.4f')}  "
-        f"N {_number(e.nussbaum_gain, '.4f')}  k {_number(e.adaptive_gain_k, '.3g')}  "
-        f"innovation {_number(e.innovation_v, '+.2f', 1e3)} mV  {'lock' if e.lock else 'NO LOCK'}  "
-        f"{'converged' if e.converged else 'converging'}  frames {e.frames_received}  lost {e.frames_lost}"
-    )
+COUNTED = {"lock_losses": "lock losses", "reconnects": "reconnects"}
+"""Fault counter of the health -> name on the screen."""
 
 
 class View:
@@ -102,32 +72,48 @@ class View:
 
 def _blocks(scene: Scene, width: int, *, wide: bool) -> list[Block]:
     """The parts of the screen from top to bottom, each with its rank."""
-    snapshot, e = scene.snapshot, scene.latest
-    charge = _charge(scene, width - PANEL_CELLS if wide else width) if snapshot.info.capacity_ah is not None else []
-    health = Block(0, _health(snapshot.health, snapshot.parameters))
+    hint = Block(2, Text(scene.hint, style="cyan"))
+    packs = [Block(1, _packs(scene))] if len(scene.packs) > 1 else []
+    if not scene.device:
+        return [Block(0, _header(scene, wide=wide)), Block(0, Text("no pack has published anything yet")), hint]
+    state, health, parameters = scene.state, scene.health, scene.parameters
+    charge = [] if scene.has_no_charge else _charge(scene, width - PANEL_CELLS if wide else width)
+    wrong = [Block(0, _alarms(scene.alarms)), Block(0, _health(health, parameters))]
     below = [
-        Block(5, _observer(e)),
-        Block(6, _link(e, snapshot.health)),
+        Block(4, _cells(state)),
+        Block(5, _energy(state)),
+        Block(5, _observer(state)),
+        Block(6, _link(state, health)),
         Block(9, _log(scene.log)),
-        Block(2, Text(scene.hint, style="cyan")),
+        hint,
     ]
-    header, elements = Block(1, _header(snapshot, wide=wide)), _elements(snapshot.parameters.elements)
+    header, elements = Block(1, _header(scene, wide=wide)), _elements(parameters.fields("elements"))
     if not wide:
         sparks = Block(7, _sparks(scene, width))
-        return [header, *charge, Block(0, Flow(*_measured(e))), health, sparks, Block(8, elements), *below]
+        parts = [header, *packs, *charge, Block(0, Flow(*_measured(state))), *wrong, sparks, Block(8, elements), *below]
+        return _shown(parts)
     columns = Table.grid(expand=True)
     columns.add_column(ratio=1)
     columns.add_column(ratio=1)
-    left = Group(*_measured(e, VALUE_CELLS), _sparks(scene, width // 2 - PANEL_CELLS))
+    left = Group(*_measured(state, VALUE_CELLS), _sparks(scene, width // 2 - PANEL_CELLS))
     columns.add_row(_panel(left, "Measured"), _panel(elements, "Elements at this SOC" if charge else "Learned"))
     soc = [Block(0, _panel(Group(*(block.content for block in charge)), "State of charge"))] if charge else []
-    return [header, *soc, health, Block(0, columns), *below]
+    return _shown([header, *packs, *soc, *wrong, Block(0, columns), *below])
+
+
+def _shown(blocks: Sequence[Block]) -> list[Block]:
+    """Without those that have nothing to say."""
+    return [block for block in blocks if not (isinstance(block.content, Flow) and block.content.is_empty())]
 
 
 def _charge(scene: Scene, cells: int) -> list[Block]:
     """What a battery holds."""
-    e = scene.latest
-    return [Block(0, _soc(e, scene.true_soc)), Block(4, _bar(e, scene.true_soc, cells)), Block(3, _left(e))]
+    state = scene.state
+    return [
+        Block(0, _soc(state, scene.true_soc)),
+        Block(4, _bar(state, scene.true_soc, cells)),
+        Block(3, _left(state)),
+    ]
 
 
 def sparkline(values: Sequence[float], cells: int) -> str:
@@ -140,26 +126,46 @@ def sparkline(values: Sequence[float], cells: int) -> str:
     return "".join(SPARKS[round((value - low) * scale)] for value in shown)
 
 
-def _header(snapshot: Snapshot, *, wide: bool) -> RenderableType:
-    info, health = snapshot.info, snapshot.health
-    left = Text.assemble((f" {info.device} ", "bold reverse"), overflow="ellipsis")
-    if wide:
-        holds = "" if info.capacity_ah is None else f", {info.capacity_ah:.4g} Ah"
-        cells = f"{info.series_count} cell{'s' if info.series_count > 1 else ''}"
-        left += Text(f"  {info.cell}, {cells} in series, {info.nominal_voltage_v:.4g} V{holds}")
-    state = Text("● live", style="bold green") if health.sensor_online else Text("● stale", style="bold red")
+def _packs(scene: Scene) -> Table:
+    """All packs, a line each, around the one that is shown below."""
+    names = [pack.device for pack in scene.packs]
+    first = max(min(names.index(scene.device) - MOST_PACKS // 2, len(names) - MOST_PACKS), 0)
+    table = Table.grid(padding=(0, 2))
+    for pack in scene.packs[first : first + MOST_PACKS]:
+        here = pack.device == scene.device
+        stale, alarms = pack.stale, len(pack.alarms)
+        table.add_row(
+            Text(f"{'▸' if here else ' '} {pack.device}", style="bold" if here else ""),
+            f"{_number(pack.state.number('soc'), '.1%')}",
+            f"{_number(pack.state.number('voltage_v'), '.2f')} V",
+            f"{_number(pack.state.number('current_a'), '+.2f')} A",
+            Text("stale" if stale else "live", style="red" if stale else "green"),
+            Text(f"{alarms} alarm{'s' if alarms > 1 else ''}" if alarms else "", style="bold red"),
+        )
+    return table
+
+
+def _header(scene: Scene, *, wide: bool) -> RenderableType:
+    info = scene.info
+    left = Text.assemble((f" {scene.device or 'no pack'} ", "bold reverse"), overflow="ellipsis")
+    if wide and info:
+        capacity, series = info.number("capacity_ah"), info.count("series_count")
+        holds = "" if capacity is None else f", {capacity:.4g} Ah"
+        nominal = _number(info.number("nominal_voltage_v"), ".4g")
+        left += Text(f"  {info.text('cell')}, {series} cell{'s' if series > 1 else ''} in series, {nominal} V{holds}")
+    state = Text(f"● {scene.stale}", style="bold red") if scene.stale else Text("● live", style="bold green")
     row = Table.grid(expand=True)
     row.add_column(no_wrap=True)
-    row.add_column(justify="right", no_wrap=True)
-    row.add_row(left, state + Text(f"  {health.publish_time[11:19]}Z", style="dim"))
+    row.add_column(justify="right", no_wrap=not scene.stale)
+    row.add_row(left, state + Text(f"  {iso_utc(scene.now_s)[11:19]}Z", style="dim"))
     return row
 
 
-def _soc(e: Estimate | None, true_soc: float | None) -> Flow:
+def _soc(state: Fields, true_soc: float | None) -> Flow:
     """The estimate with its band; beside it the truth, where it is known."""
-    soc = e.soc if e else None
+    soc = state.number("soc")
     texts = [
-        Text.assemble(("SOC ", "dim"), (f"{_number(soc, '.2%')}{_band_text(e, '%')}", "bold"), (" (2 std)", "dim"))
+        Text.assemble(("SOC ", "dim"), (f"{_number(soc, '.2%')}{band_text(state, '%')}", "bold"), (" (2 std)", "dim"))
     ]
     if true_soc is not None:
         texts.append(Text.assemble(("true ", "dim"), (f"{true_soc:.2%}", "bold magenta")))
@@ -168,10 +174,9 @@ def _soc(e: Estimate | None, true_soc: float | None) -> Flow:
     return Flow(*texts)
 
 
-def _bar(e: Estimate | None, true_soc: float | None, cells: int) -> Text:
+def _bar(state: Fields, true_soc: float | None, cells: int) -> Text:
     """Filled to the SOC, its band hatched, a tick where the truth is."""
-    soc = e.soc if e and e.soc is not None else 0.0
-    band = BAND_STDS * e.soc_std if e and e.soc_std is not None else 0.0
+    soc, band = state.number("soc") or 0.0, BAND_STDS * (state.number("soc_std") or 0.0)
     colour = "green" if soc > LOW_SOC else "yellow"
 
     def part(cell: int) -> tuple[str, str]:
@@ -186,17 +191,22 @@ def _bar(e: Estimate | None, true_soc: float | None, cells: int) -> Text:
     return Text.assemble(*((mark * len(list(same)), style) for (mark, style), same in parts))
 
 
-def _left(e: Estimate | None) -> Flow:
+def _left(state: Fields) -> Flow:
     """What is left, and how long it lasts."""
-    seconds = e.time_to_empty_s if e else None
-    lasts = "empty in - : no load" if seconds is None else f"empty in {_duration(seconds)} at this load"
-    ah, wh = (e.remaining_capacity_ah, e.remaining_energy_wh) if e else (None, None)
+    empty_s, full_s = state.number("time_to_empty_s"), state.number("time_to_full_s")
+    lasts = "empty in - : no load"
+    if empty_s is not None:
+        lasts = f"empty in {_duration(empty_s)} at this load"
+    elif full_s is not None:
+        lasts = f"full in {_duration(full_s)} at this current"
+    ah, wh = state.number("remaining_capacity_ah"), state.number("remaining_energy_wh")
     return Flow(Text(lasts), Text(f"{_number(ah, '.3f')} Ah"), Text(f"{_number(wh, '.2f')} Wh left"))
 
 
-def _measured(e: Estimate | None, cells: int = 0) -> list[Text]:
+def _measured(state: Fields, cells: int = 0) -> list[Text]:
     """Means of the publish window, each number right-aligned in ``cells``."""
-    v, i, p, t = (e.voltage_v, e.current_a, e.power_w, e.temperature_c) if e else (None,) * 4
+    v, i = state.number("voltage_v"), state.number("current_a")
+    p, t = state.number("power_w"), state.number("temperature_c")
     way = "" if i is None else " discharge" if i > 0.0 else " charge" if i < 0.0 else ""
     return [
         Text.assemble((f"{_number(v, '.3f'):>{cells}}", "bold"), (" V", "dim")),
@@ -213,67 +223,115 @@ def _sparks(scene: Scene, width: int) -> Text:
     return Text.assemble(("V ", "dim"), (voltage, "cyan"), ("\nA ", "dim"), (current, "magenta"))
 
 
-def _elements(elements: dict[str, Parameter]) -> Table:
+def _elements(elements: Fields) -> Table:
     """Each element with its standard deviation and where it comes from; bold where it is valid."""
     table = Table.grid(padding=(0, 1))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(justify="right", no_wrap=True, min_width=VALUE_CELLS)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(style="dim", no_wrap=True)
-    for key, parameter in elements.items():
+    for key in elements.names():
+        if key not in ELEMENT_UNITS:
+            continue
         name, factor, unit = ELEMENT_UNITS[key]
-        std = "" if parameter.std is None else f"± {_short(parameter.std * factor)} "
-        value = Text(_number(parameter.value, ".4g", factor), style="bold" if parameter.valid else "")
-        table.add_row(name, value, f"{std}{unit}", parameter.source)
+        parameter = elements.fields(key)
+        std = parameter.number("std")
+        spread = "" if std is None else f"± {_short(std * factor)} "
+        value = _number(parameter.number("value"), ".4g", factor)
+        style = "bold" if parameter.flag("valid") else ""
+        table.add_row(name, Text(value, style=style), f"{spread}{unit}", parameter.text("source"))
     return table
 
 
-def _health(health: Health, parameters: ParameterReport) -> Flow:
-    """What is wrong, in full; else how worn the pack is."""
-    wrong = [Text(health.sensor_message, style="bold red")] if health.sensor_message else []
-    wrong += [Text(f"suspected: {suspect}", style="bold yellow") for suspect in health.suspects]
-    if wrong:
-        return Flow(*wrong)
-    worn = parameters.state_of_health.items()
-    known = [
-        f"{WORN[name]} {p.value:.2f} ± {p.std:.2f} of new"
-        for name, p in worn
-        if name in WORN and p.valid and p.value and p.std
+def _alarms(alarms: Sequence[Fields]) -> Flow:
+    """Those that are raised, the critical first."""
+    worst = sorted(alarms, key=lambda alarm: alarm.text("severity") != "critical")
+    texts = [
+        Text(
+            f"{alarm.text('severity')}: {alarm.text('text') or alarm.text('name')}",
+            style="bold red" if alarm.text("severity") == "critical" else "bold yellow",
+        )
+        for alarm in worst[:MOST_ALARMS]
     ]
-    return Flow(Text.assemble(("health ", "dim"), ("good", "bold green")), *map(Text, known))
+    more = len(worst) - len(texts)
+    return Flow(*texts, *([Text(f"and {more} more", style="bold red")] if more else []))
 
 
-def _observer(e: Estimate | None) -> Flow:
-    """The thesis's observer: where its model stays stable, its gain, and whether it tracks."""
-    margin = e.stability_margin if e else None
-    narrow = margin is not None and margin < NARROW_MARGIN
+def _health(health: Fields, parameters: Fields) -> Flow:
+    """What is wrong, in full; else how worn the pack is."""
+    message = health.text("sensor_message")
+    wrong = [Text(message, style="bold red")] if message else []
+    wrong += [Text(f"suspected: {suspect}", style="bold yellow") for suspect in health.texts("suspects")]
+    if wrong or not health:
+        return Flow(*wrong)
+    known = []
+    for key, name in WORN.items():
+        worn = parameters.fields("state_of_health").fields(key)
+        value, std = worn.number("value"), worn.number("std")
+        if worn.flag("valid") and value and std:
+            known.append(Text(f"{name} {value:.2f} ± {std:.2f} of new"))
+    return Flow(Text.assemble(("health ", "dim"), ("good", "bold green")), *known)
+
+
+def _cells(state: Fields) -> Flow:
+    """Single cells, where they are measured: how many, the lowest and the highest with their numbers."""
+    low_v, high_v = state.number("cell_lowest_v"), state.number("cell_highest_v")
+    if low_v is None or high_v is None:
+        return Flow()
+    count = len(state.numbers("cells_v"))
     return Flow(
-        Text.assemble(("observer ", "dim"), ("lock", "green") if e and e.lock else ("NO LOCK", "bold red")),
-        Text(f"δ1 {_number(e.delta_1 if e else None, '.4f')}"),
-        Text(f"δ2 {_number(e.delta_2 if e else None, '.4f')}"),
-        Text(f"margin {_number(margin, '.4f')}", style="bold red" if narrow else ""),
-        Text(f"N {_number(e.nussbaum_gain if e else None, '.4f')}"),
-        Text(f"k {_number(e.adaptive_gain_k if e else None, '.3g')}"),
+        Text.assemble(("cells ", "dim"), str(count) if count else ""),
+        Text(f"lowest {low_v:.3f} V{_cell(state, 'cell_lowest')}"),
+        Text(f"highest {high_v:.3f} V{_cell(state, 'cell_highest')}"),
+        Text(f"apart {1e3 * (high_v - low_v):.0f} mV"),
     )
 
 
-def _link(e: Estimate | None, health: Health) -> Flow:
+def _cell(state: Fields, name: str) -> str:
+    """A cell's number in brackets, where it is known."""
+    number = state.number(name)
+    return "" if number is None else f" (cell {number:.0f})"
+
+
+def _energy(state: Fields) -> Flow:
+    """What went in and out since counting began."""
+    out_kwh, in_kwh, cycles = (state.number(key) for key in ("energy_out_kwh", "energy_in_kwh", "equivalent_cycles"))
+    if out_kwh is None or in_kwh is None:
+        return Flow()
+    counted = [Text.assemble(("energy ", "dim"), f"{out_kwh:.3f} kWh out"), Text(f"{in_kwh:.3f} kWh in")]
+    return Flow(*counted, *([] if cycles is None else [Text(f"{cycles:.1f} cycles")]))
+
+
+def _observer(state: Fields) -> Flow:
+    """The thesis's observer: where its model stays stable, its gain, and whether it tracks."""
+    margin = state.number("stability_margin")
+    narrow = margin is not None and margin < NARROW_MARGIN
+    return Flow(
+        Text.assemble(("observer ", "dim"), ("lock", "green") if state.flag("lock") else ("NO LOCK", "bold red")),
+        Text(f"δ1 {_number(state.number('delta_1'), '.4f')}"),
+        Text(f"δ2 {_number(state.number('delta_2'), '.4f')}"),
+        Text(f"margin {_number(margin, '.4f')}", style="bold red" if narrow else ""),
+        Text(f"N {_number(state.number('nussbaum_gain'), '.4f')}"),
+        Text(f"k {_number(state.number('adaptive_gain_k'), '.3g')}"),
+    )
+
+
+def _link(state: Fields, health: Fields) -> Flow:
     """The line and the service; faults are red."""
-    dropped = sum(count for name, count in health.samples.items() if name.startswith("dropped_"))
+    line, samples = health.fields("line"), health.fields("samples")
+    dropped = sum(samples.count(name) for name in samples.names() if name.startswith("dropped_"))
     counts = {
-        "frames lost": health.line.get("frames_lost", 0),
-        "CRC errors": health.line.get("crc_errors", 0),
+        "frames lost": line.count("frames_lost"),
+        "CRC errors": line.count("crc_errors"),
         "samples dropped": dropped,
-        "reconnects": health.reconnects,
-        "lock losses": health.lock_losses,
-    }
+    } | {name: health.count(key) for key, name in COUNTED.items()}
     faults = [Text(f"{count:,} {name}", style="bold red") for name, count in counts.items() if count]
     return Flow(
-        Text.assemble(("link ", "dim"), f"{health.line.get('frames_received', 0):,} frames"),
-        Text(f"{_number(e.sample_rate_hz if e else None, '.1f')} Hz"),
+        Text.assemble(("link ", "dim"), f"{line.count('frames_received'):,} frames"),
+        Text(f"{_number(state.number('sample_rate_hz'), '.1f')} Hz"),
         *(faults or [Text("no faults")]),
-        Text(f"up {health.uptime_s:,.0f} s"),
-        Text(f"{_number(health.rss_mib, '.0f')} MiB"),
+        Text(f"up {health.number('uptime_s') or 0.0:,.0f} s"),
+        Text(f"{_number(health.number('rss_mib'), '.0f')} MiB"),
     )
 
 
@@ -287,8 +345,10 @@ def _panel(content: RenderableType, title: str) -> Panel:
     return Panel(content, title=title, title_align="left", box=box.ROUNDED, border_style="dim")
 
 
-def _band_text(e: Estimate | None, unit: str = "") -> str:
-    return "" if e is None or e.soc_std is None else f" ± {100.0 * BAND_STDS * e.soc_std:.2f}{unit}"
+def band_text(state: Fields, unit: str = "") -> str:
+    """`` ± 1.20%``, or nothing where no error is known."""
+    std = state.number("soc_std")
+    return "" if std is None else f" ± {100.0 * BAND_STDS * std:.2f}{unit}"
 
 
 def _duration(seconds: float) -> str:

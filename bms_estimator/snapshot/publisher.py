@@ -7,13 +7,19 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.model.alarm_limits import charging_a, watched
+from bms_estimator.model.alarm_settings import AlarmName
+from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.estimate import Estimate, Health, Info, LoopHealth, RecordingHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
+from bms_estimator.model.suspect import Suspect
 from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
-from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
+from bms_estimator.snapshot.alarms import Alarms, Change, Counts
+from bms_estimator.snapshot.flow import Flow
+from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters, suspicions
 from bms_estimator.snapshot.impossible import impossible_sample
 from bms_estimator.snapshot.latency import Latency
 from bms_estimator.snapshot.parameters import parameter_report
@@ -28,8 +34,10 @@ log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
 """Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
-
-
+UNUSABLE = "not_finite", "range", "saturated"
+"""Kinds of dropped samples that tell of a fault of the sensor."""
+JUDGE_S, JUDGE_ROWS = 0.1, 1024
+"""Alarms look at samples this often [s], or once there are so many: at each block it would take as long as the estimate."""
 UNTENDED_S = 20.0
 """A source that has not looked after its line for so long hangs: it tries a port that is missing each 10 s at least [s]."""
 
@@ -50,11 +58,14 @@ class Publisher:
         delivery: What became of what was sent and asked.
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
+        on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
 
     Attributes:
+        alarms: What is watched, and what is raised.
         checkpoint: What became of the last checkpoint.
         disk_free_mib: Where it is [MiB].
         log_lines_lost: Since start.
+        kept: What has flowed, as the next start will find it; None: nothing will be found.
         latest: The last estimate that there was.
         snapshot: The last snapshot.
     """
@@ -74,6 +85,7 @@ class Publisher:
         delivery: Delivery | None = None,
         pulse: Callable[[], Pulse] | None = None,
         recording: Callable[[], RecordingHealth | None] = lambda: None,
+        on_alarm: Callable[[Change], object] = lambda _: None,
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
         self._source, self._sinks, self._clock = source, sinks, clock
@@ -84,13 +96,19 @@ class Publisher:
         self._pulse, self._recording, self._latency = pulse, recording, Latency()
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
+        self.kept: Flow | None = None
+        self._flow = Flow()  # as it was told last
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
+        gap_s = float(estimator.settings["gap_s"][0])
+        self.alarms, self._on_alarm = Alarms(watched(settings, cell), charging_a(cell), gap_s), on_alarm
+        self._arrival_s, self._judged_s = clock.wall(), -math.inf
         self._suspects = 0  # bits of ``Suspect``, as logged
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._sample_s = -math.inf  # monotonic, of the last accepted sample
+        self._heard_s = self._started_s  # monotonic, of the last sample, be it accepted or not
         self._impossible = ""  # why the last sample that was dropped is none, where that can be said
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
@@ -117,8 +135,12 @@ class Publisher:
             self._sample_s = now_s
         if trace.size < block.size:
             self._impossible = impossible_sample(block, self._estimator.settings[0]) or ""
+        self.alarms.add(block, trace, self._source.cells)
+        self._heard_s, self._arrival_s = now_s, self._clock.wall()
         if now_s >= self._due_s:
             self.publish()
+        elif now_s - self._judged_s >= JUDGE_S or self.alarms.rows >= JUDGE_ROWS:
+            self._judge(now_s)
 
     def add_lag(self, lag_s: float) -> None:
         """Take by how much the loop woke too late [s]."""
@@ -130,6 +152,7 @@ class Publisher:
         self._due_s += self.period_s
         if self._due_s <= now_s:  # behind: do not catch up
             self._due_s = now_s + self.period_s
+        self._judge(now_s)
         self.snapshot = self._next_snapshot(now_s)
         if self.snapshot.estimate is not None:
             self.latest = self.snapshot.estimate
@@ -143,6 +166,37 @@ class Publisher:
         """Publish the end, all of it made anew."""
         self._slow_s = -math.inf
         self.publish()
+
+    def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
+        """Somebody knows of an alarm; None: of all. Returns of which."""
+        known = self.alarms.acknowledge(name)
+        self._tell_of_alarms()
+        return known
+
+    def _judge(self, now_s: float) -> None:
+        """Look for alarms in what has come since the last time, and in that nothing came."""
+        self._judged_s = now_s
+        record = self._estimator.record[0]
+        suspects = Suspect(int(record["checks"]["suspects"]))
+        said = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
+        self.alarms.judge(self._arrival_s, self._counts(), suspects, said)
+        self.alarms.silent(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
+        self._tell_of_alarms()
+
+    def _counts(self) -> Counts:
+        """A damaged frame is missing in the sequence, too, where there is one."""
+        line, samples = self._source.counters, sample_counters(self._estimator.state[0])
+        lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
+        return Counts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))
+
+    def _tell_of_alarms(self) -> None:
+        for change in self.alarms.changes():
+            alarm = change.alarm
+            if alarm.active:
+                log.warning("alarm raised", alarm=alarm.name, severity=alarm.severity, reason=alarm.text)
+            else:
+                log.info("alarm cleared", alarm=alarm.name)
+            self._on_alarm(change)
 
     @property
     def alive(self) -> bool:
@@ -166,7 +220,9 @@ class Publisher:
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_s = self._started_s
         parameters = parameter_report(self._estimator, self._started_wall_s)
-        return Snapshot(None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info())
+        return Snapshot(
+            None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info(), self.alarms.report()
+        )
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
         """The estimate of this window; of the rest, what is old enough to be made anew."""
@@ -181,11 +237,14 @@ class Publisher:
         if old or health.sensor_online != (message is None):
             health = self._health(now_s, message)
             self._log_suspicions(health)
-        return Snapshot(estimate, parameters, health, info)
+        return Snapshot(estimate, parameters, health, info, self.alarms.report())
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         remaining = remaining_charge(self._estimator, window.current_a)
-        return estimate_report(window, remaining, self._source.counters, wall_s)
+        # only what outlives a kill, so that the next run goes on from there
+        self._flow = self._flow.at_least(self.kept or self._tally.flow)
+        capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
+        return estimate_report(window, remaining, self._source.counters, wall_s, self._flow, capacity_ah)
 
     def _health(self, now_s: float, message: str | None) -> Health:
         lag_s, self._lag_s = self._lag_s, 0.0

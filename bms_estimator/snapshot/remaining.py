@@ -11,7 +11,7 @@ from bms_estimator.estimator.learned import present_elements, relative_capacity
 from bms_estimator.kernels import cell as chen_mora
 
 LONGEST_H = 1000.0
-"""A load that would take longer to empty the pack is none."""
+"""A load that would take longer to empty the pack is none, and a charge that would take longer to fill it."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class RemainingCharge:
     usable_ah: float = math.nan  # down to max(delta1, delta2), below which the model does not hold
     energy_wh: float = math.nan  # at the terminals, down to SOC 0, at the present current
     time_to_empty_s: float = math.nan  # down to SOC 0, at the present current
+    time_to_full_s: float = math.nan  # up to SOC 1, at the present current
 
 
 def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
@@ -29,7 +30,7 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
 
     Args:
         estimator: Read only.
-        current_a: The load [A], positive on discharge; charging counts as none.
+        current_a: At present [A], positive on discharge.
     """
     state, settings = estimator.state[0], estimator.settings[0]
     if not state["started"] or math.isnan(state["soc"]):
@@ -42,8 +43,14 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
     usable_ah = max(soc - max(state["delta_1"], state["delta_2"]), 0.0) * capacity_ah
     open_circuit_wh = _mean_ocv(settings["ocv_v"], soc) * charge_ah
     lost_wh = load_a * _resistance(estimator, soc) * charge_ah
-    hours = charge_ah / load_a if load_a * LONGEST_H > capacity_ah else math.nan
-    return RemainingCharge(charge_ah, usable_ah, max(open_circuit_wh - lost_wh, 0.0), 3600.0 * hours)
+    to_empty_s = _time(charge_ah, load_a, capacity_ah)
+    to_full_s = _time(capacity_ah - charge_ah, -current_a, capacity_ah)
+    return RemainingCharge(charge_ah, usable_ah, max(open_circuit_wh - lost_wh, 0.0), to_empty_s, to_full_s)
+
+
+def _time(charge_ah: float, current_a: float, capacity_ah: float) -> float:
+    """How long ``charge_ah`` takes [s]; NaN where the current, for that of a pack of ``capacity_ah``, is none."""
+    return 3600.0 * charge_ah / current_a if current_a * LONGEST_H > capacity_ah else math.nan
 
 
 def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:

@@ -2,15 +2,18 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator import __version__
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Estimate, Info
+from bms_estimator.model.estimate import PAYLOAD_VERSION, Estimate, Info
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.remaining import RemainingCharge
 from bms_estimator.snapshot.window import WindowSummary
 
@@ -22,7 +25,12 @@ def finite(value: float) -> float | None:
 
 
 def estimate_report(
-    window: WindowSummary, remaining: RemainingCharge, counters: Mapping[str, int], now_s: float
+    window: WindowSummary,
+    remaining: RemainingCharge,
+    counters: Mapping[str, int],
+    now_s: float,
+    flow: Flow,
+    capacity_ah: float | None,
 ) -> Estimate:
     """Topic ``state``.
 
@@ -31,10 +39,11 @@ def estimate_report(
         remaining: What is left in the pack.
         counters: The source's.
         now_s: Wall clock [s since 1970].
+        flow: What has gone through the terminals.
+        capacity_ah: Of the pack, rated; None of a fuel cell.
     """
     last = window.last
     soc = finite(last["soc"])
-    cells_v = window.cells_v[np.isfinite(window.cells_v)]
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
@@ -43,8 +52,7 @@ def estimate_report(
         current_a=window.current_a,
         power_w=window.power_w,
         temperature_c=finite(window.temperature_c),
-        cell_lowest_v=float(cells_v.min()) if cells_v.size else None,
-        cell_highest_v=float(cells_v.max()) if cells_v.size else None,
+        **_cells(window.cells_v),
         soc=soc,
         soc_percent=None if soc is None else 100.0 * soc,
         soc_std=finite(last["soc_std"]),
@@ -54,6 +62,9 @@ def estimate_report(
         usable_capacity_ah=finite(remaining.usable_ah),
         remaining_energy_wh=finite(remaining.energy_wh),
         time_to_empty_s=finite(remaining.time_to_empty_s),
+        time_to_full_s=finite(remaining.time_to_full_s),
+        **flow._asdict(),
+        equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
         voltage_estimate_v=finite(last["voltage_estimate_v"]),
         innovation_v=finite(last["innovation_v"]),
         tracking_error_v=finite(last["tracking_error_v"]),
@@ -69,6 +80,20 @@ def estimate_report(
         crc_errors=counters.get("crc_errors", 0),
         sample_rate_hz=finite(window.sample_rate_hz),
     )
+
+
+def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
+    """What is told of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
+    if not np.isfinite(cells_v).any():
+        return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))
+    lowest, highest = int(np.nanargmin(cells_v)), int(np.nanargmax(cells_v))
+    return {
+        "cell_lowest_v": float(cells_v[lowest]),
+        "cell_highest_v": float(cells_v[highest]),
+        "cell_lowest": lowest + 1,
+        "cell_highest": highest + 1,
+        "cells_v": [finite(volts) for volts in cells_v],
+    }
 
 
 def info_report(
@@ -87,6 +112,7 @@ def info_report(
     return Info(
         device=settings.pack.name,
         version=__version__,
+        payload_version=PAYLOAD_VERSION,
         started=iso_utc(started_s),
         cell=cell.cell.name,
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,

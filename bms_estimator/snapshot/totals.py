@@ -1,4 +1,4 @@
-"""What is counted over restarts: samples, crashes, and the time in which nobody measured."""
+"""What is counted over restarts: samples, crashes, the time in which nobody measured, charge and energy."""
 
 import math
 from collections import Counter
@@ -12,6 +12,7 @@ from bms_estimator.kernels.sample_step import GAP_RATIO
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Totals
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.snapshot.flow import Flow, Meter
 from bms_estimator.snapshot.health import sample_counters
 
 
@@ -34,6 +35,7 @@ class Tally:
 
     def __init__(self, estimator: Estimator, before: Totals) -> None:
         self.estimator, self._before = estimator, before
+        self._meter = Meter(Flow.of(before), float(estimator.settings["gap_s"][0]))
         self._unseen_s = 0.0  # of this run
         self.unseen_s: float | None = None
 
@@ -43,13 +45,19 @@ class Tally:
         samples = Counter(self._before.samples)
         samples.update(sample_counters(self.estimator.state[0]))
         changed = {"samples": dict(samples), "unseen_s": self._before.unseen_s + self._unseen_s}
-        return self._before.model_copy(update=changed)
+        return self._before.model_copy(update=changed | self.flow._asdict())
+
+    @property
+    def flow(self) -> Flow:
+        """Through the terminals, in all runs."""
+        return self._meter.flow
 
     def run(self, block: SampleBlock) -> TraceBlock:
         """As ``Estimator.run``."""
         s = self.estimator.state
         before_s, step_s, gaps = float(s["time_s"][0]), float(s["step_s"][0]), int(s["gaps"][0])
         trace = self.estimator.run(block)
+        self._meter.add(trace)
         if s["gaps"][0] != gaps or (trace.size and math.isinf(before_s)):
             restart_s = float(self.estimator.record["unseen_s"][0])
             gap_s = float(self.estimator.settings["gap_s"][0])

@@ -10,6 +10,9 @@ from bms_estimator.sources.reports import Bringer, Reports
 KINDS: Mapping[str, str] = {
     "mqtt": "mqtt_reports",
     "linux": "linux_sensor",
+    "modbus": "modbus",
+    "can": "can_bus",
+    "ble": "ble",
 }
 """By ``source.kind``: a module of this package whose ``bringer(settings)`` makes what brings the values."""
 

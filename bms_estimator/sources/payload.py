@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
-from bms_estimator.model.mqtt_source import Place
+from bms_estimator.model.mqtt_source_settings import Place
 from bms_estimator.sources.number import number
 
 SHOWN = 40

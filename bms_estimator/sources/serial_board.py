@@ -257,7 +257,7 @@ class SerialBoard:
                 continue
             elif fault := self._listener.fault:
                 self._say_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
-            elif now_s - heard_s >= self._silent_s:
+            elif now_s - heard_s >= max(self._silent_s, self._listener.quiet_s):
                 self._say_or_leave(f"{path}: open, but silent")
             self._faults.see(counters, now_s)
 

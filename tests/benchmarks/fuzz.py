@@ -36,14 +36,19 @@ from serial.tools.list_ports_common import ListPortInfo
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
-from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.model.settings import SensorSettings, Settings, load_settings
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.curve import read_curve
+from bms_estimator.sources.dialects import Dialect, daly, jbd, jk
 from bms_estimator.sources.dialects.board import BoardDialect
+from bms_estimator.sources.dialects.junctek import JunctekDialect
+from bms_estimator.sources.dialects.pylontech import PylontechDialect
+from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.dialects.text import TextDialect
+from bms_estimator.sources.dialects.vedirect import VeDirectDialect
 from bms_estimator.sources.ports import NoPortError, may_be_board, resolve_port
 from bms_estimator.sources.protocol import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
 from bms_estimator.sources.raw_capture import MAGIC
@@ -103,6 +108,38 @@ def _text(_: Path) -> Read:
         _ = dialect.fault, dialect.described, dialect.counters
 
     return read
+
+
+def _meter(make: Callable[[], Dialect]) -> Callable[[Path], Read]:
+    """Of a dialect that only needs bytes."""
+
+    def read(data: bytes) -> None:
+        dialect = make()
+        dialect.feed(1.0, data[: len(data) // 2])
+        dialect.due(1.5)
+        dialect.feed(2.0, data[len(data) // 2 :])
+        _ = dialect.fault, dialect.described, dialect.counters
+
+    return lambda _: read
+
+
+def _asked(protocol: str) -> Callable[[Path], Read]:
+    """Of a BMS that is asked."""
+
+    def make(_: Path) -> Read:
+        def read(data: bytes) -> None:
+            dialect = make_dialect(SensorSettings.model_validate({"protocol": protocol}))
+            dialect.feed(1.0, data[: len(data) // 2])
+            dialect.due(1.5)
+            dialect.opened()
+            dialect.feed(2.0, data[len(data) // 2 :])
+            dialect.due(3.0)
+            assert dialect.counters["noise_bytes"] <= dialect.counters["bytes_received"] == len(data)
+            _ = dialect.fault, dialect.described, dialect.quiet_s
+
+        return read
+
+    return make
 
 
 def _messages(_: Path) -> Read:
@@ -205,6 +242,53 @@ def _sealed(random: random.Random, data: bytes) -> bytes:
     return DELIMITER.join(frames)
 
 
+def _summed(random: random.Random, data: bytes) -> bytes:
+    """VE.Direct blocks with right checksums again."""
+    if random.random() < 0.3:
+        return data
+    blocks = data.split(b"\r\nChecksum\t")
+    return b"".join(
+        (whole := (b[1:] if n else b) + b"\r\nChecksum\t") + bytes((-sum(whole) & 0xFF,)) for n, b in enumerate(blocks)
+    )
+
+
+def _counted(random: random.Random, data: bytes) -> bytes:
+    """Answers of a Junctek with right checksums again."""
+    if random.random() < 0.3:
+        return data
+    fixed = []
+    for line in data.split(b"\n"):
+        head, *values = line.strip().split(b",")
+        numbers = [int(v) for v in values[1:] if v.isdigit() and len(v) < 20]
+        fixed.append(b",".join([head, b"%d" % (sum(numbers) % 255 + 1), *values[1:]]))
+    return b"\n".join(fixed)
+
+
+def _jbd_summed(random: random.Random, data: bytes) -> bytes:
+    """One frame with a right checksum again, of whatever length it says."""
+    at = data.find(b"\xdd", random.randrange(len(data) + 1))
+    end = at + 4 + data[at + 3] if 0 <= at < len(data) - 4 else len(data)
+    return data[:end] + jbd.checksum(data[at + 2 : end]) + b"\x77" + data[end + 3 :] if end < len(data) else data
+
+
+def _daly_summed(random: random.Random, data: bytes) -> bytes:
+    at = data.find(b"\xa5", random.randrange(len(data) + 1))
+    return data[:at] + daly.sealed(data[at : at + 12]) + data[at + 13 :] if at >= 0 else data
+
+
+def _jk_summed(random: random.Random, data: bytes) -> bytes:
+    """The first frame of either family."""
+    newer, at = data.find(jk.START), data.find(jk.OLD_START)
+    if newer >= 0:
+        frame = data[newer : newer + 299].ljust(299, b"\0")
+        return data[:newer] + frame + bytes((sum(frame) & 0xFF,)) + data[newer + 300 :]
+    if at < 0 or random.random() < 0.3:
+        return data
+    body = data[at + 4 :][:480]
+    frame = jk.OLD_START + (len(body) + 7).to_bytes(2, "big") + body + bytes((jk.OLD_END,))
+    return data[:at] + jk.old_sealed(frame)
+
+
 def _headed(random: random.Random, data: bytes) -> bytes:
     """A capture whose header has a right length and CRC again."""
     begin, end = data.find(b"{"), data.find(b"}") + 1
@@ -276,6 +360,14 @@ _JSON = (b"null", b'"version"', b": [", b'{"a":', b"\\ud800", b'"soc"', b'"trans
 TARGETS: Mapping[str, Target] = {
     "frames": Target(_frames, (DELIMITER, b"\x01\x01", b"\x01\x02", b"\xff\xff\xff\xff"), _sealed, decoder=True),
     "text": Target(_text, (b"V=", b"I=", b"T=", b"cells=", b'{"voltage":', b";", b" mA", b"kV"), decoder=True),
+    "vedirect": Target(_meter(VeDirectDialect), (b"\r\nV\t", b"\r\nI\t", b"\r\nChecksum\t", b":7F0"), _summed),
+    "junctek": Target(_meter(JunctekDialect), (b":r50=1,", b",", b":R50=1,2,1,\r\n"), _counted),
+    "pylontech": Target(_meter(PylontechDialect), (b"pylon>", b"Power Volt", b"Absent", b"bat 2", b" - ")),
+    "jbd": Target(_asked("jbd"), (b"\xdd\x03\0", b"\xdd\x04\0", b"\x77"), _jbd_summed, decoder=True),
+    "daly": Target(_asked("daly"), (b"\xa5\x01\x90\x08", b"\xa5\x01\x95\x08"), _daly_summed, decoder=True),
+    "jk": Target(
+        _asked("jk"), (jk.OLD_START, jk.START, jk.START + b"\x02", b"\xc0\x01", b"\x79"), _jk_summed, decoder=True
+    ),
     "messages": Target(_messages, (DELIMITER, b"\x01\x02"), _sealed),
     "settings": Target(_file("pack.toml", load_settings), _TOML),
     "cell": Target(_file("cell.toml", load_any), _TOML),

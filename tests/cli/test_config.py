@@ -27,6 +27,15 @@ def test_init_writes_a_file_of_the_defaults_that_check_accepts(pack, capsys):
     assert load_settings(pack) == Settings()
 
 
+NEEDED = {
+    "ble": "name = 'battery'\n",
+    "can": "voltage = { id = 0x356 }\ncurrent = { id = 0x356, start_bit = 16 }\n",
+    "mqtt": "profile = 'opendtu'\n",
+    "modbus": "host = 'gx'\nvoltage = { address = 259 }\ncurrent = { address = 261 }\n",
+}
+"""What a section of ``[source]`` has to say, by kind."""
+
+
 def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, capsys):
     run(capsys, "config", "init", pack)
     lines = pack.read_text().splitlines()
@@ -37,16 +46,16 @@ def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, cap
     sources = [section for section in sections if section.startswith("[source]")]
     assert len(sources) == len(KINDS)
     for source in sources:  # one of them
-        others = "".join(section for section in sections if section not in sources)
-        must = 'profile = "opendtu"\n' if 'kind = "mqtt"' in source else ""  # without one it would have to tell more
-        pack.write_text(f"{others}\n{source}{must}")
+        kind = tomllib.loads(source)["source"]["kind"]
+        whole = source + NEEDED.get(kind, "")
+        pack.write_text("\n".join([*(section for section in sections if section not in sources), whole]))
         written = tomllib.loads(pack.read_text())
         assert written["sensor"]["baud"] == Settings().sensor.baud
         assert set(written) == set(Settings.model_fields)
         loaded = load_settings(pack)
         assert loaded.source
         assert loaded.source.kind in KINDS
-        assert loaded.sensor == Settings().sensor.model_copy(update={"protocol": "text"})
+        assert loaded.sensor == Settings().sensor.model_copy(update={"protocol": "text", "period_s": 1.0})
 
 
 def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
@@ -63,7 +72,7 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ("[pack]\nseries = 0\n", ["pack.series = 0", "greater than or equal to 1"]),
         ("[pack]\nsereis = 2\n", ["pack.sereis", "unknown key"]),
         ("[wrong]\na = 1\n", ["wrong", "unknown key"]),
-        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary' or 'text'"]),
+        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary', 'text'"]),
         ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "number, without quotes"]),
         ("[observer]\nlambda = -1\n", ["observer.lambda = -1", "greater than 0"]),
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),

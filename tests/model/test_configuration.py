@@ -79,9 +79,12 @@ def test_table_ocv_must_increase(tmp_path: Path) -> None:
         ("[pack]\ninitial_soc = 80", r"pack\.initial_soc = 80: .*less than or equal to 1"),
         ("[observer]\nalpha = 2.0", r"observer\.alpha = 2\.0: .*greater than 2.*\(2, 3\]"),
         ("[mqtt]\nurl = 'http://x'", r"mqtt\.url = 'http://x'.*mqtts://host:port"),
-        ("[mqtt]\ncommands = ['reboot']", r"mqtt\.commands\.0 = 'reboot'.*'set_soc' or 'current_zero'"),
+        (
+            "[mqtt]\ncommands = ['reboot']",
+            r"mqtt\.commands\.0 = 'reboot'.*'set_soc', 'current_zero', 'acknowledge_alarm' or 'publish_rate'",
+        ),
         ("[mqtt]\npublish_rate_hz = 2", r"pack\.toml: mqtt: publish_rate_hz is now .* rate_hz .* section \[publish\]$"),
-        ("[sensor]\ncurrent_resolution_a = 0.05", r"sensor\.current_resolution_a.*: unknown key"),
+        ("[sensor]\ncurrent_step_a = 0.05", r"sensor\.current_step_a.*: unknown key"),
         ("[sensor]\nsample_rate_hz = 5000", r"sensor\.sample_rate_hz = 5000: .*1000"),
     ],
 )

@@ -18,6 +18,7 @@ from bms_estimator.service import saving
 from bms_estimator.service.checkpoint import FORMAT, LATER, CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.moment import Moment
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.totals import gap_lengths
 from tests.collector import Collector
 from tests.patience import LONG_S
@@ -55,6 +56,40 @@ async def test_counters_outlive_restarts_and_what_nobody_saw_is_added_up(tmp_pat
     assert health.unseen_s == pytest.approx(3600.0, abs=LONG_S)
     assert health.total.unseen_s == pytest.approx(health.unseen_s + 60.0)
     assert (health.restarts, health.total.crashes) == (1, 0)
+
+
+async def test_what_has_flowed_outlives_restarts(tmp_path: Path) -> None:
+    hour = [(float(s), 2.0, 3.8) for s in range(3601)]
+    _, discharged = await run_at(0.0, tmp_path, *hour)
+    _, charged = await run_at(2.0, tmp_path, *((s, -1.0, v) for s, _, v in hour))
+    async with often(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(4.0))) as (source, sink, _):
+        source.give(hour[0])
+        told = (await sink.until(lambda s: s.estimate is not None)).estimate
+    assert Flow.of(discharged.health.total) == pytest.approx((2.0, 0.0, 7.6e-3, 0.0))
+    assert Flow.of(charged.health.total) == pytest.approx((2.0, 1.0, 7.6e-3, 3.8e-3))
+    assert told
+    assert Flow(*(getattr(told, name) for name in Flow._fields)) == Flow.of(charged.health.total)
+    assert told.equivalent_cycles == pytest.approx(2.0 / CELL.cell.capacity_ah)
+
+
+async def test_what_has_flowed_is_told_once_it_is_on_disk_so_that_a_kill_sets_nothing_back(tmp_path: Path) -> None:
+    release = threading.Event()
+
+    class SlowDisk(CheckpointFile):
+        def save(self, state: Any, ledger: Ledger) -> None:
+            assert release.wait(LONG_S)
+            super().save(state, ledger)
+
+    file = SlowDisk(tmp_path, SETTINGS, CELL)
+    async with often(file) as (source, sink, _):
+        source.give(*((float(s), 2.0, 3.8) for s in range(1801)))
+        last = await sink.until(lambda s: s.health.total.charge_out_ah > 0.9)
+        told = [s.estimate.charge_out_ah for s in sink.snapshots if s.estimate]
+        kept = CheckpointFile(tmp_path, SETTINGS, CELL).load().ledger.total.charge_out_ah
+        release.set()
+    assert last.health.samples["samples"] == 1801
+    assert set(told) == {kept} == {0.0}
+    assert file.load().ledger.total.charge_out_ah == pytest.approx(1.0)
 
 
 async def test_a_run_without_a_sample_changes_no_counter_and_not_the_age_of_the_state(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ async def test_samples_that_cannot_be_used_are_dropped_counted_and_published() -
         "gaps": 1,
     }
     for snapshot in run.sink.snapshots:
-        for part in snapshot:
+        for part in (*snapshot[:4], *snapshot.alarms):
             assert part is None or "NaN" not in part.model_dump_json()
 
 

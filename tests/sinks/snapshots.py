@@ -3,12 +3,13 @@
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.estimate import LoopHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
 from bms_estimator.sinks import Delivery
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.health import health_report
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
@@ -34,6 +35,10 @@ def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None
     return _of(cell, Estimator(cell, identifier=None, initial_soc=0.5), 3.8, sensor_message, delivery)
 
 
+def _capacity_ah(cell: PackModel) -> float | None:
+    return cell.cell.capacity_ah if isinstance(cell, CellModel) else None
+
+
 def of_fuel_cell() -> Snapshot:
     stack = load_fuel_cell("pem_30w")
     return _of(stack, Estimator(stack), 13.0)
@@ -54,7 +59,7 @@ def _of(
     summary = window.take()
     assert summary
     return Snapshot(
-        estimate_report(summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW),
+        estimate_report(summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW, Flow(), _capacity_ah(cell)),
         parameter_report(estimator, NOW),
         health_report(
             estimator.record[0],

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.sinks.messages import Message, Messages, Sent, schema
+from bms_estimator.sinks.messages import Message, Messages, Sent
+from bms_estimator.sinks.payloads import schema
 from tests.sinks.snapshots import NOTHING_YET, NOW, ONE, snapshot
 
 MESSAGES = Messages("bms", "pack")
@@ -27,7 +28,6 @@ def test_a_broker_that_got_nothing_gets_everything_that_is_not_kept():
         "info",
         DISCOVERY,
         "home_assistant",
-        "home_assistant/problems",
     ]
     assert sent.snapshot is ONE
 

@@ -65,6 +65,12 @@ def test_a_pack_that_does_not_discharge_has_no_time_to_empty(current_a: float) -
     assert math.isnan(remaining_charge(at(0.5), current_a).time_to_empty_s)
 
 
+def test_a_pack_that_charges_has_a_time_to_full_and_no_other_has() -> None:
+    assert remaining_charge(at(0.4), -0.055).time_to_full_s == pytest.approx(0.6 * Q_AH / 0.055 * 3600.0)
+    assert remaining_charge(at(1.0), -0.055).time_to_full_s == 0.0
+    assert all(math.isnan(remaining_charge(at(0.5), a).time_to_full_s) for a in (0.0, 1.0, -1e-5))
+
+
 def test_nothing_is_known_before_the_first_sample() -> None:
     estimator = Estimator(CELL, initial_soc=0.5, identifier=None)
     assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)

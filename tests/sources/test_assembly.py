@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.model.mqtt_source import MqttSource
+from bms_estimator.model.mqtt_source_settings import MqttSource
 from bms_estimator.model.settings import Settings
 from bms_estimator.sources.assembly import Assembly
 from bms_estimator.sources.payload import NoNumberError, many, one

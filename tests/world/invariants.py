@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 from pydantic_core import from_json
 
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.estimate import Estimate, Snapshot
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.sources.protocol import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
 from tests.world.broker import Connection, Packet
 
@@ -164,6 +165,22 @@ class Band:
         if beyond > MOST_STDS:
             return f"SOC {e.soc:.4f} +- {e.soc_std:.4f}, true {true_soc:.4f}"
         return ""
+
+
+@dataclass
+class Flowed:
+    """Charge and energy that the service has told, over all its processes."""
+
+    kept: Flow = field(default_factory=Flow)
+    """What it told that was on disk."""
+
+    def take(self, estimate: Estimate, *, kept: bool) -> str:
+        """A state; ``kept``: the disk has taken what it tells. Returns what is wrong with that."""
+        flow = Flow(*(getattr(estimate, name) for name in Flow._fields))
+        wrong = f"{flow} after {self.kept}" if any(a < b for a, b in zip(flow, self.kept, strict=True)) else ""
+        if kept:
+            self.kept = flow
+        return wrong
 
 
 @dataclass

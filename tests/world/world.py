@@ -35,7 +35,7 @@ from tests.world import invariants
 from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError
 from tests.world.faults import CLOCK, Fault, schedule, usual
-from tests.world.invariants import Band, InvariantError, Reference, Said, Truth
+from tests.world.invariants import Band, Flowed, InvariantError, Reference, Said, Truth
 from tests.world.line import Board, Cable
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 from tests.world.pack import CELL, new_pack
@@ -111,6 +111,8 @@ class Process:
     """... it was frozen the last time: what came meanwhile came late."""
     foreign: bool = False
     """It was given bytes of another board."""
+    disk_failed: bool = False
+    """What it told of charge and energy may be on no disk."""
 
 
 class World:
@@ -160,7 +162,7 @@ class World:
         self.kill_after: int | None = None
         self.threads: Threads | None = None
         self.disk_good_s = 0.0
-        self.said, self.band = Said(), Band()
+        self.said, self.band, self.flowed = Said(), Band(), Flowed()
         self.online = Truth(ONLINE_S)
         self.sensor_online = Truth(SENSOR_ONLINE_S)
         self.will_certain = True
@@ -400,6 +402,9 @@ class World:
         said = snapshot.estimate.model_dump_json().encode()
         self.said.say(said, process.number, self.timeline.now_s, disk_failed=self._disk_fails)
         self.figures["states"] += 1
+        process.disk_failed |= self._disk_fails
+        if wrong := self.flowed.take(snapshot.estimate, kept=not process.disk_failed):
+            self.fail(wrong)
         behind = self._reads(process) > 0  # it was frozen: the state is of a sample before those that wait
         if not behind and (wrong := self.band.take(snapshot, self.seen_soc)):
             self.fail(wrong)

@@ -29,6 +29,8 @@ class Dialect(ABC):
 
     cells: CellBlock = NO_CELLS
     """Beside the samples that ``feed`` or ``feed_reads`` returned last."""
+    probing: bool = False
+    """Set where nobody knows who is there: ``due`` then sends only what changes nothing in any device."""
 
     @property
     @abstractmethod
@@ -54,6 +56,11 @@ class Dialect(ABC):
     def clock_ppm(self) -> float | None:
         """How much faster the device's clock runs than that of the arrivals [1e-6]; None while or where unknown."""
         return None
+
+    @property
+    def quiet_s(self) -> float:
+        """So long it may say nothing while all is well [s]."""
+        return 0.0
 
     @abstractmethod
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:

@@ -1,0 +1,229 @@
+"""Battery monitors and batteries without hardware: they speak their makers' protocols on a pseudo-terminal.
+
+Beside ``virtual_board``, which speaks the firmware's. They round as the device does, and tell what the pack has at the time.
+"""
+
+import asyncio
+import math
+import os
+import tty
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Self
+
+from bms_estimator.simulation.virtual_converter import Reading
+
+Signal = Callable[[float], Reading]
+"""Readings by time [s], which never steps back."""
+
+
+class SimulatedMeter(ABC):
+    """A device on a pseudo-terminal. Open it as a context manager, then ``run`` it.
+
+    Args:
+        signal: What is at its sensors.
+        speed: Its seconds per second.
+    """
+
+    period_s = math.inf
+    """It speaks by itself so often [s]."""
+
+    def __init__(self, signal: Signal, *, speed: float = 1.0) -> None:
+        self._signal, self._speed = signal, speed
+        self._master = self._slave = -1
+        self.path = ""
+        """Of the pseudo-terminal."""
+        self.time_s = 0.0
+        """Of the last reading."""
+        self.samples = 0
+        """Readings told."""
+        self.last = Reading(math.nan, math.nan)
+        """The reading told last."""
+
+    def __enter__(self) -> Self:
+        """Open the pseudo-terminal."""
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Pull the plug: the host's descriptor dies."""
+        for descriptor in (self._master, self._slave):
+            os.close(descriptor)
+
+    @abstractmethod
+    def message(self, reading: Reading) -> bytes:
+        """What it tells of a reading."""
+
+    def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:  # noqa: ARG002 - for those that are asked
+        """What it says to ``heard``, and how many bytes of that it has understood."""
+        return b"", len(heard)
+
+    def send(self, data: bytes) -> None:
+        """Put any bytes on the line; a host that does not read loses them."""
+        try:
+            os.write(self._master, data)
+        except BlockingIOError:
+            return
+
+    async def run(self, seconds: float = math.inf) -> None:
+        """Speak and answer for ``seconds`` of its time."""
+        loop, inbox = asyncio.get_running_loop(), bytearray()
+        start_s, heard = loop.time(), asyncio.Event()
+
+        def hear() -> None:
+            inbox.extend(os.read(self._master, 4096))
+            heard.set()
+
+        loop.add_reader(self._master, hear)
+        try:
+            due_s = 0.0
+            while (now_s := (loop.time() - start_s) * self._speed) < seconds:
+                if now_s >= due_s:
+                    due_s += self.period_s
+                    self._tell(now_s)
+                if inbox:
+                    said, understood = self.answer(bytes(inbox), self._read(now_s))
+                    del inbox[:understood]
+                    self.send(said)
+                heard.clear()
+                wait_s = (min(due_s, seconds) - now_s) / self._speed
+                try:
+                    async with asyncio.timeout(wait_s if math.isfinite(wait_s) else None):
+                        await heard.wait()
+                except TimeoutError:
+                    continue
+        finally:
+            loop.remove_reader(self._master)
+
+    def _tell(self, now_s: float) -> None:
+        if math.isfinite(self.period_s):
+            self.send(self.message(self._read(now_s)))
+
+    def _read(self, now_s: float) -> Reading:
+        """What is at its sensors now."""
+        self.time_s = now_s
+        self.samples += 1
+        self.last = self._signal(now_s)
+        return self.last
+
+
+class SimulatedVeDirect(SimulatedMeter):
+    """A SmartShunt: a block each second, and one of history that tells nothing of now."""
+
+    period_s = 1.0
+
+    def message(self, reading: Reading) -> bytes:
+        """Both blocks."""
+        temperature = "---" if math.isnan(reading.temperature_c) else f"{reading.temperature_c:.0f}"
+        fields = {
+            "PID": "0xA389",
+            "V": f"{1e3 * reading.voltage_v:.0f}",
+            "T": temperature,
+            "I": f"{-1e3 * reading.current_a:.0f}",
+            "P": f"{-reading.voltage_v * reading.current_a:.0f}",
+            "CE": "---",
+            "SOC": "---",
+            "TTG": "-1",
+            "Alarm": "OFF",
+            "AR": "0",
+            "BMV": "SmartShunt 500A/50mV",
+            "FW": "0416",
+            "MON": "0",
+        }
+        return _block(fields) + _block({"H1": "0", "H2": "0", "H3": "0", "H4": "0"})
+
+
+def _block(fields: Mapping[str, str]) -> bytes:
+    body = "".join(f"\r\n{label}\t{value}" for label, value in fields.items()).encode() + b"\r\nChecksum\t"
+    return body + bytes((-sum(body) & 0xFF,))
+
+
+class SimulatedJunctek(SimulatedMeter):
+    """A monitor of Junctek at address 1."""
+
+    def message(self, reading: Reading) -> bytes:
+        """All measured values."""
+        warm = 25.0 if math.isnan(reading.temperature_c) else reading.temperature_c
+        values = [
+            round(100 * reading.voltage_v),
+            round(100 * abs(reading.current_a)),
+            *(50_000, 1_000, 10_000, round(self.time_s), round(warm) + 100, 0, 0),
+            int(reading.current_a < 0.0),
+            *(0, 0),
+        ]
+        return b":r50=1,%d,%s,\r\n" % (sum(values) % 255 + 1, ",".join(map(str, values)).encode())
+
+    def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:
+        """To ``:R50=1,``."""
+        *lines, rest = heard.split(b"\n")
+        asked = sum(line.startswith(b":R50=1,") for line in lines)
+        return asked * self.message(reading), len(heard) - len(rest)
+
+
+class SimulatedPylontech(SimulatedMeter):
+    """The console of one battery of so many cells.
+
+    Args:
+        signal: What is at its sensors.
+        speed: Its seconds per second.
+        cells: In series.
+    """
+
+    def __init__(self, signal: Signal, *, speed: float = 1.0, cells: int = 15) -> None:
+        super().__init__(signal, speed=speed)
+        self._cells = cells
+
+    def message(self, reading: Reading) -> bytes:
+        """The table of all batteries."""
+        each, warm = round(1e3 * reading.voltage_v / self._cells), self._warm(reading)
+        head = (
+            "Power Volt   Curr   Tempr  Tlow   Thigh  Vlow   Vhigh  Base.St  Volt.St  Curr.St  Temp.St  Coulomb  Time"
+        )
+        volt, amp = round(1e3 * reading.voltage_v), -round(1e3 * reading.current_a)
+        row = f"1     {volt:<6} {amp:<6} {warm:<6} {warm:<6} {warm:<6} {each:<6} {each:<6} {_state(amp):<8} Normal"
+        absent = ["2     -      -      -      -      -      -      -      Absent   -"]
+        return _table("pwr", [head, row + "   Normal   Normal   50%      2026-01-01 00:00:00", *absent])
+
+    def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:
+        """To ``pwr`` and ``bat 1``."""
+        *lines, rest = heard.replace(b"\r", b"\n").split(b"\n")
+        said = b"".join(self._command(line.decode("ascii", "replace").strip(), reading) for line in lines)
+        return said, len(heard) - len(rest)
+
+    def _command(self, line: str, reading: Reading) -> bytes:
+        match line.split():
+            case ["pwr"]:
+                return self.message(reading)
+            case ["bat", "1"]:
+                each, warm = round(1e3 * reading.voltage_v / self._cells), self._warm(reading)
+                amp = -round(1e3 * reading.current_a)
+                head = "Battery  Volt     Curr     Tempr    Base State   Volt. State  Curr. State  Temp. State  Coulomb"
+                tail = f"{amp:<8} {warm:<8} {_state(amp):<12} Normal       Normal       Normal       50%"
+                return _table(line, [head, *(f"{n:<8} {each:<8} {tail}" for n in range(self._cells))])
+            case []:
+                return b"\n\rpylon>"
+        return f"{line}\n\r@\r\r\nUnknown command '{line}' - try 'help'\r\n\r$$\r\n\rpylon>".encode()
+
+    @staticmethod
+    def _warm(reading: Reading) -> int:
+        return 25_000 if math.isnan(reading.temperature_c) else round(reading.temperature_c) * 1000
+
+
+def _state(milliamperes: int) -> str:
+    return "Idle" if milliamperes == 0 else "Charge" if milliamperes > 0 else "Dischg"
+
+
+def _table(command: str, lines: list[str]) -> bytes:
+    text = f"{command}\n\r@\r\r\n" + "\r\r\n".join(lines) + "\r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
+    return text.encode()
+
+
+METERS: Mapping[str, Callable[[Signal, float], SimulatedMeter]] = {
+    "vedirect": lambda signal, speed: SimulatedVeDirect(signal, speed=speed),
+    "junctek": lambda signal, speed: SimulatedJunctek(signal, speed=speed),
+    "pylontech": lambda signal, speed: SimulatedPylontech(signal, speed=speed),
+}
+"""By ``sensor.protocol``."""

@@ -1,0 +1,72 @@
+"""A payload's fields, each of the kind that is asked for: another version, or anybody else, may publish anything. Pure."""
+
+from collections.abc import Iterator
+
+LARGEST = 1e12
+"""No number of a battery is larger; what is would only fill a screen."""
+LONGEST_TEXT = 400
+"""Texts are shown so far [characters]."""
+
+
+class Fields:
+    """The fields of a JSON object; of anything else none.
+
+    Args:
+        payload: As ``published.parsed`` has it.
+    """
+
+    def __init__(self, payload: object) -> None:
+        self._of = payload if isinstance(payload, dict) else {}
+
+    def __bool__(self) -> bool:
+        return bool(self._of)
+
+    def number(self, name: str) -> float | None:
+        """A number; None where there is none."""
+        return _number(self._of.get(name))
+
+    def count(self, name: str) -> int:
+        """A whole number; 0 where there is none."""
+        return int(self.number(name) or 0)
+
+    def text(self, name: str) -> str:
+        """A text without what would control a terminal; empty where there is none."""
+        return _text(self._of.get(name))
+
+    def flag(self, name: str) -> bool:
+        """Whether it is true."""
+        return self._of.get(name) is True
+
+    def is_null(self, name: str) -> bool:
+        """Whether it is there and null."""
+        return name in self._of and self._of[name] is None
+
+    def fields(self, name: str) -> "Fields":
+        """An object."""
+        return Fields(self._of.get(name))
+
+    def texts(self, name: str) -> list[str]:
+        """A list of texts."""
+        return [_text(item) for item in self._list(name) if isinstance(item, str)]
+
+    def numbers(self, name: str) -> list[float | None]:
+        """A list of numbers, some of which may be missing."""
+        return [_number(item) for item in self._list(name)]
+
+    def names(self) -> Iterator[str]:
+        """Of all fields."""
+        return (_text(name) for name in self._of)
+
+    def _list(self, name: str) -> list[object]:
+        found = self._of.get(name)
+        return found if isinstance(found, list) else []
+
+
+def _number(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > LARGEST:
+        return None
+    return float(value)
+
+
+def _text(value: object) -> str:
+    return "".join(c for c in value[:LONGEST_TEXT] if c.isprintable()) if isinstance(value, str) else ""

@@ -1,0 +1,125 @@
+"""One alarm: hysteresis, delays, latch. Pure: it knows the time of the samples and no clock."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.alarm_limits import Watched
+
+Floats = NDArray[np.float64]
+
+
+class Raising(NamedTuple):
+    """When an alarm was raised, and at what."""
+
+    since_s: float
+    """Wall clock [s since 1970]."""
+    value: float | None
+
+
+class Turn(NamedTuple):
+    """That an alarm was raised, or ended."""
+
+    at_s: float
+    """On the samples' clock [s]."""
+    raising: Raising | None
+    """None: it has ended."""
+
+
+@dataclass
+class AlarmState:
+    """An alarm as it stands.
+
+    Attributes:
+        watched: What is watched.
+        raising: Of an alarm that is active; None of one that is not.
+        gone: The cause is gone, but it is latched.
+        acknowledged: Somebody knows: it ends once the cause is gone.
+        known: A value has come.
+    """
+
+    watched: Watched
+    raising: Raising | None = None
+    gone: bool = False
+    acknowledged: bool = False
+    known: bool = False
+    _held_s: float | None = None
+    """For how long what leads to the next state has held [s]; None: it does not."""
+
+    def take(self, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float) -> list[Turn]:
+        """Take values as they came.
+
+        Args:
+            times_s: Shape (n,): when, on the samples' clock [s].
+            steps_s: Shape (n,): since the sample before, 0 after a gap [s]: what nobody saw holds nothing.
+            values: Shape (n,): in the unit of the limit; NaN: not measured, which neither raises nor ends anything.
+            wall_s: Wall clock less the samples' clock [s].
+
+        Returns:
+            Turns within, oldest first.
+        """
+        sign = 1.0 if self.watched.above else -1.0
+        signed = sign * values
+        if self.raising is None and self._held_s is None and not bool((signed >= sign * self.watched.limit).any()):
+            self.known = self.known or not bool(np.isnan(values).all())
+            return []
+        turns = []
+        for at_s, step_s, value in zip(times_s.tolist(), steps_s.tolist(), signed.tolist(), strict=True):
+            if math.isnan(value):
+                continue
+            self.known = True
+            if self._due(value, step_s, sign):
+                turns += self._turn(at_s, sign * value, wall_s)
+        return turns
+
+    def raise_at(self, at_s: float, raising: Raising) -> list[Turn]:
+        """It is raised, whatever came before; unless it is already."""
+        if self.raising is not None:
+            return []
+        self.raising, self._held_s = raising, None
+        return [Turn(at_s, raising)]
+
+    def acknowledge(self) -> bool:
+        """Somebody knows. Returns whether it has ended by that."""
+        self.acknowledged = self.raising is not None
+        if not self.gone:
+            return False
+        self._end()
+        return True
+
+    def restore(self, raising: Raising, *, gone: bool, acknowledged: bool) -> None:
+        """Go on from a run before."""
+        self.raising, self.gone, self.acknowledged = raising, gone, acknowledged
+        self._held_s = None
+
+    def _due(self, signed: float, step_s: float, sign: float) -> bool:
+        """Whether what leads to the next state has now held for long enough."""
+        raised = self.raising is not None and not self.gone
+        holds = signed < sign * self.watched.clear if raised else signed >= sign * self.watched.limit
+        if not holds:
+            self._held_s = None
+            return False
+        self._held_s = 0.0 if self._held_s is None else self._held_s + step_s
+        if self._held_s < (self.watched.clear_delay_s if raised else self.watched.delay_s):
+            return False
+        self._held_s = None
+        return True
+
+    def _turn(self, at_s: float, value: float, wall_s: float) -> list[Turn]:
+        """Go to the next state. Returns what others need to know of it."""
+        if self.raising is None:
+            return self.raise_at(at_s, Raising(at_s + wall_s, value if math.isfinite(value) else None))
+        if self.gone:  # it is back
+            self.gone = False
+            return []
+        if self.watched.latch and not self.acknowledged:
+            self.gone = True
+            return []
+        self._end()
+        return [Turn(at_s, None)]
+
+    def _end(self) -> None:
+        self.raising, self.gone, self.acknowledged, self._held_s = None, False, False, None

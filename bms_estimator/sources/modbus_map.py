@@ -1,0 +1,115 @@
+"""Registers of a Modbus device to a reading, and the requests that bring them. Does no I/O."""
+
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+from bms_estimator.model.modbus_settings import MOST_WORDS, ModbusSource, Register
+from bms_estimator.sources.text_line import Reading
+
+GAP_WORDS = 8
+"""So many registers that nobody wants are read along, so that what lies around them is of one moment."""
+
+DECIMALS = 5
+"""Of V, A and degC: finer than any register, and 259 times 0.01 is 2.59."""
+
+Table = Literal["holding", "input"]
+Words = Mapping[tuple[Table, int], int]
+"""What the registers hold, by table and address."""
+
+_FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
+
+
+class Value(NamedTuple):
+    """One register value and what it is of."""
+
+    quantity: str
+    """Key within ``[source]``: ``voltage``, ``current``, ``temperature``, ``cells``."""
+    register: Register
+
+    @property
+    def needed(self) -> bool:
+        """Whether there is no reading without it."""
+        return self.quantity in ("voltage", "current")
+
+
+class Request(NamedTuple):
+    """Registers that one request asks for."""
+
+    table: Table
+    address: int
+    words: int
+    values: tuple[Value, ...]
+    """What lies within, by address."""
+
+    @property
+    def described(self) -> str:
+        """For people: ``source.voltage, source.current (holding registers 259 to 261)``."""
+        quantities = ", ".join(dict.fromkeys(f"source.{value.quantity}" for value in self.values))
+        last = f" to {self.address + self.words - 1}" if self.words > 1 else ""
+        return f"{quantities} ({self.table} register{'s' if last else ''} {self.address}{last})"
+
+
+def values_of(settings: ModbusSource) -> tuple[Value, ...]:
+    """What the device is asked for."""
+    named = {"voltage": settings.voltage, "current": settings.current, "temperature": settings.temperature}
+    values = [Value(quantity, register) for quantity, register in named.items() if register is not None]
+    if settings.cells is not None:
+        values += [Value("cells", settings.cells.cell(number)) for number in range(settings.cells.count)]
+    return tuple(values)
+
+
+def plan(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
+    """The requests that bring ``values``: as few as their tables, ``gap`` and ``MOST_WORDS`` allow."""
+    requests: list[Request] = []
+    for value in sorted(values, key=lambda value: (value.register.table, value.register.address)):
+        register, end = value.register, value.register.address + value.register.words
+        if requests:
+            last = requests[-1]
+            near = last.table == register.table and register.address <= last.address + last.words + gap
+            if near and end - last.address <= MOST_WORDS:
+                words = max(last.words, end - last.address)
+                requests[-1] = last._replace(words=words, values=(*last.values, value))
+                continue
+        requests.append(Request(register.table, register.address, register.words, (value,)))
+    return tuple(requests)
+
+
+def split(request: Request) -> tuple[Request, ...]:
+    """The same by quantity and without gaps: which of them a device refuses then shows itself. One that cannot be split is returned."""
+    quantities = dict.fromkeys(value.quantity for value in request.values)
+    return tuple(
+        part
+        for quantity in quantities
+        for part in plan([value for value in request.values if value.quantity == quantity], gap=0)
+    )
+
+
+def decode(register: Register, words: Words) -> float:
+    """The value in V, A or degC; NaN where there is none: it was not read, is ``absent``, or a NaN itself."""
+    addresses = range(register.address, register.address + register.words)
+    if any((register.table, address) not in words for address in addresses):
+        return math.nan
+    ordered = [words[register.table, address] for address in addresses]
+    if register.low_word_first:
+        ordered.reverse()
+    data = b"".join(word.to_bytes(2, "big") for word in ordered)
+    raw: float = struct.unpack(_FORMATS[register.type], data)[0]
+    if raw == register.absent or not math.isfinite(raw):
+        return math.nan
+    return round(raw * register.scale + register.offset, DECIMALS)
+
+
+def reading_of(settings: ModbusSource, words: Words) -> Reading | None:
+    """What the registers say, the current as the device counts it; None where they tell no voltage or no current."""
+    found: dict[str, list[float]] = {}
+    for quantity, register in values_of(settings):
+        found.setdefault(quantity, []).append(decode(register, words))
+    (voltage_v,), (current_a,), (temperature_c,) = (
+        found.get(name, [math.nan]) for name in ("voltage", "current", "temperature")
+    )
+    if math.isnan(voltage_v) or math.isnan(current_a):
+        return None
+    cells_v = tuple(found.get("cells", ()))
+    return Reading(voltage_v, current_a, temperature_c, () if all(map(math.isnan, cells_v)) else cells_v)

@@ -1,0 +1,37 @@
+"""Sources whose libraries are extras: what is missing is named, with the extra that brings it."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.sources.kinds import KINDS
+from tests.command_line import run
+
+V, I = "voltage = { id = 1 }", "current = { id = 2 }"  # noqa: E741
+
+
+@pytest.mark.parametrize(
+    ("source", "package", "extra"),
+    [
+        ('kind = "modbus"\nprofile = "victron-gx"\nhost = "127.0.0.1"', "pymodbus", "modbus"),
+        ('kind = "can"\nprofile = "pylontech-can"', "can", "can"),
+        ('kind = "can"\nprofile = "pylontech-can"', "cantools", "can"),
+    ],
+)
+def test_a_missing_package_is_named(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    source: str,
+    package: str,
+    extra: str,
+) -> None:
+    for module in [*KINDS.values(), "can_map"]:
+        monkeypatch.delitem(sys.modules, f"bms_estimator.sources.{module}", raising=False)
+    monkeypatch.setitem(sys.modules, package, None)
+    pack = tmp_path / "pack.toml"
+    pack.write_text(f"[source]\n{source}\n")
+    code, _, err = run(capsys, "record", "--pack", pack, tmp_path / "out.bmsraw")
+    assert code == 2
+    assert f"this needs {package}: pip install 'bms_estimator[{extra}]'" in err
