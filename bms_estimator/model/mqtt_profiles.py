@@ -27,8 +27,9 @@ class Profile(NamedTuple):
     table: Mapping[str, Any]
     """Of ``[source]``."""
     current_sign: str
-    """What it calls positive."""
+    """What it calls positive; the steps of what it shows follow."""
     voltage_resolution_v: float
+    current_resolution_a: float
     needs: Mapping[str, str] = {}
     """Parameters without which it cannot be found: what each is."""
 
@@ -67,6 +68,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
         },
         DISCHARGE,
         0.01,  # four significant digits
+        0.01,
         {"prefix": "alias or address of the device in its options"},
     ),
     # syssi/esphome-jk-bms, esp32-example.yaml and esp32-ble-example.yaml
@@ -74,16 +76,22 @@ PROFILES: Mapping[ProfileName, Profile] = {
         _esphome("total_voltage", "current", "temperature_sensor_1", "cell_voltage_{cell}"),
         CHARGE,
         0.01,
+        0.01,
         _node("jk-bms"),
     ),
     # syssi/esphome-jbd-bms, esp32-ble-example.yaml
     "esphome-jbd": Profile(
-        _esphome("total_voltage", "current", "temperature_1", "cell_voltage_{cell}"), CHARGE, 0.01, _node("jbd-bms-ble")
+        _esphome("total_voltage", "current", "temperature_1", "cell_voltage_{cell}"),
+        CHARGE,
+        0.01,
+        0.01,
+        _node("jbd-bms-ble"),
     ),
     # ESPHome's own daly_bms with the names of its documentation: every 20 s there
     "esphome-daly": Profile(
         _esphome("battery_voltage", "battery_current", "max_temperature", "cell_{cell}_voltage") | {"interval_s": 20.0},
         CHARGE,
+        0.1,
         0.1,
         _node("daly-bms"),
     ),
@@ -107,6 +115,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
         },
         CHARGE,
         0.01,
+        0.1,
         {
             "prefix": "VRM portal ID, in Settings, VRM online portal",
             "instance": "device instance of the battery, as in the topics N/<portal>/battery/<instance>/...",
@@ -124,6 +133,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
         },
         CHARGE,
         0.1,
+        0.1,
     ),
     # hoylabs/OpenDTU-OnBattery, src/battery/Stats.cpp and src/battery/jkbms/Stats.cpp
     "opendtu": Profile(
@@ -137,6 +147,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
         },
         CHARGE,
         0.01,
+        0.01,
     ),
     # arendst/Tasmota, tasmota/tasmota_xdrv_driver: {"Time":...,"INA219":{"Voltage":4.494,"Current":0.020,"Power":0.089}}
     "tasmota": Profile(
@@ -147,6 +158,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "availability_topic": "tele/{prefix}/LWT",
         },
         DISCHARGE,
+        0.01,
         0.01,
         {"prefix": "Topic of the device, Configuration, MQTT"},
     ),
@@ -160,6 +172,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
         },
         DISCHARGE,
         0.1,
+        0.01,
         {"prefix": "friendly name of the meter"},
     ),
 }

@@ -158,8 +158,9 @@ class MqttSource(ReportSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """Sign of the current and step of the voltage, as the profile has them."""
+        """Sign of the current and steps of what is shown, as the profile has them."""
         if self.profile is None:
             return {"voltage_resolution_v": 0.01}
         profile = PROFILES[self.profile]
-        return {"current_sign": profile.current_sign, "voltage_resolution_v": profile.voltage_resolution_v}
+        shown = ("current_sign", "voltage_resolution_v", "current_resolution_a")
+        return {name: getattr(profile, name) for name in shown}

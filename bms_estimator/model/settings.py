@@ -320,12 +320,7 @@ class Settings(Strict):
             return tables
         if not isinstance(told, dict):
             return tables
-        return tables | {"sensor": {**source.sensor, **told, "protocol": "text"}}
-
-    @property
-    def sample_period_s(self) -> float:
-        """Between two samples, as expected [s]."""
-        return self.source.period_s if self.source else self.sensor.sample_period_s
+        return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **told, "protocol": "text"}}
 
 
 def load_settings(path: Path) -> Settings:

@@ -40,4 +40,4 @@ def open_reports(settings: Settings, *, tap: Tap | None = None) -> Reports | Non
     bringer = make_bringer(settings)
     if bringer is None:
         return None
-    return Reports(bringer, settings.sensor, period_s=settings.sample_period_s, tap=tap)
+    return Reports(bringer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)

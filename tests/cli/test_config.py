@@ -55,7 +55,9 @@ def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, cap
         loaded = load_settings(pack)
         assert loaded.source
         assert loaded.source.kind in KINDS
-        assert loaded.sensor == Settings().sensor.model_copy(update={"protocol": "text", "period_s": 1.0})
+        assert loaded.sensor.protocol == "text"
+        told = set(written["sensor"]) - {"protocol"}
+        assert loaded.sensor.model_dump(include=told) == Settings().sensor.model_dump(include=told)
 
 
 def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
