@@ -19,6 +19,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import MqttSettings, Settings
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
+from bms_estimator.sources.kinds import make_bringer
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 
@@ -48,6 +49,8 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
+        settings = settings.model_copy(update={"mqtt": mqtt})
+    make_bringer(settings)  # says what of [source] cannot be used, or is not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")

@@ -137,8 +137,10 @@ def bringer(settings: Settings) -> MqttReports:
     if source.url is not None:
         told = {"url": source.url, "username": source.username}
         mqtt = MqttSettings(**told, password_file=source.password_file, ca_file=source.ca_file)
-    elif settings.mqtt is not None:
-        mqtt = settings.mqtt
-    else:
+        try:
+            return MqttReports(source, mqtt)
+        except UserError as error:
+            raise UserError(str(error).replace("mqtt.", "source.", 1)) from None
+    if settings.mqtt is None:
         raise UserError("source.url: missing, and there is no [mqtt] whose broker could be meant")
-    return MqttReports(source, mqtt)
+    return MqttReports(source, settings.mqtt)
