@@ -24,6 +24,7 @@ from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
 from bms_estimator.sinks.influx import target
+from bms_estimator.sources.kinds import make_bringer
 from bms_estimator.sources.ports import board_ports
 from bms_estimator.sources.probe import Found
 from bms_estimator.sources.probe import probe as who_is_there
@@ -97,6 +98,8 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
         warnings += unseen
         target(settings.influx.model_copy(update=dict.fromkeys(unread)))
+        settings = settings.model_copy(update={"mqtt": mqtt})
+    make_bringer(settings)  # says what of [source] cannot be used, or is not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
