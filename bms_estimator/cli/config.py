@@ -126,6 +126,7 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         voltage_resolution_v=settings.sensor.voltage_resolution_v,
         voltage_noise_v=settings.sensor.voltage_noise_v,
         initial_soc=settings.pack.initial_soc,
+        sampling=settings.sampling,
     )[0]["observer"]
     follows = {
         "pack.nominal_voltage_v": cell.cell.nominal_voltage_v,
