@@ -17,10 +17,13 @@ from bms_estimator.kernels.margins import delta
 from bms_estimator.model.alarm_limits import out_of_range, watched
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.export_settings import InfluxSettings
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import MqttSettings, SensorSettings, Settings
+from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
+from bms_estimator.sinks.influx import target
 from bms_estimator.sources.ports import board_ports
 from bms_estimator.sources.probe import Found
 from bms_estimator.sources.probe import probe as who_is_there
@@ -86,10 +89,14 @@ def _probed(ports: Sequence[str]) -> Given:
 def check(file: PackFile = Path("pack.toml")) -> None:
     """Check a settings file and its cell file; name what is wrong, warn of what will not work well."""
     settings, cell = load_pack(file)
-    warnings = [*implausible(settings, cell), *out_of_range(settings, cell), *_lemma(cell)]
+    warnings = [*implausible(settings, cell), *out_of_range(settings, cell), *unusable(settings), *_lemma(cell)]
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
+    if settings.influx is not None:
+        unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
+        warnings += unseen
+        target(settings.influx.model_copy(update=dict.fromkeys(unread)))
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
@@ -137,13 +144,17 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
 
 def _here(mqtt: MqttSettings) -> tuple[MqttSettings, list[str]]:
     """The settings without what only the running service can read, and a warning for each such file."""
-    files = {"password_file": mqtt.password_file, "cert_file": mqtt.cert_file, "key_file": mqtt.key_file}
-    unseen = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
-    without = set(unseen)
+    without, warnings = _unread("mqtt", mqtt, "password_file", "cert_file", "key_file")
     if without & {"cert_file", "key_file"}:  # one is of no use without the other
         without |= {"cert_file", "key_file"}
-    warnings = [f"mqtt.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unseen.items()]
     return mqtt.model_copy(update=dict.fromkeys(without)), warnings
+
+
+def _unread(section: str, settings: MqttSettings | InfluxSettings, *keys: str) -> tuple[set[str], list[str]]:
+    """The keys of files that only the running service can read, and a warning for each."""
+    files = {key: getattr(settings, key) for key in keys}
+    unread = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
+    return set(unread), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unread.items()]
 
 
 def _lemma(cell: PackModel) -> list[str]:

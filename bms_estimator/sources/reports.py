@@ -133,6 +133,8 @@ class Reports:
 
     current_zero: None = None
     """There is no zero to be set."""
+    relay: None = None
+    """Nor is there a relay."""
 
     def pulse(self) -> Pulse:
         """Whether the task that takes what is brought lives."""

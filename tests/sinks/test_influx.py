@@ -13,25 +13,15 @@ import pytest
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Alarm, Snapshot
+from bms_estimator.model.estimate import Snapshot
 from bms_estimator.model.export_settings import InfluxSettings
 from bms_estimator.sinks.influx import BATCH, MOST_WAITING, InfluxSink
 from bms_estimator.sinks.line_protocol import lines
 from tests.influxdb import INFLUXD, InfluxDB
 from tests.sinks.service import until
-from tests.sinks.snapshots import NOTHING_YET, ONE
+from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW
 
-LOW = Alarm(
-    name="soc_low",
-    severity="warning",
-    active=True,
-    latched=False,
-    since="2024-05-01T12:00:00.000Z",
-    value=9.5,
-    limit=10.0,
-    unit="%",
-    text='charge "it" soon, \\now\nor never',
-)
+LOW = SOC_LOW.model_copy(update={"text": 'charge "it" soon, \\now\nor never'})
 
 
 def at(second: int, **changes: Any) -> Snapshot:
@@ -168,7 +158,8 @@ async def test_what_waits_is_bounded_and_goes_out_in_batches(server: Any) -> Non
     assert max(body.count(b"\n") + 1 for _, _, body in server.asked) <= BATCH
 
 
-async def test_a_server_that_never_answers_stops_nobody() -> None:
+async def test_a_server_that_never_answers_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bms_estimator.sinks.influx.CLOSING_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts
         async with sink(f"http://127.0.0.1:{silent.getsockname()[1]}") as writing:
             for second in range(20):
