@@ -16,7 +16,9 @@ from bms_estimator.model.alarm_limits import out_of_range, watched
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.model.settings import MqttSettings, Settings
+from bms_estimator.page.guard import guard_of
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
 
@@ -48,6 +50,8 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
+    if settings.page is not None:
+        warnings += _token(settings.page)
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
@@ -102,6 +106,18 @@ def _here(mqtt: MqttSettings) -> tuple[MqttSettings, list[str]]:
         without |= {"cert_file", "key_file"}
     warnings = [f"mqtt.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unseen.items()]
     return mqtt.model_copy(update=dict.fromkeys(without)), warnings
+
+
+def _token(page: PageSettings) -> list[str]:
+    """A warning where only the running service can read the token.
+
+    Raises:
+        UserError: It cannot be used.
+    """
+    if page.token_file is not None and is_for_the_service(page.token_file):
+        return [f"page.token_file = {page.token_file}: {ONLY_IN_SERVICE}"]
+    guard_of(page)
+    return []
 
 
 def _lemma(cell: PackModel) -> list[str]:

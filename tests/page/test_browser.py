@@ -27,6 +27,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 
 MINUS = "\N{MINUS SIGN}"
+PACK = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
 CELLS = (3.311, 3.325, 3.318, 3.322)
 CELLAR = "bms/cellar"
 ODD = {
@@ -116,7 +117,7 @@ def board(_time_s: float) -> dict[str, Any]:
 async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
     await keep(folder / "cellar.sqlite", [])
     port = free_port()
-    async with Service(folder, broker, free_port(), board, series=4) as service, Listener(broker) as live:
+    async with Service(folder, broker, free_port(), board, pack=PACK) as service, Listener(broker) as live:
         arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
         process = await starting(folder, "dashboard", *arguments, port=port)
         await publish(live, "availability", b"online")
