@@ -17,6 +17,9 @@ import pytest_asyncio
 from playwright.async_api import Browser
 
 from bms_estimator.model.estimate import Alarm
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.model.settings import MqttSettings
+from bms_estimator.page.dashboard import dashboard
 from tests.mosquitto import MOSQUITTO, Broker, Listener, free_port
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, starting
@@ -339,11 +342,10 @@ async def test_it_is_stale_while_the_broker_is_away_until_new_values_come(browse
 
 
 async def test_beyond_this_machine_it_asks_for_the_token(browser: Browser, folder: Path, broker: Broker) -> None:
-    port, token = free_port(), folder / "token"
+    token = folder / "token"
     token.write_text("0123456789abcdef")
-    arguments = ("--mqtt", broker.url, "--listen", f"0.0.0.0:{port}", "--token-file", token, "--no-browser")
-    process = await starting(folder, "dashboard", *arguments, port=port)
-    async with tab(browser, f"http://127.0.0.1:{port}/") as opened:
+    settings = PageSettings(listen=f"0.0.0.0:{free_port()}", token_file=token)
+    async with dashboard(MqttSettings(url=broker.url), settings, folder) as url, tab(browser, url) as opened:
         assert await opened.page.locator("#pack").count() == 0
         await opened.page.get_by_label("Token").fill("0123456789abcdef")
         await opened.page.keyboard.press("Enter")
@@ -351,8 +353,6 @@ async def test_beyond_this_machine_it_asks_for_the_token(browser: Browser, folde
         assert "token" not in opened.page.url
         await opened.page.reload()
         await opened.page.locator("#pack").wait_for()
-    process.terminate()
-    assert await process.wait() == 0
 
 
 @pytest.mark.parametrize("size", [PHONE, {"width": 320, "height": 600}, {"width": 1920, "height": 1080}], ids=str)
