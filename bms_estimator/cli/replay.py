@@ -125,7 +125,8 @@ async def _publisher(
         return None
     delivery = Delivery()
     outbox = Outbox(None, most=settings.store.outbox_messages)
-    mqtt = MqttSink(settings.mqtt, settings.pack.name, Requests(delivery), delivery, outbox)
+    home = settings.home_assistant
+    mqtt = MqttSink(settings.mqtt, settings.pack.name, Requests(delivery), delivery, outbox, home_assistant=home)
     sinks = [await stack.enter_async_context(mqtt)]
     return Publisher(settings, cell, estimator, source=source, sinks=sinks, clock=Clock(), delivery=delivery)
 

@@ -30,6 +30,7 @@ async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Se
     sensors = [settings.sensor for settings, _ in packs if settings.source is None]
     _differ("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
     _differ("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
+    _differ("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
     stop, notifier, pages = stop_on_signal(), Notifier(names), Pages()
 
     async def serve_one(settings: Settings, cell: PackModel, reload: Reload) -> None:

@@ -1,112 +1,50 @@
-"""Home Assistant's device discovery: one retained message that describes all entities of one pack.
-
-Home Assistant keeps a row for each change of each entity. So it gets topics of its own, rounded and slow
-(``home_assistant_values``); what only a researcher looks at is there but disabled until he enables it.
-"""
+"""Home Assistant's device discovery: one retained message that describes all entities of one pack."""
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, get_args
 
+from bms_estimator.model.alarm_settings import ALARMS
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Info
+from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Command
 from bms_estimator.sinks import FRESH_PERIODS
+from bms_estimator.sinks.home_assistant_entities import BATTERY, CELL, FUEL_CELL, OF_CELLS, Entity, cell_key, entities
 
-BIRTH_TOPIC = "homeassistant/status"
-"""Home Assistant says ``online`` here when it has started."""
-VALUES, PROBLEMS = "home_assistant", "home_assistant/problems"
-"""Topics below the device's."""
+VALUES = "home_assistant"
+"""Topic below the device's."""
 LEAST_EXPIRY_S = 30
 """Home Assistant calls no value unavailable that is younger than this [s]."""
-QUICK_S = 15.0
-"""What a load moves all the time is shown anew no more often than this: four rows a minute [s]."""
-SLOW_S = 60.0
-"""All other values [s]."""
-
-
-class Entity(NamedTuple):
-    """A number that Home Assistant shows."""
-
-    name: str
-    unit: str | None
-    decimals: int
-    """To which it is rounded."""
-    step: float
-    """It is shown anew when it has changed by so much, in its unit: what noise moves is less."""
-    device_class: str | None = None
-    pace_s: float = SLOW_S
-    """Nor more often than this [s]."""
-    main: bool = False
-    """Else Home Assistant lists it among the diagnostics."""
-    enabled: bool = True
-    """Else the user enables it."""
-    state_class: str = "measurement"
-
-
-def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
-    """What the observer looks like inside."""
-    return Entity(name, unit, decimals, 10.0**-decimals, device_class, enabled=False)
-
-
-ESTIMATE = {
-    # by field of the estimate
-    "voltage_v": Entity("Voltage", "V", 2, 0.02, "voltage", QUICK_S, main=True),
-    "current_a": Entity("Current (discharge positive)", "A", 2, 0.05, "current", QUICK_S, main=True),
-    "power_w": Entity("Power (discharge positive)", "W", 1, 0.5, "power", QUICK_S, main=True),
-    "temperature_c": Entity("Temperature", "°C", 1, 0.3, "temperature", main=True),
-    "soc_percent": Entity("State of charge", "%", 1, 0.2, "battery", main=True),
-    "remaining_capacity_ah": Entity("Remaining capacity", "Ah", 2, 0.02, main=True),
-    "remaining_energy_wh": Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", main=True),
-    "time_to_empty_s": Entity("Time to empty", "s", 0, 60.0, "duration", main=True),
-    "frames_lost": Entity("Frames lost", None, 0, 1.0, state_class="total_increasing"),
-    "crc_errors": Entity("CRC errors", None, 0, 1.0, state_class="total_increasing"),
-    "soc_std": _raw("State of charge, standard deviation", None, 3),
-    "usable_capacity_ah": _raw("Usable capacity", "Ah", 2),
-    "voltage_estimate_v": _raw("Estimated voltage", "V", 2, "voltage"),
-    "innovation_v": _raw("Innovation", "V", 3, "voltage"),
-    "stability_margin": _raw("Stability margin", None, 3),
-    "delta_1": _raw("delta 1", None, 4),
-    "delta_2": _raw("delta 2", None, 4),
-    "adaptive_gain_k": _raw("Adaptive gain k", "V²s", 6),
-    "nussbaum_gain": _raw("Nussbaum gain", None, 3),
-    "sample_rate_hz": _raw("Sample rate", "Hz", 1, "frequency"),
+ALARM_CLASSES = {
+    "soc_low": "battery",
+    "over_temperature": "heat",
+    "under_temperature": "cold",
+    "charging_below_freezing": "cold",
 }
-ELEMENTS = {
-    # by element of the parameters
-    "r_s_ohm": Entity("R_s", "Ω", 4, 0.0005),
-    "r_ts_ohm": _raw("R_ts", "Ω", 4),
-    "r_tl_ohm": _raw("R_tl", "Ω", 4),
-    "c_ts_farad": _raw("C_ts", "F", 0),
-    "c_tl_farad": _raw("C_tl", "F", 0),
-}
-STACK = {
-    # by element of the parameters of a fuel cell
-    "r_ohm": Entity("Resistance", "Ω", 4, 0.0005),
-    "tafel_slope_v": _raw("Tafel slope", "V", 4),
-    "exchange_current_a": _raw("Exchange current", "A", 9),
-    "c_dl_farad": _raw("Double layer capacitance", "F", 4),
-    "concentration_v": _raw("Concentration loss B", "V", 4),
-    "limiting_current_a": _raw("Limiting current", "A", 2),
-    "internal_current_a": _raw("Internal current", "A", 4),
-}
-OF_CHARGE = (
-    "soc_percent",
-    "remaining_capacity_ah",
-    "remaining_energy_wh",
-    "time_to_empty_s",
-    "soc_std",
-    "usable_capacity_ah",
-    "stability_margin",
-    "delta_1",
-    "delta_2",
-)
-"""What a fuel cell has not."""
-BATTERY = ESTIMATE | ELEMENTS
-FUEL_CELL = {key: entity for key, entity in ESTIMATE.items() if key not in OF_CHARGE} | STACK
-PROBLEM_NAMES = {"sensor_silent": "Sensor silent", "suspicion": "Input suspected", "lock_lost": "Lock lost"}
+"""Where it is not "problem"."""
+NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
+"""All that ``[home_assistant.names]`` may name."""
 
 
-def entities(info: Info) -> dict[str, Entity]:
-    """The numbers of a pack by their keys."""
-    return FUEL_CELL if info.capacity_ah is None else BATTERY
+class Described(NamedTuple):
+    """On what depends which entities there are."""
+
+    info: Info
+    cells: int = 0
+    """So many are measured."""
+    alarms: tuple[str, ...] = ()
+    commands: tuple[str, ...] = ()
+    """That are allowed."""
+
+
+def check_names(settings: HomeAssistantSettings) -> None:
+    """Raises UserError: There is no such entity."""
+    unknown = sorted(set(settings.names) - NAMED)
+    if unknown:
+        raise UserError(
+            f"home_assistant.names.{unknown[0]}: there is no such entity; there are {', '.join(sorted(NAMED))}"
+        )
 
 
 def device_id(device: str) -> str:
@@ -114,22 +52,26 @@ def device_id(device: str) -> str:
     return f"bms_{device}"
 
 
-def discovery_topic(device: str) -> str:
+def discovery_topic(settings: HomeAssistantSettings, device: str) -> str:
     """Where the discovery message goes; an empty retained payload there removes the device."""
-    return f"homeassistant/device/{device_id(device)}/config"
+    return f"{settings.discovery_prefix}/device/{device_id(device)}/config"
 
 
-def discovery(info: Info, root: str, sample_period_s: float) -> dict[str, Any]:
+def discovery(
+    settings: HomeAssistantSettings, described: Described, root: str, sample_period_s: float
+) -> dict[str, Any]:
     """The discovery message.
 
     Args:
-        info: Of the pack.
+        settings: How the pack is to stand there.
+        described: What there is of it.
         root: Topic of the device, ``bms/<device>``.
         sample_period_s: Between two samples [s].
     """
+    info = described.info
     device = {
         "identifiers": [device_id(info.device)],
-        "name": info.device,
+        "name": settings.name or info.device,
         "model": info.cell,
         "manufacturer": "bms_estimator",
         "sw_version": info.version,
@@ -138,30 +80,57 @@ def discovery(info: Info, root: str, sample_period_s: float) -> dict[str, Any]:
         device["serial_number"] = info.board["serial"]
     fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
     expiry_s = max(LEAST_EXPIRY_S, math.ceil(fresh_s))
-    numbers = {key: _number(key, entity, root, expiry_s) for key, entity in entities(info).items()}
-    problems = {key: _problem(key, name, root) for key, name in PROBLEM_NAMES.items()}
+    positive = settings.current_sign.removesuffix("_positive")
+    numbers = entities(info, described.cells).items()
+    components = {
+        **{key: _number(key, entity, root, expiry_s) for key, entity in numbers},
+        **{
+            key: _number(key, entity, root, expiry_s) | _sign(root, positive)
+            for key, entity in numbers
+            if entity.signed
+        },
+        **{f"alarm_{name}": _alarm(name, root) for name in described.alarms},
+        **{name: _COMMANDS[name](root) for name in described.commands},
+    }
+    names = settings.names | _cell_names(settings, described.cells)
     return {
         "device": device,
         "origin": {"name": "bms_estimator", "sw_version": info.version},
         "availability": [{"topic": f"{root}/availability"}, {"topic": f"{root}/sensor/availability"}],
         "availability_mode": "all",
         "components": {
-            key: component | _identity(info.device, key, component["platform"])
-            for key, component in (numbers | problems).items()
+            key: component | _identity(info.device, key, component["platform"]) | _named(names, key)
+            for key, component in components.items()
         },
     }
 
 
+def _cell_names(settings: HomeAssistantSettings, cells: int) -> dict[str, str]:
+    if CELL not in settings.names:
+        return {}
+    return {cell_key(number): f"{settings.names[CELL]} {number}" for number in range(1, cells + 1)}
+
+
+def _named(names: Mapping[str, str], key: str) -> dict[str, str]:
+    name = names.get(key.removeprefix("alarm_"))
+    return {"name": name} if name else {}
+
+
 def _identity(device: str, key: str, platform: str) -> dict[str, str]:
+    """Its entity's id does not depend on its name, so that a dashboard fits in any language.
+
+    Before 2025.10 the id was ``object_id``, which later versions do not read where the other is told.
+    """
     entity = f"{device_id(device)}_{key}"
-    return {"unique_id": entity, "default_entity_id": f"{platform}.{entity}"}
+    return {"unique_id": entity, "default_entity_id": f"{platform}.{entity}", "object_id": entity}
 
 
 def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any]:
+    topic = f"{root}/{VALUES}"
     options = {
         "platform": "sensor",
         "name": entity.name,
-        "state_topic": f"{root}/{VALUES}",
+        "state_topic": topic,
         "value_template": f"{{{{ value_json.{key} }}}}",
         "unit_of_measurement": entity.unit,
         "device_class": entity.device_class,
@@ -174,17 +143,78 @@ def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
     return {option: value for option, value in options.items() if value is not None}
 
 
-def _problem(key: str, name: str, root: str) -> dict[str, Any]:
-    """On while there is a reason, which is its only attribute; it matters when the sensor is silent, too."""
-    topic = f"{root}/{PROBLEMS}"
+def _sign(root: str, positive: str) -> dict[str, str]:
+    """What it calls positive is its only attribute."""
+    template = f"{{{{ {{'positive': '{positive}'}} | tojson }}}}"
+    return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
+
+
+def _alarm(name: str, root: str) -> dict[str, Any]:
+    """On while it is active; it matters when the sensor is silent, too."""
+    topic = f"{root}/alarm/{name}"
     return {
         "platform": "binary_sensor",
-        "name": name,
+        "name": name.replace("_", " ").capitalize().replace("Soc", "State of charge"),
         "state_topic": topic,
-        "value_template": f"{{{{ 'ON' if value_json.{key} else 'OFF' }}}}",
+        "value_template": "{{ 'ON' if value_json.active else 'OFF' }}",
         "json_attributes_topic": topic,
-        "json_attributes_template": f"{{{{ {{'reason': value_json.{key}}} | tojson }}}}",
+        "json_attributes_template": "{{ {'reason': value_json.text, 'severity': value_json.severity} | tojson }}",
         "availability": [{"topic": f"{root}/availability"}],
-        "device_class": "problem",
-        "entity_category": "diagnostic",
+        "device_class": ALARM_CLASSES.get(name, "problem"),
     }
+
+
+def _set_soc(root: str) -> dict[str, Any]:
+    """It shows what was set last: to show the SOC, too, would make a row more for each change of it."""
+    return {
+        "platform": "number",
+        "name": "Set state of charge",
+        "command_topic": f"{root}/request/set_soc",
+        "command_template": '{"soc": {{ value / 100 }}}',
+        "min": 0,
+        "max": 100,
+        "step": 0.1,
+        "mode": "box",
+        "unit_of_measurement": "%",
+        "entity_category": "config",
+    }
+
+
+def _current_zero(root: str) -> dict[str, Any]:
+    return _button("Take present current as zero", f"{root}/request/current_zero") | {"entity_category": "config"}
+
+
+def _acknowledge(root: str) -> dict[str, Any]:
+    """All alarms at once."""
+    availability = {"availability": [{"topic": f"{root}/availability"}]}
+    return _button("Acknowledge alarms", f"{root}/request/acknowledge_alarm") | availability
+
+
+def _button(name: str, topic: str) -> dict[str, Any]:
+    return {"platform": "button", "name": name, "command_topic": topic, "payload_press": "{}"}
+
+
+def _publish_rate(root: str) -> dict[str, Any]:
+    return {
+        "platform": "number",
+        "name": "Publish rate",
+        "state_topic": f"{root}/info",
+        "value_template": "{{ value_json.publish_rate_hz }}",
+        "command_topic": f"{root}/request/publish_rate",
+        "command_template": '{"rate_hz": {{ value }}}',
+        "min": LEAST_RATE_HZ,
+        "max": MOST_RATE_HZ,
+        "step": 0.1,
+        "mode": "box",
+        "unit_of_measurement": "Hz",
+        "availability": [{"topic": f"{root}/availability"}],
+        "entity_category": "config",
+    }
+
+
+_COMMANDS = {
+    "set_soc": _set_soc,
+    "current_zero": _current_zero,
+    "acknowledge_alarm": _acknowledge,
+    "publish_rate": _publish_rate,
+}

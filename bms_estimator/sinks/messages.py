@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
-from bms_estimator.model.estimate import Health, Info, Report, Snapshot
+from bms_estimator.model.estimate import Health, Report, Snapshot
 from bms_estimator.model.event import events
-from bms_estimator.sinks.home_assistant import PROBLEMS, VALUES, discovery, discovery_topic
-from bms_estimator.sinks.home_assistant_values import Shown, next_problems, next_values
+from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.sinks.home_assistant import VALUES, Described, check_names, discovery, discovery_topic
+from bms_estimator.sinks.home_assistant_values import Shown, next_values
 from bms_estimator.sinks.payloads import schema
 
 AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
@@ -29,6 +30,8 @@ class Sent(NamedTuple):
 
     snapshot: Snapshot | None = None
     shown: Shown = Shown()
+    described: Described | None = None
+    """To Home Assistant."""
 
 
 class Messages:
@@ -38,10 +41,27 @@ class Messages:
         base_topic: First part of all topics.
         device: Name of the pack.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
+        home_assistant: How the pack is to stand there.
+
+    Attributes:
+        root: Of all topics.
+        commands: Those that are allowed.
+
+    Raises:
+        UserError: ``home_assistant`` names what there is not.
     """
 
-    def __init__(self, base_topic: str, device: str, sample_period_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        base_topic: str,
+        device: str,
+        sample_period_s: float = 0.0,
+        home_assistant: HomeAssistantSettings | None = None,
+    ) -> None:
         self.root = f"{base_topic}/{device}"
+        self.commands: tuple[str, ...] = ()
+        self._home = home_assistant or HomeAssistantSettings()
+        check_names(self._home)
         self._device, self._sample_period_s = device, sample_period_s
         self._schema = _schema()  # takes milliseconds, and here nothing waits yet
 
@@ -90,28 +110,37 @@ class Messages:
             messages.append(self._retained("health", _report(health)))
         if before is None or before.info != info:
             messages.append(self._retained("info", _report(info)))
-            if before is None or self._discovery(before.info) != self._discovery(info):
-                messages.append(Message(discovery_topic(self._device), _json(self._discovery(info)), 1, retain=True))
+        described = self._described(sent, snapshot)
+        if described != sent.described:
+            payload = self._discovery(described)
+            if sent.described is None or payload != self._discovery(sent.described):
+                messages.append(Message(discovery_topic(self._home, self._device), payload, 1, retain=True))
         known_alarms = before.alarms if before else ()
         messages += [self._retained(f"alarm/{a.name}", _report(a)) for a in alarms if a not in known_alarms]
-        told, shown = self._home_assistant(sent.shown, snapshot, now_s)
-        return messages + told, Sent(snapshot, shown)
+        told, shown = self._home_assistant(sent.shown, snapshot, described, now_s)
+        return messages + told, Sent(snapshot, shown, described)
 
-    def _home_assistant(self, before: Shown, snapshot: Snapshot, now_s: float) -> tuple[list[Message], Shown]:
-        messages = []
-        shown = next_values(before, snapshot, now_s)
-        if shown is not before:
-            messages.append(self._live(VALUES, _json(shown.values)))
-        after = next_problems(shown, snapshot, now_s)
-        if after is not shown:
-            messages.append(self._retained(PROBLEMS, _json(after.problems)))
-        return messages, after
+    def _described(self, sent: Sent, snapshot: Snapshot) -> Described:
+        """Cells that were measured once stay."""
+        cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
+        known = sent.described.cells if sent.described else 0
+        return Described(snapshot.info, max(cells, known), tuple(a.name for a in snapshot.alarms), self.commands)
+
+    def _home_assistant(
+        self, before: Shown, snapshot: Snapshot, described: Described, now_s: float
+    ) -> tuple[list[Message], Shown]:
+        if not self._home.enabled:
+            return [], before
+        sign = 1.0 if self._home.current_sign == "discharge_positive" else -1.0
+        shown = next_values(before, snapshot, described, now_s, sign=sign)
+        return ([] if shown is before else [self._live(VALUES, _json(shown.values))]), shown
 
     def _sensor(self, health: Health) -> Message:
         return self._retained(SENSOR_AVAILABILITY, b"online" if health.sensor_online else b"offline")
 
-    def _discovery(self, info: Info) -> dict[str, Any]:
-        return discovery(info, self.root, self._sample_period_s)
+    def _discovery(self, described: Described) -> bytes:
+        """Empty, which removes the device, where Home Assistant is to know none."""
+        return _json(discovery(self._home, described, self.root, self._sample_period_s)) if self._home.enabled else b""
 
     def _kept(self, topic: str, report: Report) -> Message:
         return Message(f"{self.root}/{topic}", _report(report), 1, retain=False)

@@ -14,6 +14,7 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import ECHO_S, Availability
@@ -21,7 +22,6 @@ from bms_estimator.sinks.backlog import Backlog
 from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connect, Connection, Hello, Received
 from bms_estimator.sinks.dial import Dial
-from bms_estimator.sinks.home_assistant import BIRTH_TOPIC
 from bms_estimator.sinks.link import Link
 from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY, Message, Messages, Sent
 from bms_estimator.sinks.pauses import FIRST_DELAY_S
@@ -50,6 +50,7 @@ class MqttSink:
         outbox: What must reach the broker.
         connect: Makes a connection; over TCP when left out.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
+        home_assistant: How the pack is to stand there.
         first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
         birth_delay_s: From Home Assistant's birth message to the retained messages [s].
         echo_s: Until a broker has given back ``online`` [s].
@@ -68,6 +69,7 @@ class MqttSink:
         *,
         connect: Connect | None = None,
         sample_period_s: float = 0.0,
+        home_assistant: HomeAssistantSettings | None = None,
         first_delay_s: float = FIRST_DELAY_S,
         birth_delay_s: float = BIRTH_DELAY_S,
         echo_s: float = ECHO_S,
@@ -76,7 +78,8 @@ class MqttSink:
         self._refusals = Refusals(delivery, self._say_again, first_delay_s)
         self._backlog = Backlog(outbox, delivery, self._refusals, first_delay_s)
         self._birth_delay_s = birth_delay_s
-        self._messages = Messages(settings.base_topic, device, sample_period_s)
+        self._messages = Messages(settings.base_topic, device, sample_period_s, home_assistant)
+        self._birth_topic = (home_assistant or HomeAssistantSettings()).status_topic
         identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.farewell()[-1]
         hello = Hello(identifier, will, lambda kind, topic: requests.refuse(kind, topic[:MOST_SHOWN]))
         for warning in check(settings):
@@ -99,6 +102,10 @@ class MqttSink:
         self._backlog.put(self._messages.kept(self._before, snapshot))
         self._slot = self._before = snapshot
         self._wake.set()
+
+    def say(self, topic: str, payload: bytes) -> None:
+        """Publish a message of somebody else at QoS 1; it waits for a broker that is away, as states do."""
+        self._backlog.put([Message(topic, payload, 1, retain=False)])
 
     async def __aenter__(self) -> Self:
         """Start reaching for the broker."""
@@ -142,7 +149,7 @@ class MqttSink:
         At QoS 0: Mosquitto counts what it keeps back as too long among the messages in flight, where at QoS 1 it stays.
         """
         availabilities = [self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)]
-        refused = await connection.subscribe(self._topic("request/+"), [*availabilities, BIRTH_TOPIC])
+        refused = await connection.subscribe(self._topic("request/+"), [*availabilities, self._birth_topic])
         for topic, why in refused.items():
             self._refusals.deny(topic, f"not allowed to read it: {why}")
 
@@ -165,6 +172,7 @@ class MqttSink:
             snapshot, self._slot = self._slot, None
             if snapshot is not None:
                 now_s = asyncio.get_running_loop().time()
+                self._messages.commands = self._requests.allowed
                 messages, self._sent = self._messages.due(self._sent, snapshot, now_s)
                 await self._publish(connection, messages)
             if self._link.closing.is_set():
@@ -178,7 +186,7 @@ class MqttSink:
         """Answer requests, hear Home Assistant's birth, watch over the availabilities."""
         while True:
             message = await connection.receive()
-            if message.topic == BIRTH_TOPIC:
+            if message.topic == self._birth_topic:
                 if message.payload == b"online" and not message.retain:
                     asyncio.get_running_loop().call_later(self._birth_delay_s, self._say_again)
             elif message.topic in (self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)):

@@ -60,6 +60,11 @@ class Requests:
         """Make a request of ``NAMES`` answerable."""
         self._handlers[name] = handler
 
+    @property
+    def allowed(self) -> tuple[Command, ...]:
+        """Commands that are allowed, in the order in which all stand."""
+        return tuple(command for command in COMMANDS if command in self._allowed)
+
     def allow(self, commands: Collection[Command]) -> None:
         """Allow these commands from now on, and no others."""
         self._allowed = commands

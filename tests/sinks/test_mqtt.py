@@ -33,7 +33,7 @@ from tests.sinks.snapshots import ONE, snapshot
 
 MOST_KEPT = 4
 AT_START = len(events(None, ONE))
-RETAINED = ("info", "availability", "sensor/availability", "schema", "health", "home_assistant/problems")
+RETAINED = ("info", "availability", "sensor/availability", "schema", "health")
 DISCOVERY = "homeassistant/device/bms_pack/config"
 HELLO = Hello("test", Message("bms/pack/availability", b"offline", 1, retain=True), lambda *_: None)
 DYNAMIC_SECURITY = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)

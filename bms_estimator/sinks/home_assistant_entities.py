@@ -1,0 +1,129 @@
+"""The numbers that Home Assistant shows of a pack.
+
+Home Assistant keeps a row for each change of each entity. So it gets topics of its own, rounded and slow
+(``home_assistant_values``); what only a researcher looks at is there but disabled until he enables it.
+"""
+
+from typing import NamedTuple
+
+from bms_estimator.model.estimate import Info
+
+QUICK_S = 15.0
+"""What a load moves all the time is shown anew no more often than this: four rows a minute [s]."""
+SLOW_S = 60.0
+"""All other values [s]."""
+
+
+class Entity(NamedTuple):
+    """A number that Home Assistant shows."""
+
+    name: str | None
+    """None: Home Assistant names it by its device class, in its user's language."""
+    unit: str | None
+    decimals: int
+    """To which it is rounded."""
+    step: float
+    """It is shown anew when it has changed by so much, in its unit: what noise moves is less."""
+    device_class: str | None = None
+    pace_s: float = SLOW_S
+    """Nor more often than this [s]."""
+    main: bool = False
+    """Else Home Assistant lists it among the diagnostics."""
+    enabled: bool = True
+    """Else the user enables it."""
+    state_class: str | None = "measurement"
+    signed: bool = False
+    """Its sign is that of the current."""
+
+
+def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
+    """What the observer looks like inside."""
+    return Entity(name, unit, decimals, 10.0**-decimals, device_class, enabled=False)
+
+
+def _total(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
+    """What is counted over all runs."""
+    step = 10.0**-decimals
+    return Entity(name, unit, decimals, step, device_class, main=True, state_class="total_increasing")
+
+
+def _count(name: str) -> Entity:
+    """What is counted since start."""
+    return Entity(name, None, 0, 1.0, enabled=False, state_class="total_increasing")
+
+
+ESTIMATE = {
+    "voltage_v": Entity(None, "V", 2, 0.02, "voltage", QUICK_S, main=True),
+    "current_a": Entity(None, "A", 2, 0.05, "current", QUICK_S, main=True, signed=True),
+    "power_w": Entity(None, "W", 1, 0.5, "power", QUICK_S, main=True, signed=True),
+    "temperature_c": Entity(None, "°C", 1, 0.3, "temperature", main=True),
+    "energy_out_kwh": _total("Energy out", "kWh", 3, "energy"),
+    "energy_in_kwh": _total("Energy in", "kWh", 3, "energy"),
+    "charge_out_ah": _total("Charge out", "Ah", 2)._replace(enabled=False),
+    "charge_in_ah": _total("Charge in", "Ah", 2)._replace(enabled=False),
+    "frames_lost": _count("Frames lost"),
+    "crc_errors": _count("CRC errors"),
+    "voltage_estimate_v": _raw("Estimated voltage", "V", 2, "voltage"),
+    "innovation_v": _raw("Innovation", "V", 3, "voltage"),
+    "adaptive_gain_k": _raw("Adaptive gain k", "V²s", 6),
+    "nussbaum_gain": _raw("Nussbaum gain", None, 3),
+    "sample_rate_hz": _raw("Sample rate", "Hz", 1, "frequency"),
+}
+OF_CHARGE = {
+    "soc_percent": Entity(None, "%", 1, 0.2, "battery", main=True),
+    "soc_std_percent": Entity("State of charge, standard deviation", "%", 1, 0.2, main=True),
+    "remaining_capacity_ah": Entity("Remaining capacity", "Ah", 2, 0.02, main=True),
+    "remaining_energy_wh": Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", main=True),
+    "time_to_empty_h": Entity("Time to empty", "h", 2, 0.05, "duration", main=True),
+    "time_to_full_h": Entity("Time to full", "h", 2, 0.05, "duration", main=True),
+    "equivalent_cycles": _total("Equivalent cycles", None, 2),
+    "soh_percent": Entity("State of health", "%", 1, 0.2),
+    "soh_std_percent": Entity("State of health, standard deviation", "%", 1, 0.2),
+    "usable_capacity_ah": _raw("Usable capacity", "Ah", 2),
+    "stability_margin": _raw("Stability margin", None, 3),
+    "delta_1": _raw("delta 1", None, 4),
+    "delta_2": _raw("delta 2", None, 4),
+}
+"""What a fuel cell has not."""
+OF_CELLS = {
+    "cell_lowest": Entity("Weakest cell", None, 0, 1.0, state_class=None),
+    "cell_lowest_v": Entity("Weakest cell, voltage", "V", 3, 0.005, "voltage"),
+    "cell_highest": Entity("Highest cell", None, 0, 1.0, enabled=False, state_class=None),
+    "cell_highest_v": _raw("Highest cell, voltage", "V", 3, "voltage"),
+}
+"""Where single cells are measured."""
+CELL = "cell_v"
+"""Names all single cells, with their number behind."""
+ELEMENTS = {
+    # by element of the parameters
+    "r_s_ohm": Entity("R_s", "Ω", 4, 0.0005),
+    "r_ts_ohm": _raw("R_ts", "Ω", 4),
+    "r_tl_ohm": _raw("R_tl", "Ω", 4),
+    "c_ts_farad": _raw("C_ts", "F", 0),
+    "c_tl_farad": _raw("C_tl", "F", 0),
+}
+STACK = {
+    # by element of the parameters of a fuel cell
+    "r_ohm": Entity("Resistance", "Ω", 4, 0.0005),
+    "tafel_slope_v": _raw("Tafel slope", "V", 4),
+    "exchange_current_a": _raw("Exchange current", "A", 9),
+    "c_dl_farad": _raw("Double layer capacitance", "F", 4),
+    "concentration_v": _raw("Concentration loss B", "V", 4),
+    "limiting_current_a": _raw("Limiting current", "A", 2),
+    "internal_current_a": _raw("Internal current", "A", 4),
+}
+BATTERY = ESTIMATE | OF_CHARGE | ELEMENTS
+FUEL_CELL = ESTIMATE | STACK
+
+
+def cell_key(number: int) -> str:
+    """Of the voltage of a single cell, numbers from 1."""
+    return f"cell_{number}_v"
+
+
+def entities(info: Info, cells: int) -> dict[str, Entity]:
+    """The numbers of a pack by their keys; ``cells`` of it are measured."""
+    shown = FUEL_CELL if info.capacity_ah is None else BATTERY
+    if not cells:
+        return shown
+    return shown | OF_CELLS | {cell_key(n): _raw(f"Cell {n}", "V", 3, "voltage") for n in range(1, cells + 1)}
