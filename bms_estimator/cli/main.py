@@ -31,10 +31,12 @@ COMMANDS = {
     "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
     "top": Entry("bms_estimator.cli.top:top", "All packs of a broker at a glance."),
     "replay": Entry("bms_estimator.cli.replay:replay", "Estimate from a recorded capture or a table."),
+    "alarms": Entry("bms_estimator.cli.alarms:alarms", "Which alarms a recorded capture would have raised."),
     "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),
     "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
     "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
     "board": Entry("bms_estimator.cli.board:board", "Show a board, set its bandgap, gains and serial number."),
+    "dashboard": Entry("bms_estimator.cli.dashboard:dashboard", "The live page of all packs of a broker."),
     "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
     "ocv": Entry(
         "bms_estimator.cli.ocv:ocv", "Open-circuit voltage from rests, slow curves or given curves, into a cell file."
@@ -55,6 +57,7 @@ EXTRAS = {
     "pyarrow": "parquet",
     "amqtt": "demo",
     "matplotlib": "report",
+    "prometheus_client": "prometheus",
     "pymodbus": "modbus",
     "can": "can",
     "cantools": "can",

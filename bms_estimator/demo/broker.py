@@ -20,6 +20,8 @@ from bms_estimator.model.errors import UserError
 MQTT_PORT = 1883
 """Where MQTT clients look when nobody tells them."""
 LOOPBACK = "127.0.0.1"
+DELIVERY_S, LOOK_S = 5.0, 0.02
+"""At its end the broker gives its clients so long for what they have not got yet, and looks so often [s]."""
 ANONYMOUS = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
 MQTT_5 = b"MQTT\x05"
 """How the CONNECT of an MQTT 5 client goes on after its length."""
@@ -49,6 +51,14 @@ class _Broker(Broker):  # type: ignore[misc]  # amqtt carries no types
         with contextlib.suppress(ConnectionError):
             await writer.drain()
         writer.close()
+
+    @property
+    def idle(self) -> bool:
+        """Whether all that came has gone out, or into nothing."""
+        handed_on = all(
+            session is None or session.delivered_message_queue.empty() for session, _ in self._sessions.values()
+        )
+        return handed_on and self._broadcast_queue.empty() and all(task.done() for task in self._tasks_queue)
 
     async def _publish_retained_messages_for_subscription(
         self, subscription: tuple[str, int], session: Session
@@ -82,7 +92,7 @@ class DemoBroker:
     """
 
     def __init__(self, port: int | None = None) -> None:
-        self.port = _choose(port)
+        self.port = choose_port(port, MQTT_PORT)
         logging.getLogger("amqtt").setLevel(logging.CRITICAL)  # it logs whole stacks when a client goes without a word
         listener = ListenerConfig(bind=f"{LOOPBACK}:{self.port}")
         self._broker = _Broker(BrokerConfig(listeners={"default": listener}, plugins=ANONYMOUS))
@@ -104,17 +114,31 @@ class DemoBroker:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Part from all clients."""
+        """Part from all clients, once they have what came: it would be dropped."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(DELIVERY_S):
+                await self._stand_idle()
         await self._broker.shutdown()
 
+    async def _stand_idle(self) -> None:
+        """Until nothing has moved between two looks: what is being handed on shows in no queue."""
+        looks = 0
+        while looks < 2:
+            await asyncio.sleep(LOOK_S)
+            looks = looks + 1 if self._broker.idle else 0
 
-def _choose(port: int | None) -> int:
-    """The port to listen on: as asked, else 1883, else a free one."""
+
+def choose_port(port: int | None, usual: int) -> int:
+    """The port to listen on: as asked, else the usual one, else a free one.
+
+    Raises:
+        UserError: The port asked for is taken.
+    """
     if port is not None:
         if not _free(port):
             raise UserError(f"port {port}: taken by another program; leave --port out to have a free one chosen")
         return port
-    return MQTT_PORT if _free(MQTT_PORT) else _any_free()
+    return usual if _free(usual) else _any_free()
 
 
 def _free(port: int) -> bool:

@@ -2,14 +2,15 @@
 
 import asyncio
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from bms_estimator.demo.board import running_board
-from bms_estimator.demo.broker import DemoBroker
+from bms_estimator.demo.broker import LOOPBACK, DemoBroker, choose_port
 from bms_estimator.demo.totals import Totals
 from bms_estimator.demo.truth import Truth
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.page_settings import DEFAULT_LISTEN, PageSettings, parse_listen
 from bms_estimator.model.settings import (
     MqttSettings,
     ObserverSettings,
@@ -18,6 +19,7 @@ from bms_estimator.model.settings import (
     SensorSettings,
     Settings,
 )
+from bms_estimator.page.sink import Pages
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.serve import serve
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
@@ -36,7 +38,15 @@ LAMBDA = 1e4
 
 
 async def run_demo(
-    build: Path | None, *, rate_hz: int, speed: float, port: int | None, seconds: float | None, log: Iterable[str]
+    build: Path | None,
+    *,
+    rate_hz: int,
+    speed: float,
+    port: int | None,
+    page_port: int | None,
+    seconds: float | None,
+    log: Iterable[str],
+    opened: Callable[[str], object],
 ) -> str:
     """Run until a signal or the time's end.
 
@@ -45,8 +55,10 @@ async def run_demo(
         rate_hz: Samples per second of the board's time.
         speed: The board's seconds per second.
         port: Of the broker; None: 1883, or a free one.
+        page_port: Of the live page; None: 8765, or a free one.
         seconds: How long; None: until a signal.
         log: Log lines for the live view.
+        opened: Called with the address of the live page once it is served.
 
     Returns:
         What came of it, in a line.
@@ -56,22 +68,26 @@ async def run_demo(
     truth = Truth(SimulatedPack(cell, random_steps(LOAD_A), soc=TRUE_SOC))
     totals = Totals(TOLD_SOC - TRUE_SOC, truth.soc)
     async with DemoBroker(port) as broker, running_board(build, truth, rate_hz=rate_hz, speed=speed) as board:
-        hint = f"{board.name}; in a second terminal: {broker.look_command}"
+        page = f"{LOOPBACK}:{choose_port(page_port, parse_listen(DEFAULT_LISTEN).port)}"
+        hint = f"live page: http://{page}/  {board.name}; in a second terminal: {broker.look_command}"
         if not sys.stdout.isatty():
             sys.stdout.write(f"{hint}\n")
         if seconds is not None:
             asyncio.get_running_loop().call_later(seconds, stop.set)
-        settings = _settings(board.path, broker.url, rate_hz)
+        settings = _settings(board.path, broker.url, page, rate_hz)
         view = ConsoleSink(log=log, hint=hint, true_soc=truth.soc)
-        await serve(settings, cell, sinks=[view, totals], tap=truth, stop=stop)  # no state: it begins anew each time
+        pages = Pages(opened)
+        # no folder of state: it begins anew each time
+        await serve(settings, cell, sinks=[view, totals], tap=truth, stop=stop, pages=pages)
     return totals.summary()
 
 
-def _settings(path: str, url: str, rate_hz: int) -> Settings:
+def _settings(path: str, url: str, page: str, rate_hz: int) -> Settings:
     return Settings(
         pack=PackSettings(name="demo", cell=CELL, initial_soc=TOLD_SOC),
         sensor=SensorSettings(port=path, sample_rate_hz=rate_hz, voltage_resolution_v=RESOLUTION_V),
         observer=ObserverSettings.model_validate({"lambda": LAMBDA}),
         publish=PublishSettings(rate_hz=PUBLISH_RATE_HZ),
         mqtt=MqttSettings(url=url),
+        page=PageSettings(listen=page),
     )

@@ -1,14 +1,16 @@
 """The settings of one pack: what ``pack.toml`` holds. Values are SI, the unit stands in the key."""
 
-import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from bms_estimator.model.alarm_settings import AlarmSettings
+from bms_estimator.model.broker_url import of_brokers
+from bms_estimator.model.export_settings import InfluxSettings, PrometheusSettings
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
-from bms_estimator.model.resolution import RESOLUTIONS
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.model.resolution import RESOLUTIONS, Sampling
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
@@ -40,8 +42,13 @@ class PackSettings(Strict):
     initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
 
 
-_OWN_PACE_S = {"text": 1.0}
-"""By protocol: boards that print at their own pace are taken to do so at this [s]."""
+def _filled(sensor: dict[str, object]) -> dict[str, object]:
+    """The table ``[sensor]`` with what it leaves out, as ``RESOLUTIONS`` has it of the device."""
+    protocol = sensor.get("protocol")
+    if not isinstance(protocol, str) or protocol not in RESOLUTIONS:
+        return sensor
+    declared = vars(RESOLUTIONS[protocol])
+    return {name: value for name, value in declared.items() if value is not None} | sensor
 
 
 class SensorSettings(Strict):
@@ -55,8 +62,12 @@ class SensorSettings(Strict):
         description='the only board that is taken, as `bms-estimator board` shows its number, such as "0000002a"; '
         "the first that came, which is remembered, when left out",
     )
-    protocol: Literal["binary", "text", "vedirect", "junctek", "pylontech"] = Field(
-        default="binary", description="frames of the firmware, text lines, or a device by its name"
+    protocol: Literal["binary", "text", "jbd", "daly", "jk", "vedirect", "junctek", "pylontech"] = Field(
+        default="binary", description="frames of the firmware, text lines, or a BMS or meter by its name"
+    )
+    address: Annotated[int, Field(ge=0, le=255)] | None = Field(
+        default=None,
+        description="of several packs on one RS485 line, the one that is taken; the first that answers when left out",
     )
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
         default=500_000, description="a device's own when left out"
@@ -85,27 +96,28 @@ class SensorSettings(Strict):
         default=None, description="between the moments of voltage and current of one sample; a device's when left out"
     )
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _as_the_device(cls, table: object) -> object:
-        """What is not said is as ``RESOLUTIONS`` has it of the device."""
-        if not isinstance(table, dict) or table.get("protocol") not in RESOLUTIONS:
-            return table
-        declared = vars(RESOLUTIONS[table["protocol"]])
-        return {name: value for name, value in declared.items() if value is not None} | table
+    def _as_the_device_does(cls, table: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        """What is left out is as the protocol has it, and does not count as set."""
+        if not isinstance(table, dict):
+            return validate(table)
+        made = validate(_filled(table))
+        made.model_fields_set.intersection_update(table)
+        return made
 
     @model_validator(mode="after")
-    def _only_boards_have_a_serial(self) -> Self:
-        if self.serial and self.protocol == "text":
-            raise ValueError("serial: a board that prints text tells no serial number; leave it out")
+    def _only_boards_have_serials(self) -> Self:
         if self.serial and self.protocol != "binary":
-            raise ValueError(f"serial: {self.protocol} tells no serial number; leave it out")
+            raise ValueError(
+                f"serial: only a binary board tells its number, and protocol is {self.protocol}; leave it out"
+            )
         return self
 
     @property
     def sample_period_s(self) -> float:
         """Between two samples [s]."""
-        return self.period_s or _OWN_PACE_S.get(self.protocol, 1.0 / self.sample_rate_hz)
+        return self.period_s or 1.0 / self.sample_rate_hz
 
 
 class ObserverSettings(Strict):
@@ -187,25 +199,12 @@ class PublishSettings(Strict):
     )
 
 
-def _of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
-    """Addresses as they must be."""
-    urls = (value,) if isinstance(value, str) else value
-    if not urls:
-        raise ValueError("must name a broker")
-    for url in urls:
-        if "@" in url:
-            raise ValueError("a name goes to mqtt.username, a password to a file that mqtt.password_file names")
-        if not re.fullmatch(r"mqtts?://[^/\s]+", url):
-            raise ValueError("must be mqtt://host:port")
-    return value
-
-
 class MqttSettings(Strict):
     """The broker, and what others may have done over it."""
 
     model_config = ConfigDict(hide_input_in_errors=True)
 
-    url: Annotated[str | tuple[str, ...], AfterValidator(_of_brokers)] = Field(
+    url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] = Field(
         default="mqtt://localhost:1883",
         description="mqtt://host:port or mqtts://host:port for TLS; or a list of them, tried in turn",
     )
@@ -288,6 +287,9 @@ class Settings(Strict):
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
     home_assistant: HomeAssistantSettings = HomeAssistantSettings()
+    influx: InfluxSettings | None = Field(default=None, description="leave out to write to none")
+    prometheus: PrometheusSettings | None = Field(default=None, description="leave out to listen nowhere")
+    page: PageSettings | None = Field(default=None, description="leave out to serve none")
     state: StateSettings = StateSettings()
     store: StoreSettings = StoreSettings()
     log: LogSettings = LogSettings()
@@ -318,12 +320,15 @@ class Settings(Strict):
             return tables
         if not isinstance(told, dict):
             return tables
-        return tables | {"sensor": {**source.sensor, **told, "protocol": "text"}}
+        return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **told, "protocol": "text"}}
 
     @property
-    def sample_period_s(self) -> float:
-        """Between two samples, as expected [s]."""
-        return self.source.period_s if self.source else self.sensor.sample_period_s
+    def sampling(self) -> Sampling:
+        """What the source tells of the current, and how often."""
+        s = self.sensor
+        return Sampling(
+            self.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0, s.delay_s or 0.0
+        )
 
 
 def load_settings(path: Path) -> Settings:

@@ -16,6 +16,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.page.sink import Pages, PageSink
+from bms_estimator.service.alarm_hooks import Hooks, Say, relay_of
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
@@ -24,6 +26,7 @@ from bms_estimator.service.logs import set_level
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
 from bms_estimator.sinks import Delivery, Sink
+from bms_estimator.sinks.influx import InfluxSink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sources import Tap
@@ -48,6 +51,7 @@ async def serve(
     folder: Path | None = None,
     notifier: Notifier | None = None,
     reload: Reload | None = None,
+    pages: Pages | None = None,
 ) -> Estimator:
     """Run until SIGINT or SIGTERM.
 
@@ -60,6 +64,7 @@ async def serve(
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
         reload: Where is offered what can be changed while it runs.
+        pages: The live pages of this process.
 
     Returns:
         The estimator as the last sample left it.
@@ -73,7 +78,7 @@ async def serve(
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
-    all_sinks = list(sinks)
+    all_sinks = [*sinks, *export_sinks(settings)]
     requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = BoardMemory(folder, settings.pack.name) if folder else None
     source = open_reports(settings, tap=tap) or SerialBoard(settings.sensor, tap=tap, memory=memory)
@@ -83,6 +88,7 @@ async def serve(
     if reload:
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
+    say: Say | None = None
     if settings.mqtt is not None:
         mqtt = MqttSink(
             settings.mqtt,
@@ -90,10 +96,15 @@ async def serve(
             requests,
             delivery,
             outbox,
-            sample_period_s=settings.sample_period_s,
+            sample_period_s=settings.sensor.sample_period_s,
             home_assistant=settings.home_assistant,
         )
         all_sinks.append(mqtt)
+        say = mqtt.say
+    hooks = Hooks(settings.alarms.hook, settings.pack.name, say, relay_of(settings, source.relay))
+    if settings.page is not None:
+        history = database.path if database and settings.store.history_days else None
+        all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
@@ -115,7 +126,23 @@ async def serve(
             reload=reload,
             pulse=source.pulse,
             recording=partial(recording_health, tap),
+            hooks=hooks,
         )
+
+
+def export_sinks(settings: Settings) -> list[Sink]:
+    """Where values go beside the broker.
+
+    Raises:
+        UserError: A file of the settings cannot be used.
+        ModuleNotFoundError: The optional package that one needs is not installed.
+    """
+    found: list[Sink] = [InfluxSink(settings.influx)] if settings.influx else []
+    if settings.prometheus:
+        from bms_estimator.sinks.prometheus import PrometheusSink  # noqa: PLC0415 - needs an optional package
+
+        found.append(PrometheusSink(settings.prometheus))
+    return found
 
 
 def recording_health(tap: Tap | None) -> RecordingHealth | None:

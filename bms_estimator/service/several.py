@@ -8,6 +8,7 @@ from structlog.contextvars import bind_contextvars
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
+from bms_estimator.page.sink import Pages
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
@@ -29,12 +30,14 @@ async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Se
     sensors = [settings.sensor for settings, _ in packs if settings.source is None]
     _differ("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
     _differ("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
-    stop, notifier = stop_on_signal(), Notifier(names)
+    _differ("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
+    stop, notifier, pages = stop_on_signal(), Notifier(names), Pages()
 
     async def serve_one(settings: Settings, cell: PackModel, reload: Reload) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
-            await serve(settings, cell, stop=stop, folder=state_folder(settings), notifier=notifier, reload=reload)
+            folder = state_folder(settings)
+            await serve(settings, cell, stop=stop, folder=folder, notifier=notifier, reload=reload, pages=pages)
         except UserError as error:
             raise UserError(f"{settings.pack.name}: {error}") from error
         finally:

@@ -4,8 +4,8 @@ File format, version 1, numbers little-endian::
 
     header   8 bytes  "BMSRAW1\n"
              u32      length of the JSON that follows
-             JSON     UTF-8: version, started (wall clock, ISO 8601 UTC), mode ("binary" or "text"), port, baud,
-                      current_sign; other names are ignored
+             JSON     UTF-8: version, started (wall clock, ISO 8601 UTC), mode ("binary", "text" or another protocol),
+                      port, baud, current_sign, address; other names are ignored
              u16      CRC-16/CCITT-FALSE of the JSON
     record   f64      arrival time [s], the very float that the decoder got
              u32      length
@@ -68,6 +68,8 @@ class CaptureHeader:
     started: str = ""
     """Wall clock at the first byte, ISO 8601 UTC; set by the writer when empty."""
     version: int = VERSION
+    address: int | None = None
+    """Of several packs on the line, the one that was taken."""
 
 
 _VERSIONED, _HEADER = TypeAdapter(_Versioned), TypeAdapter(CaptureHeader)
@@ -77,7 +79,7 @@ def header_of(sensor: SensorSettings, source: ReportSource | None = None) -> Cap
     """What a capture of this board's line says of it, or of lines that another source has brought."""
     if source is not None:
         return CaptureHeader(sensor.protocol, source.described, 0, sensor.current_sign)
-    return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign)
+    return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign, address=sensor.address)
 
 
 def sensor_of(path: Path) -> SensorSettings:
@@ -88,7 +90,8 @@ def sensor_of(path: Path) -> SensorSettings:
     """
     header = read_header(path)
     try:
-        return SensorSettings.model_validate({"protocol": header.mode, "current_sign": header.current_sign})
+        told = {"protocol": header.mode, "current_sign": header.current_sign, "address": header.address}
+        return SensorSettings.model_validate(told)
     except ValidationError:
         raise UserError(
             f"{path}: recorded from mode {header.mode!r}, current_sign {header.current_sign!r}: "

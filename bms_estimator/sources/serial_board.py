@@ -15,12 +15,13 @@ from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources import Pulse, Tap
 from bms_estimator.sources.board_memory import BoardMemory
-from bms_estimator.sources.dialects import Dialect
+from bms_estimator.sources.dialects import Command, Dialect
 from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
 from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.line import FIRST_RETRY_S, Line, Read
 from bms_estimator.sources.ports import NoPortError, open_port
+from bms_estimator.sources.protocol import Relay
 from bms_estimator.sources.whereabouts import HELD_S, LEFT_S, Whereabouts
 
 if TYPE_CHECKING:
@@ -31,7 +32,9 @@ TALK_S = 0.25
 TALKS = 4
 """After so many is looked whether samples come."""
 SILENT_S = 3.0
-"""Without a frame for so long the line is at fault [s]."""
+"""Without a frame for so long the line is at fault [s], ..."""
+SILENT_PERIODS = 3.0
+"""... and of a slower device for so many of its periods."""
 ANSWER_S = 4.0
 """A board measures for a second before it answers a command [s]."""
 
@@ -66,7 +69,9 @@ class SerialBoard:
         silent_s: float = SILENT_S,
     ) -> None:
         self._settings, self._tap = settings, tap
-        self._monotonic, self._silent_s = monotonic, silent_s
+        slow_s = settings.period_s or 0.0
+        self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
+        self._monotonic = monotonic
         make_dialect(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
         self._dialect = make_dialect(settings)
         tells_serial = settings.protocol == "binary"  # what prints text could never be told from another
@@ -87,6 +92,7 @@ class SerialBoard:
         self._arrived_s = math.nan  # of the last block's bytes, on the line's clock
         self._faults = FaultLog()
         self._decoded = asyncio.Event()
+        self._asking = asyncio.Lock()
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -198,7 +204,31 @@ class SerialBoard:
         Raises:
             UserError: The board is not connected, takes no commands, does not answer, or refuses.
         """
-        command = self._dialect.command("current_zero")
+        await self._ask(lambda: self._dialect.command("current_zero"))
+
+    async def relay(self, relay: Relay) -> None:
+        """Have the board set its relay pin; somebody must iterate over the blocks meanwhile.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
+        await self._ask(lambda: self._dialect.relay(relay))
+
+    async def _ask(self, ask: Callable[[], Command]) -> None:
+        """Have a command given, after those before it, and wait for its answer.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
+        async with self._asking:
+            await self._answer(ask())
+
+    async def _answer(self, command: Command) -> None:
+        """Wait for the answer to a command.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
         try:
             if not self._line.is_open:
                 raise UserError(f"the board is not connected: {self._message}")
@@ -257,7 +287,7 @@ class SerialBoard:
                 continue
             elif fault := self._listener.fault:
                 self._say_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
-            elif now_s - heard_s >= self._silent_s:
+            elif now_s - heard_s >= max(self._silent_s, self._listener.quiet_s):
                 self._say_or_leave(f"{path}: open, but silent")
             self._faults.see(counters, now_s)
 

@@ -31,21 +31,26 @@ from pathlib import Path
 from typing import Any
 
 import structlog
+from rich.console import Console
 from serial.tools.list_ports_common import ListPortInfo
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
-from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.model.settings import SensorSettings, Settings, load_settings
 from bms_estimator.service.checkpoint import CheckpointFile
-from bms_estimator.sinks import Delivery
+from bms_estimator.sinks import Delivery, console_line
+from bms_estimator.sinks.console_scene import Scene
+from bms_estimator.sinks.console_view import View
+from bms_estimator.sinks.published import Published
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.curve import read_curve
-from bms_estimator.sources.dialects import Dialect
+from bms_estimator.sources.dialects import Dialect, daly, jbd, jk
 from bms_estimator.sources.dialects.board import BoardDialect
 from bms_estimator.sources.dialects.junctek import JunctekDialect
 from bms_estimator.sources.dialects.pylontech import PylontechDialect
+from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.dialects.text import TextDialect
 from bms_estimator.sources.dialects.vedirect import VeDirectDialect
 from bms_estimator.sources.ports import NoPortError, may_be_board, resolve_port
@@ -122,6 +127,25 @@ def _meter(make: Callable[[], Dialect]) -> Callable[[Path], Read]:
     return lambda _: read
 
 
+def _asked(protocol: str) -> Callable[[Path], Read]:
+    """Of a BMS that is asked."""
+
+    def make(_: Path) -> Read:
+        def read(data: bytes) -> None:
+            dialect = make_dialect(SensorSettings.model_validate({"protocol": protocol}))
+            dialect.feed(1.0, data[: len(data) // 2])
+            dialect.due(1.5)
+            dialect.opened()
+            dialect.feed(2.0, data[len(data) // 2 :])
+            dialect.due(3.0)
+            assert dialect.counters["noise_bytes"] <= dialect.counters["bytes_received"] == len(data)
+            _ = dialect.fault, dialect.described, dialect.quiet_s
+
+        return read
+
+    return make
+
+
 def _messages(_: Path) -> Read:
     def read(data: bytes) -> None:
         for decode in (Hello.decode, Ack.decode, SampleMessage.decode):
@@ -168,6 +192,25 @@ def _requests(_: Path) -> Read:
             if answered.value is not None:
                 json.loads(answered.value)
         assert not counts.requests.get("failed"), "a fault of the service's own"
+
+    return read
+
+
+def _published(_: Path) -> Read:
+    """What a subscriber hears, as a screen and as lines."""
+    topics = ("state", "health", "info", "parameters", "availability", "alarm/soc_low")
+    console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, color_system=None)
+
+    def read(data: bytes) -> None:
+        published = Published("bms")
+        for topic in topics:
+            heard = published.take(f"bms/pack/{topic}", data, 0.0)
+            told = console_line.line(heard) if heard else None
+            assert told is None or told.isprintable(), told
+        if data:
+            scene = Scene("pack", published.devices["pack"].topics, 0.0, 0.0)
+            drawn = "".join(segment.text for segment in console.render(View(scene)))
+            assert all(each.isprintable() or each == "\n" for each in drawn), drawn
 
     return read
 
@@ -244,6 +287,31 @@ def _counted(random: random.Random, data: bytes) -> bytes:
     return b"\n".join(fixed)
 
 
+def _jbd_summed(random: random.Random, data: bytes) -> bytes:
+    """One frame with a right checksum again, of whatever length it says."""
+    at = data.find(b"\xdd", random.randrange(len(data) + 1))
+    end = at + 4 + data[at + 3] if 0 <= at < len(data) - 4 else len(data)
+    return data[:end] + jbd.checksum(data[at + 2 : end]) + b"\x77" + data[end + 3 :] if end < len(data) else data
+
+
+def _daly_summed(random: random.Random, data: bytes) -> bytes:
+    at = data.find(b"\xa5", random.randrange(len(data) + 1))
+    return data[:at] + daly.sealed(data[at : at + 12]) + data[at + 13 :] if at >= 0 else data
+
+
+def _jk_summed(random: random.Random, data: bytes) -> bytes:
+    """The first frame of either family."""
+    newer, at = data.find(jk.START), data.find(jk.OLD_START)
+    if newer >= 0:
+        frame = data[newer : newer + 299].ljust(299, b"\0")
+        return data[:newer] + frame + bytes((sum(frame) & 0xFF,)) + data[newer + 300 :]
+    if at < 0 or random.random() < 0.3:
+        return data
+    body = data[at + 4 :][:480]
+    frame = jk.OLD_START + (len(body) + 7).to_bytes(2, "big") + body + bytes((jk.OLD_END,))
+    return data[:at] + jk.old_sealed(frame)
+
+
 def _headed(random: random.Random, data: bytes) -> bytes:
     """A capture whose header has a right length and CRC again."""
     begin, end = data.find(b"{"), data.find(b"}") + 1
@@ -318,6 +386,11 @@ TARGETS: Mapping[str, Target] = {
     "vedirect": Target(_meter(VeDirectDialect), (b"\r\nV\t", b"\r\nI\t", b"\r\nChecksum\t", b":7F0"), _summed),
     "junctek": Target(_meter(JunctekDialect), (b":r50=1,", b",", b":R50=1,2,1,\r\n"), _counted),
     "pylontech": Target(_meter(PylontechDialect), (b"pylon>", b"Power Volt", b"Absent", b"bat 2", b" - ")),
+    "jbd": Target(_asked("jbd"), (b"\xdd\x03\0", b"\xdd\x04\0", b"\x77"), _jbd_summed, decoder=True),
+    "daly": Target(_asked("daly"), (b"\xa5\x01\x90\x08", b"\xa5\x01\x95\x08"), _daly_summed, decoder=True),
+    "jk": Target(
+        _asked("jk"), (jk.OLD_START, jk.START, jk.START + b"\x02", b"\xc0\x01", b"\x79"), _jk_summed, decoder=True
+    ),
     "messages": Target(_messages, (DELIMITER, b"\x01\x02"), _sealed),
     "settings": Target(_file("pack.toml", load_settings), _TOML),
     "cell": Target(_file("cell.toml", load_any), _TOML),
@@ -329,6 +402,7 @@ TARGETS: Mapping[str, Target] = {
     "curve": Target(_file("curve.csv", read_curve), (b"soc", b"ocv_v", b"hysteresis_v", b",,")),
     "capture": Target(_file("line.bms", load_capture), _JSON, _headed),
     "requests": Target(_requests, _JSON),
+    "published": Target(_published, (*_JSON, b"\\u001b[2J", b'"active":true', b'"text":"', b'"cells_v":[')),
     "checkpoint": Target(_checkpoint, (b"PK\x03\x04", b"{'descr':", b"'|O'", b"'<f8'", b"(1,)"), _zipped),
     "memory": Target(_memory, _JSON),
     "ports": Target(_ports, (b"zigbee", b"auto", b"/dev/", b"../")),

@@ -15,6 +15,8 @@ V, I = "voltage = { id = 1 }", "current = { id = 2 }"  # noqa: E741
     ("source", "package", "extra"),
     [
         ('kind = "modbus"\nprofile = "victron-gx"\nhost = "127.0.0.1"', "pymodbus", "modbus"),
+        ('kind = "can"\nprofile = "pylontech-can"', "can", "can"),
+        ('kind = "can"\nprofile = "pylontech-can"', "cantools", "can"),
     ],
 )
 def test_a_missing_package_is_named(

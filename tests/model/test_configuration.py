@@ -81,7 +81,7 @@ def test_table_ocv_must_increase(tmp_path: Path) -> None:
         ("[mqtt]\nurl = 'http://x'", r"mqtt\.url = 'http://x'.*mqtts://host:port"),
         (
             "[mqtt]\ncommands = ['reboot']",
-            r"mqtt\.commands\.0 = 'reboot'.*'set_soc', 'current_zero' or 'acknowledge_alarm'",
+            r"mqtt\.commands\.0 = 'reboot'.*'set_soc', 'current_zero', 'acknowledge_alarm' or 'publish_rate'",
         ),
         ("[mqtt]\npublish_rate_hz = 2", r"pack\.toml: mqtt: publish_rate_hz is now .* rate_hz .* section \[publish\]$"),
         ("[sensor]\ncurrent_step_a = 0.05", r"sensor\.current_step_a.*: unknown key"),

@@ -75,7 +75,8 @@ def test_a_refused_request_is_split_by_quantity_and_without_gaps() -> None:
 
 def test_readings_of_known_devices() -> None:
     victron = source(profile="victron-gx")
-    assert victron.sensor == {"current_sign": "charge_positive", "voltage_resolution_v": 0.01}
+    steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
+    assert victron.sensor == {"current_sign": "charge_positive", **steps, "period_s": 1.0}
     told = words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
     assert reading_of(victron, told) == (52.34, -12.3, -2.5, (), pytest.approx(math.nan, nan_ok=True))
     seplos = source(profile="seplos-v3")
@@ -96,6 +97,11 @@ def test_a_float_that_is_no_number_is_not_measured(raw: float) -> None:
     assert math.isnan(reading.temperature_c)
     assert reading_of(given, held | words(raw, "float32")) is None
     assert reading_of(given, held | words(raw, "float32", address=2)) is None
+
+
+def test_a_value_beyond_all_numbers_is_not_measured() -> None:
+    register = Register(address=0, type="float32", scale=1e300)
+    assert math.isnan(decode(register, words(1e30, "float32")))
 
 
 def test_what_stands_for_nothing_measured_is_nothing_measured() -> None:

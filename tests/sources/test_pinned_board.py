@@ -391,7 +391,7 @@ def test_the_settings_name_a_board_as_the_board_command_shows_it() -> None:
     for wrong in ("42", "0000002A", 42):
         with pytest.raises(ValidationError):
             SensorSettings.model_validate({"serial": wrong})
-    with pytest.raises(ValidationError, match="prints text tells no serial number"):
+    with pytest.raises(ValidationError, match="only a binary board tells its number"):
         SensorSettings(serial="0000002a", protocol="text")
 
 

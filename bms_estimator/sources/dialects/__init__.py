@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
+from bms_estimator.sources.protocol import Relay
 
 
 @dataclass
@@ -29,6 +30,8 @@ class Dialect(ABC):
 
     cells: CellBlock = NO_CELLS
     """Beside the samples that ``feed`` or ``feed_reads`` returned last."""
+    probing: bool = False
+    """Set where nobody knows who is there: ``due`` then sends only what changes nothing in any device."""
 
     @property
     @abstractmethod
@@ -54,6 +57,11 @@ class Dialect(ABC):
     def clock_ppm(self) -> float | None:
         """How much faster the device's clock runs than that of the arrivals [1e-6]; None while or where unknown."""
         return None
+
+    @property
+    def quiet_s(self) -> float:
+        """So long it may say nothing while all is well [s]."""
+        return 0.0
 
     @abstractmethod
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
@@ -102,6 +110,14 @@ class Dialect(ABC):
             UserError: It takes no such command.
         """
         raise UserError(f"this board takes no commands, nor {name}")
+
+    def relay(self, relay: Relay) -> Command:  # noqa: ARG002 - for those that have one
+        """Have ``due`` send what sets the level of the relay pin.
+
+        Raises:
+            UserError: There is none.
+        """
+        raise UserError("this board has no relay pin")
 
 
 def cell_block(rows: Sequence[Sequence[float]]) -> CellBlock:

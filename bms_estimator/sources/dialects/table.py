@@ -5,6 +5,9 @@ from collections.abc import Callable, Mapping
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.dialects.board import BoardDialect
+from bms_estimator.sources.dialects.daly import DalyDialect
+from bms_estimator.sources.dialects.jbd import JbdDialect
+from bms_estimator.sources.dialects.jk import JkDialect
 from bms_estimator.sources.dialects.junctek import JunctekDialect
 from bms_estimator.sources.dialects.pylontech import PylontechDialect
 from bms_estimator.sources.dialects.text import TextDialect
@@ -16,6 +19,9 @@ DIALECTS: Mapping[str, Callable[[SensorSettings], Dialect]] = {
     "vedirect": lambda sensor: VeDirectDialect(current_sign=sensor.current_sign),
     "junctek": lambda sensor: JunctekDialect(current_sign=sensor.current_sign),
     "pylontech": lambda sensor: PylontechDialect(current_sign=sensor.current_sign),
+    "jbd": lambda sensor: JbdDialect(current_sign=sensor.current_sign),
+    "daly": lambda sensor: DalyDialect(current_sign=sensor.current_sign, address=sensor.address),
+    "jk": lambda sensor: JkDialect(current_sign=sensor.current_sign, address=sensor.address),
 }
 """By the protocol's name in the settings and in the header of a capture."""
 

@@ -1,0 +1,98 @@
+"""Who may see the page: names under which it is asked for, and the token. Pure.
+
+A page that others open in the same browser may send it here under a name of theirs (DNS rebinding): so the name must be ours.
+"""
+
+import hashlib
+import hmac
+import ipaddress
+import socket
+from collections.abc import Iterable
+from urllib.parse import urlsplit
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.sinks.credential import credential
+
+SHORTEST_TOKEN = 16
+"""Letters of a token, at least: `openssl rand -hex 16` makes 32."""
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+}
+"""Of every answer: nothing from elsewhere is loaded, nobody frames it, and no address with a token in it leaks."""
+
+
+class Guard:
+    """Decides on requests.
+
+    Args:
+        hosts: Names of ours, beside addresses, ``localhost`` and this machine's own name.
+        token: What is to be shown; None: nothing.
+    """
+
+    def __init__(self, hosts: Iterable[str] = (), token: str | None = None) -> None:
+        own = socket.gethostname().lower()
+        self._hosts = {"localhost", own, f"{own}.local", *(host.lower() for host in hosts)}
+        self._token = token.encode() if token is not None else None
+
+    @property
+    def cookie(self) -> str:
+        """What a browser that has shown the token keeps in its place."""
+        return hashlib.sha256(b"bms-estimator page " + (self._token or b"")).hexdigest()
+
+    def knows_host(self, header: str) -> bool:
+        """Whether a ``Host`` header names us; an address always does, for no name can be made to lead there."""
+        try:
+            host = urlsplit(f"//{header}").hostname or ""
+        except ValueError:
+            return False
+        return host in self._hosts or _is_address(host)
+
+    def knows_token(self, token: str) -> bool:
+        """Whether it is the token, or none is asked for; takes as long whatever is wrong with it."""
+        return self._token is None or hmac.compare_digest(token.encode(), self._token)
+
+    def knows_cookie(self, cookie: str) -> bool:
+        """Whether it is what was given in place of the token."""
+        return self._token is None or hmac.compare_digest(cookie.encode(), self.cookie.encode())
+
+
+def guard_of(settings: PageSettings) -> Guard:
+    """The guard that settings ask for.
+
+    Raises:
+        UserError: The token cannot be read, or is too short.
+    """
+    return Guard((settings.address.host, *settings.hosts), _token(settings))
+
+
+def _token(settings: PageSettings) -> str | None:
+    name = settings.token_file
+    if name is None:
+        return None
+    try:
+        token = credential(name).read_text(encoding="utf-8").strip()
+    except OSError as error:
+        raise UserError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:  # whose text holds the bytes
+        raise UserError(f"page.token_file = {name}: cannot be read: not UTF-8 text") from None
+    if len(token) < SHORTEST_TOKEN:
+        raise UserError(
+            f"page.token_file = {name}: the token has {len(token)} letters, must have {SHORTEST_TOKEN} or more; "
+            f"`openssl rand -hex 16 > {name}` makes one"
+        )
+    return token
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,85 @@
+"""A pack's history for the curves of the page: at most some hundred points, read off the event loop."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.store.disk_thread import DiskThread
+from bms_estimator.store.minute import MINUTE_S
+from bms_estimator.store.reading import HistoryFile
+
+MOST_EVENTS = 50
+FIELDS = (
+    "time_s",
+    "voltage_v",
+    "voltage_min_v",
+    "voltage_max_v",
+    "current_a",
+    "current_min_a",
+    "current_max_a",
+    "temperature_c",
+    "soc",
+    "soc_std",
+    "energy_out_wh",
+    "energy_in_wh",
+)
+
+
+class Span(NamedTuple):
+    """How far back, and how fine."""
+
+    length_s: int
+    step_s: int
+
+
+SPANS = {"hour": Span(3600, MINUTE_S), "day": Span(86_400, 5 * MINUTE_S), "month": Span(30 * 86_400, 120 * MINUTE_S)}
+"""60, 288 and 360 points."""
+
+
+class Past:
+    """Reads histories, one at a time; what several ask for within a minute is read once.
+
+    Args:
+        clock: Seconds since 1970.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.time) -> None:
+        self._files: dict[str, Path] = {}
+        self._read: dict[tuple[str, str], tuple[float, bytes]] = {}
+        self._clock = clock
+        self.thread = DiskThread("page")
+
+    def add(self, pack: str, path: Path) -> None:
+        """Say where a pack's history is kept."""
+        self._files[pack] = path
+
+    def read(self, pack: str, name: str) -> bytes:
+        """A span of a pack's history as JSON, by columns; to be called in ``thread``.
+
+        Args:
+            pack: Its name.
+            name: Of ``SPANS``.
+
+        Raises:
+            UserError: There is none, or it cannot be read.
+        """
+        if pack not in self._files:
+            raise UserError(f"{pack}: no history is kept here")
+        now_s = self._clock()
+        read_s, text = self._read.get((pack, name), (0.0, b""))
+        if not 0.0 <= now_s - read_s < MINUTE_S / 2:
+            text = _columns(HistoryFile(self._files[pack]), SPANS[name], now_s)
+            self._read[pack, name] = now_s, text
+        return text
+
+
+def _columns(file: HistoryFile, span: Span, now_s: float) -> bytes:
+    since_s, until_s = now_s - span.length_s, now_s + MINUTE_S
+    rows = file.rows(since_s, until_s, span.step_s)
+    events = file.events(since_s, until_s)[-MOST_EVENTS:]
+    columns = {field: [getattr(row, field) for row in rows] for field in FIELDS}
+    shown = {"step_s": span.step_s, **columns, "events": [event._asdict() for event in events]}
+    return json.dumps(shown, separators=(",", ":")).encode()

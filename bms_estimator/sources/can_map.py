@@ -1,0 +1,234 @@
+"""Frames of a CAN bus to readings. Does no I/O but to read the DBC file."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import cantools
+from cantools.database import DecodeError
+from cantools.database.can import Database, Message
+
+from bms_estimator.model.can_settings import CanSource, Signal
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.text_line import Reading
+
+DECIMALS = 5
+"""Of V, A and degC: 5234 times 0.01 is 52.34."""
+KEPT_S = 30.0
+"""What came longer ago than this is no part of a reading [s]: batteries send temperatures and cells every few seconds."""
+
+SHOWN = 20
+"""So many names of a DBC file are shown."""
+
+
+class Place(NamedTuple):
+    """Which frame holds a value."""
+
+    id: int
+    extended: bool
+
+    def __str__(self) -> str:
+        return f"0x{self.id:08X}" if self.extended else f"0x{self.id:03X}"
+
+
+def bits_of(signal: Signal, data: bytes) -> int | None:
+    """The whole number that lies in ``data`` where ``signal`` says; None where the frame is too short."""
+    size = 8 * len(data)
+    if signal.byte_order == "little":
+        shift = signal.start_bit
+        end = signal.start_bit + signal.bits
+    else:  # within a byte a DBC file counts bits from its lowest, and a big endian value goes on in the next byte
+        end = 8 * (signal.start_bit // 8) + 7 - signal.start_bit % 8 + signal.bits
+        shift = size - end
+    if end > size:
+        return None
+    raw = int.from_bytes(data, signal.byte_order) >> shift & (1 << signal.bits) - 1
+    return raw - (1 << signal.bits) if signal.signed and raw >> signal.bits - 1 else raw
+
+
+Key = tuple[str, int]
+"""Quantity as ``[source]`` calls it, and number of the cell from 0."""
+
+
+@dataclass
+class _Frame:
+    """What is wanted of one frame."""
+
+    signals: list[tuple[Key, Signal]] = field(default_factory=list)
+    message: Message | None = None
+    """Of the DBC file, where one of the signals is named."""
+
+    def values(self, data: bytes) -> Iterator[tuple[Key, float | None]]:
+        """In V, A or degC; NaN where one is absent, None where ``data`` does not hold it."""
+        named = _named(self.message, data) if self.message is not None else {}
+        for key, signal in self.signals:
+            raw = bits_of(signal, data) if signal.signal is None else named.get(signal.signal.split(".")[-1])
+            if raw is None:
+                yield key, None
+            elif raw == signal.absent or not math.isfinite(value := raw * signal.scale + signal.offset):
+                yield key, math.nan
+            else:
+                yield key, round(value, DECIMALS)
+
+
+class CanMap:
+    """The newest values of a bus, and the readings that they make, the current as the bus counts it.
+
+    A reading is made when voltage and current have both come anew; temperature and cells are the newest.
+
+    Args:
+        settings: Where the values lie.
+
+    Raises:
+        UserError: The DBC file cannot be read, or does not know a signal.
+    """
+
+    def __init__(self, settings: CanSource) -> None:
+        self._frames: dict[Place, _Frame] = {}
+        database = _load(settings.dbc) if settings.dbc is not None else None
+        for key, signal in _signals(settings):
+            self._want(key, signal, database)
+        self._cells = sum(cells.count for cells in settings.cells)
+        self._newest: dict[Key, tuple[float, float]] = {}  # arrival [s], value
+        self._fresh: set[str] = set()
+        self._short = self._absent = 0
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Since start: frames that are too short for a signal, values that are not measured."""
+        return {"short_frames": self._short, "not_measured": self._absent}
+
+    @property
+    def places(self) -> Sequence[Place]:
+        """The frames that are looked at."""
+        return tuple(self._frames)
+
+    @property
+    def missing(self) -> str | None:
+        """What has to come before there is a reading, for people; None where nothing has."""
+        waited = {
+            quantity: str(place)
+            for place, frame in self._frames.items()
+            for (quantity, _), _ in frame.signals
+            if quantity in ("voltage", "current") and quantity not in self._fresh
+        }
+        return ", ".join(f"source.{quantity} (frame {place})" for quantity, place in waited.items()) or None
+
+    def feed(self, arrival_s: float, identifier: int, extended: bool, data: bytes) -> Reading | None:
+        """Take a frame. Returns the reading that is whole with it.
+
+        Args:
+            arrival_s: On any clock that never steps back [s].
+            identifier: Of the frame.
+            extended: Whether it has 29 bits.
+            data: What the frame holds.
+        """
+        frame = self._frames.get(Place(identifier, extended))
+        if frame is None:
+            return None
+        values = dict(frame.values(data))
+        self._short += None in values.values()
+        for key, value in values.items():
+            if value is None:
+                continue
+            self._newest[key] = arrival_s, value
+            self._absent += math.isnan(value)
+            self._fresh.add(key[0])
+        if not {"voltage", "current"} <= self._fresh:
+            return None
+        self._fresh.clear()
+        reading = self._reading(arrival_s)
+        return None if math.isnan(reading.voltage_v) or math.isnan(reading.current_a) else reading
+
+    def _want(self, key: Key, signal: Signal, database: Database | None) -> None:
+        """Look at the frame that holds ``signal``.
+
+        Raises:
+            UserError: The DBC file does not know it, or knows several.
+        """
+        if signal.id is not None:
+            self._frames.setdefault(Place(signal.id, signal.extended), _Frame()).signals.append((key, signal))
+        elif signal.signal is not None and database is not None:
+            message = _message(key[0], signal.signal, database)
+            frame = self._frames.setdefault(Place(message.frame_id, message.is_extended_frame), _Frame())
+            frame.message = message
+            frame.signals.append((key, signal))
+
+    def _reading(self, now_s: float) -> Reading:
+        cells_v = tuple(self._get("cells", now_s, number) for number in range(self._cells))
+        return Reading(
+            self._get("voltage", now_s),
+            self._get("current", now_s),
+            self._get("temperature", now_s),
+            () if all(map(math.isnan, cells_v)) else cells_v,
+        )
+
+    def _get(self, quantity: str, now_s: float, number: int = 0) -> float:
+        """The newest value; NaN where there is none, or an old one."""
+        came_s, value = self._newest.get((quantity, number), (-math.inf, math.nan))
+        return value if now_s - came_s <= KEPT_S else math.nan
+
+
+def _signals(settings: CanSource) -> Iterator[tuple[Key, Signal]]:
+    """All signals of the settings."""
+    yield ("voltage", 0), settings.voltage
+    yield ("current", 0), settings.current
+    if settings.temperature is not None:
+        yield ("temperature", 0), settings.temperature
+    members = [signal for cells in settings.cells for signal in cells.members()]
+    yield from ((("cells", number), signal) for number, signal in enumerate(members))
+
+
+def _load(path: Path) -> Database:
+    """The file that names the signals.
+
+    Raises:
+        UserError: It cannot be read.
+    """
+    try:
+        loaded = cantools.database.load_file(path)
+    except OSError as error:
+        raise UserError(f"source.dbc = {path}: cannot be read: {error.strerror}") from None
+    except (cantools.Error, ValueError) as error:
+        raise UserError(f"source.dbc = {path}: {str(error)[:300]}") from None
+    if not isinstance(loaded, Database):
+        raise UserError(f"source.dbc = {path}: it describes no frames of a CAN bus")
+    return loaded
+
+
+def _message(quantity: str, signal: str, database: Database) -> Message:
+    """The one that holds a signal.
+
+    Raises:
+        UserError: None does, or several do.
+    """
+    *of_message, name = signal.split(".")
+    found = [
+        message
+        for message in database.messages
+        if (not of_message or message.name == of_message[0]) and name in (s.name for s in message.signals)
+    ]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        reason = f"several messages have it: write {' or '.join(f'{message.name}.{name}' for message in found)}"
+    else:
+        known = sorted(s.name for message in database.messages for s in message.signals)
+        shown = ", ".join(known[:SHOWN]) + (f" and {len(known) - SHOWN} more" if len(known) > SHOWN else "")
+        reason = f"the DBC file has no such signal; it has {shown or 'none'}"
+    raise UserError(f"source.{quantity}: signal = {signal!r}: {reason}")
+
+
+def _named(message: Message, data: bytes) -> Mapping[str, float]:
+    """Values as the DBC file scales them, by name: those that the frame is long enough for, and that its multiplexer names."""
+    try:
+        values = message.decode(data, decode_choices=False, allow_truncated=True)
+    except (DecodeError, ValueError, KeyError):
+        return {}
+    return (
+        {name: float(value) for name, value in values.items() if isinstance(value, int | float)}
+        if isinstance(values, dict)
+        else {}
+    )

@@ -1,0 +1,70 @@
+"""The dashboard asks for what is written: its queries, run on a real InfluxDB that holds a state and an alarm."""
+
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bms_estimator.model.estimate import Alarm, Estimate
+from bms_estimator.sinks.line_protocol import ALARM, STATE, lines
+from tests.influxdb import INFLUXD, InfluxDB
+from tests.sinks.snapshots import ONE, SOC_LOW
+
+DASHBOARD = json.loads((Path(__file__).parents[2] / "deploy/grafana/bms.json").read_text(encoding="utf-8"))
+TARGETS = [(panel["title"], target) for panel in DASHBOARD["panels"] for target in panel["targets"]]
+MODELS = {STATE: Estimate, ALARM: Alarm}
+TAGS = {"device", "name", "severity"}
+
+
+def fields(query: str) -> set[str]:
+    """What is asked for between SELECT and FROM."""
+    asked = re.search(r"SELECT (.*) FROM", query)
+    assert asked
+    return set(re.findall(r'(?<!AS )"(\w+)"', asked[1]))
+
+
+@pytest.fixture(scope="module")
+def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
+    if INFLUXD is None:
+        pytest.skip("influxd is not installed (apt-get install influxdb)")
+    server = InfluxDB(tmp_path_factory.mktemp("influxdb")).start()
+    assert ONE.estimate
+    numbers = {
+        name: 1.0
+        for name, field in Estimate.model_fields.items()
+        if "float" in str(field.annotation) and "list" not in str(field.annotation)
+    }
+    server.write(lines(None, ONE._replace(estimate=ONE.estimate.model_copy(update=numbers), alarms=(SOC_LOW,))))
+    yield server
+    server.stop()
+
+
+@pytest.mark.parametrize(("title", "target"), TARGETS, ids=[f"{title}-{t['refId']}" for title, t in TARGETS])
+def test_every_field_that_a_panel_asks_for_is_published(title: str, target: dict[str, Any]) -> None:
+    measurement = re.search(r'FROM "(\w+)"', target["query"])
+    assert measurement
+    assert fields(target["query"]) - TAGS <= set(MODELS[measurement[1]].model_fields)
+
+
+def test_every_query_brings_a_value_from_a_real_influxdb(influxdb: InfluxDB) -> None:
+    assert influxdb.ask(DASHBOARD["templating"]["list"][1]["query"]) == [{"key": "device", "value": "pack"}]
+    for title, target in TARGETS:
+        query = target["query"].replace("$device", "pack").replace("$timeFilter", "time > now() - 36500d")
+        rows = influxdb.ask(query.replace("$__interval", "3650d"))
+        values = [value for row in rows for name, value in row.items() if name not in {"time", *TAGS}]
+        assert any(value is not None for value in values), f"{title}: {query}"
+
+
+def test_panels_stand_beside_each_other_and_use_the_source_that_is_chosen() -> None:
+    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
+    for one, other in itertools.combinations([panel["gridPos"] for panel in DASHBOARD["panels"]], 2):
+        apart = [a[k] + a[s] <= b[k] for a, b in ((one, other), (other, one)) for k, s in (("x", "w"), ("y", "h"))]
+        assert any(apart)
+        assert one["x"] + one["w"] <= 24
+    for _, target in TARGETS:
+        assert target["datasource"]["uid"] == "${source}"
+        assert "\"device\" = '$device' AND $timeFilter" in target["query"]
