@@ -327,7 +327,7 @@ class Settings(Strict):
         """What the source tells of the current, and how often."""
         s = self.sensor
         return Sampling(
-            self.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0, s.delay_s or 0.0
+            s.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0, s.delay_s or 0.0
         )
 
 
