@@ -6,15 +6,16 @@ PYTHON  ?= python3
 READY   := $(VENV)/.ready
 COMPARE := .venv-compare
 AUDIT   := .venv-audit
+NODE    := .node
 ARGS    ?=
 HOME_ASSISTANT ?= 2025.2.5
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
-APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev mosquitto mosquitto-clients nats-server systemd systemd-container udev
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels payloads lock
+.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -95,6 +96,11 @@ simulate: venv ## the whole service simulated: make simulate SEED=5, or many, e.
 firmware: ## the board's firmware and its simulator, where the compilers are installed
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
 	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
+
+integrations: apt venv ## what the real Node-RED, AsyncAPI's parser, InfluxDB and promtool make of us; installs the first two in .node
+	@[ -d $(NODE)/node_modules/node-red ] || npm install --prefix $(NODE) --no-audit --no-fund --ignore-scripts node-red@4.1.15 @asyncapi/parser@3.6.3
+	$(BIN)/python -m pytest tests/deploy/test_node_red.py tests/deploy/test_asyncapi.py tests/deploy/test_grafana.py \
+		tests/deploy/test_telegraf.py tests/sinks/test_influx.py tests/sinks/test_prometheus.py $(ARGS)
 
 payloads: venv ## remember what is published now; refuses what readers would miss in the same version
 	@$(BIN)/python -m tests.sinks.payload_record

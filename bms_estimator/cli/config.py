@@ -17,6 +17,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import MqttSettings, Settings
+from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
 from bms_estimator.sources.kinds import make_bringer
@@ -45,7 +46,7 @@ def init(file: PackFile = Path("pack.toml")) -> None:
 def check(file: PackFile = Path("pack.toml")) -> None:
     """Check a settings file and its cell file; name what is wrong, warn of what will not work well."""
     settings, cell = load_pack(file)
-    warnings = [*implausible(settings, cell), *out_of_range(settings, cell), *_lemma(cell)]
+    warnings = [*implausible(settings, cell), *out_of_range(settings, cell), *unusable(settings), *_lemma(cell)]
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)

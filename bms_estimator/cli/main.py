@@ -31,6 +31,7 @@ COMMANDS = {
     "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
     "top": Entry("bms_estimator.cli.top:top", "All packs of a broker at a glance."),
     "replay": Entry("bms_estimator.cli.replay:replay", "Estimate from a recorded capture or a table."),
+    "alarms": Entry("bms_estimator.cli.alarms:alarms", "Which alarms a recorded capture would have raised."),
     "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),
     "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
     "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),

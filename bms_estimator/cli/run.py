@@ -24,11 +24,9 @@ from bms_estimator.service.serve import serve, state_folder
 from bms_estimator.service.several import serve_several
 from bms_estimator.service.warm_up import load_kernels
 from bms_estimator.sinks.console_sink import ConsoleSink
+from bms_estimator.sinks.console_view import LOG_LINES
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
-
-LOG_LINES = 5
-"""So many of the log's last lines stay in sight below the live view."""
 
 
 def run(

@@ -9,16 +9,19 @@ import typer
 from bms_estimator.cli.captures import CELL_HELP, CapacityAh
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.cli.pack import with_broker
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import Cell, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import MqttSettings, Settings
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
 from bms_estimator.service.logs import configure_logs
+from bms_estimator.simulation.bms_answers import BMS_ANSWERS
+from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
 from bms_estimator.simulation.simulated_node import SimulatedNode
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
+DEVICES = (*METERS, *BMS_ANSWERS)
 DEFAULT_LOAD_C = 3.0
 """A load of so many times the capacity per hour moves SOC while one looks."""
 
@@ -39,7 +42,10 @@ def simulate(
     text: Annotated[bool, typer.Option("--text", help="print text lines, as hobby sketches do")] = False,
     protocol: Annotated[
         str | None,
-        typer.Option(help=f"be another device, as sensor.protocol names it: {', '.join(METERS)}", show_default=False),
+        typer.Option(
+            help=f"be another device, as sensor.protocol names it: {', '.join(DEVICES)}; jk-pb is a jk with the newer frames",
+            show_default=False,
+        ),
     ] = None,
     mqtt: Annotated[
         str | None,
@@ -73,10 +79,32 @@ def simulate(
         board = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)
     elif protocol in METERS:
         board = METERS[protocol](pack, speed)
+    elif protocol in BMS_ANSWERS:
+        board = _bms(protocol, pack, model.cell, speed, seed)
     else:
-        raise UserError(f"--protocol {protocol}: must be one of {', '.join(METERS)}")
+        raise UserError(f"--protocol {protocol}: must be one of {', '.join(DEVICES)}")
     asyncio.run(_serve(board, seconds))
     typer.echo(f"{board.samples:,} samples in {board.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
+
+
+def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int) -> SimulatedBms:
+    """With a cell for each in series.
+
+    Raises:
+        UserError: It has no room for so many.
+    """
+    try:
+        return SimulatedBms(
+            protocol,
+            pack,
+            cells=cell.series_count,
+            speed=speed,
+            soc=lambda: pack.soc,
+            capacity_ah=cell.capacity_ah,
+            seed=seed,
+        )
+    except ValueError as error:
+        raise UserError(f"--series: {error}") from None
 
 
 async def _serve(board: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: float) -> None:

@@ -1,6 +1,7 @@
 """``[alarms]`` of a pack's settings: what is watched, from where on, for how long."""
 
-from typing import Annotated, Any, Literal, get_args
+from string import Template
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
@@ -74,6 +75,52 @@ class LinkRule(AlarmRule):
     limit_s: Positive | None = None
 
 
+class AlarmHook(Strict):
+    """What is done when alarms are raised and end: run a program, publish a message, or switch the board's relay."""
+
+    alarms: tuple[AlarmName, ...] = Field(default=(), description="which ones; all when left out")
+    on: tuple[Literal["raised", "cleared"], ...] = Field(
+        default=("raised", "cleared"), description="when a program is run or a message published"
+    )
+    run: tuple[Annotated[str, Field(min_length=1)], ...] | None = Field(
+        default=None, description="program and its arguments; no shell"
+    )
+    timeout_s: Annotated[float, Field(gt=0, le=3600)] = Field(
+        default=10.0, description="a program that takes longer is killed"
+    )
+    topic: Annotated[str, Field(pattern=r"^[^+#\s]{1,200}$")] | None = Field(
+        default=None, description="where a message is published at QoS 1, not retained"
+    )
+    payload: str = Field(
+        default="$json", description="of the message; $json, $name, $state, $text and so on are filled in"
+    )
+    relay: Literal["high", "low"] | None = Field(
+        default=None,
+        description="level of the board's relay pin while one of the alarms is active; else it is the other",
+    )
+    when_silent: Literal["keep", "high", "low"] = Field(
+        default="keep", description="level of the pin once the board has not heard of the service for silent_s"
+    )
+    silent_s: Annotated[int, Field(ge=15, le=3600)] = 30
+    dry_run: bool = Field(default=False, description="log what would be done, and do nothing")
+
+    @model_validator(mode="after")
+    def _one_of_three(self) -> Self:
+        told = [name for name in ("run", "topic", "relay") if getattr(self, name)]
+        if len(told) != 1:
+            raise ValueError("give one of run, topic and relay: a hook does one thing")
+        try:
+            Template(self.payload).substitute(dict.fromkeys(PAYLOAD_FIELDS, ""))
+        except (KeyError, ValueError) as error:
+            known = ", ".join(f"${name}" for name in PAYLOAD_FIELDS)
+            raise ValueError(f"payload: {error}: must be one of {known}, or $$ for a $") from None
+        return self
+
+
+PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value", "limit", "unit", "text")
+"""What a message's payload may name. ``state`` is ``raised`` or ``cleared``."""
+
+
 class AlarmSettings(Strict):
     """What is an alarm; a table for each, as in pack_over_voltage = {limit_v = 29.2, delay_s = 5}. docs/alarms.md."""
 
@@ -99,6 +146,16 @@ class AlarmSettings(Strict):
         default=LinkRule(delay_s=0.0, clear_delay_s=5.0),
         description="limit_s: without a sample; 10 s, or 3 periods where that is longer",
     )
+
+    hook: tuple[AlarmHook, ...] = Field(
+        default=(), description="what is done of it, as in [[alarms.hook]]; nothing when left out"
+    )
+
+    @model_validator(mode="after")
+    def _one_relay(self) -> Self:
+        if sum(hook.relay is not None for hook in self.hook) > 1:
+            raise ValueError("hook: the board has one relay: give it one hook, with all its alarms")
+        return self
 
     @model_validator(mode="before")
     @classmethod

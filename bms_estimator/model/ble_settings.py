@@ -7,8 +7,8 @@ from pydantic import Field, model_validator
 
 from bms_estimator.model.report_source import ReportSource
 
-STEP_V = 0.01
-"""Most of them tell the pack's voltage in steps of 10 mV, some finer [V]."""
+STEP_V, STEP_A = 0.01, 0.01
+"""As JBD has them [V, A]; JK is finer, the current of Daly has steps of 0.1 A."""
 
 
 class BleSource(ReportSource):
@@ -44,4 +44,9 @@ class BleSource(ReportSource):
     @property
     def sensor(self) -> Mapping[str, object]:
         """The library counts charge as positive, whatever the BMS does."""
-        return {"current_sign": "charge_positive", "voltage_resolution_v": STEP_V}
+        return {
+            "current_sign": "charge_positive",
+            "voltage_resolution_v": STEP_V,
+            "current_resolution_a": STEP_A,
+            "period_s": self.poll_s,
+        }

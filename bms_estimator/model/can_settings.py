@@ -143,7 +143,8 @@ class CanSource(ReportSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The sign of a known bus, and the step of a voltage that is placed by hand."""
+        """The sign of a known bus, and the steps of what is placed by hand."""
         sign = {"current_sign": "charge_positive"} if self.profile else {}
-        step = {} if self.voltage.signal else {"voltage_resolution_v": abs(self.voltage.scale)}
-        return {**sign, **step}
+        volts = {} if self.voltage.signal else {"voltage_resolution_v": abs(self.voltage.scale)}
+        amperes = {} if self.current.signal else {"current_resolution_a": abs(self.current.scale)}
+        return {**sign, **volts, **amperes, "period_s": self.interval_s}

@@ -136,7 +136,8 @@ class ModbusSource(ReportSource):
 
     @property
     def sensor(self) -> Mapping[str, object]:
-        """The sign of a known device, and the step of a voltage that is a whole number."""
+        """The sign of a known device, and the steps of what is told in whole numbers."""
         sign = {"current_sign": "charge_positive"} if self.profile else {}
-        step = {} if self.voltage.type == "float32" else {"voltage_resolution_v": abs(self.voltage.scale)}
-        return {**sign, **step}
+        volts = {} if self.voltage.type == "float32" else {"voltage_resolution_v": abs(self.voltage.scale)}
+        amperes = {} if self.current.type == "float32" else {"current_resolution_a": abs(self.current.scale)}
+        return {**sign, **volts, **amperes, "period_s": self.poll_s}

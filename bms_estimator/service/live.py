@@ -18,6 +18,7 @@ from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
+from bms_estimator.service.alarm_hooks import Hooks
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
 from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
@@ -55,6 +56,7 @@ async def run_live(
     reload: Reload | None = None,
     pulse: Callable[[], Pulse] | None = None,
     recording: Callable[[], RecordingHealth | None] = lambda: None,
+    hooks: Hooks | None = None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
 
@@ -73,11 +75,13 @@ async def run_live(
         reload: Where this loop offers what it can change while it runs; None: nothing is read anew.
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
+        hooks: What is done of alarms; opened and closed here.
 
     Returns:
         The estimator as the last sample left it.
     """
     name, clock = settings.pack.name, clock or Clock()
+    hooks = hooks or Hooks((), name, None, None)
     notifier = notifier or Notifier([name])
     estimator = new_estimator(settings, cell)
     ledger, restored = _restore(estimator, checkpoint, clock)
@@ -96,8 +100,10 @@ async def run_live(
         delivery=delivery,
         pulse=pulse,
         recording=recording,
+        on_alarm=hooks.tell,
     )
     _restore_alarms(publisher, ledger.alarms)
+    hooks.begin(publisher.alarms.active)
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
     every_s = settings.state.checkpoint_s
@@ -112,6 +118,7 @@ async def run_live(
         for sink in sinks:
             await stack.enter_async_context(sink)
         await stack.enter_async_context(source)
+        await stack.enter_async_context(hooks)
         notifier.ready(name)
         tasks = [
             _estimate(source, tally, publisher, lambda: since_boot() - restored_s),

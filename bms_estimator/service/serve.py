@@ -17,6 +17,7 @@ from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.page.sink import Pages, PageSink
+from bms_estimator.service.alarm_hooks import Hooks, Say, relay_of
 from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.interrupt import stop_on_signal
@@ -87,6 +88,7 @@ async def serve(
     if reload:
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
+    say: Say | None = None
     if settings.mqtt is not None:
         mqtt = MqttSink(
             settings.mqtt,
@@ -98,6 +100,8 @@ async def serve(
             home_assistant=settings.home_assistant,
         )
         all_sinks.append(mqtt)
+        say = mqtt.say
+    hooks = Hooks(settings.alarms.hook, settings.pack.name, say, relay_of(settings, source.relay))
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None
         all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
@@ -122,6 +126,7 @@ async def serve(
             reload=reload,
             pulse=source.pulse,
             recording=partial(recording_health, tap),
+            hooks=hooks,
         )
 
 

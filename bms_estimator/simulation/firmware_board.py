@@ -27,6 +27,7 @@ class FirmwareBoard:
         avcc_mv: Supply and reference of its converter.
         noise_lsb: Noise of its converter [steps].
         loop: Begin a file again after its last line; else that is held.
+        relay: Whether its relay pin cuts the load while it is high.
         seed: Of the noise.
 
     Attributes:
@@ -43,6 +44,7 @@ class FirmwareBoard:
         avcc_mv: int = 5000,
         noise_lsb: float = 0.5,
         loop: bool = False,
+        relay: bool = False,
         seed: int = 1,
     ) -> None:
         self._readings, self._fed = readings, 0
@@ -52,6 +54,7 @@ class FirmwareBoard:
             *("--speed", "inf" if math.isinf(speed) else str(speed), "--avcc-mv", str(avcc_mv)),
             *("--noise-lsb", str(noise_lsb), "--seed", str(seed)),
             *(["--loop"] if loop else []),
+            *(["--relay"] if relay else []),
         ]
         self.path = ""
         self.exit_code: int | None = None

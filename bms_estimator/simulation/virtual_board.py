@@ -33,9 +33,12 @@ from bms_estimator.sources.protocol import (
     MODULUS,
     MOST_BANDGAP_V,
     MOST_DIVIDER,
+    MOST_SILENT_S,
     MOST_VOLTS_PER_AMPERE,
     PROTOCOL_VERSION,
     RATE_HZ,
+    RELAY_HIGH,
+    RELAY_KEEP,
     Ack,
     AckResult,
     BoardStatus,
@@ -51,7 +54,7 @@ from bms_estimator.sources.protocol import (
 Signal = Callable[[float], Reading] | Iterable[Reading]
 """Readings by time [s], or one for each sample; the board stops where they end."""
 
-FIRMWARE = (0, 1, 0)
+FIRMWARE = (0, 2, 0)
 RATE_HZ_AT_RESET = 100
 _LINE_BYTES = 2048
 """So much waits for a host that does not read; then samples are dropped, as a board drops them."""
@@ -152,6 +155,8 @@ class VirtualBoard:
         """Of the signal, at the end of the last sample; goes on across resets."""
         self.samples = 0
         """Samples taken since the board was made."""
+        self.relay_high = False
+        """Level of the relay pin."""
         self._boot(ResetCause.POWER_ON)
 
     def __enter__(self) -> Self:
@@ -227,6 +232,13 @@ class VirtualBoard:
 
     def _boot(self, cause: ResetCause) -> None:
         self._cause = cause
+        self.relay_high, self._relay_then, self._relay_s, self._relay_word, self._relay_told_s = (
+            False,
+            RELAY_KEEP,
+            0,
+            0,
+            0.0,
+        )
         self._boot_id = (self._boot_id + 1) % (1 << 16)
         self._sequence, self._ns, self._overrun, self._aux_is_ntc = 0, self._clock_us * 1000, False, False
         self._set_rate(self._first_rate_hz)
@@ -263,6 +275,7 @@ class VirtualBoard:
         self._reading = reading
         self._ns += self._period_ns
         self.samples += 1
+        self._watch_relay()
         message = self._message(reading)
         self._sequence = (self._sequence + 1) % MODULUS
         if len(self._line) > _LINE_BYTES and not math.isinf(self._speed):
@@ -372,6 +385,8 @@ class VirtualBoard:
             if rate_hz in RATE_HZ:
                 self._set_rate(rate_hz)
             self._answer(kind, AckResult.OK if rate_hz in RATE_HZ else AckResult.BAD_VALUE, self._period_ns)
+        elif kind == MessageType.COMMAND_SET_RELAY and len(body) == 4:
+            self._set_relay(*struct.unpack("<I", body))
         elif kind in self._kept and len(body) == 4:
             self._keep(MessageType(kind), *struct.unpack("<I", body))
         else:
@@ -383,6 +398,26 @@ class VirtualBoard:
         if good:
             self._kept[kind] = value
         self._answer(kind, AckResult.OK if good else AckResult.BAD_VALUE, self._kept[kind])
+
+    def _set_relay(self, word: int) -> None:
+        """Bits as ``relay_word`` has them; a level in silence needs a time."""
+        then, silent_s = word >> 8 & 0xFF, word >> 16
+        good = (
+            word & 0xFE == 0
+            and then <= RELAY_HIGH
+            and silent_s <= MOST_SILENT_S
+            and (then == RELAY_KEEP or silent_s > 0)
+        )
+        if good:
+            self.relay_high, self._relay_then, self._relay_s = bool(word & 1), then, silent_s
+            self._relay_told_s = self.time_s
+            self._relay_word = word
+        self._answer(MessageType.COMMAND_SET_RELAY, AckResult.OK if good else AckResult.BAD_VALUE, self._relay_word)
+
+    def _watch_relay(self) -> None:
+        """What becomes of the relay when the host is silent."""
+        if self._relay_then != RELAY_KEEP and self.time_s - self._relay_told_s >= self._relay_s:
+            self.relay_high, self._relay_then = self._relay_then == RELAY_HIGH, RELAY_KEEP
 
     def _zero_current(self) -> None:
         """Take the present current as zero."""

@@ -26,6 +26,7 @@ VALUE_CELLS = 8
 """Numbers change their length; columns must not dance."""
 SPARKS = "▁▂▃▄▅▆▇█"
 LOG_LINES = 2
+"""The last of the log, which the screen hides."""
 MOST_ALARMS = 4
 """So many are shown in full."""
 MOST_PACKS = 8

@@ -103,6 +103,10 @@ class MqttSink:
         self._slot = self._before = snapshot
         self._wake.set()
 
+    def say(self, topic: str, payload: bytes) -> None:
+        """Publish a message of somebody else at QoS 1; it waits for a broker that is away, as states do."""
+        self._backlog.put([Message(topic, payload, 1, retain=False)])
+
     async def __aenter__(self) -> Self:
         """Start reaching for the broker."""
         self._task = asyncio.create_task(self._link.run(), name="mqtt")

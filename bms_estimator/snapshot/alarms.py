@@ -24,7 +24,7 @@ from bms_estimator.snapshot.alarm_state import AlarmState, Floats, Raising, Turn
 from bms_estimator.snapshot.alarm_text import alarm_text
 
 SENSOR_SUSPECTS = Suspect.SIGN_OF_CURRENT | Suspect.OFFSET | Suspect.OUTLIERS
-MODEL_SUSPECTS = Suspect.CAPACITY | Suspect.OCV | Suspect.TEMPERATURE
+MODEL_SUSPECTS = Suspect.CAPACITY | Suspect.OCV
 ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """These are watched before anything was measured."""
 SHARE_S = 1.0
@@ -119,6 +119,7 @@ class Alarms:
         self._counts: Counts | None = None
         self._counted_s = -math.inf
         self._at_s = 0.0  # of the last sample
+        self._mismatch_suspected = False
         self._reasons: dict[AlarmName, Reasons] = {}
         self._changes: list[Change] = []
         self._unshown: dict[AlarmName, Told] = {}
@@ -196,6 +197,11 @@ class Alarms:
         """Of all that are watched."""
         return tuple(self._states)
 
+    @property
+    def active(self) -> tuple[AlarmName, ...]:
+        """Of those that are raised."""
+        return tuple(name for name, state in self._states.items() if state.raising is not None)
+
     def changes(self) -> list[Change]:
         """What was raised and ended since the last call."""
         changes, self._changes = self._changes, []
@@ -267,7 +273,9 @@ class Alarms:
         times_s = trace["time_s"]
         _, seen_s = self._traced.of(times_s)
         soc, std = trace["soc"], trace["soc_std"]
-        lost = (trace["lock"] == 0) | bool(suspects & MODEL_SUSPECTS)
+        lost = (trace["lock"] == 0) | self._mismatch_suspected
+        self._mismatch_suspected = bool(suspects & MODEL_SUSPECTS)
+        lost[-1] |= self._mismatch_suspected  # since when, nobody knows: not before
         values: dict[AlarmName, Floats] = {
             "soc_low": soc - np.where(np.isnan(std), 0.0, std),
             "stability_margin_low": trace["stability_margin"],

@@ -75,6 +75,8 @@ class BleBringer(Bringer):
             raise NothingComesError("it wants a password; take that away in its app") from None
         except TimeoutError:
             raise NothingComesError("no answer") from None
+        except FileNotFoundError:  # the socket of D-Bus
+            raise NothingComesError("no Bluetooth: are D-Bus and bluetoothd running?") from None
         except (BleakError, EOFError, OSError, ValueError) as error:
             raise NothingComesError(str(error) or type(error).__name__) from None
 

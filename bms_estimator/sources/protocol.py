@@ -8,7 +8,7 @@ import math
 import struct
 from dataclasses import dataclass, fields
 from enum import IntEnum, IntFlag
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 from cobs import cobs
 
@@ -39,6 +39,7 @@ class MessageType(IntEnum):
     COMMAND_SET_DIVIDER = 0x16
     COMMAND_SET_CURRENT_SLOPE = 0x17
     COMMAND_SET_RATIOMETRIC = 0x18
+    COMMAND_SET_RELAY = 0x19
 
 
 class AckResult(IntEnum):
@@ -151,6 +152,32 @@ def set_current_slope_command(volts_per_ampere: float) -> bytes:
 def set_ratiometric_command(ratiometric: int) -> bytes:
     """Tell the board whether its current sensor's slope is proportional to the supply: 0 or 1, for good."""
     return command(MessageType.COMMAND_SET_RATIOMETRIC, struct.pack("<I", ratiometric))
+
+
+class Relay(NamedTuple):
+    """Level of the relay pin, until the next reset."""
+
+    high: bool
+    high_when_silent: bool | None
+    """Level once no command of this kind has come for ``silent_s``; None: it stays as it is."""
+    silent_s: int = 0
+    """0..3600."""
+
+
+RELAY_KEEP, RELAY_LOW, RELAY_HIGH = range(3)
+"""What becomes of the level when the host is silent."""
+MOST_SILENT_S = 3600
+
+
+def set_relay_command(relay: Relay) -> bytes:
+    """Set the relay pin."""
+    return command(MessageType.COMMAND_SET_RELAY, struct.pack("<I", relay_word(relay)))
+
+
+def relay_word(relay: Relay) -> int:
+    """As it travels: bit 0 the level, bits 8 and 9 what becomes of it in silence, the upper half after how long [s]."""
+    then = RELAY_KEEP if relay.high_when_silent is None else RELAY_HIGH if relay.high_when_silent else RELAY_LOW
+    return relay.high | then << 8 | relay.silent_s << 16
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """A recorded capture as a source: as fast as it goes, or paced by its time stamps."""
 
 import asyncio
+import itertools
 import math
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
@@ -97,6 +98,7 @@ class Replay:
     Args:
         capture: What is replayed.
         speed: Times as fast as it was recorded; None: as fast as it goes.
+        longest_s: As fast as it goes, blocks are cut so that none lasts longer on the samples' clock [s].
         monotonic: Monotonic clock [s].
     """
 
@@ -104,11 +106,16 @@ class Replay:
     """There is always a sample."""
 
     def __init__(
-        self, capture: Capture, *, speed: float | None = None, monotonic: Callable[[], float] = time.monotonic
+        self,
+        capture: Capture,
+        *,
+        speed: float | None = None,
+        longest_s: float = math.inf,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.capture = capture
         self._decoder = capture.decoder if isinstance(capture, RawCapture) else None
-        self._speed, self._monotonic = speed, monotonic
+        self._speed, self._longest_s, self._monotonic = speed, longest_s, monotonic
         self.samples = 0
         self.cells: CellBlock = NO_CELLS
 
@@ -144,8 +151,10 @@ class Replay:
 
     async def _at_once(self) -> AsyncIterator[SampleBlock]:
         for block in self.capture:
-            self.cells = self._cells()
-            yield block
+            cells = self._cells()
+            for part in _parts(block["time_s"], self._longest_s):
+                self.cells = cells[part]
+                yield block[part]
 
     def _cells(self) -> CellBlock:
         """Beside the capture's last block."""
@@ -167,6 +176,17 @@ class Replay:
                 else:
                     await asyncio.sleep(min((due_s[first] - now_s) / speed + TICK_S, 1.0))
             last_s, elapsed_s = float(block["time_s"][-1]), float(due_s[-1])
+
+
+def _parts(time_s: NDArray[np.float64], longest_s: float) -> Iterator[slice]:
+    """Where a block is cut so that no part lasts longer."""
+    if math.isinf(longest_s):
+        yield slice(None)
+        return
+    number = np.floor(_elapsed(time_s, float(time_s[0])) / longest_s)
+    edges = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), time_s.size]
+    for first, end in itertools.pairwise(edges):
+        yield slice(first, end)
 
 
 def _elapsed(time_s: NDArray[np.float64], last_s: float) -> NDArray[np.float64]:

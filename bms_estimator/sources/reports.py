@@ -135,6 +135,8 @@ class Reports:
 
     current_zero: None = None
     """There is no zero to be set."""
+    relay: None = None
+    """Nor is there a relay."""
 
     def pulse(self) -> Pulse:
         """Whether somebody still looks after what is brought."""

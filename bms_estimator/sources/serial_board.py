@@ -15,12 +15,13 @@ from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources import Pulse, Tap
 from bms_estimator.sources.board_memory import BoardMemory
-from bms_estimator.sources.dialects import Dialect
+from bms_estimator.sources.dialects import Command, Dialect
 from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
 from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.line import FIRST_RETRY_S, Line, Read
 from bms_estimator.sources.ports import NoPortError, open_port
+from bms_estimator.sources.protocol import Relay
 from bms_estimator.sources.whereabouts import HELD_S, LEFT_S, Whereabouts
 
 if TYPE_CHECKING:
@@ -87,6 +88,7 @@ class SerialBoard:
         self._arrived_s = math.nan  # of the last block's bytes, on the line's clock
         self._faults = FaultLog()
         self._decoded = asyncio.Event()
+        self._asking = asyncio.Lock()
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -198,7 +200,31 @@ class SerialBoard:
         Raises:
             UserError: The board is not connected, takes no commands, does not answer, or refuses.
         """
-        command = self._dialect.command("current_zero")
+        await self._ask(lambda: self._dialect.command("current_zero"))
+
+    async def relay(self, relay: Relay) -> None:
+        """Have the board set its relay pin; somebody must iterate over the blocks meanwhile.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
+        await self._ask(lambda: self._dialect.relay(relay))
+
+    async def _ask(self, ask: Callable[[], Command]) -> None:
+        """Have a command given, after those before it, and wait for its answer.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
+        async with self._asking:
+            await self._answer(ask())
+
+    async def _answer(self, command: Command) -> None:
+        """Wait for the answer to a command.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
         try:
             if not self._line.is_open:
                 raise UserError(f"the board is not connected: {self._message}")

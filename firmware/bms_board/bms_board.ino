@@ -11,6 +11,7 @@
 #include "commands.h"
 #include "line.h"
 #include "protocol.h"
+#include "relay.h"
 #include "reset.h"
 #include "sampling.h"
 #include "settings.h"
@@ -18,6 +19,7 @@
 static bool overrun;
 
 void setup() {
+    relay_start();
     TIMSK0 = 0;  // nobody asks for millis(), and its interrupt would only delay ours
     reset_start_watchdog();
     settings_load();

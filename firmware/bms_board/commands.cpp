@@ -1,11 +1,12 @@
 #include "commands.h"
 
 #include "line.h"
+#include "relay.h"
 #include "reset.h"
 #include "settings.h"
 
 #define FIRMWARE_MAJOR 0
-#define FIRMWARE_MINOR 1
+#define FIRMWARE_MINOR 2
 #define FIRMWARE_PATCH 0
 
 #define ADC_BITS 10
@@ -74,6 +75,11 @@ static void set_rate(uint32_t rate_hz) {
     answer_ack(COMMAND_SET_RATE, good ? ACK_OK : ACK_BAD_VALUE, period_ns(&sampling_timing()));
 }
 
+static void set_relay(uint32_t number) {
+    const bool good = relay_set(number);
+    answer_ack(COMMAND_SET_RELAY, good ? ACK_OK : ACK_BAD_VALUE, relay_get());
+}
+
 static void zero_current() {
     if (zero.measuring) {
         answer_ack(COMMAND_ZERO_CURRENT, ACK_BUSY, settings_get(SETTING_CURRENT_ZERO_PPM));
@@ -98,6 +104,7 @@ static void add_to_zero(const sample_message &sample) {
 void commands_see(const sample_message &sample) {
     next_sequence = sample.sequence + 1;
     last_us = sample.board_us;
+    relay_see(sample.board_us);
     if (zero.measuring && !zero.measured) add_to_zero(sample);
 }
 
@@ -130,6 +137,8 @@ static void obey(const uint8_t *packet, uint8_t length) {
         set_rate(take(body, 2));
     else if (command == COMMAND_ZERO_CURRENT)
         zero_current();
+    else if (command == COMMAND_SET_RELAY && bytes == 4)
+        set_relay(take(body, 4));
     else if (setting_of(command) != SETTINGS && bytes == 4)
         answer_setting(command, setting_of(command), take(body, 4));
     else if (command == COMMAND_RESTART) {

@@ -20,7 +20,8 @@ enum message_type {
     COMMAND_SET_BANDGAP = 0x15,
     COMMAND_SET_DIVIDER = 0x16,
     COMMAND_SET_CURRENT_SLOPE = 0x17,
-    COMMAND_SET_RATIOMETRIC = 0x18
+    COMMAND_SET_RATIOMETRIC = 0x18,
+    COMMAND_SET_RELAY = 0x19
 };
 
 enum ack_result {
@@ -40,6 +41,11 @@ enum sample_status {
 
 #define CHANNEL_NTC 0x01
 #define CHANNEL_CURRENT_RATIOMETRIC 0x02
+
+// The number of COMMAND_SET_RELAY: bit 0 is the level, the byte above what becomes of it when the host is silent, the
+// upper half after how many seconds.
+enum relay_silence { RELAY_KEEP = 0, RELAY_LOW = 1, RELAY_HIGH = 2 };
+#define RELAY_SILENT_MAX_S 3600
 
 #define RATE_MIN_HZ 1
 #define RATE_MAX_HZ 1000

@@ -28,14 +28,15 @@
 
 static const char usage[] =
     "usage: board_sim ELF --readings FILE|- [--speed X] [--avcc-mv MV] [--noise-lsb LSB] [--seed N]\n"
-    "                     [--loop] [--stop-at-end]\n"
+    "                     [--loop] [--stop-at-end] [--relay]\n"
     "Prints the path of the board's serial line. The board starts when a host opens it, as an Arduino does.\n"
     "  --readings     lines time_s,current_a,voltage_v[,temperature_c], each held until the next; -: stdin\n"
     "  --speed        board seconds per second, 1 unless told; inf: as fast as the host reads\n"
     "  --avcc-mv      supply and reference of the converter, 5000 unless told\n"
     "  --noise-lsb    standard deviation of a conversion, 0.5 unless told\n"
     "  --loop         begin again after the last line; else it is held\n"
-    "  --stop-at-end  exit at the last line\n";
+    "  --stop-at-end  exit at the last line\n"
+    "  --relay        the relay pin cuts the load while it is high\n";
 
 typedef struct {
     const char *elf, *readings;
@@ -158,12 +159,12 @@ static avr_t *power_up(const options *o) {
 }
 
 static bool parse_options(int argc, char **argv, options *o) {
-    enum { READINGS, SPEED, AVCC, NOISE, SEED, LOOP, STOP_AT_END, HELP };
+    enum { READINGS, SPEED, AVCC, NOISE, SEED, LOOP, STOP_AT_END, RELAY, HELP };
     static const struct option known[] = {
         {"readings", required_argument, NULL, READINGS}, {"speed", required_argument, NULL, SPEED},
         {"avcc-mv", required_argument, NULL, AVCC},      {"noise-lsb", required_argument, NULL, NOISE},
         {"seed", required_argument, NULL, SEED},         {"loop", no_argument, NULL, LOOP},
-        {"stop-at-end", no_argument, NULL, STOP_AT_END}, {"help", no_argument, NULL, HELP},
+        {"stop-at-end", no_argument, NULL, STOP_AT_END}, {"relay", no_argument, NULL, RELAY}, {"help", no_argument, NULL, HELP},
         {NULL, 0, NULL, 0}};
     int which;
     while ((which = getopt_long(argc, argv, "", known, NULL)) != -1) switch (which) {
@@ -174,6 +175,7 @@ static bool parse_options(int argc, char **argv, options *o) {
             case SEED: o->parts.seed = strtoull(optarg, NULL, 0); break;
             case LOOP: o->loop = true; break;
             case STOP_AT_END: o->stop_at_end = true; break;
+            case RELAY: o->parts.relay = true; break;
             default: return false;
         }
     if (optind == argc - 1) o->elf = argv[optind];

@@ -34,6 +34,10 @@ enum { PIN_VOLTAGE = 0, PIN_CURRENT = 1, PIN_NTC = 2, PIN_BANDGAP = 7 };  // of 
 #define OCF1B_BIT 2
 #define TIMER1_COMPB_VECTOR 12
 
+#define DDRD_ADDRESS 0x2A
+#define PORTD_ADDRESS 0x2B
+#define RELAY_PIN 0x10  // D4
+
 static avr_t *board;
 static converter parts;
 static bool trigger_armed = true;
@@ -50,11 +54,15 @@ static double noise(void) {  // Box and Muller
     return parts.noise_lsb * sqrt(-2.0 * log(uniform())) * cos(2.0 * M_PI * uniform());
 }
 
+static bool load_is_cut(void) {
+    return parts.relay && (board->data[DDRD_ADDRESS] & board->data[PORTD_ADDRESS] & RELAY_PIN);
+}
+
 static double pin_v(unsigned pin) {
     const reading *r = readings_at((double)board->cycle / (double)board->frequency);
     switch (pin) {
         case PIN_VOLTAGE: return r->voltage_v / DIVIDER;
-        case PIN_CURRENT: return parts.avcc_v * (0.5 + r->current_a * PART_PER_AMPERE);
+        case PIN_CURRENT: return parts.avcc_v * (0.5 + (load_is_cut() ? 0.0 : r->current_a) * PART_PER_AMPERE);
         case PIN_BANDGAP: return BANDGAP_V;
         case PIN_NTC:
             if (!isnan(r->temperature_c)) {

@@ -57,7 +57,7 @@ def test_it_shows_what_the_board_says_of_itself(capsys):
         code, out, err = board(capsys, path)
     assert (code, err) == (0, "")
     said = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert (said["firmware"], said["serial"], said["rate"]) == ("0.1.0", "00c0ffee", "50 Hz")
+    assert (said["firmware"], said["serial"], said["rate"]) == ("0.2.0", "00c0ffee", "50 Hz")
     assert (said["voltage"], said["bandgap"]) == ("divider 6.1", "1.1000 V")
     assert said["current"] == "0.1 V/A at 5 V, ratiometric, zero at 0.500000 of the reference"
     assert float(said["reference"].split()[0]) == pytest.approx(4.8, rel=1e-3)

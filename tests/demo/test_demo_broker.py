@@ -1,6 +1,7 @@
 """The demo's broker is right in what our topics need: retained messages and last wills."""
 
 import asyncio
+import contextlib
 import json
 import shutil
 import socket
@@ -135,3 +136,21 @@ async def test_a_client_of_mqtt_5_hears_at_once_that_it_is_not_spoken(free_port)
     async with DemoBroker(free_port):
         with pytest.raises(aiomqtt.MqttError, match="Unsupported protocol version"):
             await newer.__aenter__()
+
+
+async def test_what_came_before_its_end_is_handed_on(free_port):
+    async with DemoBroker(free_port):
+        listener = aiomqtt.Client("127.0.0.1", free_port)
+        await listener.__aenter__()
+        await listener.subscribe("bms/#")
+        async with aiomqtt.Client("127.0.0.1", free_port) as client:
+            for number in range(2000):
+                await client.publish("bms/p/state", str(number))
+    seen = list[bytes]()
+    with contextlib.suppress(aiomqtt.MqttError):  # the broker has gone
+        async with asyncio.timeout(LONG_S):
+            async for message in listener.messages:
+                seen.append(message.payload)
+    with contextlib.suppress(aiomqtt.MqttError):
+        await listener.__aexit__(None, None, None)
+    assert [int(payload) for payload in seen] == list(range(2000))

@@ -168,7 +168,8 @@ async def test_what_waits_is_bounded_and_goes_out_in_batches(server: Any) -> Non
     assert max(body.count(b"\n") + 1 for _, _, body in server.asked) <= BATCH
 
 
-async def test_a_server_that_never_answers_stops_nobody() -> None:
+async def test_a_server_that_never_answers_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bms_estimator.sinks.influx.CLOSING_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts
         async with sink(f"http://127.0.0.1:{silent.getsockname()[1]}") as writing:
             for second in range(20):

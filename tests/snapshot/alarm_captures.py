@@ -1,6 +1,7 @@
 """Captures of a board that prints JSON lines, each second one, replayed through estimator and publisher."""
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,7 +75,13 @@ def settings(alarms: dict[str, Any] | None = None, **sections: Any) -> Settings:
 
 
 async def replayed(
-    path: Path, told: Settings, cell: CellModel = PACK, kept: str = "", *, at_once: bool = False
+    path: Path,
+    told: Settings,
+    cell: CellModel = PACK,
+    kept: str = "",
+    *,
+    at_once: bool = False,
+    begin_s: float = WALL_S,
 ) -> Told:
     """The capture through estimator and publisher, whose clocks are the capture's.
 
@@ -83,23 +90,20 @@ async def replayed(
         told: The pack's settings.
         cell: The pack.
         kept: Alarms of a run before.
+        begin_s: Wall clock at its begin [s since 1970].
         at_once: As few and long blocks as the capture has; else each sample as it came.
     """
     now_s, result, sink = 0.0, Told(), Collector()
-    source = Replay(open_capture(path, told.sensor))
+    source = Replay(open_capture(path, told.sensor), longest_s=math.inf if at_once else 0.05)
     estimator = new_estimator(told, cell)
-    clock = Clock(wall=lambda: WALL_S + now_s, monotonic=lambda: now_s)
+    clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
     publisher = Publisher(
         told, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
     )
     publisher.alarms.restore(kept)
     async for block in source:
-        cells = source.cells
-        for first in range(0, block.size, block.size if at_once else 1):
-            part = block[first:] if at_once else block[first : first + 1]
-            now_s = float(part["time_s"][-1])
-            source.cells = cells if at_once or not cells.size else cells[first : first + 1]
-            publisher.add(part, estimator.run(part))
+        now_s = float(block["time_s"][-1])
+        publisher.add(block, estimator.run(block))
     publisher.publish_last()
     result.snapshots, result.kept = sink.snapshots, publisher.alarms.kept
     return result

@@ -1,15 +1,28 @@
 """Each alarm is raised and ends on a capture; what holds whatever the alarm is."""
 
 import itertools
+import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from bms_estimator.kernels.state import TRACE
+from bms_estimator.model.alarm_limits import Watched, out_of_range, watched
 from bms_estimator.model.alarm_settings import ALARMS
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.event import events
-from tests.snapshot.alarm_captures import Line, Told, record, replayed, settings
+from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
+from bms_estimator.model.suspect import Suspect
+from bms_estimator.snapshot.alarm_state import AlarmState
+from bms_estimator.snapshot.alarms import Alarms, Counts
+from tests.snapshot.alarm_captures import PACK, WALL_S, Line, Told, record, replayed, settings
 
+NAN = math.nan
 GOOD_CELLS = (3.70, 3.70)
 COUNTED: dict[str, Any] = {"identifier": {"enabled": False}}
 """The SOC is what is counted, and without a band."""
@@ -119,3 +132,127 @@ async def test_however_a_capture_is_cut_into_blocks_the_same_is_raised_at_the_sa
 
 def _named(told: Told) -> list[tuple[float, str, bool]]:
     return [(change.at_s, change.alarm.name, change.alarm.active) for change in told.changes]
+
+
+def _values(state: AlarmState, *values: float, step_s: float = 1.0, begin_s: float = 0.0) -> list[tuple[float, bool]]:
+    """When it is raised and ends, of values each ``step_s``."""
+    times_s = begin_s + step_s * np.arange(len(values))
+    steps_s = np.full(len(values), step_s)
+    return [(turn.at_s, turn.raising is not None) for turn in state.take(times_s, steps_s, np.array(values), WALL_S)]
+
+
+def _state(**told: Any) -> AlarmState:
+    rule = {"severity": "warning", "unit": "V", "above": True, "limit": 10.0, "clear": 8.0, "delay_s": 2.0}
+    return AlarmState(Watched(**{"name": "pack_over_voltage", "clear_delay_s": 3.0, "latch": False, **rule, **told}))
+
+
+@pytest.mark.parametrize(
+    ("values", "turns"),
+    [
+        ([9.9, 10.0, 10.0, 10.0, 9.0], [(3.0, True)]),  # reached is enough, for the whole delay
+        ([10.0, 10.0, 9.99, 10.0, 10.0, 9.0], []),  # the delay begins anew
+        ([11.0] * 3 + [8.0] * 9, [(2.0, True)]),  # back at clear is not back beyond it
+        ([11.0] * 3 + [7.9] * 3 + [8.0] + [7.9] * 4, [(2.0, True), (10.0, False)]),
+        ([11.0, 11.0, NAN, NAN, 11.0, 11.0], [(4.0, True)]),  # what was not measured adds nothing and ends nothing
+        ([11.0] * 3 + [NAN] * 20, [(2.0, True)]),
+        ([NAN] * 5, []),
+    ],
+)
+def test_limit_clear_and_delays_at_their_edges(values: list[float], turns: list[tuple[float, bool]]) -> None:
+    assert _values(_state(), *values) == turns
+    below = _state(above=False, limit=-10.0, clear=-8.0)
+    assert _values(below, *(-value for value in values)) == turns
+
+
+def test_how_values_are_cut_changes_nothing() -> None:
+    values = [11.0, 11.0, 9.0, 11.0, 11.0, 11.0, NAN, 7.0, 7.0, 7.0, 7.0, 11.0]
+    state = _state()
+    one_by_one = [turn for i, value in enumerate(values) for turn in _values(state, value, begin_s=float(i))]
+    assert one_by_one == _values(_state(), *values) == [(5.0, True), (10.0, False)]
+
+
+def test_no_delay_and_no_hysteresis_are_one_turn_for_each_side() -> None:
+    state = _state(clear=10.0, delay_s=0.0, clear_delay_s=0.0)
+    assert _values(state, 9.0, 10.0, 9.9, 10.0) == [(1.0, True), (2.0, False), (3.0, True)]
+
+
+def test_one_that_latches_waits_until_somebody_knows_and_comes_again_unless_it_is_known() -> None:
+    state = _state(latch=True, delay_s=0.0, clear_delay_s=0.0)
+    assert _values(state, 11.0, 7.0) == [(0.0, True)]
+    assert state.gone
+    assert _values(state, 11.0) == []  # it never ended
+    assert not state.gone
+    assert not state.acknowledge(), "the cause is there"
+    assert _values(state, 7.0) == [(0.0, False)]
+    assert not state.acknowledge()
+    assert _values(state, 11.0, 7.0) == [(0.0, True)], "nobody knows of this one"
+    assert state.acknowledge()
+    assert state.raising is None
+
+
+async def test_a_gap_between_samples_counts_for_no_delay_and_slow_sampling_is_no_gap(tmp_path: Path) -> None:
+    rule = {"over_temperature": {"delay_s": 25.0}, "link_lost": {"enabled": False}}
+    hot = Line(20, temperature_c=70.0)
+    lines = [Line(5), hot, hot._replace(silent=True), hot._replace(seconds=10)]
+    told = await replayed(record(tmp_path / "gap.bms", lines), settings(rule))
+    assert told.turns("over_temperature") == [(51.0, True)]  # 19 s, nothing, then 6 s
+    slow = [Line(50), Line(80, temperature_c=70.0)]
+    told = await replayed(record(tmp_path / "slow.bms", slow, period_s=10.0), settings(rule))
+    assert told.turns("over_temperature") == [(80.0, True)]
+
+
+async def test_what_latches_outlives_a_restart_and_the_rest_does_not(tmp_path: Path) -> None:
+    before = await replayed(record(tmp_path / "one.bms", CAPTURES["pack_over_voltage"][0]), settings())
+    assert '"pack_over_voltage"' in before.kept
+    well = record(tmp_path / "two.bms", [Line(30)])
+    after = await replayed(well, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    first, last = (next(a for a in s.alarms if a.active) for s in (after.snapshots[0], after.snapshots[-1]))
+    assert (first, last.since, last.latched) == (last, first.since, True)
+    assert after.changes == []
+    named = [event.name for event in events(None, after.snapshots[0])]
+    assert "alarm_raised" not in named, "the run before has told of it"
+    off = await replayed(well, settings({"pack_over_voltage": {"latch": False}}), kept=before.kept)
+    assert not any(alarm.active for alarm in off.snapshots[-1].alarms)
+
+
+async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
+    alarms = Alarms(watched(settings({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}}), PACK), 0.2, 5.0)
+    block = np.zeros(2, dtype=SAMPLE)
+    block["time_s"], block["current_a"], block["voltage_v"] = [0.0, 0.1], 25.0, 7.4
+    block["status"] = [0, int(SampleStatus.CURRENT_SATURATED)]
+    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    (change,) = alarms.changes()
+    assert (change.alarm.name, change.at_s, change.alarm.value) == ("discharge_over_current", 0.1, None)
+    assert change.alarm.since == iso_utc(WALL_S)
+
+
+@pytest.mark.parametrize(
+    ("alarms", "reason"),
+    [
+        ({"pack_over_voltage": {"limit_v": 8.4, "clear_v": 8.5}}, r"clear_v = 8\.5: must not be above limit_v = 8\.4"),
+        ({"soc_low": {"clear": 0.05}}, r"soc_low\.clear = 0\.05: must not be below limit = 0\.1"),
+    ],
+)
+def test_an_alarm_that_would_end_where_it_is_raised_is_refused(alarms: dict[str, Any], reason: str) -> None:
+    with pytest.raises(UserError, match=reason):
+        watched(settings(alarms), PACK)
+
+
+def test_a_limit_that_the_pack_never_reaches_is_named() -> None:
+    assert out_of_range(settings(), PACK) == []
+    (line,) = out_of_range(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
+    assert line.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 2 to 4.5 V")
+
+
+def test_limits_follow_chemistry_size_and_what_is_set() -> None:
+    lfp = {each.name: each for each in watched(settings(), load_cell("lfp", 100.0).pack(16, 2))}
+    assert (lfp["pack_over_voltage"].limit, lfp["pack_over_voltage"].clear) == pytest.approx((58.4, 54.4))
+    assert (lfp["discharge_over_current"].limit, lfp["charge_over_current"].limit) == (1000.0, 200.0)
+    told = {"pack_over_voltage": {"limit_v": 57.6}, "cell_imbalance": {"enabled": False}}
+    told_of = {each.name: each for each in watched(settings(told), load_cell("lfp", 100.0).pack(16, 2))}
+    assert told_of["pack_over_voltage"].clear == pytest.approx(53.6)
+    assert told_of["pack_over_voltage"].latch
+    assert "cell_imbalance" not in told_of
+    stack = {each.name for each in watched(settings(), load_fuel_cell("pem_30w"))}
+    assert not stack & {"cell_over_voltage", "cell_under_voltage", "charge_over_current", "charging_below_freezing"}

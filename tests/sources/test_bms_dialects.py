@@ -246,7 +246,7 @@ def test_of_several_packs_on_a_line_the_first_or_the_one_that_was_told_is_taken(
     assert first.counters["other_packs"] == told.counters["other_packs"] == 2
     only = dialect("jk", address=5)
     fed(only, two)
-    assert only.fault == "pack 2 answers, and pack 5 is wanted: see sensor.address"
+    assert only.fault == "pack 0 answers, and pack 5 is wanted: see sensor.address"
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

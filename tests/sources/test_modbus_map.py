@@ -75,7 +75,8 @@ def test_a_refused_request_is_split_by_quantity_and_without_gaps() -> None:
 
 def test_readings_of_known_devices() -> None:
     victron = source(profile="victron-gx")
-    assert victron.sensor == {"current_sign": "charge_positive", "voltage_resolution_v": 0.01}
+    steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
+    assert victron.sensor == {"current_sign": "charge_positive", **steps, "period_s": 1.0}
     told = words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
     assert reading_of(victron, told) == (52.34, -12.3, -2.5, (), pytest.approx(math.nan, nan_ok=True))
     seplos = source(profile="seplos-v3")

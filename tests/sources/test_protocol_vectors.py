@@ -14,6 +14,7 @@ from bms_estimator.sources.protocol import (
     Hello,
     MessageType,
     ProtocolError,
+    Relay,
     SampleMessage,
     command,
     hello_command,
@@ -22,6 +23,7 @@ from bms_estimator.sources.protocol import (
     set_divider_command,
     set_rate_command,
     set_ratiometric_command,
+    set_relay_command,
     set_serial_command,
     unseal,
     zero_current_command,
@@ -39,6 +41,7 @@ COMMANDS: dict[str, Callable[..., bytes]] = {
     "set_divider": set_divider_command,
     "set_current_slope": set_current_slope_command,
     "set_ratiometric": set_ratiometric_command,
+    "set_relay": lambda told: set_relay_command(Relay(*told)),
 }
 CLASSES: dict[str, type[SampleMessage | Hello | Ack]] = {"sample": SampleMessage, "hello": Hello, "ack": Ack}
 

@@ -13,7 +13,7 @@ const $ = (id) => document.getElementById(id);
 const number = (x) => typeof x === "number";
 const clip = (x) => Math.min(Math.max(x, 0), 1);
 const packs = new Map();
-const ui = { pack: null, span: "live", element: null, drawn: 0, curves: 0, described: 0, due: false };
+const ui = { pack: null, span: "live", element: null, drawn: 0, curves: -Infinity, described: -Infinity, due: false };
 const stream = { open: false, heard: 0, link: null, linkSince: 0 };
 
 // ---- what came last
@@ -453,7 +453,7 @@ function curveOf(a, name, factor) {
 
 // ---- what people do
 
-function redrawAll() { ui.curves = ui.described = 0; drawSoon(); }
+function redrawAll() { ui.curves = ui.described = -Infinity; drawSoon(); }
 
 function listPacks() {
 	const names = [...packs.keys()].sort(), wanted = decodeURIComponent(location.hash.slice(1));

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
+from bms_estimator.sources.protocol import Relay
 
 
 @dataclass
@@ -109,6 +110,14 @@ class Dialect(ABC):
             UserError: It takes no such command.
         """
         raise UserError(f"this board takes no commands, nor {name}")
+
+    def relay(self, relay: Relay) -> Command:  # noqa: ARG002 - for those that have one
+        """Have ``due`` send what sets the level of the relay pin.
+
+        Raises:
+            UserError: There is none.
+        """
+        raise UserError("this board has no relay pin")
 
 
 def cell_block(rows: Sequence[Sequence[float]]) -> CellBlock:

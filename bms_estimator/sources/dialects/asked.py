@@ -3,16 +3,13 @@
 import math
 import re
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from enum import Enum
 
-import numpy as np
-
-from bms_estimator.model.sample import LEAST_C, LEAST_CELL_V, MOST_C, MOST_CELL_V, SAMPLE, SampleBlock, forget_beyond
-from bms_estimator.sources.dialects import Dialect, cell_block
-from bms_estimator.sources.dialects.arrivals import ArrivalTimes
+from bms_estimator.model.sample import LEAST_C, MOST_C
+from bms_estimator.sources.dialects.meter import MeterDialect
 from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.text_line import Reading
 
 PACE_S = 1.0
 """A round of questions begins so often [s]; these devices measure two to ten times a second."""
@@ -25,19 +22,9 @@ NOISE_BYTES = 64
 
 LONGEST_START = 4
 """No frame begins with more bytes that are always the same."""
+FAULTS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs")
 FRESH_S = 3.0
 """Cell voltages that are older stand beside no sample [s]."""
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What an answer says of the pack."""
-
-    voltage_v: float
-    current_a: float
-    """As the device signs it."""
-    temperature_c: float = math.nan
-    cells_v: Sequence[float] = ()
 
 
 class Look(Enum):
@@ -48,7 +35,7 @@ class Look(Enum):
     LENGTH = "a frame with a length that none has"
 
 
-class AskedDialect(Dialect):
+class AskedDialect(MeterDialect):
     """Frames to samples, and the questions at their own pace. It takes no commands.
 
     What is no frame is skipped byte by byte, so that the next whole frame is found wherever it begins; how the bytes are
@@ -64,21 +51,11 @@ class AskedDialect(Dialect):
     def __init__(
         self, name: str, start: re.Pattern[bytes], current_sign: CurrentSign, address: int | None = None
     ) -> None:
-        self._name, self._start = name, start
-        self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
-        self._address = address
+        super().__init__(current_sign, FAULTS)
+        self._name, self._start, self._address = name, start, address
         self._rest = b""
-        self._times = ArrivalTimes()
-        self._counts = dict.fromkeys(
-            (
-                *("bytes_received", "frames_received", "crc_errors", "length_errors", "short_frames", "noise_bytes"),
-                *("refused", "other_packs", "implausible"),
-            ),
-            0,
-        )
         self._answers = 0  # good frames of any kind
         self._noise = 0  # bytes since the last of them
-        self._fault: str | None = None
         self._due: list[bytes] = []
         self._asked = b""
         self._way = self._unanswered = 0
@@ -86,16 +63,11 @@ class AskedDialect(Dialect):
         self._round_s = self._asked_s = -math.inf
 
     @property
-    def counters(self) -> Mapping[str, int]:
-        """Samples and faults since start."""
-        return dict(self._counts)
-
-    @property
     def fault(self) -> str | None:
-        """What came last that is no answer."""
-        if self._fault is None and self._noise > NOISE_BYTES:
+        """What came first since the last sample that is no answer."""
+        if self._wrong is None and self._noise > NOISE_BYTES:
             return f"bytes come that are no answer of a {self._name}: wrong baud rate, or another sensor.protocol?"
-        return self._fault
+        return self._wrong
 
     @abstractmethod
     def _ways(self) -> Sequence[Sequence[bytes]]:
@@ -139,30 +111,12 @@ class AskedDialect(Dialect):
         ways = self._ways()
         self._due = list(ways[self._way % len(ways)])
 
-    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is since the first sample, by arrival."""
-        self._counts["bytes_received"] += len(data)
-        readings = [reading for frame in self._frames(data) if (reading := self._read(arrival_s, frame)) is not None]
-        self.cells = cell_block([reading.cells_v for reading in readings])
-        self._counts["implausible"] += forget_beyond(self.cells, LEAST_CELL_V, MOST_CELL_V)
-        block = np.empty(len(readings), dtype=SAMPLE)
-        if readings:
-            self._counts["frames_received"] += len(readings)
-            block["voltage_v"] = [reading.voltage_v for reading in readings]
-            block["current_a"] = [self._sign * reading.current_a + 0.0 for reading in readings]  # no -0
-            block["temperature_c"] = [reading.temperature_c for reading in readings]
-            self._counts["implausible"] += forget_beyond(block["temperature_c"], LEAST_C, MOST_C)
-            block["status"] = 0
-            block["time_s"] = self._times.of(arrival_s, len(readings))
-        return block
-
-    def _read(self, arrival_s: float, frame: bytes) -> Reading | None:
-        self._answers += 1
-        self._noise = 0
-        reading = self._take(arrival_s, frame)
-        if reading is not None:
-            self._fault = None
-        return reading
+    def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
+        for frame in self._frames(data):
+            self._answers += 1
+            self._noise = 0
+            if (reading := self._take(arrival_s, frame)) is not None:
+                yield reading
 
     def _frames(self, data: bytes) -> list[bytes]:
         """Whole frames that end in ``data``; what may become one is kept."""
@@ -175,7 +129,7 @@ class AskedDialect(Dialect):
                 look = Look.MORE
             if isinstance(look, int) and self._is_whole(rest[at : at + look]):
                 if waiting >= 0:
-                    self._bad("short_frames", "an answer broke off: interference, or a second master on the line?")
+                    self._blame("short_frames", "an answer broke off: interference, or a second master on the line?")
                 self._skip(at - done)
                 done, waiting = at + look, -1
                 frames.append(rest[at:done])
@@ -185,11 +139,11 @@ class AskedDialect(Dialect):
                 if look is Look.MORE:
                     waiting = at
                 elif look is Look.LENGTH:
-                    self._bad(
+                    self._blame(
                         "length_errors", "answers come with impossible lengths: interference, or a wrong baud rate?"
                     )
                 elif look is not Look.NOISE:
-                    self._bad(
+                    self._blame(
                         "crc_errors", "answers come with wrong checksums: interference, or a second master on the line?"
                     )
             at = self._next(rest, at + 1)
@@ -208,17 +162,13 @@ class AskedDialect(Dialect):
         self._counts["noise_bytes"] += count
         self._noise += count
 
-    def _bad(self, counter: str, fault: str) -> None:
-        self._counts[counter] += 1
-        self._fault = fault
-
     def _is_other(self, address: int) -> bool:
         """Whether an answer is another pack's; the first one settles which is ours where that was not told."""
         if self._address is None:
             self._address = address
         if address == self._address:
             return False
-        self._bad("other_packs", f"pack {address} answers, and pack {self._address} is wanted: see sensor.address")
+        self._blame("other_packs", f"pack {address} answers, and pack {self._address} is wanted: see sensor.address")
         return True
 
     def _mean_c(self, probes_c: Sequence[float]) -> float:
@@ -238,6 +188,6 @@ class Beside:
         """Those that came now."""
         self._arrival_s, self._cells_v = arrival_s, tuple(cells_v)
 
-    def at(self, arrival_s: float) -> Sequence[float]:
+    def at(self, arrival_s: float) -> tuple[float, ...]:
         """Of the round of a sample; none where their answer has not come."""
         return self._cells_v if arrival_s - self._arrival_s < FRESH_S else ()

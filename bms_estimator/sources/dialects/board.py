@@ -14,8 +14,10 @@ from bms_estimator.sources.frames import CurrentSign, FrameDecoder
 from bms_estimator.sources.protocol import (
     AckResult,
     Hello,
+    Relay,
     hello_command,
     set_rate_command,
+    set_relay_command,
     unseal,
     zero_current_command,
 )
@@ -32,6 +34,7 @@ class _Told(Command):
     frame: bytes = b""
     again_s: float = ASK_AGAIN_S
     hint: str = ""
+    changes_hello: bool = True
     acknowledged: bool = False
 
 
@@ -132,14 +135,21 @@ class BoardDialect(Dialect):
         hint = "; is the sensor connected, and no current flowing?"
         return self._tell(zero_current_command(), again_s=math.inf, hint=hint)  # it measures for a second
 
+    def relay(self, relay: Relay) -> Command:
+        """Set the level of the relay pin."""
+        hint = "; firmware before 0.2.0 has no relay pin"
+        return self._tell(set_relay_command(relay), hint=hint, changes_hello=False)
+
     def tell(self, frame: bytes) -> Command:
         """Have ``due`` send a command that may be given twice."""
         return self._tell(frame)
 
-    def _tell(self, frame: bytes, *, again_s: float = ASK_AGAIN_S, hint: str = "") -> Command:
+    def _tell(
+        self, frame: bytes, *, again_s: float = ASK_AGAIN_S, hint: str = "", changes_hello: bool = True
+    ) -> Command:
         self._decoder.take_acks()  # of what was asked before
         self._asked = b""
-        self._told = _Told(frame=frame, again_s=again_s, hint=hint)
+        self._told = _Told(frame=frame, again_s=again_s, hint=hint, changes_hello=changes_hello)
         return self._told
 
     def _wanted(self) -> tuple[bytes, float]:
@@ -160,6 +170,8 @@ class BoardDialect(Dialect):
                 continue
             if ack.result == AckResult.OK:
                 told.acknowledged = True
+                if not told.changes_hello:
+                    continue
                 self._decoder.forget_hello()  # the next one holds what was set; one that is lost is asked for again
             else:
                 told.refusal = f"the board refuses: {ack.result.name.lower().replace('_', ' ')}{told.hint}"

@@ -12,8 +12,9 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 
-from bms_estimator.sources.dialects.asked import FRESH_S, AskedDialect, Look, Reading
+from bms_estimator.sources.dialects.asked import FRESH_S, AskedDialect, Look
 from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.text_line import Reading
 
 PACK, STATUS, CELLS, PROBES = 0x90, 0x94, 0x95, 0x96
 COMMANDS = range(0x90, 0x99)
@@ -84,7 +85,7 @@ class DalyDialect(AskedDialect):
         if command == STATUS:
             self._cells, self._probes = data[0] or None, data[1]
         elif command in (CELLS, PROBES) and data[0] > MOST_FRAMES:
-            self._bad("length_errors", f"a frame with number {data[0]} comes, and there are at most {MOST_FRAMES}")
+            self._blame("length_errors", f"a frame with number {data[0]} comes, and there are at most {MOST_FRAMES}")
         elif command == CELLS:
             self._first = 0 if data[0] == 0 else self._first
             self._cells_v[data[0]], self._cells_s = [mv / 1000 for mv in struct.unpack_from(">3H", data, 1)], arrival_s
@@ -99,7 +100,7 @@ class DalyDialect(AskedDialect):
         probes_c = self._joined(self._probes_c, PROBES_A_FRAME, self._probes) if fresh else []
         self._cells_v, self._told = {}, True
         there_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
-        return Reading(decivolts / 10, (deciamperes - NO_CURRENT) / 10, self._mean_c(there_c), cells_v)
+        return Reading(decivolts / 10, (deciamperes - NO_CURRENT) / 10, self._mean_c(there_c), tuple(cells_v))
 
     def _joined(self, frames: Mapping[int, Sequence[float]], each: int, count: int | None) -> list[float]:
         """Values of all frames in the order of their numbers, NaN where one did not come.

@@ -9,8 +9,9 @@ import re
 import struct
 from collections.abc import Sequence
 
-from bms_estimator.sources.dialects.asked import AskedDialect, Beside, Look, Reading
+from bms_estimator.sources.dialects.asked import AskedDialect, Beside, Look
 from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.text_line import Reading
 
 BASIC, CELLS, NAME = 0x03, 0x04, 0x05
 START, END, READ = 0xDD, 0x77, 0xA5
@@ -70,13 +71,13 @@ class JbdDialect(AskedDialect):
     def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
         register, status, data = frame[1], frame[2], frame[HEAD:-TAIL]
         if status == REFUSED:
-            self._bad("refused", f"the BMS refuses to tell register 0x{register:02x}")
+            self._blame("refused", f"the BMS refuses to tell register 0x{register:02x}")
         elif register == NAME:
             self._model = data.decode("ascii", "replace").strip("\0 ")
         elif register == CELLS:
             self._beside.keep(arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])])
         elif len(data) < LEAST_BASIC:
-            self._bad("length_errors", "its basic information is too short")
+            self._blame("length_errors", "its basic information is too short")
         else:
             return self._basic(arrival_s, data)
         return None

@@ -15,8 +15,9 @@ import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 
-from bms_estimator.sources.dialects.asked import AskedDialect, Look, Reading
+from bms_estimator.sources.dialects.asked import AskedDialect, Look
 from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.sources.text_line import Reading
 
 OLD_START, START = b"\x4e\x57", b"\x55\xaa\xeb\x90"
 OLD_HEAD, OLD_TAIL, OLD_MOST = 11, 9, 512
@@ -145,7 +146,7 @@ class JkDialect(AskedDialect):
             return None
         registers = dict(_registers(frame[OLD_HEAD:-OLD_TAIL]))
         if not {VOLTAGE, CURRENT} <= registers.keys():
-            self._bad("length_errors", "its answer tells no voltage or no current")
+            self._blame("length_errors", "its answer tells no voltage or no current")
             return None
         cells_v = [mv / 1000 for _, mv in struct.iter_unpack(">BH", registers.get(CELLS, b""))]
         self._told = f"JK-BMS, {len(cells_v)} cells"
@@ -158,11 +159,11 @@ class JkDialect(AskedDialect):
             current_a = (raw & ~CHARGING) / (100 if raw & CHARGING else -100)
         probes = [_number(registers[code]) for code in (BOX_C, BATTERY_C) if code in registers]
         probes_c = [float(probe if probe <= 100 else 100 - probe) for probe in probes if probe != ABSENT_C]
-        return Reading(_number(registers[VOLTAGE]) / 100, current_a, self._mean_c(probes_c), cells_v)
+        return Reading(_number(registers[VOLTAGE]) / 100, current_a, self._mean_c(probes_c), tuple(cells_v))
 
     def _newer(self, arrival_s: float, frame: bytes) -> Reading | None:
         address = frame[FRAME_BYTES] if len(frame) > FRAME_BYTES else None
-        if address is None or question(address) != self._asked:
+        if address is not None and question(address) != self._asked:
             self._overheard_s = arrival_s
         if (address is not None and self._is_other(address)) or frame[4] != REALTIME:
             return None
@@ -173,7 +174,7 @@ class JkDialect(AskedDialect):
         cells_v = [mv / 1000 for i, mv in enumerate(cells) if there >> i & 1]
         self._told = f"JK-BMS, {len(cells_v)} cells" + ("" if address is None else f", pack {address}")
         probes_c = [c / 10 for c in struct.unpack_from("<2h", frame, 162) if c != ABSENT_DECI_C]
-        return Reading(millivolts / 1000, milliamperes / 1000, self._mean_c(probes_c), cells_v)
+        return Reading(millivolts / 1000, milliamperes / 1000, self._mean_c(probes_c), tuple(cells_v))
 
 
 def _registers(data: bytes) -> Iterator[tuple[int, bytes]]:

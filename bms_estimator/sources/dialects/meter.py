@@ -52,7 +52,7 @@ class MeterDialect(Dialect):
         if readings:
             self._counts["frames_received"] += len(readings)
             block["voltage_v"] = [reading.voltage_v for reading in readings]
-            block["current_a"] = [self._sign * reading.current_a for reading in readings]
+            block["current_a"] = [self._sign * reading.current_a + 0.0 for reading in readings]  # no -0
             block["temperature_c"] = [reading.temperature_c for reading in readings]
             self._counts["implausible"] += forget_beyond(block["temperature_c"], LEAST_C, MOST_C)
             block["status"] = 0

@@ -1,0 +1,137 @@
+"""What a BMS answers to each question, by protocol: the other side of ``sources.dialects``."""
+
+import math
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from bms_estimator.sources.dialects import daly, jbd, jk
+
+NAME = b"SIMULATED"
+PACK = 1
+"""Address of the newer JK and the Daly."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a BMS has measured last; current positive on discharge, temperature NaN without a probe."""
+
+    voltage_v: float
+    current_a: float
+    temperature_c: float
+    cells_v: Sequence[float]
+    soc: float
+    capacity_ah: float
+
+
+Answers = Mapping[bytes, Callable[[Measured], bytes]]
+"""By the question."""
+
+
+def _steps(value: float, per_unit: float, least: int, most: int) -> int:
+    """What a converter makes of a value: steps within its range."""
+    return min(max(round(value * per_unit), least), most)
+
+
+def _u16(value: float, per_unit: float) -> int:
+    return _steps(value, per_unit, 0, 0xFFFF)
+
+
+def _jbd(register: int, data: bytes) -> bytes:
+    body = bytes((0, len(data))) + data
+    return bytes((jbd.START, register)) + body + jbd.checksum(body) + bytes((jbd.END,))
+
+
+def _jbd_basic(told: Measured) -> bytes:
+    probes = [] if math.isnan(told.temperature_c) else [_u16(told.temperature_c + jbd.ZERO_C / 10, 10)]
+    data = struct.pack(
+        ">HhHHHHHHHBBBBB",
+        *(_u16(told.voltage_v, 100), _steps(-told.current_a, 100, -0x8000, 0x7FFF)),
+        *(_u16(told.soc * told.capacity_ah, 100), _u16(told.capacity_ah, 100), 0, 0, 0, 0, 0),
+        *(0x20, _steps(told.soc, 100, 0, 100), 3, len(told.cells_v), len(probes)),
+    )
+    return _jbd(jbd.BASIC, data + struct.pack(f">{len(probes)}H", *probes))
+
+
+def _jbd_cells(told: Measured) -> bytes:
+    return _jbd(jbd.CELLS, struct.pack(f">{len(told.cells_v)}H", *(_u16(v, 1000) for v in told.cells_v)))
+
+
+def _daly(command: int, data: bytes) -> bytes:
+    return daly.sealed(bytes((daly.START, PACK, command, daly.DATA_BYTES)) + data.ljust(daly.DATA_BYTES, b"\0"))
+
+
+def _daly_status(told: Measured) -> bytes:
+    return _daly(daly.STATUS, bytes((len(told.cells_v), int(not math.isnan(told.temperature_c)))))
+
+
+def _daly_cells(told: Measured) -> bytes:
+    steps = [_u16(v, 1000) for v in told.cells_v] + [0, 0]
+    frames = range(math.ceil(len(told.cells_v) / daly.CELLS_A_FRAME))
+    return b"".join(_daly(daly.CELLS, struct.pack(">B3H", i + 1, *steps[3 * i : 3 * i + 3])) for i in frames)
+
+
+def _daly_probes(told: Measured) -> bytes:
+    there = not math.isnan(told.temperature_c)
+    return _daly(daly.PROBES, bytes((1, _steps(told.temperature_c + daly.ZERO_C, 1, 1, 255) if there else 0)))
+
+
+def _daly_pack(told: Measured) -> bytes:
+    current = _u16(told.current_a + daly.NO_CURRENT / 10, 10)
+    return _daly(daly.PACK, struct.pack(">4H", _u16(told.voltage_v, 10), 0, current, _u16(told.soc, 1000)))
+
+
+def _jk_old(told: Measured) -> bytes:
+    amperes = _steps(abs(told.current_a), 100, 0, jk.CHARGING - 1) | (jk.CHARGING if told.current_a < 0.0 else 0)
+    celsius = jk.ABSENT_C if math.isnan(told.temperature_c) else _steps(told.temperature_c, 1, -39, 100)
+    probe = celsius if celsius >= 0 else 100 - celsius
+    cells = b"".join(struct.pack(">BH", i, _u16(v, 1000)) for i, v in enumerate(told.cells_v, 1))
+    registers = (
+        bytes((jk.CELLS, len(cells)))
+        + cells
+        + struct.pack(">BHBHBH", 0x80, probe, jk.BOX_C, probe, jk.BATTERY_C, probe)
+        + struct.pack(">BHBH", jk.VOLTAGE, _u16(told.voltage_v, 100), jk.CURRENT, amperes)
+        + struct.pack(">BBBB", 0x85, _steps(told.soc, 100, 0, 100), 0x86, 2)
+        + struct.pack(">BHBI", 0x8A, len(told.cells_v), 0xAA, round(told.capacity_ah))
+        + bytes((jk.SOFTWARE,))
+        + NAME.ljust(15, b"_")
+        + bytes((jk.VERSION, 1))
+    )
+    head = bytes((0, 0, 0, 0, jk.READ_ALL, jk.FROM_BMS, jk.ANSWER))
+    body = head + registers + bytes((0, 0, 0, 0, jk.OLD_END))
+    return jk.old_sealed(jk.OLD_START + (len(body) + 6).to_bytes(2, "big") + body)
+
+
+def _jk_newer(told: Measured) -> bytes:
+    frame = bytearray(jk.FRAME_BYTES)
+    frame[:5] = jk.START + bytes((jk.REALTIME,))
+    struct.pack_into(f"<{len(told.cells_v)}H", frame, 6, *(_u16(v, 1000) for v in told.cells_v))
+    struct.pack_into("<I", frame, 70, (1 << len(told.cells_v)) - 1)
+    struct.pack_into("<I", frame, 150, round(1000 * told.voltage_v))
+    struct.pack_into("<i", frame, 158, round(-1000 * told.current_a))
+    probe = jk.ABSENT_DECI_C if math.isnan(told.temperature_c) else round(10 * told.temperature_c)
+    struct.pack_into("<2h", frame, 162, probe, probe)
+    frame[173] = _steps(told.soc, 100, 0, 100)
+    frame[-1] = sum(frame) & 0xFF
+    record = struct.pack(">BBHH", PACK, jk.MODBUS_WRITE, jk.REALTIME_REGISTER, 1)
+    return bytes(frame) + record + jk.crc16(record)
+
+
+BMS_ANSWERS: Mapping[str, Answers] = {
+    "jbd": {
+        jbd.question(jbd.NAME): lambda _: _jbd(jbd.NAME, NAME),
+        jbd.question(jbd.CELLS): _jbd_cells,
+        jbd.question(jbd.BASIC): _jbd_basic,
+    },
+    "daly": {
+        daly.question(daly.HOSTS[0], daly.STATUS): _daly_status,
+        daly.question(daly.HOSTS[0], daly.CELLS): _daly_cells,
+        daly.question(daly.HOSTS[0], daly.PROBES): _daly_probes,
+        daly.question(daly.HOSTS[0], daly.PACK): _daly_pack,
+    },
+    "jk": {jk.OLD_QUESTION: _jk_old},
+    "jk-pb": {jk.question(PACK): _jk_newer},
+}
+"""By protocol; ``jk`` and ``jk-pb`` are the two families of JK."""
+MOST_CELLS = 32
+"""No protocol has room for more in all its frames."""

@@ -1,0 +1,38 @@
+"""AsyncAPI's own parser takes the document; ``make integrations`` installs it."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.sinks.asyncapi import document
+from tests.patience import LONG_S
+
+NODE = shutil.which("node")
+FOLDER = Path(__file__).parents[2] / ".node"
+PARSE = """
+const { Parser } = require('@asyncapi/parser');
+const fs = require('fs');
+new Parser().parse(fs.readFileSync(0, 'utf8')).then(({ document, diagnostics }) => {
+    const wrong = diagnostics.filter((d) => d.severity < 2).map((d) => `${d.path.join('.')}: ${d.message}`);
+    console.log(JSON.stringify({ wrong, channels: document ? document.channels().all().length : 0 }));
+});
+"""
+
+
+def test_the_parser_finds_nothing_wrong() -> None:
+    if NODE is None or not (FOLDER / "node_modules/@asyncapi/parser").is_dir():
+        pytest.skip("@asyncapi/parser is not installed (make integrations)")
+    told = document("bms")
+    judged = subprocess.run(
+        [NODE, "-e", PARSE],
+        input=json.dumps(told),
+        cwd=FOLDER,
+        capture_output=True,
+        text=True,
+        timeout=LONG_S,
+        check=True,
+    )
+    assert json.loads(judged.stdout) == {"wrong": [], "channels": len(told["channels"])}

@@ -1,0 +1,77 @@
+"""A real Chromium without a screen, for all tests of a module."""
+
+import contextlib
+import shutil
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from playwright.async_api import Browser, Page, async_playwright
+
+from tests.patience import LONG_S
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+
+
+@contextlib.asynccontextmanager
+async def chromium() -> AsyncIterator[Browser]:
+    """Chromium in a folder of its own, that knows nobody."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed (apt-get install chromium)")
+    async with async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=1e3 * LONG_S)
+        yield browser
+        await browser.close()
+
+
+@dataclass
+class Tab:
+    """A page of ours, and what it complained of and asked for meanwhile."""
+
+    page: Page
+    errors: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+    async def text(self, quantity: str) -> str:
+        """What is shown of a quantity; empty where it is hidden."""
+        shown = self.page.locator(f'[data-q="{quantity}"]')
+        return await shown.inner_text() if await shown.is_visible() else ""
+
+    async def until(self, condition: str, argument: Any = None) -> None:
+        """Wait until JavaScript says so."""
+        await self.page.wait_for_function(condition, arg=argument)
+
+    async def until_status(self, text: str) -> None:
+        await self.until("text => document.getElementById('status').innerText.includes(text)", text)
+
+    async def until_text(self, quantity: str, text: str) -> None:
+        await self.until(
+            '([name, text]) => document.querySelector(`[data-q="${name}"]`).innerText === text', [quantity, text]
+        )
+
+
+@contextlib.asynccontextmanager
+async def tab(browser: Browser, url: str, *, size: dict[str, int] = DESKTOP, **options: Any) -> AsyncIterator[Tab]:
+    """A page opened, as somebody does who was never there."""
+    context = await browser.new_context(viewport=size, **options)  # type: ignore[arg-type]
+    context.set_default_timeout(1e3 * LONG_S)
+    page = await context.new_page()
+    opened = Tab(page)
+    page.on("console", lambda message: opened.errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: opened.errors.append(str(error)))
+    page.on("request", lambda request: opened.requests.append(request.url))
+    await page.goto(url)
+    yield opened
+    await context.close()

@@ -1,0 +1,430 @@
+"""The page in a real Chromium: what is on it is what was published, and it says when that is not what is now.
+
+A real Mosquitto; the real service of a pack with four cells, whose page is one; the real ``dashboard`` of the broker, whose
+page is the other. A second pack on that broker is this test's own, so that it may publish anything.
+"""
+
+import asyncio
+import contextlib
+import json
+import re
+from collections.abc import AsyncIterator, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import pytest_asyncio
+from playwright.async_api import Browser
+
+from bms_estimator.model.estimate import Alarm
+from tests.command_line import PROGRAM
+from tests.mosquitto import MOSQUITTO, Broker, Listener, free_port
+from tests.page.chromium import PHONE, Tab, chromium, tab
+from tests.patience import LONG_S
+from tests.serial_line import Line
+from tests.sinks.snapshots import ONE, STACK
+from tests.store.test_history import at, keep
+
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
+
+MINUS = "\N{MINUS SIGN}"
+CELLS = (3.311, 3.325, 3.318, 3.322)
+CELLAR = "bms/cellar"
+ODD = {
+    "soc": 0.4321,
+    "soc_percent": 43.21,
+    "soc_std": 0.0123,
+    "voltage_v": 52.3456,
+    "voltage_estimate_v": 52.4,
+    "current_a": -12.3456,
+    "power_w": -646.2,
+    "temperature_c": 21.37,
+    "innovation_v": -0.0543,
+    "remaining_energy_wh": 2345.6,
+    "remaining_capacity_ah": 45.678,
+    "time_to_empty_s": None,
+    "time_to_full_s": 11_520.0,
+    "energy_out_kwh": 12.3456,
+    "energy_in_kwh": 123.456,
+    "delta_1": 0.031,
+    "delta_2": 0.0789,
+    "stability_margin": 0.3532,
+    "cells_v": [3.271, 3.2755, None, 3.2688],
+}
+SHOWN = {
+    "soc": "43.2",
+    "soc_std": "2.5",
+    "voltage_v": "52.35 V",
+    "voltage_estimate_v": "52.40 V",
+    "current_a": f"{MINUS}12.35 A",
+    "way": "charging",
+    "power_w": f"{MINUS}646 W",
+    "temperature_c": "21.4 °C",
+    "innovation_v": f"{MINUS}54.3 mV",
+    "remaining_energy_wh": "2346 Wh",
+    "remaining_capacity_ah": "45.68 Ah",
+    "time_left": "3 h 12 min",
+    "time_left_label": "To full",
+    "energy_out_kwh": "12.3 kWh",
+    "energy_in_kwh": "123.5 kWh",
+    "stop": "7.9",
+    "deltas": "δ₁ 3.1 %, δ₂ 7.9 %",
+    "stability_margin": "35.3",
+    "celllow": "3.269 V · cell 4",
+    "cellhigh": "3.276 V · cell 2",
+    "cellmean": "3.272 V",
+    "cellapart": "6.7 mV",
+    "cellspread": "3 measured · deviations in mV",
+}
+
+
+class House(NamedTuple):
+    """All that runs."""
+
+    broker: Broker
+    page: str
+    """Of the service."""
+    dashboard: str
+    """Of the broker."""
+    live: Listener
+
+
+async def starting(folder: Path, *arguments: object, port: int) -> asyncio.subprocess.Process:
+    """A program of ours that serves a page, once it does."""
+    with (folder / f"{port}.log").open("wb") as log:
+        process = await asyncio.create_subprocess_exec(
+            PROGRAM,
+            *map(str, arguments),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=log,
+        )
+    async with asyncio.timeout(LONG_S):
+        while process.returncode is None:
+            with contextlib.suppress(OSError):
+                _, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.close()
+                return process
+            await asyncio.sleep(0.05)
+    raise AssertionError((folder / f"{port}.log").read_text())
+
+
+async def feed(line: Line) -> None:
+    """A board with four cells that prints at 20 Hz."""
+    text = json.dumps({"voltage": sum(CELLS), "current": 2.5, "temperature": 21.5, "cells": CELLS})
+    while True:
+        with contextlib.suppress(BlockingIOError, OSError):
+            line.write(text.encode() + b"\r\n")
+        await asyncio.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("page")
+
+
+@pytest.fixture(scope="module")
+def broker(folder: Path) -> Iterator[Broker]:
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    running = Broker(folder).start()
+    yield running
+    running.stop()
+
+
+@module_fixture
+async def browser() -> AsyncIterator[Browser]:
+    async with chromium() as running:
+        yield running
+
+
+@contextlib.asynccontextmanager
+async def attic(folder: Path, broker: Broker, port: int) -> AsyncIterator[asyncio.subprocess.Process]:
+    """The real service of a real pack."""
+    line = Line(folder / f"board-{port}")
+    line.plug()
+    pack = folder / f"attic-{port}.toml"
+    pack.write_text(
+        f"""
+[pack]
+name = "attic"
+cell = "lfp"
+capacity_ah = 100
+series = 4
+initial_soc = 0.6
+[sensor]
+port = "{line.path}"
+protocol = "text"
+[publish]
+rate_hz = 10
+[mqtt]
+url = "{broker.url}"
+[page]
+listen = "127.0.0.1:{port}"
+[state]
+folder = "{folder}"
+"""
+    )
+    board = asyncio.create_task(feed(line))
+    process = await starting(folder, "run", "--no-view", pack, port=port)
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+        board.cancel()
+        line.unplug()
+
+
+@module_fixture
+async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
+    await keep(folder / "cellar.sqlite", [])
+    page, dashboard = free_port(), free_port()
+    async with attic(folder, broker, page), Listener(broker) as live:
+        arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{dashboard}", "--folder", folder, "--no-browser")
+        process = await starting(folder, "dashboard", *arguments, port=dashboard)
+        await publish(live, "availability", b"online")
+        await publish(live, "sensor/availability", b"online")
+        await publish(live, "info", ONE.info.model_copy(update={"device": "cellar"}).model_dump_json())
+        await publish(live, "health", ONE.health.model_dump_json())
+        yield House(broker, f"http://127.0.0.1:{page}/", f"http://127.0.0.1:{dashboard}/", live)
+        process.terminate()
+        assert await process.wait() == 0
+
+
+async def publish(live: Listener, topic: str, payload: str | bytes, *, retain: bool = True) -> None:
+    await live.publish(f"{CELLAR}/{topic}", payload, qos=1, retain=retain)
+
+
+async def publish_state(live: Listener, **values: Any) -> dict[str, Any]:
+    assert ONE.estimate
+    state = ONE.estimate.model_dump() | {"time": "2026-11-22T16:04:05.000Z"} | values
+    await publish(live, "state", json.dumps(state), retain=False)
+    return state
+
+
+@contextlib.asynccontextmanager
+async def dashboard_of(browser: Browser, house: House, pack: str, **options: Any) -> AsyncIterator[Tab]:
+    async with tab(browser, f"{house.dashboard}#{pack}", **options) as opened:
+        await opened.until("name => document.getElementById('name').textContent === name", pack)
+        yield opened
+
+
+def of_clock(time: str) -> str:
+    """As a browser on this machine shows it."""
+    return datetime.fromisoformat(time).astimezone().strftime("%H:%M:%S")
+
+
+async def test_what_is_on_the_page_is_what_was_published_with_its_units(browser: Browser, house: House) -> None:
+    async with dashboard_of(browser, house, "cellar") as opened:
+        await publish_state(house.live, **ODD)
+        await opened.until_text("soc", SHOWN["soc"])
+        assert {name: await opened.text(name) for name in SHOWN} == SHOWN
+        meter = opened.page.get_by_role("meter", name="State of charge")
+        assert await meter.get_attribute("aria-valuenow") == "43"
+        cell = opened.page.get_by_role("img", name="cell 4: 3.269 V, lowest")
+        assert await cell.is_visible()
+        assert await opened.page.get_by_role("img", name="cell 3: not measured").count() == 1
+        assert await opened.page.title() == "43 % · cellar"
+        await opened.until_status("live")
+        assert opened.errors == []
+
+
+async def test_what_is_not_known_is_not_shown(browser: Browser, house: House) -> None:
+    async with dashboard_of(browser, house, "cellar") as opened:
+        state = await publish_state(house.live, soc_std=None, temperature_c=None, innovation_v=None, voltage_v=3.21)
+        await opened.until_text("voltage_v", "3.210 V")
+        for name in ("soc_std", "temperature_c", "innovation_v", "time_left", "celllow"):
+            assert await opened.text(name) == "", name
+        assert STACK.estimate
+        await publish_state(house.live, **STACK.estimate.model_dump(exclude={"time"}))
+        await opened.until_text("voltage_v", "13.00 V")
+        assert not await opened.page.locator(".hero").is_visible()  # a fuel cell has no state of charge
+        for key in set(state) - {"time", "voltage_v"}:
+            state.pop(key)
+        await publish_state(house.live, **dict.fromkeys(ODD))
+        await opened.until_text("voltage_v", "")
+        body = await opened.page.inner_text("body")
+        assert not re.search("NaN|undefined|null|Infinity", body)
+        assert opened.errors == []
+
+
+async def test_the_pack_of_a_service_is_shown_by_both_alike_and_by_nobody_else(browser: Browser, house: House) -> None:
+    parameters = await house.live.wait_json("bms/attic/parameters")
+    async with tab(browser, house.page) as own, dashboard_of(browser, house, "attic") as other:
+        for opened in (own, other):
+            await opened.until_text("voltage_v", f"{sum(CELLS):.2f} V")
+            assert await opened.text("current_a") == "2.500 A"
+            assert await opened.text("power_w") == f"{2.5 * sum(CELLS):.1f} W"
+            assert await opened.text("temperature_c") == "21.5 °C"
+            assert await opened.text("way") == "discharging"
+            for name, published, factor in (("soc", "soc", 100.0), ("soc_std", "soc_std", 200.0)):
+                text = await opened.text(name)
+                await house.live.wait_json("bms/attic/state", lambda s: f"{factor * s[published]:.1f}" == text)  # noqa: B023
+            assert re.fullmatch(r"\d+ h \d\d min", await opened.text("time_left"))
+            assert await opened.text("celllow") == "3.311 V · cell 1"
+            assert "in series" in await opened.page.inner_text("#what")
+            await opened.until("count => document.querySelectorAll('#params tr').length === count", len_of(parameters))
+            row = opened.page.locator('[data-p="a a1"]')
+            assert float((await row.locator("td").nth(0).inner_text()).replace(MINUS, "-")) == pytest.approx(
+                parameters["a"]["a1"]["value"], rel=1e-3
+            )
+            await opened.until_status("live")
+            assert opened.errors == []
+            origin = "/".join(opened.page.url.split("/")[:3])
+            assert all(url.startswith(origin) for url in opened.requests), opened.requests
+        assert await own.page.get_by_role("tab").count() == 0
+        assert await other.page.get_by_role("tab").count() == 2
+
+
+def len_of(parameters: dict[str, Any]) -> int:
+    return sum(len(parameters[group]) for group in ("a", "elements", "state_of_health"))
+
+
+async def test_two_packs_are_changed_between_by_the_keyboard_alone(browser: Browser, house: House) -> None:
+    async with dashboard_of(browser, house, "attic") as opened:
+        page = opened.page
+        await page.keyboard.press("Tab")
+        assert await page.evaluate("document.activeElement.textContent") == "attic"
+        await page.keyboard.press("ArrowRight")
+        await opened.until("() => document.getElementById('name').textContent === 'cellar'")
+        selected = page.get_by_role("tab", selected=True)
+        assert await selected.inner_text() == "cellar"
+        assert page.url.endswith("#cellar")
+        await page.keyboard.press("Home")
+        await opened.until("() => document.getElementById('name').textContent === 'attic'")
+        await page.keyboard.press("Tab")
+        await page.keyboard.press("ArrowRight")
+        assert await page.get_by_role("radio", name="Hour").is_checked()
+        await page.keyboard.press("ArrowLeft")
+        await page.keyboard.press("Tab")
+        assert await page.evaluate("document.activeElement.id") == "element"
+
+
+async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: House) -> None:
+    alarm = Alarm(
+        name="cell_under_voltage",
+        severity="critical",
+        active=True,
+        latched=True,
+        since="2026-11-22T16:00:00.000Z",
+        value=2.412,
+        limit=2.5,
+        unit="V",
+        text="cell 3 has 2.412 V: stop discharging",
+    )
+    async with dashboard_of(browser, house, "cellar") as opened:
+        await publish(house.live, "alarm/cell_under_voltage", alarm.model_dump_json())
+        shown = opened.page.get_by_role("alert").locator(".alarm")
+        await shown.wait_for()
+        text = await shown.inner_text()
+        for said in (
+            "under voltage",
+            "cell 3 has 2.412 V: stop discharging",
+            "2.412 V",
+            "limit 2.5 V",
+            "critical",
+            "latched",
+        ):
+            assert said in text
+        await publish(
+            house.live, "alarm/cell_under_voltage", alarm.model_copy(update={"active": False}).model_dump_json()
+        )
+        await shown.wait_for(state="detached")
+        await publish(house.live, "alarm/cell_under_voltage", b"")
+        assert opened.errors == []
+
+
+async def test_history_is_drawn_for_each_span(browser: Browser, house: House, folder: Path) -> None:
+    now_s = datetime.now(UTC).timestamp()
+    begin_s = datetime.fromisoformat(at(0.0).estimate.time).timestamp()
+    await keep(folder / "cellar.sqlite", [at(now_s - begin_s - 30.0 * s, 3.0, 3.9) for s in range(100, 0, -1)])
+    async with dashboard_of(browser, house, "cellar") as opened:
+        for span in ("Hour", "Day", "Month"):
+            await opened.page.get_by_text(span, exact=True).click()
+            chart = opened.page.get_by_role("img", name=f"Voltage, last {span.lower()}: from 3.900 to 3.900 V")
+            await chart.wait_for()
+            assert await chart.locator("canvas").is_visible()
+        assert opened.errors == []
+
+
+async def test_where_no_history_is_kept_it_says_so(browser: Browser, house: House) -> None:
+    await house.live.publish("bms/guest/availability", b"online", qos=1)
+    async with dashboard_of(browser, house, "guest") as opened:
+        await opened.page.get_by_text("Day", exact=True).click()
+        await opened.page.get_by_text("No history is kept here").wait_for()
+
+
+async def test_it_is_stale_while_the_sensor_or_the_service_is_offline(browser: Browser, house: House) -> None:
+    async with dashboard_of(browser, house, "cellar") as opened:
+        state = await publish_state(house.live)
+        await opened.until_status("live")
+        offline = ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "the board is silent"})
+        await publish(house.live, "health", offline.model_dump_json())
+        await publish(house.live, "sensor/availability", b"offline")
+        await opened.until_status(f"stale since {of_clock(state['time'])}")
+        assert "the board is silent" in await opened.page.inner_text("#why")
+        await publish(house.live, "sensor/availability", b"online")
+        await publish(house.live, "health", ONE.health.model_dump_json())
+        await opened.until_status("live")
+        await publish(house.live, "availability", b"offline")
+        await opened.until_status("stale since")
+        assert await opened.page.inner_text("#why") == "the service is offline"
+        await publish(house.live, "availability", b"online")
+        await opened.until_status("live")
+
+
+async def test_it_is_stale_when_the_service_is_killed_and_live_when_it_is_back(
+    browser: Browser, folder: Path, broker: Broker
+) -> None:
+    port = free_port()
+    async with contextlib.AsyncExitStack() as stack:
+        own = folder / "killed"
+        own.mkdir()
+        async with attic(own, broker, port) as process:
+            opened = await stack.enter_async_context(tab(browser, f"http://127.0.0.1:{port}/"))
+            await opened.until_status("live")
+            process.kill()
+            await opened.until_status("stale since")
+            assert await opened.page.inner_text("#why") == "the page's server does not answer"
+        async with attic(own, broker, port):
+            await opened.until_status("live")
+
+
+async def test_it_is_stale_while_the_broker_is_away_until_new_values_come(browser: Browser, house: House) -> None:
+    async with dashboard_of(browser, house, "attic") as opened:
+        await opened.until_status("live")
+        house.broker.stop()
+        await opened.until_status("stale since")
+        assert await opened.page.inner_text("#why")
+        house.broker.start()
+        await opened.until_status("live")
+
+
+async def test_beyond_this_machine_it_asks_for_the_token(browser: Browser, folder: Path, broker: Broker) -> None:
+    port, token = free_port(), folder / "token"
+    token.write_text("0123456789abcdef")
+    arguments = ("--mqtt", broker.url, "--listen", f"0.0.0.0:{port}", "--token-file", token, "--no-browser")
+    process = await starting(folder, "dashboard", *arguments, port=port)
+    async with tab(browser, f"http://127.0.0.1:{port}/") as opened:
+        assert await opened.page.locator("#pack").count() == 0
+        await opened.page.get_by_label("Token").fill("0123456789abcdef")
+        await opened.page.keyboard.press("Enter")
+        await opened.page.locator("#pack").wait_for()
+        assert "token" not in opened.page.url
+        await opened.page.reload()
+        await opened.page.locator("#pack").wait_for()
+    process.terminate()
+    assert await process.wait() == 0
+
+
+@pytest.mark.parametrize("size", [PHONE, {"width": 320, "height": 600}, {"width": 1920, "height": 1080}], ids=str)
+async def test_nothing_is_wider_than_the_screen(browser: Browser, house: House, size: dict[str, int]) -> None:
+    async with dashboard_of(browser, house, "attic", size=size) as opened:
+        await opened.until_text("celllow", "3.311 V · cell 1")
+        wider = """width => [...document.querySelectorAll("body, header *, #pack, .card, .card :not(.scroll *)")]
+            .filter((e) => e.getBoundingClientRect().right > width + 0.5).map((e) => e.outerHTML.slice(0, 80))"""
+        assert await opened.page.evaluate(wider, size["width"]) == []

@@ -1,0 +1,226 @@
+"""The page's server over real sockets: its files, the stream, the token, what was; and what it does when an address is taken."""
+
+import asyncio
+import contextlib
+import json
+import socket
+from collections.abc import AsyncIterator
+
+import aiohttp
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.page import server as of_server
+from bms_estimator.page.hub import Hub
+from bms_estimator.page.past import Past
+from bms_estimator.page.server import FILES, STATIC, PageServer
+from bms_estimator.page.sink import Pages, PageSink
+from bms_estimator.store.minute import epoch_s
+from tests.patience import LONG_S
+from tests.sinks.snapshots import ONE
+from tests.store.test_history import at, keep
+
+MOST_BYTES = 100_000
+"""Of all that a browser is given."""
+TOKEN = "0123456789abcdef"
+
+
+@pytest.fixture
+def hub() -> Hub:
+    return Hub()
+
+
+@pytest.fixture
+def past() -> Past:
+    return Past()
+
+
+@contextlib.asynccontextmanager
+async def browsing(hub: Hub, past: Past, settings: PageSettings | None = None) -> AsyncIterator[aiohttp.ClientSession]:
+    """Somebody who keeps cookies, at a server's address."""
+    jar = aiohttp.CookieJar(unsafe=True)  # of an address, too
+    async with (
+        PageServer(settings or PageSettings(listen="127.0.0.1:0"), hub, past, patient=False) as server,
+        aiohttp.ClientSession(server.url, cookie_jar=jar) as session,
+    ):
+        yield session
+
+
+async def messages(response: aiohttp.ClientResponse) -> AsyncIterator[dict[str, object]]:
+    async for line in response.content:
+        if line.startswith(b"data: "):
+            yield json.loads(line[6:])
+
+
+def test_all_that_a_browser_is_given_is_small_and_comes_from_here():
+    given = [STATIC / name for name, _ in FILES.values()]
+    assert sorted(given) == sorted(STATIC.iterdir())
+    assert sum(path.stat().st_size for path in given) <= MOST_BYTES
+    own = [path.read_text() for path in given if path.name != "uplot.js"]
+    assert not any("http://" in text.replace("http://www.w3.org/2000/svg", "") or "https://" in text for text in own)
+
+
+async def test_files_come_with_their_kind_protected_and_once(hub, past):
+    async with browsing(hub, past) as session:
+        for path, (name, kind) in FILES.items():
+            async with session.get(path) as response:
+                assert (response.status, response.content_type) == (200, kind)
+                assert await response.read() == (STATIC / name).read_bytes()
+                assert "default-src 'none'" in response.headers["Content-Security-Policy"]
+                assert response.headers["X-Content-Type-Options"] == "nosniff"
+            async with session.get(path, headers={"If-None-Match": response.headers["ETag"]}) as again:
+                assert again.status == 304
+        for path in ("/../hub.py", "/static/index.html", "/x"):
+            async with session.get(path) as response:
+                assert response.status == 404
+        async with session.post("/") as response:
+            assert response.status == 405
+
+
+async def test_who_reads_gets_what_is_known_and_then_what_is_new(hub, past):
+    hub.put("attic", "availability", "online")
+    async with browsing(hub, past) as session, session.get("/events") as response:
+        assert response.content_type == "text/event-stream"
+        stream = messages(response)
+        assert (await anext(stream))["attic/availability"] == "online"
+        hub.put("attic", "state", {"time": "2026-11-22T16:00:00Z", "soc": 0.5})
+        assert (await anext(stream)) == {"attic/state": {"time": "2026-11-22T16:00:00Z", "soc": 0.5}}
+
+
+async def test_silence_is_broken_so_that_a_lost_line_is_found_out(hub, past, monkeypatch):
+    monkeypatch.setattr(of_server, "PING_S", 0.05)
+    async with browsing(hub, past) as session, session.get("/events") as response:
+        stream = messages(response)
+        assert [await anext(stream) for _ in range(3)] == [{}, {}, {}]
+
+
+async def test_one_who_reads_nothing_holds_a_bounded_amount_and_is_parted_from(hub, past, monkeypatch):
+    monkeypatch.setattr(of_server, "WRITE_S", 0.2)
+    async with browsing(hub, past) as session:
+        reader, writer = await asyncio.open_connection(session._base_url.host, session._base_url.port, limit=1024)
+        writer.write(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        async with asyncio.timeout(LONG_S):
+            await reader.readuntil(b"retry")
+            payload = {"text": "x" * 60_000}
+            while hub.readers:  # the sockets' buffers take some
+                hub.put("attic", "health", payload)
+                assert all(len(waiting._waiting) <= 4 for waiting in hub._readers)
+                await asyncio.sleep(0)
+        writer.close()
+
+
+async def test_there_is_room_for_so_many_readers(hub, past, monkeypatch):
+    monkeypatch.setattr(of_server, "MOST_READERS", 1)
+    async with browsing(hub, past) as session, session.get("/events") as first:
+        await anext(messages(first))
+        async with session.get("/events") as second:
+            assert second.status == 503
+
+
+async def test_a_name_that_is_not_ours_is_not_answered(hub, past):
+    async with browsing(hub, past) as session:
+        for path in ("/", "/events", "/history"):
+            async with session.get(path, headers={"Host": "evil.example.org"}) as response:
+                assert response.status == 403
+
+
+async def test_a_token_is_shown_once_and_a_cookie_goes_on(hub, past, tmp_path):
+    (tmp_path / "token").write_text(TOKEN)
+    settings = PageSettings(listen="0.0.0.0:0", token_file=tmp_path / "token")
+    async with browsing(hub, past, settings) as session:
+        for path in ("/", "/page.js", "/events", "/history?pack=a&span=day", "/?token=wrong", "/?token="):
+            async with session.get(path) as response:
+                assert response.status == 401, path
+                assert "Content-Security-Policy" in response.headers
+        for header in (
+            {"Authorization": f"Bearer {TOKEN}0"},
+            {"Authorization": TOKEN},
+            {"Cookie": f"bms_page={TOKEN}"},
+        ):
+            async with session.get("/", headers=header) as response:
+                assert response.status == 401
+        async with session.get("/", headers={"Authorization": f"Bearer {TOKEN}"}) as response:
+            assert response.status == 200
+        async with session.get(f"/?token={TOKEN}", allow_redirects=False) as response:
+            assert (response.status, response.headers["Location"]) == (303, "/")
+            cookie = response.headers["Set-Cookie"]
+            assert TOKEN not in cookie
+            assert "HttpOnly" in cookie
+            assert "SameSite=Strict" in cookie
+        async with session.get("/") as response:
+            assert response.status == 200
+
+
+async def test_history_comes_in_a_bounded_number_of_points(tmp_path, hub):
+    await keep(tmp_path / "attic.sqlite", [at(30.0 * s) for s in range(4000)])  # 33 h
+    now_s = epoch_s(at(30.0 * 3999).estimate.time)
+    past = Past(lambda: now_s)
+    past.add("attic", tmp_path / "attic.sqlite")
+    async with browsing(hub, past) as session:
+        lengths = {}
+        for span in ("hour", "day", "month"):
+            async with session.get("/history", params={"pack": "attic", "span": span}) as response:
+                assert response.status == 200
+                found = await response.json()
+            lengths[span] = len(found["time_s"])
+            assert {len(column) for name, column in found.items() if name not in ("step_s", "events")} == {
+                lengths[span]
+            }
+            assert found["voltage_v"][-1] == pytest.approx(at(0.0).estimate.voltage_v)
+        assert 60 <= lengths["hour"] <= 61
+        assert 288 <= lengths["day"] <= 289
+        assert 17 <= lengths["month"] <= 18
+        for query, status in (("pack=attic&span=x", 400), ("pack=x&span=day", 404), ("", 400)):
+            async with session.get(f"/history?{query}") as response:
+                assert response.status == status
+
+
+async def test_a_pack_without_a_database_has_no_history(tmp_path, hub, past):
+    past.add("attic", tmp_path / "attic.sqlite")
+    async with browsing(hub, past) as session, session.get("/history?pack=attic&span=day") as response:
+        assert response.status == 404
+        assert "no history there" in await response.text()
+
+
+async def test_an_address_that_is_taken_is_said_and_tried_again(hub, past, monkeypatch):
+    monkeypatch.setattr(of_server, "AGAIN_S", 0.05)
+    opened = asyncio.Queue[str]()
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        settings = PageSettings(listen=f"127.0.0.1:{other.getsockname()[1]}")
+        with pytest.raises(UserError, match=r"page\.listen = 127\.0\.0\.1:\d+: .*in use"):
+            async with PageServer(settings, hub, past, patient=False):
+                pass
+        server = await PageServer(settings, hub, past, opened=opened.put_nowait).__aenter__()
+        assert opened.empty()
+    async with asyncio.timeout(LONG_S):
+        url = await opened.get()
+    async with aiohttp.ClientSession(url) as session, session.get("/") as response:
+        assert response.status == 200
+    await server.__aexit__(None, None, None)
+
+
+async def test_packs_that_share_an_address_share_a_page_until_the_last_one_ends():
+    opened: list[str] = []
+    pages, settings = Pages(opened.append), PageSettings(listen="127.0.0.1:0")
+    async with PageSink(pages, settings, "attic") as attic:
+        async with PageSink(pages, settings, "cellar") as cellar:
+            (url,) = opened
+            for sink in (attic, cellar):
+                sink.publish(ONE)
+            async with aiohttp.ClientSession(url) as session, session.get("/events") as response:
+                stream = messages(response)
+                found = await anext(stream)
+                for pack in ("attic", "cellar"):
+                    assert found[f"{pack}/state"] == json.loads(ONE.estimate.model_dump_json())
+                    assert found[f"{pack}/health"] == json.loads(ONE.health.model_dump_json())
+                    assert found[f"{pack}/availability"] == "online"
+                await cellar.__aexit__(None, None, None)
+                assert (await anext(stream))["cellar/availability"] == "offline"
+                await cellar.__aenter__()
+        with pytest.raises(UserError, match="must share token_file and hosts"):
+            async with PageSink(pages, settings.model_copy(update={"hosts": ("x",)}), "third"):
+                pass
+    with pytest.raises(aiohttp.ClientConnectionError):
+        async with aiohttp.ClientSession(url) as session, session.get("/"):
+            pass
