@@ -15,7 +15,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere resolution unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -63,6 +63,9 @@ anywhere: venv ## the SOC when switched on anywhere, on real captures, e.g. make
 
 chapter5: venv ## the experiments of the thesis's chapter 5 on real captures, beside Tables 11 and 13
 	@$(BIN)/python -m tests.benchmarks.chapter5
+
+resolution: venv ## the SOC by rate, steps and delay of a source, simulated, e.g. make resolution ARGS=house: two minutes
+	@$(BIN)/python -m tests.benchmarks.resolution $(ARGS)
 
 unseen: venv ## the SOC through kills, restarts and gaps, on real captures: minutes
 	@$(BIN)/python -m tests.benchmarks.unseen $(ARGS)

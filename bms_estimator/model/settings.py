@@ -10,7 +10,7 @@ from bms_estimator.model.broker_url import of_brokers
 from bms_estimator.model.export_settings import InfluxSettings, PrometheusSettings
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
 from bms_estimator.model.page_settings import PageSettings
-from bms_estimator.model.resolution import RESOLUTIONS
+from bms_estimator.model.resolution import RESOLUTIONS, Sampling
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
@@ -321,6 +321,14 @@ class Settings(Strict):
         if not isinstance(told, dict):
             return tables
         return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **told, "protocol": "text"}}
+
+    @property
+    def sampling(self) -> Sampling:
+        """What the source tells of the current, and how often."""
+        s = self.sensor
+        return Sampling(
+            s.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0, s.delay_s or 0.0
+        )
 
 
 def load_settings(path: Path) -> Settings:

@@ -152,6 +152,7 @@ def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
             voltage_resolution_v=settings.sensor.voltage_resolution_v,
             voltage_noise_v=settings.sensor.voltage_noise_v,
             initial_soc=settings.pack.initial_soc,
+            sampling=settings.sampling,
         )
 
     make().run(np.zeros(1, dtype=SAMPLE))
