@@ -4,8 +4,8 @@ import asyncio
 import json
 import logging
 import sys
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -85,8 +85,7 @@ def alarms(
     if soc is not None:
         refuse_soc(model, "--soc")
         settings = with_pack(settings, initial_soc=soc)
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
-    with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
+    with _quiet(), standard_input() if str(capture) == "-" else nullcontext(capture) as path:
         with compiling_shown():
             read = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
         source = Replay(read, longest_s=STEP_S)
@@ -97,6 +96,17 @@ def alarms(
         sys.stdout.write(json.dumps(asdict(found)) + "\n")
     else:
         _show(path.name, found)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """What the service would log is what is shown here."""
+    before = structlog.get_config()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    try:
+        yield
+    finally:
+        structlog.configure(**before)
 
 
 async def _found(settings: Settings, cell: PackModel, source: Replay) -> Found:

@@ -1,5 +1,6 @@
 """``bms-estimator config``: write, check and show a pack's settings."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -7,7 +8,8 @@ import tomlkit
 import typer
 
 from bms_estimator.cli.pack import load_pack
-from bms_estimator.cli.settings_file import settings_file
+from bms_estimator.cli.ports import asking
+from bms_estimator.cli.settings_file import Given, settings_file
 from bms_estimator.estimator.lemma import Condition, failed
 from bms_estimator.estimator.plausible import implausible
 from bms_estimator.estimator.records import estimator_settings
@@ -15,11 +17,17 @@ from bms_estimator.kernels.margins import delta
 from bms_estimator.model.alarm_limits import out_of_range, watched
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.export_settings import InfluxSettings
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import MqttSettings, Settings
+from bms_estimator.model.settings import MqttSettings, SensorSettings, Settings
 from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
+from bms_estimator.sinks.influx import target
+from bms_estimator.sources.kinds import make_bringer
+from bms_estimator.sources.ports import board_ports
+from bms_estimator.sources.probe import Found
+from bms_estimator.sources.probe import probe as who_is_there
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 
@@ -29,16 +37,53 @@ PackFile = Annotated[Path, typer.Argument(help="settings of the pack")]
 
 
 @app.command()
-def init(file: PackFile = Path("pack.toml")) -> None:
+def init(
+    file: PackFile = Path("pack.toml"),
+    probe: Annotated[bool, typer.Option("--probe", help="find out what is on the serial ports, and set it")] = False,
+    port: Annotated[
+        str | None, typer.Option(help="to find out on; else all that may be it", show_default=False)
+    ] = None,
+) -> None:
     """Write a settings file with every setting, its unit, default and meaning."""
+    if port is not None and not probe:
+        raise UserError(f"--port {port}: is for --probe")
+    if file.exists():
+        raise UserError(f"{file}: exists already and is left as it is; give another name")
+    given = _probed([port] if port else board_ports()) if probe else {}
     try:
         with file.open("x", encoding="utf-8") as new:
-            new.write(settings_file(Settings))
+            new.write(settings_file(Settings, given))
     except FileExistsError:
         raise UserError(f"{file}: exists already and is left as it is; give another name") from None
     except OSError as error:
         raise UserError(f"{file}: cannot be written: {error.strerror}") from None
     typer.echo(f"{file}: written; edit it, then: bms-estimator config check {file}")
+
+
+def _probed(ports: Sequence[str]) -> Given:
+    """What follows for the settings from the device that is there; says what that is.
+
+    Raises:
+        UserError: There is none, or more than one.
+    """
+    if not ports:
+        raise UserError("--probe: no serial port is there that may be a board's or a BMS's; name it with --port")
+    answers = dict[str, Found | str]()
+    for port in ports:
+        with asking(port):
+            answers[port] = who_is_there(port)
+    said = "; ".join(f"{port}: {answer}" for port, answer in answers.items())
+    found = {port: answer for port, answer in answers.items() if isinstance(answer, Found)}
+    if not found:
+        raise UserError(f"--probe: nobody is known to be there: {said}")
+    if len(found) > 1:
+        raise UserError(f"--probe: {len(found)} devices are there; choose one with --port: {said}")
+    ((port, device),) = found.items()
+    typer.echo(f"{port}: {device}")
+    sensor: dict[str, object] = {"port": port, "protocol": device.protocol}
+    if device.baud != SensorSettings.model_validate(sensor).baud:
+        sensor["baud"] = device.baud
+    return {"sensor": sensor} | ({"pack": {"series": device.cells}} if device.cells else {})
 
 
 @app.command()
@@ -49,6 +94,12 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
+    if settings.influx is not None:
+        unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
+        warnings += unseen
+        target(settings.influx.model_copy(update=dict.fromkeys(unread)))
+        settings = settings.model_copy(update={"mqtt": mqtt})
+    make_bringer(settings)  # says what of [source] cannot be used, or is not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
@@ -97,13 +148,17 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
 
 def _here(mqtt: MqttSettings) -> tuple[MqttSettings, list[str]]:
     """The settings without what only the running service can read, and a warning for each such file."""
-    files = {"password_file": mqtt.password_file, "cert_file": mqtt.cert_file, "key_file": mqtt.key_file}
-    unseen = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
-    without = set(unseen)
+    without, warnings = _unread("mqtt", mqtt, "password_file", "cert_file", "key_file")
     if without & {"cert_file", "key_file"}:  # one is of no use without the other
         without |= {"cert_file", "key_file"}
-    warnings = [f"mqtt.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unseen.items()]
     return mqtt.model_copy(update=dict.fromkeys(without)), warnings
+
+
+def _unread(section: str, settings: MqttSettings | InfluxSettings, *keys: str) -> tuple[set[str], list[str]]:
+    """The keys of files that only the running service can read, and a warning for each."""
+    files = {key: getattr(settings, key) for key in keys}
+    unread = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
+    return set(unread), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unread.items()]
 
 
 def _lemma(cell: PackModel) -> list[str]:

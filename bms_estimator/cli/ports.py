@@ -1,5 +1,6 @@
 """``bms-estimator ports``: which serial ports there are, and what is on them."""
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Annotated
 
 import typer
@@ -11,17 +12,19 @@ from serial.tools import list_ports
 from bms_estimator.cli.decimal_option import whole
 from bms_estimator.sources.ports import holder, stable_names
 from bms_estimator.sources.probe import probe as ask
-from bms_estimator.sources.protocol import BAUD
 
 
 def ports(
     paths: Annotated[list[str] | None, typer.Argument(help="these only; else all that are found")] = None,
     probe: Annotated[
-        bool, typer.Option("--probe", help="ask each for a board; opening a port may reset its board")
+        bool, typer.Option("--probe", help="ask each who is there; opening a port may reset its board")
     ] = False,
-    baud: Annotated[int, typer.Option(parser=whole(1200), help="to ask at")] = BAUD,
+    baud: Annotated[
+        int | None,
+        typer.Option(parser=whole(1200), help="to ask at; else each protocol's own", show_default=False),
+    ] = None,
 ) -> None:
-    """List serial ports under their stable names, and ask them for a board.
+    """List serial ports under their stable names, and ask them for boards, BMS and meters.
 
     ``stable name`` is what belongs in ``sensor.port``: it stays when boards are plugged in another order.
     """
@@ -32,9 +35,17 @@ def ports(
         return
     names = {str(name.resolve()): str(name) for name in stable_names()}
     table = Table(box=box.SIMPLE_HEAD)
-    for title in ("port", "what it says of itself", "held by", *(["board"] if probe else [])):
+    for title in ("port", "what it says of itself", "held by", *(["who is there"] if probe else [])):
         table.add_column(title, overflow="fold")
     for device, description in sorted(shown.items()):
         name = names.get(device, device)
-        table.add_row(name, description, holder(device) or "", *([ask(device, baud)] if probe else []))
+        held = holder(device) or ""
+        with asking(device) if probe else nullcontext():
+            table.add_row(name, description, held, *([str(ask(device, baud))] if probe else []))
     Console().print(table)
+
+
+def asking(port: str) -> AbstractContextManager[object]:
+    """Says on a terminal that it takes a while."""
+    console = Console(stderr=True)
+    return console.status(f"asking on {port} who is there: up to 20 s") if console.is_terminal else nullcontext()

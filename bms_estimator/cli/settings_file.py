@@ -1,7 +1,8 @@
 """A commented settings file, made from the settings' models so that it cannot fall behind them."""
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tomlkit
@@ -19,23 +20,32 @@ HEAD = """\
 _SIGNS = {Gt: ("gt", "above"), Ge: ("ge", "at least"), Lt: ("lt", "below"), Le: ("le", "at most")}
 
 
-def settings_file(model: type[BaseModel]) -> str:
-    """TOML text with each section of ``model``, each setting with its meaning, unit, what is allowed, and default."""
+Given = Mapping[str, Mapping[str, object]]
+"""By section and key."""
+
+
+def settings_file(model: type[BaseModel], given: Given = MappingProxyType({})) -> str:
+    """TOML text with each section of ``model``, each setting with its meaning, unit, what is allowed, and default.
+
+    Args:
+        model: Of the sections.
+        given: Settings that are not left at their defaults.
+    """
     lines = [HEAD]
     for name, field in model.model_fields.items():
         optional = field.default is None
         why = f" {_sentence(field.description)}" if optional and field.description else ""
         for section in _models(field.annotation):  # one of them, where there are several
             lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{why}")
-            lines += [f"{'#' if optional else ''}[{name}]", *_settings(section), ""]
+            lines += [f"{'#' if optional else ''}[{name}]", *_settings(section, given.get(name, {})), ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _settings(section: type[BaseModel]) -> Iterator[str]:
+def _settings(section: type[BaseModel], given: Mapping[str, object]) -> Iterator[str]:
     for name, field in section.model_fields.items():
         key = field.alias or name
         yield from _comment("  ".join(part for part in (field.description, _allowed(key, field)) if part))
-        yield f"#{key} = {_value(field)}"
+        yield f"{key} = {tomlkit.item(given[key]).as_string()}" if key in given else f"#{key} = {_value(field)}"
 
 
 def _value(field: FieldInfo) -> str:

@@ -89,18 +89,18 @@ def charging_a(cell: PackModel) -> float:
 
 
 def out_of_range(settings: Settings, cell: PackModel) -> list[str]:
-    """One line for each limit that the pack's range does not reach; empty where all may be."""
+    """One line for each limit that cannot be meant so; empty where all may be."""
     return list(_out_of_range(watched(settings, cell), cell))
 
 
 def _out_of_range(alarms: tuple[Watched, ...], cell: PackModel) -> Iterator[str]:
     c = cell.cell
-    low_v, high_v = c.voltage_min_v, c.voltage_max_v
+    n, middle_v = c.series_count, c.nominal_voltage_v
     ranges = {
-        "pack_over_voltage": (low_v, high_v),
-        "pack_under_voltage": (low_v, high_v),
-        "cell_over_voltage": (low_v / c.series_count, high_v / c.series_count),
-        "cell_under_voltage": (low_v / c.series_count, high_v / c.series_count),
+        "pack_over_voltage": (middle_v, c.voltage_max_v),
+        "pack_under_voltage": (c.voltage_min_v, middle_v),
+        "cell_over_voltage": (middle_v / n, c.voltage_max_v / n),
+        "cell_under_voltage": (c.voltage_min_v / n, middle_v / n),
         "discharge_over_current": (0.0, c.current_max_a),
         "charge_over_current": (0.0, c.current_max_a),
     }
@@ -109,8 +109,8 @@ def _out_of_range(alarms: tuple[Watched, ...], cell: PackModel) -> Iterator[str]
         if not low <= alarm.limit <= high:
             key = f"alarms.{alarm.name}.limit_{'a' if alarm.unit == 'A' else 'v'}"
             yield (
-                f"{key} = {alarm.limit:g}: outside {low:g} to {high:g} {alarm.unit}, which the cell file takes for "
-                "readings at all; is it meant for a cell, or for the pack?"
+                f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {alarm.unit}, as the cell file has it; "
+                "is it meant for a cell, or for the pack?"
             )
 
 
@@ -140,7 +140,7 @@ def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> Watched | N
 def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
     """By alarm; a fuel cell has no SOC, no chemistry, and stands no charge."""
     n = cell.cell.series_count
-    silent_s = SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sample_period_s)
+    silent_s = SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s)
     common: dict[AlarmName, _Default] = {
         "over_temperature": _Default(60.0, 55.0, "°C"),
         "under_temperature": _Default(-20.0, -15.0, "°C", above=False),

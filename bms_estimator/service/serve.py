@@ -96,7 +96,7 @@ async def serve(
             requests,
             delivery,
             outbox,
-            sample_period_s=settings.sample_period_s,
+            sample_period_s=settings.sensor.sample_period_s,
             home_assistant=settings.home_assistant,
         )
         all_sinks.append(mqtt)

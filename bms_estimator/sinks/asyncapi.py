@@ -6,7 +6,7 @@ from pydantic.json_schema import models_json_schema
 
 from bms_estimator import __version__
 from bms_estimator.model.estimate import PAYLOAD_VERSION
-from bms_estimator.model.settings import DEVICE_NAME
+from bms_estimator.model.settings import DEVICE_NAME, LEAST_RATE_HZ, MOST_RATE_HZ
 from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.sinks.payloads import TOPICS
 from bms_estimator.sinks.requests import MOST_PAYLOAD_BYTES, NAMES
@@ -24,8 +24,15 @@ AVAILABILITIES = {
     SENSOR_AVAILABILITY: "whether values are fresh",
 }
 TRANSACTION = {"type": ["string", "integer", "null"], "description": "repeated in the response"}
-ARGUMENTS = {"set_soc": {"soc": {"type": "number", "minimum": 0, "maximum": 1, "description": "state of charge"}}}
-"""Of a request -> its fields."""
+ARGUMENTS: dict[str, Document] = {
+    "set_soc": {"soc": {"type": "number", "minimum": 0, "maximum": 1, "description": "state of charge"}},
+    "current_zero": {},
+    "acknowledge_alarm": {"name": {"type": ["string", "null"], "description": "of an alarm; all when left out"}},
+    "publish_rate": {"rate_hz": {"type": "number", "minimum": LEAST_RATE_HZ, "maximum": MOST_RATE_HZ}},
+}
+"""Of a command -> its fields."""
+OPTIONAL = ("name",)
+"""Fields that may be left out."""
 RESPONSE = {
     "type": "object",
     "properties": {
@@ -111,7 +118,7 @@ def _arguments(name: str) -> Document:
     return {
         "type": "object",
         "properties": own | {"transaction": TRANSACTION},
-        "required": list(own),
+        "required": [field for field in own if field not in OPTIONAL],
         "description": f"at most {MOST_PAYLOAD_BYTES} bytes; may be empty where nothing is required",
     }
 

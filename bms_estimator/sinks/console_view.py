@@ -299,7 +299,11 @@ def _energy(state: Fields) -> Flow:
     out_kwh, in_kwh, cycles = (state.number(key) for key in ("energy_out_kwh", "energy_in_kwh", "equivalent_cycles"))
     if out_kwh is None or in_kwh is None:
         return Flow()
-    counted = [Text.assemble(("energy ", "dim"), f"{out_kwh:.3f} kWh out"), Text(f"{in_kwh:.3f} kWh in")]
+    factor, unit = (1.0, "kWh") if max(out_kwh, in_kwh) >= 1.0 else (1e3, "Wh")
+    counted = [
+        Text.assemble(("energy ", "dim"), f"{factor * out_kwh:.2f} {unit} out"),
+        Text(f"{factor * in_kwh:.2f} {unit} in"),
+    ]
     return Flow(*counted, *([] if cycles is None else [Text(f"{cycles:.1f} cycles")]))
 
 

@@ -118,7 +118,7 @@ class Publisher:
         publish = self._settings.publish.model_copy(update={"rate_hz": rate_hz})
         self._settings = self._settings.model_copy(update={"publish": publish})
         self.period_s = 1.0 / rate_hz
-        self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sample_period_s)
+        self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sensor.sample_period_s)
 
     @property
     def wait_s(self) -> float:

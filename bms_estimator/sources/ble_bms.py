@@ -77,7 +77,14 @@ class BleBringer(Bringer):
             raise NothingComesError("no answer") from None
         except FileNotFoundError:  # the socket of D-Bus
             raise NothingComesError("no Bluetooth: are D-Bus and bluetoothd running?") from None
-        except (BleakError, EOFError, OSError, ValueError) as error:
+        except (
+            BleakError,
+            EOFError,
+            OSError,
+            ValueError,
+            LookupError,
+            AssertionError,
+        ) as error:  # bytes that nobody foresaw
             raise NothingComesError(str(error) or type(error).__name__) from None
 
     def _line(self, sample: Mapping[str, object]) -> bytes | None:

@@ -24,7 +24,7 @@ CLOSE_S = 5.0
 BUS_OFF = 0x40
 """Of the identifier of an error frame: CAN_ERR_BUSOFF of linux/can/error.h."""
 
-Deliver = Callable[[bytes | NothingComesError], None]
+Deliver = Callable[[bytes | Exception], None]
 
 
 class CanBringer(Bringer):
@@ -68,16 +68,16 @@ class CanBringer(Bringer):
     async def bring(self) -> AsyncGenerator[bytes, None]:
         """One line for each voltage and current."""
         loop, stop = asyncio.get_running_loop(), threading.Event()
-        heard: asyncio.Queue[bytes | NothingComesError] = asyncio.Queue()
+        heard: asyncio.Queue[bytes | Exception] = asyncio.Queue()
 
-        def deliver(item: bytes | NothingComesError) -> None:
+        def deliver(item: bytes | Exception) -> None:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(heard.put_nowait, item)
 
         thread = threading.Thread(target=self._listen, args=(deliver, stop), name=self.name, daemon=True)
         thread.start()
         try:
-            while not isinstance(item := await heard.get(), NothingComesError):
+            while not isinstance(item := await heard.get(), Exception):
                 yield item
             raise item
         finally:
@@ -85,49 +85,55 @@ class CanBringer(Bringer):
             await asyncio.to_thread(thread.join, CLOSE_S)
 
     def _listen(self, deliver: Deliver, stop: threading.Event) -> None:
-        """Open the bus and hand on lines until it is lost. In the thread."""
+        """Hand on lines until the bus is lost, and then why. In the thread."""
         try:
             bus = self._open()
-        except (can.CanError, OSError, ValueError, ImportError) as error:
-            deliver(NothingComesError(f"cannot be opened: {error}"))
-            return
-        deliver(CONNECTED)
-        try:
-            while not stop.is_set():
-                self._receive(bus, deliver)
-        except (can.CanError, OSError) as error:
-            deliver(NothingComesError(f"lost: {error}"))
-        finally:
-            with contextlib.suppress(can.CanError, OSError):
-                bus.shutdown()
+            try:
+                deliver(CONNECTED)
+                while not stop.is_set():
+                    self._take(self._next(bus), deliver)
+            finally:
+                with contextlib.suppress(Exception):  # of an adapter that is gone
+                    bus.shutdown()
+        except Exception as error:  # noqa: BLE001 - it belongs to who waits for lines
+            deliver(error)
 
     def _open(self) -> can.BusABC:
+        """Raises: NothingComesError: It cannot be opened."""
         settings = self._settings
         further: dict[str, Any] = {**settings.options}
         if settings.bitrate is not None:
             further["bitrate"] = settings.bitrate
-        return can.Bus(
-            interface=settings.interface,
-            channel=settings.channel,
-            can_filters=[
-                {"can_id": place.id, "can_mask": 0x1FFF_FFFF if place.extended else 0x7FF, "extended": place.extended}
-                for place in self._map.places
-            ],
-            ignore_config=True,
-            **further,
-        )
+        filters = [
+            {"can_id": place.id, "can_mask": 0x1FFF_FFFF if place.extended else 0x7FF, "extended": place.extended}
+            for place in self._map.places
+        ]
+        try:
+            return can.Bus(
+                interface=settings.interface,
+                channel=settings.channel,
+                can_filters=filters,
+                ignore_config=True,
+                **further,
+            )
+        except Exception as error:  # each interface raises what its library does
+            raise NothingComesError(f"cannot be opened: {error}") from error
 
-    def _receive(self, bus: can.BusABC, deliver: Deliver) -> None:
-        """Take the next frame, if one comes soon.
+    def _next(self, bus: can.BusABC) -> can.Message | None:
+        """The next frame, if one comes soon.
 
         Raises:
-            can.CanError, OSError: The bus is lost.
+            NothingComesError: The bus is lost.
         """
         try:
-            message = bus.recv(LISTEN_S)
+            return bus.recv(LISTEN_S)
         except ValueError:  # slcan: a line that is no frame
-            message = None
             self._junk += 1
+            return None
+        except Exception as error:  # as of _open
+            raise NothingComesError(f"lost: {error}") from error
+
+    def _take(self, message: can.Message | None, deliver: Deliver) -> None:
         if message is None or message.is_remote_frame:
             return
         self._is_off = message.is_error_frame and bool(message.arbitration_id & BUS_OFF)

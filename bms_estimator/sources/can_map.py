@@ -67,10 +67,10 @@ class _Frame:
             raw = bits_of(signal, data) if signal.signal is None else named.get(signal.signal.split(".")[-1])
             if raw is None:
                 yield key, None
-            elif raw == signal.absent or not math.isfinite(raw):
+            elif raw == signal.absent or not math.isfinite(value := raw * signal.scale + signal.offset):
                 yield key, math.nan
             else:
-                yield key, round(raw * signal.scale + signal.offset, DECIMALS)
+                yield key, round(value, DECIMALS)
 
 
 class CanMap:
@@ -134,14 +134,13 @@ class CanMap:
             if value is None:
                 continue
             self._newest[key] = arrival_s, value
-            if math.isnan(value):
-                self._absent += 1
-            else:
-                self._fresh.add(key[0])
+            self._absent += math.isnan(value)
+            self._fresh.add(key[0])
         if not {"voltage", "current"} <= self._fresh:
             return None
         self._fresh.clear()
-        return self._reading(arrival_s)
+        reading = self._reading(arrival_s)
+        return None if math.isnan(reading.voltage_v) or math.isnan(reading.current_a) else reading
 
     def _want(self, key: Key, signal: Signal, database: Database | None) -> None:
         """Look at the frame that holds ``signal``.

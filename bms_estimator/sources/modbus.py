@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import termios
 from collections.abc import AsyncGenerator, Mapping, Sequence
 
 import structlog
@@ -80,9 +81,7 @@ class ModbusBringer(Bringer):
         self._requests = plan(values_of(self._settings))
         client = _client(self._settings)
         try:
-            if not await client.connect():
-                what = "no connection" if self._settings.port is None else "the port cannot be opened"
-                raise NothingComesError(what)
+            await self._connect(client)
             words = await self._read(client)
             yield CONNECTED
             loop = asyncio.get_running_loop()
@@ -95,6 +94,15 @@ class ModbusBringer(Bringer):
                 words = await self._read(client)
         finally:
             client.close()
+
+    async def _connect(self, client: Client) -> None:
+        """Raises: NothingComesError: It cannot be reached."""
+        what = "no connection" if self._settings.port is None else "the port cannot be opened"
+        try:
+            if not await client.connect():
+                raise NothingComesError(what)
+        except (ValueError, termios.error) as error:  # pyserial, of a baud rate or a device that is no serial port
+            raise NothingComesError(f"{what}: {error}") from None
 
     def _line(self, words: Mapping[tuple[Table, int], int]) -> bytes | None:
         """What the registers say; None where it is not voltage and current."""

@@ -96,9 +96,8 @@ def decode(register: Register, words: Words) -> float:
         ordered.reverse()
     data = b"".join(word.to_bytes(2, "big") for word in ordered)
     raw: float = struct.unpack(_FORMATS[register.type], data)[0]
-    if raw == register.absent or not math.isfinite(raw):
-        return math.nan
-    return round(raw * register.scale + register.offset, DECIMALS)
+    value = raw * register.scale + register.offset
+    return math.nan if raw == register.absent or not math.isfinite(value) else round(value, DECIMALS)
 
 
 def reading_of(settings: ModbusSource, words: Words) -> Reading | None:

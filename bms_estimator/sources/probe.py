@@ -1,8 +1,9 @@
-"""Asks whoever is on a serial port, one thing at a time: for a board's hello, and to keep a setting."""
+"""Asks whoever is on a serial port, one thing at a time: who is there, and a board for its hello and to keep a setting."""
 
+import itertools
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self, TypeVar
 
 from bms_estimator.model.errors import UserError
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 3.0
 """A board that was reset by the opening of its port spends two seconds in its boot loader [s]."""
+EACH_S = 1.5
+"""So much longer takes a baud rate for each protocol that is tried at it, in turns with the others [s]."""
+TURN_S = 0.3
+"""For an answer before another protocol's question goes out [s]."""
+READ_S = 0.1
+"""A read waits so long [s]."""
 READ_BYTES = 4096
 REFERENCE_RATE_HZ = 100
 """The firmware's own: the bandgap is measured in every second sample, or in each without an NTC."""
@@ -31,22 +38,95 @@ REFERENCE_S = 10.0
 Answer = TypeVar("Answer")
 
 
-def probe(port: str, baud: int = BAUD) -> str:
-    """What is on ``port``, for people. Leaves a board's settings as they are; what is not understood is sent nothing.
+@dataclass(frozen=True)
+class Found:
+    """Who answers on a port."""
+
+    protocol: str
+    baud: int
+    described: str
+    """For people."""
+    cells: int | None = None
+    """In series, where they are told."""
+
+    def __str__(self) -> str:
+        """What it is, and how it is spoken to unless it is a board at the firmware's own rate."""
+        usual = self.baud == BAUD and self.protocol in ("binary", "text")
+        return self.described if usual else f"{self.described}; protocol {self.protocol}, {self.baud} baud"
+
+
+def probe(port: str, baud: int | None = None) -> Found | str:
+    """Who is on ``port``, or for people why nobody is known to be.
+
+    A board of the firmware is looked for first. Then every protocol that ``sensor.protocol`` knows is tried at its own baud
+    rate, one question at a time: questions only, which change nothing, and settings stay as they are.
 
     Args:
         port: Device path; opened for ourselves alone.
-        baud: Of the board [1/s].
+        baud: Try everything at this rate [1/s]; None: each at its own.
     """
-    dialects = [make(SensorSettings()) for make in DIALECTS.values()]
+    rates = _rates() if baud is None else {baud: list(DIALECTS)}
+    silence = "silent"
     try:
-        with open_port(port, baud, ASK_AGAIN_S) as line:
-            found = _converse(line, dialects, lambda: next((d.described for d in dialects if d.described), None))
+        with open_port(port, next(iter(rates)), READ_S) as line:
+            for rate, protocols in rates.items():
+                line.baudrate = rate
+                line.reset_input_buffer()
+                dialects = {name: _prober(name) for name in protocols}
+                patience_s = PATIENCE_S if rate == BAUD and baud is None else EACH_S * len(dialects)
+                if (found := _ask_in_turns(line, dialects, patience_s)) is not None:
+                    return Found(found, rate, *_described(dialects[found]))
+                if silence == "silent":
+                    silence = _silence(list(dialects.values()))
     except NoPortError as error:
         return str(error).removeprefix(f"{port}: ")
     except OSError as error:
         return f"lost: {error}"
-    return found or _silence(dialects)
+    return silence
+
+
+def _rates() -> Mapping[int, Sequence[str]]:
+    """Protocols by baud rate, the firmware's first, then from the fastest down; text is read at any."""
+    rates: dict[int, list[str]] = {BAUD: []}
+    for name in DIALECTS:
+        rates.setdefault(SensorSettings.model_validate({"protocol": name}).baud, []).append(name)
+    for protocols in rates.values():
+        if "text" not in protocols:
+            protocols.append("text")
+    return {rate: rates[rate] for rate in sorted(rates, key=lambda rate: (rate != BAUD, -rate))}
+
+
+def _prober(protocol: str) -> Dialect:
+    dialect = DIALECTS[protocol](SensorSettings.model_validate({"protocol": protocol}))
+    dialect.probing = True
+    return dialect
+
+
+def _ask_in_turns(line: "serial.Serial", dialects: Mapping[str, Dialect], patience_s: float) -> str | None:
+    """Have all hear, and one of them ask at a time. Returns the protocol of the first that knows who is there.
+
+    Raises:
+        OSError: The port is lost.
+    """
+    turns, next_s = itertools.cycle(dialects.values()), 0.0
+    end_s = time.monotonic() + patience_s
+    while (now_s := time.monotonic()) < end_s:
+        if now_s >= next_s:
+            questions = (dialect.due(now_s) for dialect in itertools.islice(turns, len(dialects)))
+            if question := next(filter(None, questions), b""):
+                line.write(question)
+                next_s = now_s + TURN_S
+        data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
+        for name, dialect in dialects.items():
+            dialect.feed(now_s, data)
+            if dialect.described:
+                return name
+    return None
+
+
+def _described(dialect: Dialect) -> tuple[str, int | None]:
+    """What it is, and its cells."""
+    return dialect.described or "", dialect.cells.shape[1] or None
 
 
 class AskedBoard:

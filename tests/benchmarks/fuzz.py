@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import structlog
+from rich.console import Console
 from serial.tools.list_ports_common import ListPortInfo
 
 from bms_estimator.model.cell import load_cell
@@ -38,7 +39,10 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
 from bms_estimator.model.settings import SensorSettings, Settings, load_settings
 from bms_estimator.service.checkpoint import CheckpointFile
-from bms_estimator.sinks import Delivery
+from bms_estimator.sinks import Delivery, console_line
+from bms_estimator.sinks.console_scene import Scene
+from bms_estimator.sinks.console_view import View
+from bms_estimator.sinks.published import Published
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.curve import read_curve
@@ -188,6 +192,25 @@ def _requests(_: Path) -> Read:
             if answered.value is not None:
                 json.loads(answered.value)
         assert not counts.requests.get("failed"), "a fault of the service's own"
+
+    return read
+
+
+def _published(_: Path) -> Read:
+    """What a subscriber hears, as a screen and as lines."""
+    topics = ("state", "health", "info", "parameters", "availability", "alarm/soc_low")
+    console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, color_system=None)
+
+    def read(data: bytes) -> None:
+        published = Published("bms")
+        for topic in topics:
+            heard = published.take(f"bms/pack/{topic}", data, 0.0)
+            told = console_line.line(heard) if heard else None
+            assert told is None or told.isprintable(), told
+        if data:
+            scene = Scene("pack", published.devices["pack"].topics, 0.0, 0.0)
+            drawn = "".join(segment.text for segment in console.render(View(scene)))
+            assert all(each.isprintable() or each == "\n" for each in drawn), drawn
 
     return read
 
@@ -379,6 +402,7 @@ TARGETS: Mapping[str, Target] = {
     "curve": Target(_file("curve.csv", read_curve), (b"soc", b"ocv_v", b"hysteresis_v", b",,")),
     "capture": Target(_file("line.bms", load_capture), _JSON, _headed),
     "requests": Target(_requests, _JSON),
+    "published": Target(_published, (*_JSON, b"\\u001b[2J", b'"active":true', b'"text":"', b'"cells_v":[')),
     "checkpoint": Target(_checkpoint, (b"PK\x03\x04", b"{'descr':", b"'|O'", b"'<f8'", b"(1,)"), _zipped),
     "memory": Target(_memory, _JSON),
     "ports": Target(_ports, (b"zigbee", b"auto", b"/dev/", b"../")),

@@ -8,8 +8,12 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources.kinds import KINDS
 from tests.command_line import run
+from tests.device_line import on_a_line
+from tests.patience import LONG_S
 
 
 @pytest.fixture
@@ -30,6 +34,7 @@ def test_init_writes_a_file_of_the_defaults_that_check_accepts(pack, capsys):
 NEEDED = {
     "ble": "name = 'battery'\n",
     "can": "voltage = { id = 0x356 }\ncurrent = { id = 0x356, start_bit = 16 }\n",
+    "mqtt": "profile = 'opendtu'\n",
     "modbus": "host = 'gx'\nvoltage = { address = 259 }\ncurrent = { address = 261 }\n",
 }
 """What a section of ``[source]`` has to say, by kind."""
@@ -54,11 +59,38 @@ def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, cap
         loaded = load_settings(pack)
         assert loaded.source
         assert loaded.source.kind in KINDS
-        sensor = Settings().sensor  # only what has no default is the source's to say
-        further = {name: value for name, value in loaded.source.sensor.items() if getattr(sensor, name) is None}
-        assert loaded.sensor == sensor.model_copy(
-            update={"protocol": "text", "period_s": loaded.source.period_s} | further
-        )
+        assert loaded.sensor.protocol == "text"
+        told = set(written["sensor"]) - {"protocol"}
+        assert loaded.sensor.model_dump(include=told) == Settings().sensor.model_dump(include=told)
+
+
+@pytest.fixture
+def long_probe(monkeypatch):
+    monkeypatch.setattr("bms_estimator.sources.probe.PATIENCE_S", 0.1)
+    monkeypatch.setattr("bms_estimator.sources.probe.EACH_S", LONG_S)
+
+
+def test_init_finds_out_what_is_there_and_sets_it(pack, capsys, long_probe):
+    device = SimulatedBms("jk", lambda _: Reading(1.0, 26.4, 21.0), cells=8)
+    with on_a_line(device) as path:
+        code, out, err = run(capsys, "config", "init", pack, "--probe", "--port", path)
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{path}: JK-BMS, 8 cells, software SIMULATED; protocol jk, 115200 baud\n{pack}: written")
+    settings = load_settings(pack)
+    assert (settings.sensor.port, settings.sensor.protocol, settings.sensor.baud) == (path, "jk", 115_200)
+    assert settings.pack.series == 8
+    assert tomllib.loads(pack.read_text())["sensor"] == {"port": path, "protocol": "jk"}
+
+
+def test_init_says_that_nobody_is_there_and_writes_nothing(pack, capsys, tmp_path):
+    code, out, err = run(capsys, "config", "init", pack, "--probe", "--port", tmp_path / "none")
+    assert (code, out) == (2, "")
+    assert "nobody is known to be there" in err
+    assert "cannot be opened" in err
+    assert not pack.exists()
+    code, _, err = run(capsys, "config", "init", pack, "--port", "/dev/ttyUSB0")
+    assert code == 2
+    assert "is for --probe" in err
 
 
 def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
@@ -236,3 +268,17 @@ def test_generic_cell_is_of_the_size_that_the_pack_says(pack, capsys):
     code, out, _ = run(capsys, "config", "check", pack)
     assert code == 0
     assert "lfp, 4 in series, 13 V, 200 Ah" in out
+
+
+def test_check_tries_the_files_of_influxdb_and_warns_of_those_of_the_service_alone(tmp_path, capsys):
+    pack = tmp_path / "pack.toml"
+    pack.write_text(f'[influx]\nbucket = "bms"\ntoken_file = "{tmp_path / "none"}"\n')
+    code, _, err = run(capsys, "config", "check", pack)
+    assert (code, err) == (
+        2,
+        f"error: influx.token_file = {tmp_path / 'none'}: cannot be read: No such file or directory\n",
+    )
+    pack.write_text('[influx]\nbucket = "bms"\ntoken_file = "influx-token"\n')
+    code, out, err = run(capsys, "config", "check", pack)
+    assert (code, "good" in out) == (0, True)
+    assert "influx.token_file = influx-token: not there now" in err

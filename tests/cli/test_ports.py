@@ -69,6 +69,8 @@ def test_a_board_answers_the_probe_and_goes_on(capsys, monkeypatch, options, ans
 
 def test_what_is_no_board_is_not_called_one(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "500")  # no row is folded
+    monkeypatch.setattr("bms_estimator.sources.probe.PATIENCE_S", 0.3)
+    monkeypatch.setattr("bms_estimator.sources.probe.EACH_S", 0.1)
     master, slave = os.openpty()
     try:
         silent = os.ttyname(slave)

@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.model.estimate import Alarm, Estimate
 from bms_estimator.sinks.line_protocol import ALARM, STATE, lines
 from tests.influxdb import INFLUXD, InfluxDB
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import ONE, SOC_LOW
 
 DASHBOARD = json.loads((Path(__file__).parents[2] / "deploy/grafana/bms.json").read_text(encoding="utf-8"))
 TARGETS = [(panel["title"], target) for panel in DASHBOARD["panels"] for target in panel["targets"]]
@@ -38,18 +38,7 @@ def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
         for name, field in Estimate.model_fields.items()
         if "float" in str(field.annotation) and "list" not in str(field.annotation)
     }
-    alarm = Alarm(
-        name="soc_low",
-        severity="warning",
-        active=True,
-        latched=False,
-        since=None,
-        value=9.5,
-        limit=10.0,
-        unit="%",
-        text="charge it",
-    )
-    server.write(lines(None, ONE._replace(estimate=ONE.estimate.model_copy(update=numbers), alarms=(alarm,))))
+    server.write(lines(None, ONE._replace(estimate=ONE.estimate.model_copy(update=numbers), alarms=(SOC_LOW,))))
     yield server
     server.stop()
 

@@ -13,7 +13,7 @@ from bms_estimator.model.estimate import Alarm, Estimate
 from bms_estimator.sinks.messages import Messages
 from tests.mosquitto import Broker, Listener, broker, free_port
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import ONE, SOC_LOW
 
 __all__ = ["broker"]
 
@@ -78,17 +78,7 @@ async def test_what_is_left_and_each_alarm_come_out(broker: Broker, tmp_path: Pa
         pytest.skip("node-red is not installed (make integrations)")
 
     async def alarm(client: Listener, *, active: bool) -> None:
-        told = Alarm(
-            name="soc_low",
-            severity="warning",
-            active=active,
-            latched=False,
-            since=None,
-            value=9.5,
-            limit=10.0,
-            unit="%",
-            text="charge it soon" if active else "",
-        )
+        told = SOC_LOW.model_copy(update={"active": active, "text": "charge it soon" if active else ""})
         await client.publish("bms/attic/alarm/soc_low", told.model_dump_json(), qos=1, retain=True)
 
     async with Listener(broker) as client:

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.model.estimate import Alarm, Snapshot
+from bms_estimator.model.estimate import Snapshot
 from bms_estimator.sinks.line_protocol import lines
 from bms_estimator.sinks.messages import Messages
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import ONE, SOC_LOW
 
 CONFIGURATION = tomllib.loads((Path(__file__).parents[2] / "deploy/telegraf/bms.conf").read_text(encoding="utf-8"))
 STATE, ALARM = CONFIGURATION["inputs"]["mqtt_consumer"]
@@ -75,18 +75,7 @@ def written(line: str) -> tuple[str, dict[str, str], dict[str, Any]]:
 def full() -> Snapshot:
     """With cells and an alarm."""
     assert ONE.estimate
-    alarm = Alarm(
-        name="soc_low",
-        severity="warning",
-        active=True,
-        latched=False,
-        since="2024-05-01T12:00:00.000Z",
-        value=9.5,
-        limit=10.0,
-        unit="%",
-        text="charge",
-    )
-    return ONE._replace(estimate=ONE.estimate.model_copy(update={"cells_v": [3.25, None, 3.5]}), alarms=(alarm,))
+    return ONE._replace(estimate=ONE.estimate.model_copy(update={"cells_v": [3.25, None, 3.5]}), alarms=(SOC_LOW,))
 
 
 def test_what_it_writes_of_a_state_and_an_alarm_is_what_our_own_sink_writes(full: Snapshot) -> None:

@@ -4,7 +4,6 @@ A real Mosquitto; the real service of a pack with four cells, whose page is one;
 page is the other. A second pack on that broker is this test's own, so that it may publish anything.
 """
 
-import asyncio
 import contextlib
 import json
 import re
@@ -18,11 +17,9 @@ import pytest_asyncio
 from playwright.async_api import Browser
 
 from bms_estimator.model.estimate import Alarm
-from tests.command_line import PROGRAM
 from tests.mosquitto import MOSQUITTO, Broker, Listener, free_port
 from tests.page.chromium import PHONE, Tab, chromium, tab
-from tests.patience import LONG_S
-from tests.serial_line import Line
+from tests.page.house import Service, starting
 from tests.sinks.snapshots import ONE, STACK
 from tests.store.test_history import at, keep
 
@@ -67,7 +64,7 @@ SHOWN = {
     "remaining_capacity_ah": "45.68 Ah",
     "time_left": "3 h 12 min",
     "time_left_label": "To full",
-    "energy_out_kwh": "12.3 kWh",
+    "energy_out_kwh": "12.35 kWh",
     "energy_in_kwh": "123.5 kWh",
     "stop": "7.9",
     "deltas": "δ₁ 3.1 %, δ₂ 7.9 %",
@@ -84,40 +81,10 @@ class House(NamedTuple):
     """All that runs."""
 
     broker: Broker
-    page: str
-    """Of the service."""
+    service: Service
     dashboard: str
     """Of the broker."""
     live: Listener
-
-
-async def starting(folder: Path, *arguments: object, port: int) -> asyncio.subprocess.Process:
-    """A program of ours that serves a page, once it does."""
-    with (folder / f"{port}.log").open("wb") as log:
-        process = await asyncio.create_subprocess_exec(
-            PROGRAM,
-            *map(str, arguments),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.DEVNULL,
-            stderr=log,
-        )
-    async with asyncio.timeout(LONG_S):
-        while process.returncode is None:
-            with contextlib.suppress(OSError):
-                _, writer = await asyncio.open_connection("127.0.0.1", port)
-                writer.close()
-                return process
-            await asyncio.sleep(0.05)
-    raise AssertionError((folder / f"{port}.log").read_text())
-
-
-async def feed(line: Line) -> None:
-    """A board with four cells that prints at 20 Hz."""
-    text = json.dumps({"voltage": sum(CELLS), "current": 2.5, "temperature": 21.5, "cells": CELLS})
-    while True:
-        with contextlib.suppress(BlockingIOError, OSError):
-            line.write(text.encode() + b"\r\n")
-        await asyncio.sleep(0.05)
 
 
 @pytest.fixture(scope="module")
@@ -140,57 +107,23 @@ async def browser() -> AsyncIterator[Browser]:
         yield running
 
 
-@contextlib.asynccontextmanager
-async def attic(folder: Path, broker: Broker, port: int) -> AsyncIterator[asyncio.subprocess.Process]:
-    """The real service of a real pack."""
-    line = Line(folder / f"board-{port}")
-    line.plug()
-    pack = folder / f"attic-{port}.toml"
-    pack.write_text(
-        f"""
-[pack]
-name = "attic"
-cell = "lfp"
-capacity_ah = 100
-series = 4
-initial_soc = 0.6
-[sensor]
-port = "{line.path}"
-protocol = "text"
-[publish]
-rate_hz = 10
-[mqtt]
-url = "{broker.url}"
-[page]
-listen = "127.0.0.1:{port}"
-[state]
-folder = "{folder}"
-"""
-    )
-    board = asyncio.create_task(feed(line))
-    process = await starting(folder, "run", "--no-view", pack, port=port)
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
-        board.cancel()
-        line.unplug()
+def board(_time_s: float) -> dict[str, Any]:
+    """It prints the same again and again."""
+    return {"voltage": sum(CELLS), "current": 2.5, "temperature": 21.5, "cells": CELLS}
 
 
 @module_fixture
 async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
     await keep(folder / "cellar.sqlite", [])
-    page, dashboard = free_port(), free_port()
-    async with attic(folder, broker, page), Listener(broker) as live:
-        arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{dashboard}", "--folder", folder, "--no-browser")
-        process = await starting(folder, "dashboard", *arguments, port=dashboard)
+    port = free_port()
+    async with Service(folder, broker, free_port(), board, series=4) as service, Listener(broker) as live:
+        arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
+        process = await starting(folder, "dashboard", *arguments, port=port)
         await publish(live, "availability", b"online")
         await publish(live, "sensor/availability", b"online")
         await publish(live, "info", ONE.info.model_copy(update={"device": "cellar"}).model_dump_json())
         await publish(live, "health", ONE.health.model_dump_json())
-        yield House(broker, f"http://127.0.0.1:{page}/", f"http://127.0.0.1:{dashboard}/", live)
+        yield House(broker, service, f"http://127.0.0.1:{port}/", live)
         process.terminate()
         assert await process.wait() == 0
 
@@ -254,7 +187,7 @@ async def test_what_is_not_known_is_not_shown(browser: Browser, house: House) ->
 
 async def test_the_pack_of_a_service_is_shown_by_both_alike_and_by_nobody_else(browser: Browser, house: House) -> None:
     parameters = await house.live.wait_json("bms/attic/parameters")
-    async with tab(browser, house.page) as own, dashboard_of(browser, house, "attic") as other:
+    async with tab(browser, house.service.url) as own, dashboard_of(browser, house, "attic") as other:
         for opened in (own, other):
             await opened.until_text("voltage_v", f"{sum(CELLS):.2f} V")
             assert await opened.text("current_a") == "2.500 A"
@@ -377,21 +310,21 @@ async def test_it_is_stale_while_the_sensor_or_the_service_is_offline(browser: B
         await opened.until_status("live")
 
 
-async def test_it_is_stale_when_the_service_is_killed_and_live_when_it_is_back(
-    browser: Browser, folder: Path, broker: Broker
-) -> None:
-    port = free_port()
-    async with contextlib.AsyncExitStack() as stack:
-        own = folder / "killed"
-        own.mkdir()
-        async with attic(own, broker, port) as process:
-            opened = await stack.enter_async_context(tab(browser, f"http://127.0.0.1:{port}/"))
-            await opened.until_status("live")
-            process.kill()
-            await opened.until_status("stale since")
-            assert await opened.page.inner_text("#why") == "the page's server does not answer"
-        async with attic(own, broker, port):
-            await opened.until_status("live")
+async def test_it_is_stale_when_the_service_is_killed_and_live_when_it_is_back(browser: Browser, house: House) -> None:
+    async with (
+        tab(browser, house.service.url) as own,
+        dashboard_of(browser, house, "attic") as other,
+    ):
+        await own.until_status("live")
+        await other.until_status("live")
+        await house.service.kill()
+        await own.until_status("stale since")
+        assert await own.page.inner_text("#why") == "the page's server does not answer"
+        await other.until_status("stale since")
+        assert await other.page.inner_text("#why") == "the service is offline"
+        await house.service.start()
+        await own.until_status("live")
+        await other.until_status("live")
 
 
 async def test_it_is_stale_while_the_broker_is_away_until_new_values_come(browser: Browser, house: House) -> None:

@@ -20,6 +20,7 @@ from bms_estimator.sources.protocol import (
     AckResult,
     Channels,
     MessageType,
+    Relay,
     ResetCause,
     command,
     hello_command,
@@ -28,7 +29,9 @@ from bms_estimator.sources.protocol import (
     set_divider_command,
     set_rate_command,
     set_ratiometric_command,
+    set_relay_command,
     set_serial_command,
+    unseal,
     zero_current_command,
 )
 from tests.patience import LONG_S
@@ -253,3 +256,27 @@ async def test_a_board_that_runs_for_its_host_takes_no_sample_before_it_opens_th
         await asyncio.wait_for(sampled.wait(), LONG_S)
         running.cancel()
         os.close(host)
+
+
+async def test_the_relay_goes_where_it_was_told_to_once_the_host_is_silent_and_low_at_a_reset() -> None:
+    def told(high: bool, then: bool | None, silent_s: int = 0) -> Event:
+        return lambda b: b._obey(unseal(set_relay_command(Relay(high, then, silent_s))))
+
+    seen: dict[int, bool] = {}
+    look: Event = lambda b: seen.update({b.samples: b.relay_high})  # noqa: E731
+    plan: dict[int, Event] = {10: told(True, None), 20: look, 30: told(True, False, 2), 200: look, 240: look}
+    plan |= {250: told(False, True, 1), 300: look, 360: look, 370: lambda b: b.reset(), 380: look}
+    one = board()
+    acks = FrameDecoder()
+    acks.feed(0.0, b"\0" + await received(one, 400, plan))
+    assert seen == {20: True, 200: True, 240: False, 300: False, 360: True, 380: False}
+    assert [ack.result for ack in acks.take_acks()] == [AckResult.OK] * 3
+
+
+async def test_a_relay_command_that_is_none_changes_nothing() -> None:
+    bad = command(MessageType.COMMAND_SET_RELAY, (1 << 8).to_bytes(4, "little"))  # a level in silence, but no time
+    one = board()
+    acks = FrameDecoder()
+    acks.feed(0.0, b"\0" + await received(one, 20, {10: lambda b: b._obey(unseal(bad))}))
+    assert [(ack.result, ack.value) for ack in acks.take_acks()] == [(AckResult.BAD_VALUE, 0)]
+    assert not one.relay_high

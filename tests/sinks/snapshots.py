@@ -4,7 +4,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.estimate import LoopHealth, Snapshot
+from bms_estimator.model.estimate import Alarm, LoopHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
@@ -88,3 +88,16 @@ NOTHING_YET = ONE._replace(
     estimate=None, parameters=parameter_report(Estimator(load_cell("chen_mora"), identifier=None), NOW)
 )
 """Before the first sample."""
+
+SOC_LOW = Alarm(
+    name="soc_low",
+    severity="warning",
+    active=True,
+    latched=False,
+    since="2024-05-01T12:00:00.000Z",
+    value=9.5,
+    limit=10.0,
+    unit="%",
+    text="charge",
+)
+"""Raised."""

@@ -140,7 +140,9 @@ def test_alarms_cells_and_energy_are_shown_where_they_are_published(snapshot: Sn
     }
     text = text_of(scene(snapshot, alarms | {"state": state}))
     assert "cells 3 lowest 3.250 V (cell 3) highest 3.301 V (cell 1) apart 51 mV" in text
-    assert "energy 12.346 kWh out 13.500 kWh in" in text
+    assert "energy 12.35 kWh out 13.50 kWh in 4.2 cycles" in text
+    little = state | {"energy_out_kwh": 0.0123, "energy_in_kwh": 0.0}
+    assert "energy 12.30 Wh out 0.00 Wh in" in text_of(scene(snapshot, {"state": little}))
     assert "full in 1 h 20 min at this current" in text
     assert text.index("critical: cell_over_voltage: do something") < text.index("warning: soc_low: do something")
     assert "link_lost" not in text

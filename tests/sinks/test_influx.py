@@ -13,25 +13,15 @@ import pytest
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Alarm, Snapshot
+from bms_estimator.model.estimate import Snapshot
 from bms_estimator.model.export_settings import InfluxSettings
 from bms_estimator.sinks.influx import BATCH, MOST_WAITING, InfluxSink
 from bms_estimator.sinks.line_protocol import lines
 from tests.influxdb import INFLUXD, InfluxDB
 from tests.sinks.service import until
-from tests.sinks.snapshots import NOTHING_YET, ONE
+from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW
 
-LOW = Alarm(
-    name="soc_low",
-    severity="warning",
-    active=True,
-    latched=False,
-    since="2024-05-01T12:00:00.000Z",
-    value=9.5,
-    limit=10.0,
-    unit="%",
-    text='charge "it" soon, \\now\nor never',
-)
+LOW = SOC_LOW.model_copy(update={"text": 'charge "it" soon, \\now\nor never'})
 
 
 def at(second: int, **changes: Any) -> Snapshot:

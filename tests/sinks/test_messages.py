@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.model.estimate import Alarm
 from bms_estimator.sinks.messages import Message, Messages, Sent
 from bms_estimator.sinks.payloads import schema
 from tests.sinks.snapshots import NOTHING_YET, NOW, ONE, snapshot
@@ -116,3 +117,30 @@ def test_no_message_comes_near_the_limit_of_the_broker_s_example():
     assert (
         max(len(m.payload) for m in (*messages, *MESSAGES.kept(None, ONE), *MESSAGES.greeting())) < int(limit[1]) / 10
     )
+
+
+def test_an_alarm_is_said_when_it_changes_and_all_of_them_to_a_broker_that_got_nothing():
+    quiet = Alarm(
+        name="soc_low",
+        severity="warning",
+        active=False,
+        latched=False,
+        since=None,
+        value=None,
+        limit=0.1,
+        unit=None,
+        text="",
+    )
+    other = quiet.model_copy(update={"name": "link_lost", "unit": "s", "limit": 10.0})
+    raised = quiet.model_copy(update={"active": True, "since": ONE.info.started, "value": 0.09, "text": "charge"})
+    before, after = ONE._replace(alarms=(quiet, other)), ONE._replace(alarms=(raised, other))
+    messages, sent = MESSAGES.due(Sent(), before, NOW)
+    assert {"alarm/soc_low", "alarm/link_lost"} <= set(topics(messages))
+    assert MESSAGES.due(sent, before, NOW)[0] == []
+    [message], sent = MESSAGES.due(sent, after, NOW)
+    assert (message.topic, message.qos, message.retain) == ("bms/pack/alarm/soc_low", 1, True)
+    told = json.loads(message.payload)
+    assert told == raised.model_dump()
+    assert set(told) == set(schema()["alarm"]["properties"])
+    assert [json.loads(m.payload)["name"] for m in MESSAGES.kept(before, after)[:-1]] == ["alarm_raised"]
+    assert [json.loads(m.payload)["name"] for m in MESSAGES.kept(after, before)[:-1]] == ["alarm_cleared"]

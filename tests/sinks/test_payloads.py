@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 
 from bms_estimator.model.estimate import PAYLOAD_VERSION
-from bms_estimator.sinks.asyncapi import document
+from bms_estimator.sinks.asyncapi import ARGUMENTS, document
 from bms_estimator.sinks.messages import Messages, Sent
 from bms_estimator.sinks.payloads import TOPICS
-from bms_estimator.sinks.requests import NAMES
+from bms_estimator.sinks.requests import COMMANDS, NAMES
 from tests.command_line import run
 from tests.sinks.payload_record import broken, now, recorded
-from tests.sinks.snapshots import NOW, ONE
+from tests.sinks.snapshots import NOW, ONE, SOC_LOW
 
 DOCUMENT = document("bms")
 WRITE = "make payloads writes tests/sinks/payloads.json anew"
@@ -51,10 +51,12 @@ def test_the_version_is_published() -> None:
 
 
 def test_every_message_goes_out_as_the_table_of_topics_says() -> None:
-    messages = Messages("bms", "pack")
+    messages, told = Messages("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
     sent = {
-        m.topic.removeprefix("bms/pack/"): m for m in (*messages.kept(None, ONE), *messages.due(Sent(), ONE, NOW)[0])
+        m.topic.removeprefix("bms/pack/"): m for m in (*messages.kept(None, told), *messages.due(Sent(), told, NOW)[0])
     }
+    assert sent["alarm/soc_low"].qos == TOPICS["alarm"].qos
+    assert sent["alarm/soc_low"].retain
     for name in set(TOPICS) - {"alarm"}:
         assert (sent[name].qos, sent[name].retain) == (TOPICS[name].qos, TOPICS[name].retain), name
         TOPICS[name].model.model_validate_json(sent[name].payload)
@@ -83,6 +85,14 @@ def test_the_document_has_every_topic_with_its_own_fields() -> None:
         assert set(schemas[topic.model.__name__]["properties"]) == set(topic.model.model_fields)
     for channel in DOCUMENT["channels"].values():
         assert all(f"{{{parameter}}}" in channel["address"] for parameter in channel["parameters"])
+
+
+def test_it_says_what_each_command_takes() -> None:
+    assert set(ARGUMENTS) == set(COMMANDS)
+    payloads = {name: DOCUMENT["components"]["messages"][f"request_{name}"]["payload"] for name in NAMES}
+    assert payloads["set_soc"]["required"] == ["soc"]
+    assert payloads["acknowledge_alarm"]["required"] == []
+    assert set(payloads["state"]["properties"]) == {"transaction"}
 
 
 def test_the_command_prints_it(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Alarm, Estimate, Health, Snapshot
+from bms_estimator.model.estimate import Estimate, Health, Snapshot
 from bms_estimator.model.export_settings import PrometheusSettings
 from tests.mosquitto import free_port
-from tests.sinks.snapshots import NOTHING_YET, ONE, STACK, snapshot
+from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW, STACK, snapshot
 
 pytest.importorskip("prometheus_client", reason="prometheus-client is not installed: pip install prometheus-client")
 
@@ -22,16 +22,13 @@ from bms_estimator.sinks.metrics import COUNTERS, KINDS, LEFT_OUT, OWN_NAMES, RA
 from bms_estimator.sinks.prometheus import PrometheusSink
 
 PROMTOOL = shutil.which("promtool")
-LOW = Alarm(
-    name="soc_low", severity="warning", active=True, latched=False, since=None, value=9.0, limit=10.0, unit="%", text=""
-)
 
 
 def full() -> Snapshot:
     """With cells, energy and an alarm."""
     assert ONE.estimate
     told = {"cells_v": [3.25, None, 3.5], "energy_out_kwh": 1.5, "time_to_empty_s": 60.0, "temperature_c": 21.5}
-    return ONE._replace(estimate=ONE.estimate.model_copy(update=told), alarms=(LOW,))
+    return ONE._replace(estimate=ONE.estimate.model_copy(update=told), alarms=(SOC_LOW,))
 
 
 async def fetched(snapshot: Snapshot | None) -> str:

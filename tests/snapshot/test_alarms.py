@@ -242,7 +242,7 @@ def test_an_alarm_that_would_end_where_it_is_raised_is_refused(alarms: dict[str,
 def test_a_limit_that_the_pack_never_reaches_is_named() -> None:
     assert out_of_range(settings(), PACK) == []
     (line,) = out_of_range(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
-    assert line.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 2 to 4.5 V")
+    assert line.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 3.65 to 4.5 V")
 
 
 def test_limits_follow_chemistry_size_and_what_is_set() -> None:

@@ -13,8 +13,11 @@ from bms_estimator.sources.protocol import (
     AckResult,
     Hello,
     MessageType,
+    Relay,
     hello_command,
+    relay_word,
     set_rate_command,
+    set_relay_command,
     zero_current_command,
 )
 from tests.service.test_bad_line import HELLO, frames, sample
@@ -124,3 +127,22 @@ def test_no_bytes_make_it_raise_whatever_was_asked(reads: list[bytes]) -> None:
         dialect.feed(float(at), data)
         dialect.due(float(at))
     assert dialect.counters["bytes_received"] <= sum(map(len, reads))
+
+
+def test_the_relay_is_told_until_it_is_acknowledged_and_no_hello_is_asked_for() -> None:
+    dialect, relay = talking(), Relay(high=True, high_when_silent=False, silent_s=30)
+    command = dialect.relay(relay)
+    assert dialect.due(0.0) == set_relay_command(relay)
+    assert dialect.due(1.1 * ASK_AGAIN_S) == set_relay_command(relay)
+    dialect.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
+    assert (command.done, command.refusal) == (True, None)
+    assert dialect.due(2.0) == b""
+    assert dialect.hello == HELLO
+
+
+def test_firmware_of_before_the_relay_refuses_it_and_the_reason_says_so() -> None:
+    dialect = talking()
+    command = dialect.relay(Relay(high=True, high_when_silent=None))
+    dialect.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.UNKNOWN_COMMAND, 0).encode())
+    assert command.done
+    assert command.refusal == "the board refuses: unknown command; firmware before 0.2.0 has no relay pin"

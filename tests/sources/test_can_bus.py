@@ -134,6 +134,13 @@ async def test_samples_are_positive_on_discharge(channel: str, sender: can.BusAB
         assert reports.message is None
 
 
+async def test_an_option_that_the_interface_does_not_have() -> None:
+    bringer = CanBringer(source(interface="socketcand", channel="can0", options={"hots": "127.0.0.1"}))
+    with pytest.raises(NothingComesError, match=r"cannot be opened: .*host"):
+        async with aclosing(bringer.bring()) as brought:
+            await next_of(brought)
+
+
 def test_an_interface_that_python_can_does_not_have() -> None:
     with pytest.raises(UserError, match=r"source.interface = 'canbus': python-can has .*socketcan"):
         CanBringer(source(interface="canbus"))

@@ -36,6 +36,19 @@ BO_ 2566848512 Other: 8 BMS
 """Made for these tests: big and little endian, a multiplexer, an identifier of 29 bits."""
 
 
+@pytest.fixture(scope="module")
+def named(tmp_path_factory: pytest.TempPathFactory) -> CanSource:
+    path = tmp_path_factory.mktemp("dbc") / "pack.dbc"
+    path.write_text(DBC)
+    return source(
+        dbc=str(path),
+        voltage={"signal": "PackVoltage"},
+        current={"signal": "Pack.PackCurrent"},
+        temperature={"signal": "Temp"},
+        cells=[{"signal": "Cell{}", "count": 3, "scale": 0.001}],
+    )
+
+
 def source(**told: object) -> CanSource:
     return CanSource.model_validate({"kind": "can"} | told)
 
@@ -65,6 +78,13 @@ def test_no_frames_make_it_raise(frames: list[tuple[int, bool, bytes]]) -> None:
     for identifier, extended, data in frames:
         reading = map_.feed(0.0, identifier, extended, data)
         assert (reading is not None) == ((identifier, extended) == (0x356, False) and len(data) >= 4)
+
+
+@given(st.lists(st.tuples(st.sampled_from([0x500, 0x501]), st.binary(max_size=64)), max_size=20))
+def test_no_frames_make_signals_of_a_dbc_file_raise(named: CanSource, frames: list[tuple[int, bytes]]) -> None:
+    map_ = CanMap(named)
+    for identifier, data in frames:
+        map_.feed(0.0, identifier, False, data)
 
 
 def test_a_known_bus_is_read() -> None:
@@ -112,7 +132,10 @@ def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest(
     assert map_.feed(2.0, 1, False, b"\x83") is None
     assert map_.feed(2.0, 2, False, b"\xff") is None
     assert map_.counters["not_measured"] == 1
-    late = map_.feed(KEPT_S + 0.5, 2, False, b"\x05")
+    assert map_.feed(3.0, 1, False, b"\x83") is None
+    assert map_.feed(4.0 + KEPT_S, 2, False, b"\x05") is None  # the voltage is too old
+    assert map_.feed(5.0 + KEPT_S, 1, False, b"\x83") is None
+    late = map_.feed(5.5 + KEPT_S, 2, False, b"\x05")
     assert late is not None
     assert (late.voltage_v, late.cells_v) == (13.1, ())
     assert math.isnan(late.temperature_c)
@@ -125,16 +148,8 @@ def dbc(tmp_path: Path) -> Path:
     return path
 
 
-def test_signals_by_their_names_in_a_dbc_file(dbc: Path) -> None:
-    map_ = CanMap(
-        source(
-            dbc=str(dbc),
-            voltage={"signal": "PackVoltage"},
-            current={"signal": "Pack.PackCurrent"},
-            temperature={"signal": "Temp"},
-            cells=[{"signal": "Cell{}", "count": 3, "scale": 0.001}],
-        )
-    )
+def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
+    map_ = CanMap(named)
     assert set(map_.places) == {Place(0x500, False), Place(0x501, False), Place(0x18FF0000, True)}
     assert map_.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
     assert map_.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None

@@ -110,6 +110,39 @@ async def test_no_device_and_no_port_are_said(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"\xff" * 40,
+        b"HTTP/1.1 400 Bad Request\r\n\r\n",
+        b"\0\1\0\0\0\3\5\3\x08",  # as long as its header says, but without its registers
+        b"\0\1\0\0\0\5\5\3\2\0\1",  # one register in place of four
+        b"\0\1\0\0\0\4\5\1\1\0",  # coils
+        b"\0\1\0\0\0\3\5\x83\x2a",  # an exception that nobody knows
+        b"",
+    ],
+    ids=["noise", "web", "short", "few", "coils", "exception", "closed"],
+)
+async def test_what_is_no_answer_brings_nothing(answer: bytes) -> None:
+    served = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(100)
+        writer.write(answer)
+        if answer:
+            await reader.read()  # until the other end has had enough
+        writer.close()
+        await writer.wait_closed()
+        served.set()
+
+    server = await asyncio.start_server(serve, "127.0.0.1")
+    async with server, asyncio.timeout(LONG_S):
+        port = server.sockets[0].getsockname()[1]
+        given = source(profile="victron-gx", host="127.0.0.1", tcp_port=port, timeout_s=0.1)
+        assert await failure(ModbusBringer(given))
+        await served.wait()
+
+
 async def until(brought: AsyncGenerator[bytes, None], condition: Callable[[], bool]) -> None:
     """Take what comes until it is so."""
     async with asyncio.timeout(LONG_S):
@@ -160,7 +193,7 @@ async def test_floats_that_are_no_numbers_are_no_samples_until_they_are() -> Non
 async def test_samples_are_positive_on_discharge_and_come_again_after_the_device_was_away() -> None:
     registers, port = victron(), free_port()
     told = {"kind": "modbus", "profile": "victron-gx", "host": "127.0.0.1", "tcp_port": port, "unit": UNIT}
-    settings = Settings.model_validate({"source": told | {"poll_s": 0.02, "timeout_s": 5.0}})
+    settings = Settings.model_validate({"source": told | {"poll_s": 0.02, "timeout_s": 1.0}})
     assert settings.sensor.voltage_resolution_v == 0.01
     source = open_reports(settings)
     assert source is not None

@@ -99,6 +99,11 @@ def test_a_float_that_is_no_number_is_not_measured(raw: float) -> None:
     assert reading_of(given, held | words(raw, "float32", address=2)) is None
 
 
+def test_a_value_beyond_all_numbers_is_not_measured() -> None:
+    register = Register(address=0, type="float32", scale=1e300)
+    assert math.isnan(decode(register, words(1e30, "float32")))
+
+
 def test_what_stands_for_nothing_measured_is_nothing_measured() -> None:
     given = source(
         voltage={"address": 0, "scale": 0.01},

@@ -2,8 +2,6 @@
 
 import asyncio
 import contextlib
-import os
-import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,7 +13,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources import ports, probe
+from bms_estimator.sources import ports
 from bms_estimator.sources.protocol import hello_command
 from bms_estimator.sources.serial_board import SerialBoard
 from tests.patience import LONG_S
@@ -73,20 +71,6 @@ async def test_a_board_that_is_heard_is_asked_for_its_hello(line: Line) -> None:
             return heard.startswith(hello_command())
 
         await until(asked)
-
-
-def test_a_probe_sends_nothing_to_a_silent_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(probe, "PATIENCE_S", 0.5)
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    try:
-        assert probe.probe(os.ttyname(slave)) == "silent"
-        os.set_blocking(master, False)
-        with pytest.raises(BlockingIOError):
-            os.read(master, 1)
-    finally:
-        os.close(slave)
-        os.close(master)
 
 
 @pytest.fixture

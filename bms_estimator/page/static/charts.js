@@ -38,7 +38,7 @@ export class Ring {
 export const scaled = (values, factor) => Array.from(values, (x) => (x !== null && Number.isFinite(x) ? factor * x : null));
 export const gaps = (values) => scaled(values, 1);
 
-const DAY_S = 86400;
+const DAY_S = 86400, STEPS_S = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 3600, 7200, 14400, 21600, DAY_S, 2 * DAY_S, 5 * DAY_S, 10 * DAY_S];
 function times(plot, splits) {
 	const span = plot.scales.x.max - plot.scales.x.min;
 	const text = span > 2 * DAY_S ? dayMonth : span > 600 ? hourMinute : clock;
@@ -104,7 +104,7 @@ export class Curve extends Sized {
 			cursor: { drag: { x: false, y: false }, points: { show: false }, sync: { key: "time" } },
 			hooks: { setCursor: [(u) => this.point(u.cursor.idx)] },
 			scales: { x: { time: false }, y: { range: roomy(least, low, high) } },
-			axes: [{ ...axis, values: times, size: 24, space: 90 }, { ...axis, size: 52, space: 26, values: labels }],
+			axes: [{ ...axis, values: times, size: 24, space: 90, incrs: STEPS_S }, { ...axis, size: 52, space: 26, values: labels }],
 		}, [[], [], [], [], ...(beside ? [[]] : [])], body);
 	}
 	point(index) {

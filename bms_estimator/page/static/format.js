@@ -32,9 +32,8 @@ export const celsius = (x) => unit(fixed(x, 1), "°C");
 export const millivolts = (x) => unit(known(x) ? fixed(1e3 * x, Math.abs(x) < 0.1 ? 1 : 0) : "", "mV");
 export const percent = (x, decimals = 1) => (known(x) ? fixed(100 * x, decimals) : "");
 export const ampereHours = (x) => unit(plain(x), "Ah");
-export const kilowattHours = (x) => unit(fixed(x, Math.abs(x) < 10 ? 3 : 1), "kWh");
 export const wattHours = (x) =>
-	Math.abs(x) >= 9999.5 ? unit(fixed(x / 1e3, 1), "kWh") : unit(fixed(x, Math.abs(x) < 9.995 ? 2 : Math.abs(x) < 999.5 ? 1 : 0), "Wh");
+	Math.abs(x) >= 9999.5 ? unit(plain(x / 1e3), "kWh") : unit(fixed(x, Math.abs(x) < 9.995 ? 2 : Math.abs(x) < 999.5 ? 1 : 0), "Wh");
 
 /** Hours and minutes; minutes below an hour, days from two on. */
 export function duration(seconds) {

@@ -11,6 +11,7 @@ const MOST_EVENTS = 50;
 
 const $ = (id) => document.getElementById(id);
 const number = (x) => typeof x === "number";
+const words = (name) => name.replaceAll("_", " ").replace("soc", "SOC");
 const clip = (x) => Math.min(Math.max(x, 0), 1);
 const packs = new Map();
 const ui = { pack: null, span: "live", element: null, drawn: 0, curves: -Infinity, described: -Infinity, due: false };
@@ -201,13 +202,13 @@ function alarmRow(a) {
 	const of = (x, label) => (number(x) ? `${label}${f.digits(x)} ${a.unit ?? ""}`.trim() : "");
 	const facts = [a.severity, of(a.value, ""), of(a.limit, "limit "), a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched"];
 	return node("div", { class: `alarm ${a.severity}`, "data-alarm": a.name },
-		node("b", {}, a.name.replaceAll("_", " ")), node("span", {}, a.text), node("small", {}, facts.filter(Boolean).join(" · ")));
+		node("b", {}, words(a.name)), node("span", {}, a.text), node("small", {}, facts.filter(Boolean).join(" · ")));
 }
 
 const SHOWN = {
 	voltage_v: f.volts, voltage_estimate_v: f.volts, current_a: f.amperes, power_w: f.watts, temperature_c: f.celsius,
 	innovation_v: f.millivolts, remaining_energy_wh: f.wattHours, remaining_capacity_ah: f.ampereHours,
-	energy_out_kwh: f.kilowattHours, energy_in_kwh: f.kilowattHours, soc: f.percent, stability_margin: f.percent,
+	energy_out_kwh: (x) => f.wattHours(1e3 * x), energy_in_kwh: (x) => f.wattHours(1e3 * x), soc: f.percent, stability_margin: f.percent,
 };
 
 function drawState(s) {
@@ -223,7 +224,7 @@ function drawState(s) {
 }
 
 function drawScale(s) {
-	const stop = Math.max(s.delta_1 ?? -1, s.delta_2 ?? -1), band = 2 * (s.soc_std ?? 0);
+	const known = [s.delta_1, s.delta_2].filter(number), stop = Math.max(0, ...known), band = 2 * (s.soc_std ?? 0);
 	const place = (id, name, x) => {
 		const value = `${(100 * clip(x)).toFixed(2)}%`, element = $(id);
 		if (element[name] !== value) element.style[name] = element[name] = value;
@@ -232,16 +233,14 @@ function drawScale(s) {
 	place("band", "left", s.soc - band);
 	place("band", "width", clip(s.soc + band) - clip(s.soc - band));
 	place("at", "left", s.soc);
-	for (const [id, x] of [["stop", stop], ["stopmark", stop], ["d1", s.delta_1], ["d2", s.delta_2]]) {
-		hide($(id), !(x > 0 && x <= 1));
-		place(id, id === "stop" ? "width" : "left", x ?? 0);
-	}
+	hide($("stopmark"), !known.length);
+	for (const [id, x] of [["stop", stop], ["stopmark", stop], ["d1", s.delta_1], ["d2", s.delta_2]]) place(id, id === "stop" ? "width" : "left", x ?? 0);
 	attribute($("stopmark"), "class", stop > 0.5 ? "left" : "");
 	put("stop", f.percent(stop));
 	put("deltas", [s.delta_1, s.delta_2].map((d, i) => number(d) && `δ${"₁₂"[i]} ${f.percent(d)} %`).filter(Boolean).join(", "));
 	attribute($("fill"), "class", s.soc <= Math.max(stop, 0.1) ? "bad" : s.soc < 0.2 ? "low" : "");
 	attribute($("scale"), "aria-valuenow", String(Math.round(100 * s.soc)));
-	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %; stop discharging at ${f.percent(Math.max(stop, 0), 0)} %`);
+	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %; stop discharging at ${f.percent(stop, 0)} %`);
 }
 
 // ---- cells
@@ -263,7 +262,7 @@ function drawCells(s) {
 		const item = bars.children[i], [value, box, apart] = item.children, measured = number(v);
 		const rank = low === high ? "" : i === first ? "lowest" : i === last ? "highest" : "";
 		text(value, f.fixed(v, 3));
-		text(apart, measured ? `${v < mean ? "−" : "+"}${Math.abs(1e3 * (v - mean)).toFixed(0)}` : "");
+		text(apart, measured ? f.fixed(1e3 * (v - mean), 0) : "");
 		const scale = measured ? ((v - floor) / (roof - floor)).toFixed(3) : "0";
 		if (changed(item, scale)) box.firstChild.style.transform = `scaleY(${scale})`;
 		attribute(item, "class", rank);
@@ -281,9 +280,7 @@ function drawCells(s) {
 
 const ELEMENTS = {
 	r_s_ohm: ["Rₛ", 1e3, "mΩ"], r_ts_ohm: ["Rₜₛ", 1e3, "mΩ"], c_ts_farad: ["Cₜₛ", 1, "F"], r_tl_ohm: ["Rₜₗ", 1e3, "mΩ"],
-	c_tl_farad: ["Cₜₗ", 1, "F"], e_o_v: ["E₀", 1, "V"], r_ohm: ["r", 1e3, "mΩ"], tafel_slope_v: ["A", 1, "V"],
-	exchange_current_a: ["i₀", 1e3, "mA"], c_dl_farad: ["C", 1, "F"], concentration_v: ["B", 1, "V"],
-	limiting_current_a: ["i_L", 1, "A"], internal_current_a: ["iₙ", 1e3, "mA"],
+	c_tl_farad: ["Cₜₗ", 1, "F"], e_o_v: ["E₀", 1, "V"],
 };
 const HEALTH = { capacity: ["Capacity, of new", 100, "%"], r_s: ["Rₛ, of new", 100, "%"], current_offset_a: ["Current offset", 1e3, "mA"] };
 const rows = new Map();
@@ -291,7 +288,7 @@ const rows = new Map();
 function drawParameters(report) {
 	if (!report || !changed(rows, report)) return;
 	const all = Object.entries({ elements: ELEMENTS, state_of_health: HEALTH, a: {} }).flatMap(([group, names]) =>
-		Object.entries(report[group] ?? {}).map(([key, p]) => [`${group} ${key}`, names[key] ?? [key, 1, "SI"], p]));
+		Object.entries(report[group] ?? {}).map(([key, p]) => [`${group} ${key}`, names[key] ?? [words(key), 1, "SI"], p]));
 	const kept = new Set(all.map(([key]) => key));
 	for (const [key, row] of rows) if (!kept.has(key)) { row.remove(); rows.delete(key); }
 	for (const [key, [name, factor, unit], p] of all) {
@@ -313,14 +310,13 @@ function drawHealth({ topics: { health: h, info, state } }) {
 	if (changed($("suspects"), wrong.join("\n"))) {
 		$("suspects").replaceChildren(...(wrong.length ? wrong.map((w) => node("li", { class: "bad" }, w)) : [node("li", { class: "good" }, "Nothing is suspected of the input.")]));
 	}
-	const dropped = Object.entries(h.samples ?? {}).reduce((sum, [k, n]) => sum + (k.startsWith("dropped_") ? n : 0), 0);
 	const of = (x, unit) => number(x) && `${f.digits(x, 3)} ${unit}`;
 	const facts = {
 		Sensor: h.sensor_online ? "online" : "offline", "Sample rate": of(state?.sample_rate_hz, "Hz"), Frames: h.line?.frames_received,
-		"Frames lost": h.line?.frames_lost, "Wrong checksums": h.line?.crc_errors, "Samples dropped": dropped, "Line reopened": h.reconnects,
+		"Frames lost": h.line?.frames_lost, "Wrong checksums": h.line?.crc_errors, "Line reopened": h.reconnects,
 		"Latency, median": of(1e3 * h.loop?.latency_p50_s || null, "ms"), "Board's clock": of(h.clock_ppm, "ppm"), Broker: h.broker_trouble,
 		"Waiting for it": h.publish_waiting, Disk: h.store_trouble, Checkpoint: h.checkpoint, "Running for": f.duration(h.uptime_s),
-		Crashes: h.total?.crashes, Memory: of(h.rss_mib, "MiB"), Version: info?.version,
+		Crashes: h.total?.crashes, Version: info?.version,
 	};
 	for (const [name, value] of Object.entries(facts)) {
 		const row = (drawHealth[name] ??= $("facts").appendChild(node("div", {}, node("dt", {}, name), node("dd", {}))));
@@ -333,7 +329,7 @@ function drawEvents(pack) {
 	hide($("eventcard"), !pack.events.length);
 	if (!changed($("events"), `${pack.name} ${pack.events.length} ${pack.events[0]?.time}`)) return;
 	$("events").replaceChildren(...pack.events.map((e) => node("li", {},
-		node("time", { datetime: e.time }, f.when(new Date(e.time))), node("b", {}, e.name.replaceAll("_", " ")), node("span", {}, e.text))));
+		node("time", { datetime: e.time }, f.when(new Date(e.time))), node("b", {}, words(e.name)), node("span", {}, e.text))));
 }
 
 // ---- curves
@@ -347,6 +343,7 @@ function makeCurves() {
 		v: make("Voltage", "V", "--volt", 0.02, { beside: { colour: "--estimate", label: "estimated", dash: [5, 3] } }),
 		i: make("Current", "A", "--amp", 0.02),
 		inno: make("Innovation", "mV", "--inno", 2),
+		temp: make("Temperature", "°C", "--inno", 2),
 	};
 }
 
@@ -366,6 +363,7 @@ function drawCurves(pack) {
 	for (const [name, chart] of Object.entries(curves)) {
 		const drawn = columns[name];
 		hide(chart.box, !drawn?.[2].some((v) => v !== null));
+		if (drawn?.[3]) hide(chart.box.querySelector(".estimate"), !live);
 		if (!chart.box.hidden) chart.draw([time, ...drawn], from, end);
 	}
 }
@@ -389,7 +387,7 @@ function pastColumns(data) {
 	const pick = (name) => at.map((i) => data[name][i] ?? null), no = none(at);
 	const span = (name, unit) => [pick(`${name}_max_${unit}`), pick(`${name}_min_${unit}`), pick(`${name}_${unit}`)];
 	const time = at.map((i, n) => (i < 0 ? data.time_s[at[n - 1]] + data.step_s : data.time_s[i]));
-	return { time, v: [...span("voltage", "v"), no], i: span("current", "a"), soc: socColumns(pick("soc"), pick("soc_std")) };
+	return { time, v: [...span("voltage", "v"), no], i: span("current", "a"), soc: socColumns(pick("soc"), pick("soc_std")), temp: [no, no, pick("temperature_c")] };
 }
 
 async function loadHistory(pack, span) {

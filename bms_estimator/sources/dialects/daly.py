@@ -62,6 +62,8 @@ class DalyDialect(AskedDialect):
         return f"Daly BMS, {self._cells} cells" if self._told and self._cells is not None else None
 
     def _ways(self) -> Sequence[Sequence[bytes]]:
+        if self.probing:
+            return [[question(host, command) for host in HOSTS for command in (STATUS, CELLS, PACK)]]
         commands = (CELLS, PROBES, PACK) if self._cells is not None else (STATUS, CELLS, PROBES, PACK)
         return [[question(host, command) for command in commands] for host in HOSTS]
 

@@ -1,0 +1,74 @@
+"""``alarms``: what it says of a capture; ``config check`` of what is set."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.command_line import run
+from tests.snapshot.alarm_captures import Line, record
+
+
+@pytest.fixture
+def pack(tmp_path: Path) -> Path:
+    file = tmp_path / "pack.toml"
+    file.write_text("[pack]\ncell = 'nmc'\ncapacity_ah = 10\nseries = 2\n[sensor]\nprotocol = 'text'\n[alarms]\n")
+    return file
+
+
+def test_it_says_what_would_have_been_raised_when_and_at_what(
+    tmp_path: Path, pack: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [Line(30), Line(10, voltage_v=8.6), Line(30), Line(20, temperature_c=61.0), Line(80)]
+    capture = record(tmp_path / "capture.bms", lines)
+    with pack.open("a") as file:
+        file.write("over_temperature = {delay_s = 5}\nhook = [{run = ['/none/such']}]\n")
+    code, out, _ = run(capsys, "alarms", capture, "--pack", pack, "--json")
+    assert code == 0
+    found = json.loads(out)
+    times = {each["alarm"]: (each["raised_s"], each["ended_s"], each["latched"]) for each in found["raised"]}
+    assert times == {
+        "pack_over_voltage": (pytest.approx(32.0), None, True),
+        "over_temperature": (pytest.approx(75.0), pytest.approx(150.0), False),
+    }
+    assert found["unmeasured"] == ["cell_over_voltage", "cell_under_voltage", "cell_imbalance"]
+    assert "discharge_over_current" in found["quiet"]
+    code, out, _ = run(capsys, "alarms", capture, "--pack", pack)
+    assert code == 0
+    assert "over_temperature" in out
+    assert "latched" in out
+
+
+@pytest.mark.parametrize(
+    ("alarms", "code", "said"),
+    [
+        ("soc_low = {limit = 0.2, clear = 0.1}", 2, "alarms.soc_low.clear = 0.1: must not be below limit = 0.2"),
+        ("pack_over_voltage = {limit_v = 4.2}", 0, "alarms.pack_over_voltage.limit_v = 4.2: outside 7.3 to 9 V"),
+        ("pack_over_voltage = {limit_v = 8.4, clear_v = 8.4}", 0, ""),
+        ("pack_over_voltage = {limit_c = 4.2}", 2, "alarms.pack_over_voltage.limit_c: unknown key"),
+        ("over_voltage = {limit_v = 4.2}", 2, "alarms.over_voltage: unknown key"),
+        ("hook = [{run = ['/none/such']}]", 0, "alarms.hook.0.run = /none/such: no such program here"),
+        ("hook = [{relay = 'high'}]", 2, "alarms.hook.0.relay: only the board of [sensor] with protocol = 'binary'"),
+        ("hook = [{topic = 'load/set'}]", 2, "alarms.hook.0.topic = load/set: there is no broker"),
+        ("hook = [{}]", 2, "give one of run, topic and relay"),
+        ("hook = [{topic = 'a', payload = '$nothing'}]", 2, "payload: 'nothing': must be one of $json"),
+    ],
+)
+def test_check_says_what_cannot_be(
+    pack: Path, capsys: pytest.CaptureFixture[str], alarms: str, code: int, said: str
+) -> None:
+    with pack.open("a") as file:
+        file.write(alarms)
+    ended, out, err = run(capsys, "config", "check", pack)
+    assert ended == code
+    assert said in err
+    assert ("good" in out) == (code == 0)
+
+
+def test_show_prints_the_limits_in_effect(pack: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pack.open("a") as file:
+        file.write("soc_low = {limit = 0.2}\nhook = [{run = ['/bin/true'], dry_run = true}]\n")
+    code, out, _ = run(capsys, "config", "show", pack)
+    assert code == 0
+    assert "# alarms.soc_low.clear = 0.25\n" in out
+    assert "# alarms.pack_over_voltage.limit = 8.5\n" in out

@@ -1,0 +1,140 @@
+"""What the page is shown of: the real service of a pack whose board prints its cells, and programs of ours that serve pages."""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
+from tests.command_line import PROGRAM
+from tests.mosquitto import Broker
+from tests.patience import LONG_S
+from tests.serial_line import Line
+
+Values = dict[str, Any]
+"""What a board prints."""
+CELL, SERIES, CAPACITY_AH = "ncr18650", 14, 33.0
+UNEVEN_V = [1e-3 * d for d in (2, -1, 3, 0, -4, 1, 5, -2, 1, 2, -17, 1, 4, 5)]
+"""How far the cells of a simulated pack are from their mean [V]."""
+
+
+def simulated(load_a: float = 24.0, soc: float = 0.66) -> Callable[[float], Values]:
+    """A pack of a bicycle's size under changing loads; the eleventh cell is weak."""
+    pack = SimulatedPack(load_cell(CELL, CAPACITY_AH).pack(SERIES, 1), random_steps(load_a, 4), soc=soc)
+
+    def at(time_s: float) -> Values:
+        reading = pack(time_s)
+        mean_v = reading.voltage_v / SERIES
+        cells = [round(mean_v + apart_v, 4) for apart_v in UNEVEN_V]
+        return {
+            "voltage": round(sum(cells), 4),
+            "current": round(reading.current_a, 3),
+            "temperature": 24.6,
+            "cells": cells,
+        }
+
+    return at
+
+
+async def starting(folder: Path, *arguments: object, port: int) -> asyncio.subprocess.Process:
+    """A program of ours that serves a page, once it does."""
+    log = folder / f"{port}.log"
+    with log.open("ab") as file:
+        process = await asyncio.create_subprocess_exec(
+            PROGRAM,
+            *map(str, arguments),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=file,
+        )
+    async with asyncio.timeout(LONG_S):
+        while process.returncode is None:
+            with contextlib.suppress(OSError):
+                _, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.close()
+                return process
+            await asyncio.sleep(0.05)
+    raise AssertionError(log.read_text())
+
+
+class Service:
+    """The real service of one pack, whose board prints text.
+
+    Args:
+        folder: For its files; its state is kept there, too.
+        broker: Where it publishes.
+        port: Of its page.
+        board: What the board prints, by the time since it began [s].
+        series: Cells in series.
+        name: Of the pack.
+        rate_hz: How often the board prints and the service publishes.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        broker: Broker,
+        port: int,
+        board: Callable[[float], Values],
+        *,
+        series: int = SERIES,
+        name: str = "attic",
+        rate_hz: float = 10.0,
+    ) -> None:
+        self.url = f"http://127.0.0.1:{port}/"
+        self._folder, self._port, self._board, self._rate_hz = folder, port, board, rate_hz
+        self._line = Line(folder / f"board-{name}")
+        self._pack = folder / f"{name}.toml"
+        self._settings = f"""
+[pack]
+name = "{name}"
+cell = "{CELL}"
+capacity_ah = {CAPACITY_AH}
+series = {series}
+initial_soc = 0.6
+[sensor]
+port = "{self._line.path}"
+protocol = "text"
+[publish]
+rate_hz = {rate_hz}
+[mqtt]
+url = "{broker.url}"
+[page]
+listen = "127.0.0.1:{port}"
+[state]
+folder = "{folder}"
+"""
+
+    async def __aenter__(self) -> Self:
+        self._line.plug()
+        self._printing = asyncio.create_task(self._print())
+        await self.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        if self.process.returncode is None:
+            await self.kill()
+        self._printing.cancel()
+        await asyncio.gather(self._printing, return_exceptions=True)
+        self._line.unplug()
+
+    async def start(self, settings: str = "") -> None:
+        """Start the service, with more of a pack file if need be, TOML; until its page is served."""
+        self._pack.write_text(self._settings + settings)
+        self.process = await starting(self._folder, "run", "--no-view", self._pack, port=self._port)
+
+    async def kill(self) -> None:
+        self.process.kill()
+        await self.process.wait()
+
+    async def _print(self) -> None:
+        begin_s = asyncio.get_running_loop().time()
+        while True:
+            time_s = asyncio.get_running_loop().time() - begin_s
+            with contextlib.suppress(BlockingIOError, OSError):
+                self._line.heard()
+                self._line.write(json.dumps(self._board(time_s)).encode() + b"\r\n")
+            await asyncio.sleep(1.0 / self._rate_hz)

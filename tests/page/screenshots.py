@@ -1,0 +1,120 @@
+"""The pictures of the page for README: the real service of a simulated pack in a real Chromium; ``make screenshots``.
+
+A minute: long enough for the estimator to have learned something. The history of a day before is simulated, too.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import math
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+from playwright.async_api import Browser
+
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.estimate import Snapshot
+from tests.mosquitto import Broker, free_port
+from tests.page.chromium import PHONE, Tab, chromium, tab
+from tests.page.house import CAPACITY_AH, SERIES, Service, simulated
+from tests.sinks.snapshots import ONE
+from tests.store.test_history import keep
+
+DOCS = Path(__file__).parents[2] / "docs"
+LEARN_S = 60.0
+SOC = 0.66
+ALARMS = """
+[alarms]
+cell_imbalance = {limit_v = 0.02, delay_s = 1, severity = "critical"}
+soc_low = {limit = 0.9, delay_s = 1}
+"""
+
+
+def yesterday() -> list[Snapshot]:
+    """A pack's day, minute by minute: the sun charges it, the evening uses it."""
+    assert ONE.estimate
+    times = [time.time() - 60.0 * minute for minute in range(24 * 60, 0, -1)]
+    currents = [_current_a(each) for each in times]
+    socs = [-charge_a_min / 60.0 / CAPACITY_AH for charge_a_min in itertools.accumulate(currents)]
+    snapshots = []
+    for time_s, current_a, moved in zip(times, currents, socs, strict=True):
+        soc = SOC + moved - socs[-1]
+        voltage_v = SERIES * (3.35 + 0.75 * soc - 2e-3 * current_a)
+        told = {
+            "time": iso_utc(time_s),
+            "board_time_s": time_s,
+            "voltage_v": voltage_v,
+            "current_a": current_a,
+            "power_w": voltage_v * current_a,
+            "soc": soc,
+            "soc_std": 0.012,
+            "temperature_c": 22.0 - 0.5 * current_a,
+        }
+        snapshots.append(ONE._replace(estimate=ONE.estimate.model_copy(update=told)))
+    return snapshots
+
+
+def _current_a(time_s: float) -> float:
+    """Of a house: 8 h of sun."""
+    hour = time_s % 86_400 / 3600.0
+    return 1.2 + 0.4 * math.sin(time_s / 700.0) - 6.0 * max(0.0, 1.0 - ((hour - 12.5) / 4.0) ** 2)
+
+
+async def shoot(opened: Tab, name: str, part: str = "") -> None:
+    path = DOCS / f"page-{name}.png"
+    if part:
+        await opened.page.locator(part).screenshot(path=path)
+    else:
+        await opened.page.screenshot(path=path)
+    sys.stdout.write(f"{path.relative_to(DOCS.parent)}: {path.stat().st_size / 1e3:.0f} kB\n")
+
+
+@contextlib.asynccontextmanager
+async def shown(browser: Browser, service: Service, **options: Any) -> AsyncIterator[Tab]:
+    """The page once its curves are drawn."""
+    async with tab(browser, service.url, **options) as opened:
+        await opened.until_status("live")
+        await opened.until("() => document.querySelectorAll('.curve [aria-label]').length >= 4")
+        yield opened
+
+
+async def shoot_all(service: Service, browser: Browser) -> None:
+    async with shown(browser, service) as opened:
+        await asyncio.sleep(LEARN_S)
+        await shoot(opened, "desktop")
+        await shoot(opened, "cells", ".cells")
+        await opened.page.get_by_text("Day", exact=True).click()
+        await opened.page.get_by_role("img", name="Voltage, last day: from").wait_for()
+        await shoot(opened, "day", ".curves")
+    async with shown(browser, service, size=PHONE, device_scale_factor=2) as opened:
+        await shoot(opened, "phone")
+    async with shown(browser, service, color_scheme="dark") as opened:
+        await shoot(opened, "dark")
+        await service.kill()
+        await opened.until_status("stale since")
+        await shoot(opened, "stale")
+    await service.start(ALARMS)
+    async with shown(browser, service) as opened:
+        await opened.page.locator(".alarm").nth(1).wait_for()
+        await asyncio.sleep(LEARN_S / 2)
+        await shoot(opened, "alarm")
+
+
+async def main() -> None:
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        await keep(folder / "attic.sqlite", yesterday())
+        broker = Broker(folder).start()
+        try:
+            async with Service(folder, broker, free_port(), simulated(soc=SOC)) as service, chromium() as browser:
+                await shoot_all(service, browser)
+        finally:
+            broker.stop()
+
+
+if __name__ == "__main__":
+    asyncio.run(main())

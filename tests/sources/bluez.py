@@ -1,0 +1,147 @@
+"""A Bluetooth stack as BlueZ shows it on D-Bus, with one JBD BMS in reach: what bleak talks to, on a bus of its own.
+
+Interfaces and properties as BlueZ documents them (doc/org.bluez.*.rst); nothing of the radio is simulated.
+"""
+
+import asyncio
+import os
+import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from dbus_fast import Message, MessageType, Variant
+from dbus_fast.aio import MessageBus
+
+from tests.sources.bms_frames import JBD_DISCHARGING
+
+ADDRESS, NAME = "A5:C2:37:00:00:00", "DP04S007L4S100A"
+ADAPTER = "/org/bluez/hci0"
+DEVICE = f"{ADAPTER}/dev_{ADDRESS.replace(':', '_')}"
+SERVICE, NOTIFY, WRITE = f"{DEVICE}/service0010", f"{DEVICE}/service0010/char0011", f"{DEVICE}/service0010/char0013"
+CELLS, BASIC = JBD_DISCHARGING.frames[:15], JBD_DISCHARGING.frames[15:]
+ADVERTISE_S = 0.02
+"""Between two advertisements [s]."""
+PACKET_BYTES = 20
+"""Of one notification."""
+
+
+def uuid(short: str) -> str:
+    return f"0000{short}-0000-1000-8000-00805f9b34fb"
+
+
+def variants(**values: Any) -> dict[str, Variant]:
+    signatures = {str: "s", bool: "b", int: "n", list: "as", bytes: "ay"}
+    return {name: Variant(signatures[type(value)], value) for name, value in values.items()}
+
+
+class BlueZ:
+    """``org.bluez`` on a bus.
+
+    Attributes:
+        near: Whether the BMS advertises and lets itself be connected.
+        asked: What was written to it.
+    """
+
+    def __init__(self, bus: MessageBus) -> None:
+        self._bus = bus
+        self.near, self._discovering = True, False
+        self.asked: list[bytes] = []
+        bus.add_message_handler(self._handle)
+
+    def objects(self) -> dict[str, dict[str, dict[str, Variant]]]:
+        device = variants(Address=ADDRESS, Alias=NAME, Name=NAME, UUIDs=[uuid("ff00")], Connected=False)
+        device |= variants(Paired=False, Trusted=False, ServicesResolved=False, AddressType="public")
+        service = {"Device": Variant("o", DEVICE), "UUID": Variant("s", uuid("ff00")), "Primary": Variant("b", True)}
+        characteristics = {
+            path: {
+                "org.bluez.GattCharacteristic1": {
+                    "Service": Variant("o", SERVICE),
+                    "MTU": Variant("q", 23),
+                    **variants(UUID=uuid(short), Flags=flags, Value=b""),
+                }
+            }
+            for path, short, flags in (
+                (NOTIFY, "ff01", ["read", "notify"]),
+                (WRITE, "ff02", ["write", "write-without-response"]),
+            )
+        }
+        adapter = variants(Address="00:00:00:00:00:01", Name="hci0", Powered=True, Roles=["central"])
+        return {
+            ADAPTER: {"org.bluez.Adapter1": adapter},
+            DEVICE: {"org.bluez.Device1": {**device, "Adapter": Variant("o", ADAPTER)}},
+            SERVICE: {"org.bluez.GattService1": service},
+            **characteristics,
+        }
+
+    def changed(self, path: str, interface: str, **values: Any) -> None:
+        body = [interface, variants(**values), []]
+        self._bus.send(
+            Message.new_signal(path, "org.freedesktop.DBus.Properties", "PropertiesChanged", "sa{sv}as", body)
+        )
+
+    def _advertise(self) -> None:
+        """Now, and again and again while somebody looks for it."""
+        if self._discovering:
+            if self.near:
+                self.changed(DEVICE, "org.bluez.Device1", RSSI=-50)
+            asyncio.get_running_loop().call_later(ADVERTISE_S, self._advertise)
+
+    def leave(self) -> None:
+        """The BMS is out of reach."""
+        self.near = False
+        self.changed(DEVICE, "org.bluez.Device1", Connected=False, ServicesResolved=False)
+
+    def _handle(self, message: Message) -> Message | None:
+        if message.message_type != MessageType.METHOD_CALL or not (message.path or "").startswith(("/org/bluez", "/")):
+            return None
+        if message.member == "GetManagedObjects":
+            return Message.new_method_return(message, "a{oa{sa{sv}}}", [self.objects()])
+        if message.member == "Connect" and not self.near:
+            return Message.new_error(message, "org.bluez.Error.Failed", "le-connection-abort-by-peer")
+        asyncio.get_running_loop().call_soon(self._follow, message)
+        return Message.new_method_return(message)
+
+    def _follow(self, message: Message) -> None:
+        """What comes of a call."""
+        if message.member == "StartDiscovery":
+            self._discovering = True
+            self.changed(ADAPTER, "org.bluez.Adapter1", Discovering=True)
+            self._advertise()
+        elif message.member == "StopDiscovery":
+            self._discovering = False
+            self.changed(ADAPTER, "org.bluez.Adapter1", Discovering=False)
+        elif message.member in ("Connect", "Disconnect"):
+            there = message.member == "Connect"
+            self.changed(DEVICE, "org.bluez.Device1", Connected=there, ServicesResolved=there)
+        elif message.member == "WriteValue":
+            self.asked.append(bytes(message.body[0]))
+            answer = {0x03: BASIC, 0x04: CELLS}.get(self.asked[-1][2], b"")
+            for at in range(0, len(answer), PACKET_BYTES):
+                self.changed(NOTIFY, "org.bluez.GattCharacteristic1", Value=answer[at : at + PACKET_BYTES])
+
+
+@asynccontextmanager
+async def system_bus(folder: Path) -> AsyncIterator[MessageBus]:
+    """A D-Bus of its own; who uses the system's is led to it by ``DBUS_SYSTEM_BUS_ADDRESS``."""
+    program = shutil.which("dbus-daemon")
+    assert program is not None
+    process = await asyncio.create_subprocess_exec(
+        *(program, "--session", "--nofork", "--print-address", f"--address=unix:path={folder / 'bus'}"),
+        stdout=asyncio.subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    before = os.environ.get("DBUS_SYSTEM_BUS_ADDRESS")
+    os.environ["DBUS_SYSTEM_BUS_ADDRESS"] = (await process.stdout.readline()).decode().strip()
+    try:
+        bus = await MessageBus(bus_address=os.environ["DBUS_SYSTEM_BUS_ADDRESS"]).connect()
+        yield bus
+        bus.disconnect()
+    finally:
+        if before is None:
+            del os.environ["DBUS_SYSTEM_BUS_ADDRESS"]
+        else:
+            os.environ["DBUS_SYSTEM_BUS_ADDRESS"] = before
+        process.kill()
+        await process.wait()
