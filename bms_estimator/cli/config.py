@@ -19,11 +19,14 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.export_settings import InfluxSettings
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.model.settings import MqttSettings, SensorSettings, Settings
+from bms_estimator.page.guard import guard_of
 from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
 from bms_estimator.sinks.influx import target
+from bms_estimator.sources.kinds import make_bringer
 from bms_estimator.sources.ports import board_ports
 from bms_estimator.sources.probe import Found
 from bms_estimator.sources.probe import probe as who_is_there
@@ -93,10 +96,17 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
+        settings = settings.model_copy(update={"mqtt": mqtt})
+    if settings.page is not None:
+        unread, unseen = _unread("page", settings.page, "token_file")
+        warnings += unseen
+        if not unread:
+            guard_of(settings.page)
     if settings.influx is not None:
         unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
         warnings += unseen
         target(settings.influx.model_copy(update=dict.fromkeys(unread)))
+    make_bringer(settings)  # says what of [source] cannot be used, or is not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
@@ -123,6 +133,7 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         voltage_resolution_v=settings.sensor.voltage_resolution_v,
         voltage_noise_v=settings.sensor.voltage_noise_v,
         initial_soc=settings.pack.initial_soc,
+        sampling=settings.sampling,
     )[0]["observer"]
     follows = {
         "pack.nominal_voltage_v": cell.cell.nominal_voltage_v,
@@ -150,7 +161,9 @@ def _here(mqtt: MqttSettings) -> tuple[MqttSettings, list[str]]:
     return mqtt.model_copy(update=dict.fromkeys(without)), warnings
 
 
-def _unread(section: str, settings: MqttSettings | InfluxSettings, *keys: str) -> tuple[set[str], list[str]]:
+def _unread(
+    section: str, settings: MqttSettings | InfluxSettings | PageSettings, *keys: str
+) -> tuple[set[str], list[str]]:
     """The keys of files that only the running service can read, and a warning for each."""
     files = {key: getattr(settings, key) for key in keys}
     unread = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}

@@ -8,12 +8,16 @@ import typer
 
 from bms_estimator.cli.captures import CELL_HELP, CapacityAh
 from bms_estimator.cli.decimal_option import decimal, whole
+from bms_estimator.cli.pack import with_broker
 from bms_estimator.model.cell import Cell, load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import MqttSettings, Settings
 from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
+from bms_estimator.service.logs import configure_logs
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
+from bms_estimator.simulation.simulated_node import SimulatedNode
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
@@ -43,6 +47,11 @@ def simulate(
             show_default=False,
         ),
     ] = None,
+    mqtt: Annotated[
+        str | None,
+        typer.Option(help="publish to this broker what an ESPHome node says of a JK-BMS", show_default=False),
+    ] = None,
+    prefix: Annotated[str, typer.Option(help="name of that node")] = "jk-bms",
     noise_lsb: Annotated[float, typer.Option(parser=decimal(0.0), help="of its converter, in steps")] = 0.5,
     speed: Annotated[float, typer.Option(parser=decimal(1e-3), help="its seconds per second")] = 1.0,
     seconds: Annotated[
@@ -53,13 +62,19 @@ def simulate(
     """Serve a simulated board on a pseudo-terminal, until Ctrl-C.
 
     Prints the path of the pseudo-terminal, for ``run --port PATH``. The board speaks the firmware's protocol; a
-    simulated pack with a 10-bit converter is at its pins.
+    simulated pack with a 10-bit converter is at its pins. With --mqtt it is a JK-BMS that an ESPHome node publishes, for
+    ``source.profile = "esphome-jk"``.
     """
     model = load_cell(cell, capacity_ah).pack(series, 1)
     ampere = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
     pack = SimulatedPack(model, LOADS[load](ampere, seed), soc=soc)
-    board: VirtualBoard | SimulatedMeter
-    if protocol is None:
+    board: VirtualBoard | SimulatedMeter | SimulatedNode
+    if mqtt is not None:
+        configure_logs()
+        broker = with_broker(Settings(), mqtt).mqtt or MqttSettings()
+        cells = model.cell.series_count
+        board = SimulatedNode(pack, cells=cells, mqtt=broker, prefix=prefix, speed=speed, seed=seed)
+    elif protocol is None:
         mode: Literal["binary", "text"] = "text" if text else "binary"
         board = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)
     elif protocol in METERS:
@@ -92,7 +107,7 @@ def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int
         raise UserError(f"--series: {error}") from None
 
 
-async def _serve(board: VirtualBoard | SimulatedMeter, seconds: float) -> None:
+async def _serve(board: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: float) -> None:
     """Until ``seconds`` are over, or SIGINT or SIGTERM."""
     stop = stop_on_signal()
     with board:

@@ -14,6 +14,7 @@ from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.model.resolution import BOARD, Sampling
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 
@@ -40,6 +41,7 @@ class Estimator:
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
         initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
+        sampling: What the source tells of the current, and how often; that of a board when left out.
 
     Attributes:
         record: Shape (1,), dtype ``ESTIMATOR_STATE``: all there is. It can be copied, saved, compared and put back.
@@ -57,6 +59,7 @@ class Estimator:
         voltage_resolution_v: float = 1e-3,
         voltage_noise_v: float | None = None,
         initial_soc: float | None = None,
+        sampling: Sampling = BOARD,
     ) -> None:
         self.cell = cell
         self.settings_record = estimator_settings(
@@ -66,6 +69,7 @@ class Estimator:
             voltage_resolution_v=voltage_resolution_v,
             voltage_noise_v=voltage_noise_v,
             initial_soc=initial_soc,
+            sampling=sampling,
         )
         self.settings: NDArray[np.void] = self.settings_record["observer"]
         self.record: NDArray[np.void] = np.zeros(1, dtype=ESTIMATOR_STATE)

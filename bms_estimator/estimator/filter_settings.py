@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.charge import PERIODS, UNMEASURED_S
 from bms_estimator.kernels.ekf_state import EKF_SETTINGS, Noise
 from bms_estimator.kernels.ladder import BRANCHES, GRID, RESISTANCES, TAU_S
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
+from bms_estimator.model.resolution import BOARD, Sampling
 from bms_estimator.model.settings import IdentifierSettings
 
 CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
@@ -48,6 +50,7 @@ def filter_settings(
     identifier: IdentifierSettings,
     voltage_resolution_v: float,
     voltage_noise_v: float | None,
+    sampling: Sampling = BOARD,
 ) -> NDArray[np.void]:
     """The filter's settings record.
 
@@ -57,6 +60,7 @@ def filter_settings(
         identifier: Its ``[identifier]`` section.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
+        sampling: What the source tells of the current, and how often.
 
     Returns:
         Shape (1,), dtype ``EKF_SETTINGS``.
@@ -72,6 +76,8 @@ def filter_settings(
     p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, LEAST_SHARE * p["middle_ohm"]), strong_ohm
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
+    p["unmeasured_s"] = unmeasured_s(sampling)
+    p["current_step_a"], p["dead_band_a"] = sampling.current_resolution_a, sampling.current_dead_band_a
     noise = Noise(r_std=r_std)
     if identifier.current_offset_std_a is not None:
         noise = replace(noise, offset_c=identifier.current_offset_std_a / cell.cell.capacity_ah)
@@ -84,6 +90,11 @@ def filter_settings(
         p[field.name] = getattr(noise, field.name)
     p["model_v"] *= series
     return record
+
+
+def unmeasured_s(sampling: Sampling) -> float:
+    """Over a longer step nobody measured the current [s]."""
+    return max(UNMEASURED_S, PERIODS * sampling.period_s)
 
 
 def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> None:

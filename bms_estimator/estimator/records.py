@@ -3,16 +3,18 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator.filter_settings import filter_settings
+from bms_estimator.estimator.filter_settings import filter_settings, unmeasured_s
 from bms_estimator.estimator.fuel_cell_settings import fuel_cell_settings
 from bms_estimator.estimator.learning_settings import learning_settings
 from bms_estimator.kernels.cell import OCV_POINTS, emf
+from bms_estimator.kernels.charge import PERIODS
 from bms_estimator.kernels.estimator_state import ESTIMATOR_SETTINGS
 from bms_estimator.kernels.mittag_leffler import decay_table, series_coefficients
 from bms_estimator.kernels.nussbaum import Nussbaum
 from bms_estimator.kernels.state import OBSERVER_SETTINGS, PARAMETERS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.model.resolution import BOARD, Sampling
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 
 SETTLED_STEPS = 2.0
@@ -20,7 +22,7 @@ SETTLED_STEPS = 2.0
 LOCK_FRACTION = 0.02
 """An error of this fraction of the nominal voltage is no tracking."""
 GAP_S = 5.0
-"""A step longer than this counts as a gap [s]."""
+"""A step longer than this counts as a gap [s], or of a slow source one longer than ``PERIODS``."""
 IMPROVED = range(1, 13)
 """Parameters that the improved method adapts (Algorithm 1); a13..a15 come from (4.2)."""
 
@@ -46,6 +48,7 @@ def estimator_settings(
     voltage_resolution_v: float,
     voltage_noise_v: float | None,
     initial_soc: float | None,
+    sampling: Sampling = BOARD,
 ) -> NDArray[np.void]:
     """The settings record of the whole estimator.
 
@@ -56,6 +59,7 @@ def estimator_settings(
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a sample there [V]; None: half a step.
         initial_soc: SOC 0..1 at the first sample; None: from its voltage through the OCV.
+        sampling: What the source tells of the current, and how often.
 
     Returns:
         Shape (1,), dtype ``ESTIMATOR_SETTINGS``.
@@ -64,9 +68,11 @@ def estimator_settings(
     p = record[0]
     if isinstance(cell, FuelCellModel):
         gain_and_limits(p["observer"], cell.cell, observer, voltage_resolution_v)
+        _pace(p["observer"], sampling)
         p["learning"] = fuel_cell_settings(cell, p["observer"])[0]
         return record
     p["observer"] = observer_settings(cell, observer, voltage_resolution_v, initial_soc)[0]
+    _pace(p["observer"], sampling)
     p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
     p["hand_over"] = observer.law in ("improved", "scheme-3")  # (3.16) and (3.17) have no limit to set
@@ -75,7 +81,7 @@ def estimator_settings(
     for i in range(1, PARAMETERS):
         p["lower"][i], p["upper"][i] = cell.bounds(i).lower, cell.bounds(i).upper
     grid = p["observer"]["ocv_v"], p["observer"]["ocv_slope_v"]
-    p["filter"] = filter_settings(cell, grid, identifier, voltage_resolution_v, voltage_noise_v)[0]
+    p["filter"] = filter_settings(cell, grid, identifier, voltage_resolution_v, voltage_noise_v, sampling)[0]
     return record
 
 
@@ -131,7 +137,13 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
     p["voltage_min_v"] = cell.voltage_min_v
     p["voltage_max_v"] = cell.voltage_max_v
     p["current_max_a"] = cell.current_max_a
-    p["gap_s"] = GAP_S
+    _pace(p, BOARD)
+
+
+def _pace(p: np.void, sampling: Sampling) -> None:
+    """How long a step is usual; ``p`` is of dtype ``OBSERVER_SETTINGS``, written."""
+    p["gap_s"] = max(GAP_S, PERIODS * sampling.period_s)
+    p["unmeasured_s"] = unmeasured_s(sampling)
 
 
 def _adaptation(p: np.void, cell: CellModel, observer: ObserverSettings) -> None:

@@ -3,15 +3,17 @@
 from numba import njit
 
 UNMEASURED_S = 60.0
-"""Over a longer step nobody measured the current [s]."""
+"""Over a longer step nobody measured the current [s], unless the source has slower samples: then over ``PERIODS`` of them."""
+PERIODS = 2.5
+"""A regular source may be late by so much, or lose a sample [periods]."""
 LONGEST_FLOW_S = 3600.0
 """A current is not taken to have flowed for longer without a sample: one wrong time stamp must not empty a cell [s]."""
 
 
 @njit(cache=True)
-def held_current(dt_s: float, before_a: float, now_a: float) -> float:
+def held_current(dt_s: float, before_a: float, now_a: float, unmeasured_s: float = UNMEASURED_S) -> float:
     """Current over a step of ``dt_s``: straight between its ends; what both agree on where nobody measured [A]."""
-    if dt_s <= UNMEASURED_S:
+    if dt_s <= unmeasured_s:
         return 0.5 * (before_a + now_a)
     if before_a * now_a <= 0.0:
         return 0.0

@@ -111,6 +111,10 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     if w.unknown_as > 0.0:
         add_unseen(cov, f, w.unknown_as / dt_s, dt_s / p.capacity_as)
     cov[SOC, SOC] += p.charge_error**2 * moved
+    if w.between_as2 + w.rounded_as2 > 0.0:
+        cov[SOC, SOC] += (w.between_as2 + w.rounded_as2) / (p.capacity_as * p.capacity_as)
+        for k in range(X, X + BRANCHES):
+            cov[k, k] += w.between_as2 / (dt_s * dt_s) * (1.0 - f[k]) ** 2
     a2 = (p.x_relative * w.charge_as / dt_s) ** 2
     for k in range(X, X + BRANCHES):
         cov[k, k] += a2 * (1.0 - f[k] * f[k])

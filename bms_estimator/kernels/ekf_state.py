@@ -101,6 +101,9 @@ EKF_SETTINGS = np.dtype(
         ("low_c", "f8"),  # temperatures that the resistances are known for [C]
         ("high_c", "f8"),
         ("sensor_v2", "f8"),  # variance of one voltage sample: noise and rounding [V^2]
+        ("unmeasured_s", "f8"),  # over a longer step nobody measured the current [s]
+        ("current_step_a", "f8"),  # of the current that is shown [A]; 0: none
+        ("dead_band_a", "f8"),  # a smaller one is shown as 0 [A]
         *[(field.name, "f8") for field in fields(Noise)],  # volts as of the pack
     ],
     align=True,
@@ -113,6 +116,8 @@ WINDOW = np.dtype(
         ("charge_as", "f8"),  # moved since then [A s]
         ("throughput_as", "f8"),  # its magnitude
         ("unknown_as", "f8"),  # std of the charge where nobody measured [A s]
+        ("between_as2", "f8"),  # variance of the charge that samples far apart do not show [A^2 s^2]
+        ("rounded_as2", "f8"),  # the same of what the steps of the current leave out [A^2 s^2]
         ("gap", "i8"),  # 1: samples are missing
         ("sum_v", "f8"),
         ("sum_a", "f8"),
@@ -151,6 +156,7 @@ EKF_STATE = np.dtype(
         ("reopened", "i8"),  # times the SOC became unknown: the model would have to be wrong by too much
         ("window", WINDOW),
         ("current_a", "f8"),  # of the last sample
+        ("same_s", "f8"),  # for so long the shown current has been the same, to a step [s]
         ("step", STEP),
         ("x_a", "f8", BRANCHES),  # current filtered by the branches since switch-on [A]
         ("decay", "f8", BRANCHES),  # of the branches over ``decay_s``

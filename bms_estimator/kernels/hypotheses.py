@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.charge import LONGEST_FLOW_S, UNMEASURED_S, held_current
+from bms_estimator.kernels.charge import LONGEST_FLOW_S, held_current
 from bms_estimator.kernels.ekf import HIGHEST, LOWEST, decay, inflate, predict, update
 from bms_estimator.kernels.ekf_noise import (
     bias_variance,
@@ -39,7 +39,15 @@ from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, 
 from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
-from bms_estimator.kernels.unseen import first_load, goes_on, unseen_charge, watch_load
+from bms_estimator.kernels.unseen import (
+    SLOW_S,
+    between_samples,
+    first_load,
+    goes_on,
+    rounded_charge,
+    unseen_charge,
+    watch_load,
+)
 
 WINDOW_S = 0.99
 """Samples of about a second make one update [s]."""
@@ -159,7 +167,7 @@ def clear(s: Record) -> None:
     """Begin a new window."""
     w = s.window
     w.samples = w.gap = 0
-    w.time_s = w.charge_as = w.throughput_as = w.unknown_as = 0.0
+    w.time_s = w.charge_as = w.throughput_as = w.unknown_as = w.between_as2 = w.rounded_as2 = 0.0
     w.sum_v = w.sum_a = w.sum_as = 0.0
     for k in range(BRANCHES):
         w.sum_x_a[k] = 0.0
@@ -173,9 +181,10 @@ def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, tem
         s.temperature_c += share * (temperature_c - s.temperature_c)
         s.sensed = 1
     w = s.window
-    held_a = held_current(dt_s, s.current_a, current_a)
+    held_a, change_a = held_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
+    unseen = gap or dt_s > p.unmeasured_s
     charge_as = held_a * min(dt_s, LONGEST_FLOW_S)
-    if gap and dt_s > UNMEASURED_S:
+    if gap and dt_s > p.unmeasured_s:
         charge_as += goes_on(s, held_a, dt_s)
         held_a = charge_as / dt_s
     if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
@@ -184,15 +193,33 @@ def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, tem
             s.decay[k] = math.exp(-dt_s / TAUS[k])
     for k in range(BRANCHES):
         s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
+        if dt_s > SLOW_S and not unseen:
+            s.x_a[k] += along_line(change_a, dt_s / TAUS[k], s.decay[k])
     w.time_s += dt_s
     w.charge_as += charge_as
     w.throughput_as += abs(charge_as)
     if gap:
         w.gap = 1
-    if gap or dt_s > UNMEASURED_S:
+    if unseen:
         w.unknown_as += unseen_charge(s, p, held_a, dt_s)
+    else:
+        w.between_as2 += between_samples(change_a, dt_s)
+    if p.current_step_a > 0.0 or p.dead_band_a > 0.0:
+        w.rounded_as2 += rounded_charge(s, p, dt_s, current_a)
     s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
+
+
+@njit(cache=True)
+def along_line(change_a: float, taus: float, decay: float) -> float:
+    """What a branch gains when the current goes straight from one sample to the next, beyond its mean [A].
+
+    Args:
+        change_a: From one sample to the next [A].
+        taus: Between them, in time constants of the branch.
+        decay: e^-taus.
+    """
+    return change_a * (0.5 * (1.0 + decay) - (1.0 - decay) / taus)
 
 
 @njit(cache=True)

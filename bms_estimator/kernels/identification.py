@@ -7,7 +7,6 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.ekf import decay, predict
 from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
@@ -111,7 +110,7 @@ def take_window(s: Record, p: Record) -> None:
     guard(c, s.counters, f, p.filter, dt_s)
     judge(c, f, p.filter, dt_s)
     equivalent(f, p.filter, s.elements)
-    if dt_s <= UNMEASURED_S:
+    if dt_s <= p.filter.unmeasured_s:
         learn_elements(s, p, dt_s)
 
 

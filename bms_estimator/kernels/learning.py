@@ -8,7 +8,7 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.charge import UNMEASURED_S, held_current
+from bms_estimator.kernels.charge import held_current
 from bms_estimator.kernels.learning_model import advance, give, output, settle, write
 from bms_estimator.kernels.observer import change_of_lock, update_margins
 from bms_estimator.kernels.state import Record
@@ -67,12 +67,14 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
     """Advance by one sample at the SOC that the observer has; the current was ``before_a`` [A] at the sample before."""
     m, q, o = s.learning, p.learning, s.observer
     give(q.model, m.given, p, o.soc, m.temperature_c)
-    advance(q.model, m.x, m.dx, m.theta, m.given, held_current(dt_s, before_a, o.current_a), dt_s)
+    unmeasured_s = p.observer.unmeasured_s
+    held_a = held_current(dt_s, before_a, o.current_a, unmeasured_s)
+    advance(q.model, m.x, m.dx, m.theta, m.given, held_a, dt_s)
     e = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) - m.offset_v
     o.innovation_v = e
     inject(m, q, dt_s, e)
     o.adapting = 0 if o.soc <= q.soc_floor else 1  # without a SOC always
-    m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= UNMEASURED_S else q.settle_s
+    m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= unmeasured_s else q.settle_s
     if o.adapting and m.settle_s == 0.0:
         remember(m, q, dt_s, e)
         m.waited_s += dt_s

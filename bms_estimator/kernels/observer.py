@@ -50,7 +50,7 @@ def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
 def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     """SOC by coulomb counting (3.1); none of a fuel cell."""
     if p.capacity_as > 0.0:
-        charge_as = held_current(dt_s, s.current_a, current_a) * min(dt_s, LONGEST_FLOW_S)
+        charge_as = held_current(dt_s, s.current_a, current_a, p.unmeasured_s) * min(dt_s, LONGEST_FLOW_S)
         s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
 

@@ -140,7 +140,7 @@ def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> Watched | N
 def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
     """By alarm; a fuel cell has no SOC, no chemistry, and stands no charge."""
     n = cell.cell.series_count
-    silent_s = SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sample_period_s)
+    silent_s = SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s)
     common: dict[AlarmName, _Default] = {
         "over_temperature": _Default(60.0, 55.0, "°C"),
         "under_temperature": _Default(-20.0, -15.0, "°C", above=False),

@@ -1,8 +1,14 @@
 """What all kinds of ``[source]`` have in common."""
 
 from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import Field
 
 from bms_estimator.model.toml_file import Strict
+
+Positive = Annotated[float, Field(gt=0)]
+Name = Annotated[str, Field(min_length=1)]
 
 
 class ReportSource(Strict):

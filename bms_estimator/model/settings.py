@@ -1,16 +1,16 @@
 """The settings of one pack: what ``pack.toml`` holds. Values are SI, the unit stands in the key."""
 
-import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from bms_estimator.model.alarm_settings import AlarmSettings
+from bms_estimator.model.broker_url import of_brokers
 from bms_estimator.model.export_settings import InfluxSettings, PrometheusSettings
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
 from bms_estimator.model.page_settings import PageSettings
-from bms_estimator.model.resolution import RESOLUTIONS
+from bms_estimator.model.resolution import RESOLUTIONS, Sampling
 from bms_estimator.model.source_settings import SOURCE, SourceSettings
 from bms_estimator.model.toml_file import Strict, read_toml
 
@@ -91,9 +91,6 @@ class SensorSettings(Strict):
     )
     period_s: Positive | None = Field(
         default=None, description="between two samples, where they come at their own pace; a device's when left out"
-    )
-    delay_s: NotNegative | None = Field(
-        default=None, description="between the moments of voltage and current of one sample; a device's when left out"
     )
 
     @model_validator(mode="wrap")
@@ -199,25 +196,12 @@ class PublishSettings(Strict):
     )
 
 
-def _of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
-    """Addresses as they must be."""
-    urls = (value,) if isinstance(value, str) else value
-    if not urls:
-        raise ValueError("must name a broker")
-    for url in urls:
-        if "@" in url:
-            raise ValueError("a name goes to mqtt.username, a password to a file that mqtt.password_file names")
-        if not re.fullmatch(r"mqtts?://[^/\s]+", url):
-            raise ValueError("must be mqtt://host:port")
-    return value
-
-
 class MqttSettings(Strict):
     """The broker, and what others may have done over it."""
 
     model_config = ConfigDict(hide_input_in_errors=True)
 
-    url: Annotated[str | tuple[str, ...], AfterValidator(_of_brokers)] = Field(
+    url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] = Field(
         default="mqtt://localhost:1883",
         description="mqtt://host:port or mqtts://host:port for TLS; or a list of them, tried in turn",
     )
@@ -333,12 +317,13 @@ class Settings(Strict):
             return tables
         if not isinstance(told, dict):
             return tables
-        return tables | {"sensor": {**source.sensor, **told, "protocol": "text"}}
+        return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **told, "protocol": "text"}}
 
     @property
-    def sample_period_s(self) -> float:
-        """Between two samples, as expected [s]."""
-        return self.source.period_s if self.source else self.sensor.sample_period_s
+    def sampling(self) -> Sampling:
+        """What the source tells of the current, and how often."""
+        s = self.sensor
+        return Sampling(s.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0)
 
 
 def load_settings(path: Path) -> Settings:

@@ -102,7 +102,13 @@ def _keys(table: object, detail: Any) -> list[str]:
             keys.append(str(key))
             table = table[key] if key < len(table) else None
     kind = [detail["ctx"]["discriminator"].strip("'")] if detail["type"] == "union_tag_not_found" else []
-    return [*keys, *map(str, way[-1:]), *kind]
+    last = [] if detail["type"] == "value_error" and way and not _has(table, way[-1]) else way[-1:]
+    return [*keys, *map(str, last), *kind]
+
+
+def _has(table: object, key: object) -> bool:
+    """Whether a key leads on."""
+    return key in table if isinstance(table, dict) else isinstance(table, list)
 
 
 def _description(model: type[BaseModel], keys: list[str]) -> str:

@@ -123,9 +123,9 @@ class Client(aiomqtt.Client):
             finally:
                 self._answers.pop(info.mid, None)
 
-    async def subscribe(self, requests: str, others: Sequence[str]) -> dict[str, str]:  # type: ignore[override]
+    async def subscribe(self, requests: str | None, others: Sequence[str]) -> dict[str, str]:  # type: ignore[override]
         """As ``Connection`` has it."""
-        topics = [requests, *others]
+        topics = [*([requests] if requests else []), *others]
         if self._is_5:
             wanted: Any = [(topic, SubscribeOptions(qos=0, retainAsPublished=topic == requests)) for topic in topics]
         else:

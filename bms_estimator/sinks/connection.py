@@ -50,11 +50,11 @@ class Connection(Protocol):
     protocol: str
     """For people: which MQTT is spoken."""
 
-    async def subscribe(self, requests: str, others: Sequence[str]) -> dict[str, str]:
+    async def subscribe(self, requests: str | None, others: Sequence[str]) -> dict[str, str]:
         """Ask for messages at QoS 0.
 
         Args:
-            requests: What is retained there must say so though it comes live, as far as the protocol can.
+            requests: What is retained there must say so though it comes live, as far as the protocol can; None: nowhere.
             others: Further topics.
 
         Returns:

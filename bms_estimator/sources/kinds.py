@@ -8,6 +8,7 @@ from bms_estimator.sources import Tap
 from bms_estimator.sources.reports import Bringer, Reports
 
 KINDS: Mapping[str, str] = {
+    "mqtt": "mqtt_reports",
     "linux": "linux_sensor",
     "modbus": "modbus",
     "can": "can_bus",
@@ -39,4 +40,4 @@ def open_reports(settings: Settings, *, tap: Tap | None = None) -> Reports | Non
     bringer = make_bringer(settings)
     if bringer is None:
         return None
-    return Reports(bringer, settings.sensor, period_s=settings.sample_period_s, tap=tap)
+    return Reports(bringer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)

@@ -6,8 +6,8 @@ from collections.abc import AsyncGenerator, Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+from bms_estimator.model.linux_settings import LinuxSource
 from bms_estimator.model.settings import Settings
-from bms_estimator.model.source_settings import LinuxSource
 from bms_estimator.sources.report_line import CONNECTED, report_line
 from bms_estimator.sources.reports import Bringer, NothingComesError
 from bms_estimator.sources.sysfs import SYS, Channel, JunkError, find_channel, find_chip, read_number

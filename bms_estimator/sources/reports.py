@@ -99,11 +99,13 @@ class Reports:
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
         self._lines: asyncio.Queue[Read | None] = asyncio.Queue()
         self._message: str | None = "not opened yet"
-        self._openings = 0
+        self._said = ""
+        self._openings, self._connected = 0, False
         self._tended_s = self._heard_s = monotonic()
         self._arrived_s = math.nan  # of the last block's line, on the clock of the arrivals
         self._faults = FaultLog()
         self._task: asyncio.Task[None] | None = None
+        self._watcher: asyncio.Task[None] | None = None
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -137,7 +139,7 @@ class Reports:
     """Nor is there a relay."""
 
     def pulse(self) -> Pulse:
-        """Whether the task that takes what is brought lives."""
+        """Whether somebody still looks after what is brought."""
         now_s = self._monotonic()
         return Pulse(now_s - self._tended_s, self._epoch_s + now_s - self._arrived_s, self._lines.qsize())
 
@@ -145,13 +147,15 @@ class Reports:
         """Begin to have lines brought; nothing need be there yet."""
         self._task = asyncio.create_task(self._have_brought(), name=self._bringer.name)
         self._task.add_done_callback(lambda _: self._lines.put_nowait(None))
+        self._watcher = asyncio.create_task(self._watch(), name=f"watch {self._bringer.name}")
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """Have no more brought."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+        tasks = [task for task in (self._watcher, self._task) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:
         """Blocks as lines come. What the tap gets is what has been yielded."""
@@ -159,7 +163,7 @@ class Reports:
             block = self._decode(*read)
             if block.size:
                 self._arrived_s = read[0]
-                self._message, self._retry_s = None, self._first_retry_s
+                self._message, self._said, self._retry_s = None, "", self._first_retry_s
                 yield block
         if self._task is not None and not self._task.cancelled():
             self._task.result()
@@ -176,12 +180,14 @@ class Reports:
         """Take what is brought, and begin anew. Only a fault of ours ends it: who iterates is given that."""
         while True:
             await self._pause()
+            reason = "it ended"
             try:
                 async with contextlib.aclosing(self._bringer.bring()) as lines:
-                    await self._take(lines)
-                reason = "it ended"
+                    async for line in lines:
+                        self._take(line)
             except (NothingComesError, OSError) as error:
                 reason = str(error)
+            self._connected = False
             self._say(f"{self._bringer.name}: {reason}; trying again")
 
     async def _pause(self) -> None:
@@ -189,47 +195,27 @@ class Reports:
         wait_s, self._retry_s = self._retry_s, min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
         await asyncio.sleep(wait_s)
 
-    async def _take(self, lines: AsyncGenerator[bytes, None]) -> None:
-        """Stamp and queue lines until there are no more, and look meanwhile whether samples come."""
-        self._heard_s = self._monotonic()
-        coming: asyncio.Future[bytes] | None = None
-        try:
-            while True:
-                coming = coming or asyncio.ensure_future(anext(lines))
-                await asyncio.wait({coming}, timeout=self._look_s)
-                self._look()
-                if not coming.done():
-                    continue
-                try:
-                    line = coming.result()
-                except StopAsyncIteration:
-                    return
-                coming = None
-                self._queue(line)
-        finally:
-            if coming is not None:
-                coming.cancel()
-                await asyncio.gather(coming, return_exceptions=True)
-
-    def _queue(self, line: bytes) -> None:
-        if line == CONNECTED:
-            self._openings += 1
-            self._message = f"{self._bringer.name}: connected, nothing has come yet"
-            log.info("connected", source=self._bringer.name)
-        else:
+    def _take(self, line: bytes) -> None:
+        if line != CONNECTED:
             self._lines.put_nowait((self._epoch_s + self._monotonic(), line))
+            return
+        self._openings += 1
+        self._connected, self._heard_s = True, self._monotonic()
+        self._message = f"{self._bringer.name}: connected, nothing has come yet"
+        log.info("connected", source=self._bringer.name)
 
-    def _look(self) -> None:
-        """See that the task lives; say why nothing comes; have faults logged."""
-        self._tended_s = now_s = self._monotonic()
-        if now_s - self._heard_s >= self._silent_s:
-            why = self._bringer.fault or self._dialect.fault or "connected, but silent"
-            self._say(f"{self._bringer.name}: {why}")
-        self._faults.see(self.counters, now_s)
+    async def _watch(self) -> None:
+        """Say why nothing comes; have faults logged."""
+        while True:
+            self._tended_s = now_s = self._monotonic()
+            if self._connected and now_s - self._heard_s >= self._silent_s:
+                why = self._bringer.fault or self._dialect.fault or "connected, but silent"
+                self._say(f"{self._bringer.name}: {why}")
+            self._faults.see(self.counters, now_s)
+            await asyncio.sleep(self._look_s)
 
     def _say(self, message: str) -> None:
-        """Say why no samples come, once for each reason."""
-        self._tended_s = self._monotonic()
-        if message != self._message:
+        """Say why no samples come; in the log once for each reason, until samples come."""
+        if message != self._said:
             log.warning("no samples", reason=message)
-        self._message = message
+        self._message = self._said = message

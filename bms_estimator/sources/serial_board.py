@@ -32,7 +32,9 @@ TALK_S = 0.25
 TALKS = 4
 """After so many is looked whether samples come."""
 SILENT_S = 3.0
-"""Without a frame for so long the line is at fault [s]."""
+"""Without a frame for so long the line is at fault [s], ..."""
+SILENT_PERIODS = 3.0
+"""... and of a slower device for so many of its periods."""
 ANSWER_S = 4.0
 """A board measures for a second before it answers a command [s]."""
 
@@ -67,7 +69,9 @@ class SerialBoard:
         silent_s: float = SILENT_S,
     ) -> None:
         self._settings, self._tap = settings, tap
-        self._monotonic, self._silent_s = monotonic, silent_s
+        slow_s = settings.period_s or 0.0
+        self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
+        self._monotonic = monotonic
         make_dialect(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
         self._dialect = make_dialect(settings)
         tells_serial = settings.protocol == "binary"  # what prints text could never be told from another

@@ -53,6 +53,16 @@ async def test_one_of_several_packs_that_cannot_be_served_is_named(
         await asyncio.wait_for(serve_several(packs, reloads), LONG_S)
 
 
+async def test_packs_without_a_serial_line_need_no_port_of_their_own(state_home: Path) -> None:
+    source = {"kind": "mqtt", "profile": "opendtu", "url": "mqtt://localhost"}
+    sources = {"a": source, "b": source | {"password_file": "/none"}}
+    tables = [{"pack": {"name": name}, "source": table} for name, table in sources.items()]
+    packs = [(Settings.model_validate(table), load_cell("chen_mora")) for table in tables]
+    reloads = [Reload(settings, lambda settings=settings: settings) for settings, _ in packs]
+    with pytest.raises(UserError, match=r"^b: source.password_file = /none: cannot be read"):
+        await asyncio.wait_for(serve_several(packs, reloads), LONG_S)
+
+
 def test_a_user_without_a_home_is_served_and_told_that_the_state_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setenv("HOME", "~")

@@ -126,4 +126,4 @@ def test_a_source_makes_the_sensor_what_its_lines_are_unless_told():
     told = SensorSettings(voltage_resolution_v=0.1, current_sign="charge_positive")
     settings = Settings.model_validate({"source": {"kind": "linux"}, "sensor": told})
     assert settings.sensor == told.model_copy(update={"protocol": "text", "period_s": 1.0})
-    assert settings.sample_period_s == 1.0
+    assert settings.sensor.sample_period_s == 1.0

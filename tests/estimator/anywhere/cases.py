@@ -189,7 +189,7 @@ def capture(case: Case, current_a: Floats | None = None) -> Capture:
 
 def cell_file(case: Case) -> CellModel:
     """What the estimator is told of the cell."""
-    kind = "nmc" if case.truth is OXIDE else "lfp"
+    kind = "nmc" if case.truth.ocv_v is OXIDE.ocv_v else "lfp"
     generic = load_cell(kind, case.capacity * case.truth.capacity_ah)
     if case.file_c == "generic":
         return generic

@@ -1,0 +1,178 @@
+"""What others publish of a battery by MQTT: settings of ``[source]`` by the name of the project.
+
+``{prefix}`` is ``source.prefix``, ``{instance}`` is ``source.instance``, ``{cell}`` the number of a cell from 1. What the settings
+themselves tell goes before what stands here. Where the forms come from stands at each; looked up in November 2026.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+ProfileName = Literal[
+    "batmon-ha",
+    "esphome-jk",
+    "esphome-jbd",
+    "esphome-daly",
+    "venus",
+    "battery-emulator",
+    "opendtu",
+    "tasmota",
+    "zigbee2mqtt",
+]
+CHARGE, DISCHARGE = "charge_positive", "discharge_positive"
+
+
+class Profile(NamedTuple):
+    """One project."""
+
+    table: Mapping[str, Any]
+    """Of ``[source]``."""
+    current_sign: str
+    """What it calls positive; the steps of what it shows follow."""
+    voltage_resolution_v: float
+    current_resolution_a: float
+    needs: Mapping[str, str] = {}
+    """Parameters without which it cannot be found: what each is."""
+
+
+def _esphome(voltage: str, current: str, temperature: str, cell: str) -> dict[str, Any]:
+    """ESPHome: ``<topic_prefix>/sensor/<object_id>/state``, a plain number; the object id is the sensor's name.
+
+    esphome/components/mqtt/mqtt_component.cpp. The examples begin each name with that of the node; without it is taken, too.
+    """
+
+    def topics(name: str) -> dict[str, Any]:
+        return {"topic": [f"{{prefix}}/sensor/{{prefix}}_{name}/state", f"{{prefix}}/sensor/{name}/state"]}
+
+    return {
+        "voltage": topics(voltage),
+        "current": topics(current),
+        "temperature": topics(temperature),
+        "cells": topics(cell),
+        "availability_topic": "{prefix}/status",
+    }
+
+
+def _node(example: str) -> dict[str, str]:
+    return {"prefix": f"mqtt.topic_prefix of the node, else its name, such as {example}"}
+
+
+PROFILES: Mapping[ProfileName, Profile] = {
+    # bmslib/mqtt_util.py, bmslib/wire/fields.py; the sign: issue 10. What has not changed it says each 10 s only.
+    "batmon-ha": Profile(
+        {
+            "voltage": {"topic": "{prefix}/soc/total_voltage"},
+            "current": {"topic": "{prefix}/soc/current"},
+            "temperature": {"topic": "{prefix}/temperatures/1"},
+            "cells": {"topic": "{prefix}/cell_voltages/{cell}"},
+            "interval_s": 10.0,
+        },
+        DISCHARGE,
+        0.01,  # four significant digits
+        0.01,
+        {"prefix": "alias or address of the device in its options"},
+    ),
+    # syssi/esphome-jk-bms, esp32-example.yaml and esp32-ble-example.yaml
+    "esphome-jk": Profile(
+        _esphome("total_voltage", "current", "temperature_sensor_1", "cell_voltage_{cell}"),
+        CHARGE,
+        0.01,
+        0.01,
+        _node("jk-bms"),
+    ),
+    # syssi/esphome-jbd-bms, esp32-ble-example.yaml
+    "esphome-jbd": Profile(
+        _esphome("total_voltage", "current", "temperature_1", "cell_voltage_{cell}"),
+        CHARGE,
+        0.01,
+        0.01,
+        _node("jbd-bms-ble"),
+    ),
+    # ESPHome's own daly_bms with the names of its documentation: every 20 s there
+    "esphome-daly": Profile(
+        _esphome("battery_voltage", "battery_current", "max_temperature", "cell_{cell}_voltage") | {"interval_s": 20.0},
+        CHARGE,
+        0.1,
+        0.1,
+        _node("daly-bms"),
+    ),
+    # victronenergy/dbus-flashmq, README: values are told when they change, and when they are asked for; the keep-alive lasts
+    # 60 s. Cells as dbus-serialbattery has them with BATTERY_CELL_DATA_FORMAT = 1.
+    "venus": Profile(
+        {
+            "voltage": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Voltage", "path": "value"},
+            "current": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Current", "path": "value"},
+            "temperature": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Temperature", "path": "value"},
+            "cells": {"topic": "N/{prefix}/battery/{instance}/Voltages/Cell{cell}", "path": "value"},
+            "ask": {
+                "R/{prefix}/keepalive": '{"keepalive-options":["suppress-republish"]}',
+                "R/{prefix}/battery/{instance}/Dc/0/Voltage": "",
+                "R/{prefix}/battery/{instance}/Dc/0/Current": "",
+                "R/{prefix}/battery/{instance}/Dc/0/Temperature": "",
+                "R/{prefix}/battery/{instance}/Voltages": "",
+            },
+            "ask_s": 2.0,
+            "interval_s": 2.0,
+        },
+        CHARGE,
+        0.01,
+        0.1,
+        {
+            "prefix": "VRM portal ID, in Settings, VRM online portal",
+            "instance": "device instance of the battery, as in the topics N/<portal>/battery/<instance>/...",
+        },
+    ),
+    # dalathegreat/Battery-Emulator, Software/src/devboard/mqtt/mqtt.cpp; the sign: issue 342. Cells each minute.
+    "battery-emulator": Profile(
+        {
+            "prefix": "BE",
+            "voltage": {"topic": "{prefix}/info{instance}", "path": "battery_voltage"},
+            "current": {"topic": "{prefix}/info{instance}", "path": "battery_current"},
+            "temperature": {"topic": "{prefix}/info{instance}", "path": "temperature_max"},
+            "cells": {"topic": "{prefix}/spec_data{instance}", "path": "cell_voltages"},
+            "availability_topic": "{prefix}/status",
+        },
+        CHARGE,
+        0.1,
+        0.1,
+    ),
+    # hoylabs/OpenDTU-OnBattery, src/battery/Stats.cpp and src/battery/jkbms/Stats.cpp
+    "opendtu": Profile(
+        {
+            "prefix": "solar",
+            "voltage": {"topic": "{prefix}/battery/voltage"},
+            "current": {"topic": "{prefix}/battery/current"},
+            "temperature": {"topic": ["{prefix}/battery/temperature", "{prefix}/battery/BatteryTempOneCelsius"]},
+            "cells": {"topic": "{prefix}/battery/Cell{cell}MilliVolt", "unit": "mV"},
+            "availability_topic": "{prefix}/dtu/status",
+        },
+        CHARGE,
+        0.01,
+        0.01,
+    ),
+    # arendst/Tasmota, tasmota/tasmota_xdrv_driver: {"Time":...,"INA219":{"Voltage":4.494,"Current":0.020,"Power":0.089}}
+    "tasmota": Profile(
+        {
+            "instance": "INA219",
+            "voltage": {"topic": "tele/{prefix}/SENSOR", "path": "{instance}.Voltage"},
+            "current": {"topic": "tele/{prefix}/SENSOR", "path": "{instance}.Current"},
+            "availability_topic": "tele/{prefix}/LWT",
+        },
+        DISCHARGE,
+        0.01,
+        0.01,
+        {"prefix": "Topic of the device, Configuration, MQTT"},
+    ),
+    # zigbee2mqtt.io, MQTT topics and messages: {"voltage":52.1,"current":3.2,"power":167,"linkquality":34}
+    "zigbee2mqtt": Profile(
+        {
+            "voltage": {"topic": "zigbee2mqtt/{prefix}", "path": "voltage"},
+            "current": {"topic": "zigbee2mqtt/{prefix}", "path": "current"},
+            "availability_topic": "zigbee2mqtt/{prefix}/availability",
+            "interval_s": 60.0,
+        },
+        DISCHARGE,
+        0.1,
+        0.01,
+        {"prefix": "friendly name of the meter"},
+    ),
+}

@@ -1,0 +1,191 @@
+"""What a source's rate, steps and delay do to the SOC and its band, on cells that the estimator's model does not contain.
+
+Each row is one kind of source; a run is one simulated cell (``tests.estimator.anywhere``: its cell file errs as much as it
+says), under levels of some seconds or as in a house, met in mid-load with an SOC told 0.2 too low or 0.2 too high. Judged
+from 15 min on, above SOC 0.05:
+
+- RMSE: of the SOC over all runs, and of the worst [%]
+- inside: share of time that the truth is inside soc +- 2 soc_std, of all runs and of the worst [%]
+- std: mean of soc_std [%]
+- score: interval score of that band as of 95 %: its width plus 40 times what lies outside; smaller is better [%]
+
+    make resolution ARGS="--undeclared"
+
+``--undeclared``: the estimator is not told what the source resolves, as it was before there was anything to tell.
+"""
+
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.resolution import Sampling
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, WRONG, Case, cell_file, load_a
+from tests.estimator.anywhere.score import Score, score
+from tests.estimator.anywhere.truth import Floats, simulate
+
+TRUTH_HZ = 10
+"""The truth is simulated so often, for sources that are slower."""
+SEEDS = range(1, 9)
+KELVIN_STEP = 1.0
+NOISE_V = 5e-4
+LATE = 0.02
+"""A sample comes so much early or late [periods]."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A kind of source at a pack, and what the pack is used for."""
+
+    rate_hz: float = 1.0
+    ampere_step: float = 0.01
+    dead_band_a: float = 0.0
+    delay_s: float = 0.0
+    """The current of a sample is so much older than its voltage; below 0: the voltage is."""
+    volt_step: float = 1e-3
+    """Of one cell."""
+    capacity_ah: float = 3.0
+    house: bool = False
+    """Hours of small loads and a night of standby, in place of a drive."""
+    standby_a: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Of the row."""
+        period_s = 1.0 / self.rate_hz
+        rate = f"{self.rate_hz:g} Hz" if self.rate_hz >= 1.0 else f"{period_s:g} s"
+        parts = [f"{self.capacity_ah:g} Ah", rate, f"{1e3 * self.ampere_step:g} mA"]
+        parts += [f"{1e3 * self.volt_step:g} mV"] * (self.volt_step != Source.volt_step)
+        parts += [f"{'I' if self.delay_s > 0.0 else 'V'} {abs(self.delay_s):g} s late"] * (self.delay_s != 0.0)
+        parts += ["house"] * self.house
+        parts += [f"nothing below {self.dead_band_a:g} A, standby {self.standby_a:g} A"] * (self.dead_band_a > 0.0)
+        return ", ".join(parts)
+
+    @property
+    def sampling(self) -> Sampling:
+        """What the estimator is told of it."""
+        return Sampling(1.0 / self.rate_hz, self.ampere_step, self.dead_band_a)
+
+
+RATES_HZ = (100.0, 1.0, 0.1, 1.0 / 60.0)
+SOURCES = (
+    *(Source(rate, step) for step in (0.01, 0.1) for rate in RATES_HZ),
+    *(Source(rate, delay_s=delay_s) for delay_s in (1.0, -1.0) for rate in RATES_HZ),
+    *(
+        Source(rate, delay_s=delay_s)
+        for delay_s, rate in ((3.0, 1.0), (-3.0, 1.0), (10.0, 1.0 / 60.0), (-10.0, 1.0 / 60.0))
+    ),
+    *(Source(rate, step, capacity_ah=100.0) for step in (0.01, 0.1) for rate in (1.0, 0.1, 1.0 / 60.0)),
+    Source(1.0, 0.1, volt_step=0.01),
+    Source(1.0 / 60.0, 0.1, volt_step=0.01),
+    *(Source(rate, 0.1, capacity_ah=100.0, house=True, standby_a=0.2) for rate in (1.0, 0.1, 1.0 / 60.0)),
+    *(Source(rate, 0.1, 0.3, capacity_ah=100.0, house=True, standby_a=0.2) for rate in (1.0, 1.0 / 60.0)),
+    Source(1.0, 0.1, 2.5, capacity_ah=100.0, house=True, standby_a=2.0),
+    Source(1.0 / 60.0, 0.1, 2.5, capacity_ah=100.0, house=True, standby_a=2.0),
+    Source(1.0, 0.1, house=True, standby_a=0.04),
+    Source(1.0 / 60.0, 0.1, house=True, standby_a=0.04),
+)
+
+
+def main() -> None:
+    """Print the table of the rows whose name contains an argument, or all."""
+    told = "--undeclared" not in sys.argv
+    wanted = [argument for argument in sys.argv[1:] if not argument.startswith("--")]
+    table = Table(title="RMSE/worst, inside/worst, std, score in %")
+    table.add_column("source")
+    for column in ("RMSE", "inside", "std", "score"):
+        table.add_column(column, justify="right")
+    for source in SOURCES:
+        if not wanted or any(name in source.name for name in wanted):
+            table.add_row(source.name, *cells_of(list(scores(source, told=told))))
+    Console(width=None if sys.stdout.isatty() else 130).print(table)
+
+
+def cells_of(found: list[Score]) -> Iterator[str]:
+    """One row of the table."""
+    rmse, cover = [s.rmse for s in found], [s.cover for s in found]
+    yield f"{np.sqrt(np.mean(np.square(rmse))):.2f}/{max(rmse):.2f}"
+    yield f"{np.mean(cover):.1f}/{min(cover):.0f}"
+    yield f"{np.mean([s.std for s in found]):.2f}"
+    yield f"{np.mean([s.score for s in found]):.2f}"
+
+
+def scores(source: Source, *, told: bool = True, seeds: Iterable[int] = SEEDS) -> Iterator[Score]:
+    """Of each run of a kind of source."""
+    for case in cases_of(source, seeds):
+        samples, soc = seen(case, source)
+        for wrong in WRONG:
+            sampling = {"sampling": source.sampling} if told else {}
+            estimator = Estimator(
+                cell_file(case),
+                voltage_resolution_v=source.volt_step,
+                initial_soc=float(np.clip(soc[0] + wrong, 0.0, 1.0)),
+                **sampling,
+            )
+            trace = estimator.run(samples)
+            result = score(samples["time_s"], trace["soc"], trace["soc_std"], soc)
+            assert result is not None
+            yield result
+
+
+def cases_of(source: Source, seeds: Iterable[int]) -> Iterator[Case]:
+    """Cells and loads: oxide and phosphate in turn."""
+    for seed in seeds:
+        truth, file_c = (OXIDE, (25.0, 10.0, 0.0, -10.0)) if seed % 2 else (PHOSPHATE, (25.0, 5.0, -15.0))
+        scaled = replace(truth, capacity_ah=source.capacity_ah, ohm=truth.ohm * truth.capacity_ah / source.capacity_ah)
+        hours = 13.0 if source.house else 1.3
+        yield Case(f"{source.name} {seed}", truth=scaled, file_c=file_c, hours=hours, seed=seed)
+
+
+def current_of(case: Case, source: Source, rate_hz: int) -> Floats:
+    """The true current at ``rate_hz`` [A]; levels change at any time, not on the second."""
+    seconds = round(3600 * (case.unseen_h + case.hours))
+    if not source.house:
+        return np.repeat(load_a(case, seconds), rate_hz)
+    rng, one_c = np.random.default_rng(case.seed), source.capacity_ah
+    level_a = one_c * np.abs(rng.normal(0.08, 0.08, 400))
+    level_a[rng.random(400) < 0.3] = 0.0
+    level_a = np.repeat(level_a, rng.exponential(240.0, 400).astype(int) + 5)[:seconds]
+    level_a[5 * 3600 :] = 0.0  # the night
+    level_a[round(seconds - 3 * 3600) :] = 0.1 * one_c
+    return np.repeat(level_a + source.standby_a, rate_hz)
+
+
+def seen(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
+    """What the source tells, and the SOC at each sample."""
+    rng = np.random.default_rng(1000 + case.seed)
+    rate_hz = max(TRUTH_HZ, round(source.rate_hz))
+    current_a = current_of(case, source, rate_hz)
+    shift = rng.integers(rate_hz)
+    current_a = np.concatenate([np.full(shift, current_a[0]), current_a])  # no sample falls on a change of level
+    t = case.truth
+    curves = t.ocv_v, t.per_kelvin_v, t.hysteresis_v, t.ohm
+    temperature_c = np.full(current_a.size, case.temperature_c)
+    voltage_v, soc = simulate(1.0 / rate_hz, current_a, temperature_c, case.soc, -1.0, t.capacity_ah, *curves)
+    step, late = round(rate_hz / source.rate_hz), round(source.delay_s * rate_hz)
+    at = np.arange(round(3600 * case.unseen_h * rate_hz), current_a.size, step)
+    late_by = round(LATE * step)
+    at = np.clip(at + rng.integers(-late_by, late_by + 1, at.size), 0, current_a.size - 1)
+    empty = (soc[at] < 0.02) | (voltage_v[at] < (2.5 if case.truth.ocv_v is OXIDE.ocv_v else 2.0))
+    at = at[: int(np.argmax(empty))] if empty.any() else at
+    samples = np.zeros(at.size, dtype=SAMPLE)
+    samples["time_s"] = at / rate_hz
+    shown_a = current_a[np.clip(at - late, 0, current_a.size - 1)] + rng.normal(
+        0.0, 2e-3 * source.capacity_ah / 3.0, at.size
+    )
+    shown_a[np.abs(shown_a) < source.dead_band_a] = 0.0
+    samples["current_a"] = np.round(shown_a / source.ampere_step) * source.ampere_step
+    samples["voltage_v"] = (
+        np.round((voltage_v[at] + rng.normal(0.0, NOISE_V, at.size)) / source.volt_step) * source.volt_step
+    )
+    samples["temperature_c"] = case.temperature_c
+    return samples, soc[at]
+
+
+if __name__ == "__main__":
+    main()

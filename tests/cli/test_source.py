@@ -1,0 +1,79 @@
+"""Commands for a pack whose source is no serial line."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.settings import load_settings
+from bms_estimator.sources.replay import RawCapture
+from tests.command_line import run
+from tests.sources.sysfs_folder import hwmon
+
+
+@pytest.fixture
+def pack(tmp_path: Path) -> Path:
+    return tmp_path / "pack.toml"
+
+
+def linux(pack: Path) -> Path:
+    """Settings of a pack at a chip of this machine, or what looks like it."""
+    folder = hwmon(pack.parent / "sys", in1_input=53120, curr1_input=-2510)
+    pack.write_text(f'[source]\nkind = "linux"\nchip = "{folder}"\ninterval_s = 0.01\n')
+    return pack
+
+
+def test_a_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys):
+    code, out, _ = run(capsys, "config", "check", linux(pack))
+    assert code == 0
+    assert "hwmon3 of this machine; no broker" in out
+    raw = tmp_path / "chip.raw"
+    code, _, err = run(capsys, "record", raw, "--pack", pack, "--seconds", "0.1")
+    assert code == 0, err
+    samples = np.concatenate(list(RawCapture(raw)))
+    assert samples.size > 1
+    assert set(samples["voltage_v"].tolist()) == {53.12}
+    assert set(samples["current_a"].tolist()) == {-2.51}
+
+
+@pytest.mark.parametrize(("command", "options"), [("run", ("--no-view",)), ("record", ("x.raw", "--pack"))])
+def test_a_port_is_refused_where_there_is_none(command, options, pack, capsys):
+    code, _, err = run(capsys, command, *options, linux(pack), "--port", "/dev/ttyACM0")
+    assert code == 2
+    assert "port: the settings have a [source] that is no serial line" in err
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('profile = "opendtu"', "source.url: missing, and there is no [mqtt] whose broker could be meant"),
+        ('profile = "opendtu"\nurl = "mqtt://a"\npassword_file = "/none"', "password_file = /none: cannot be read"),
+        ('profile = "opendtu"\nurl = "http://a"', "source.url = 'http://a': must be mqtt://host:port"),
+        ('profile = "open"', "source.profile = 'open': "),
+        ('profile = "venus"', "source: profile venus: prefix: missing (VRM portal ID"),
+        ('topic = "t"\nvoltage = "u"\ncurrent = {unit = "V"}', "source: current.unit = V: must be one of A, mA"),
+        ('topic = "t"\nvoltage = "u"\ncurrent = {scle = 2}', "source.current.scle: unknown key"),
+        (
+            'topic = "t"\nvoltage = "u"\ncurrent = {scale = "2"}',
+            "source.current.scale = '2': must be a number, without",
+        ),
+    ],
+)
+def test_what_is_wrong_with_it_is_named(text, said, pack, capsys):
+    pack.write_text(f'[source]\nkind = "mqtt"\n{text}\n')
+    code, out, err = run(capsys, "config", "check", pack)
+    assert (code, out) == (2, "")
+    assert said in err
+
+
+def test_what_show_prints_of_a_profile_is_read_back_as_the_same_settings(pack, tmp_path, capsys):
+    pack.write_text(
+        '[source]\nkind = "mqtt"\nprofile = "venus"\nprefix = "c0619ab"\ninstance = "1"\nurl = "mqtt://a"\n'
+    )
+    code, out, _ = run(capsys, "config", "show", pack)
+    assert code == 0
+    assert tomllib.loads(out)["source"]["voltage"]["path"] == "value"
+    again = tmp_path / "again.toml"
+    again.write_text(out)
+    assert load_settings(again) == load_settings(pack)

@@ -1,0 +1,94 @@
+"""Sources that tell little: a sample each minute, a current in steps, nothing below some amperes, voltage and current apart."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.ekf_state import EKF_SETTINGS, EKF_STATE
+from bms_estimator.kernels.unseen import rounded_charge
+from bms_estimator.model.resolution import Sampling
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.settings import Settings
+from tests.benchmarks.resolution import Source, scores
+from tests.estimator.simulated_cell import TRUTH, pulses
+
+MINUTE = Sampling(60.0)
+
+
+def steady(current_a: float, samples: int, step_s: float = 1.0) -> SampleBlock:
+    block = np.zeros(samples, dtype=SAMPLE)
+    block["time_s"] = step_s * np.arange(samples)
+    block["current_a"], block["voltage_v"], block["temperature_c"] = current_a, 3.7, 25.0
+    return block
+
+
+@pytest.mark.parametrize(
+    ("source", "rmse", "std"),
+    [
+        (Source(1.0 / 60.0, 0.1, volt_step=0.01), 3.2, 5.0),
+        (Source(1.0, 0.1, 2.5, capacity_ah=100.0, house=True, standby_a=2.0), 2.4, 2.5),
+        (Source(0.1, 0.01, delay_s=1.0), 2.4, 3.0),
+    ],
+    ids=lambda value: value.name if isinstance(value, Source) else "",
+)
+def test_the_band_is_true_where_little_is_told(source: Source, rmse: float, std: float) -> None:
+    found = list(scores(source, seeds=range(1, 5)))
+    assert np.mean([s.cover for s in found]) >= 95.0
+    assert np.sqrt(np.mean([s.rmse**2 for s in found])) <= rmse
+    assert np.mean([s.std for s in found]) <= std
+
+
+def test_a_sample_each_minute_is_no_gap_though_some_come_late_or_are_lost() -> None:
+    block, _ = pulses(hours=3.0)
+    slow = block[::60].copy()
+    slow["time_s"] += np.random.default_rng(1).uniform(0.0, 3.0, slow.size)
+    slow = np.delete(slow, [30, 90])
+    estimator = Estimator(TRUTH, sampling=MINUTE)
+    estimator.run(slow)
+    assert estimator.state["gaps"][0] == 0
+    lost = np.delete(slow, slice(100, 110))
+    estimator = Estimator(TRUTH, sampling=MINUTE)
+    estimator.run(lost)
+    assert estimator.state["gaps"][0] == 1
+
+
+def test_the_charge_between_samples_a_minute_apart_is_counted_as_straight_between_them() -> None:
+    samples = steady(0.0, 3, 70.0)
+    samples["current_a"] = [0.0, 1.0, 1.0]
+    estimator = Estimator(TRUTH, initial_soc=0.5, sampling=MINUTE)
+    estimator.run(samples)
+    drawn = (0.5 * 70.0 + 70.0) / (3600.0 * TRUTH.cell.capacity_ah)
+    assert estimator.state["soc_coulomb"][0] == pytest.approx(0.5 - drawn)
+
+
+@pytest.mark.parametrize(
+    ("sampling", "current_a", "error_a"),
+    [
+        (Sampling(1.0, 0.1), 0.3, 0.1 / np.sqrt(12.0)),
+        (Sampling(1.0, 0.1, 0.6), 0.0, 0.6 / np.sqrt(3.0)),
+        (Sampling(1.0, 0.1, 0.6), 0.7, 0.1 / np.sqrt(12.0)),
+    ],
+)
+def test_a_current_that_stays_the_same_is_wrong_by_the_same_all_the_time(
+    sampling: Sampling, current_a: float, error_a: float
+) -> None:
+    f, p = np.zeros(1, dtype=EKF_STATE)[0], np.zeros(1, dtype=EKF_SETTINGS)[0]
+    p["current_step_a"], p["dead_band_a"] = sampling.current_resolution_a, sampling.current_dead_band_a
+    f["current_a"] = current_a
+    variance_as2 = sum(rounded_charge(f, p, sampling.period_s, current_a) for _ in range(3600))
+    assert variance_as2 == pytest.approx((error_a * 3600.0) ** 2)
+    assert rounded_charge(f, p, 1.0, current_a + 1.0) == pytest.approx(0.1**2 / 12.0)  # another current errs on its own
+
+
+def test_a_board_is_as_it_was() -> None:
+    block, _ = pulses(hours=0.5)
+    told, untold = Estimator(TRUTH, sampling=Settings().sampling), Estimator(TRUTH)
+    assert told.run(block).tobytes() == untold.run(block).tobytes()
+
+
+def test_what_a_source_resolves_comes_from_its_protocol_unless_it_is_told() -> None:
+    shunt = Settings.model_validate({"sensor": {"protocol": "pylontech", "current_dead_band_a": 0.0}})
+    assert shunt.sampling == Sampling(2.0, 0.01, 0.0)
+    assert Settings().sampling == Sampling(0.01)
+    minute = Settings.model_validate({"sensor": {"protocol": "text", "period_s": 60}})
+    assert minute.sampling.period_s == minute.sensor.sample_period_s == 60.0

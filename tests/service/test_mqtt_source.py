@@ -1,0 +1,141 @@
+"""A BMS by MQTT, through to the state: stale values, garbage, a publisher that falls silent, a broker that dies."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import aiomqtt
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.serve import serve
+from bms_estimator.sources.raw_capture import header_of
+from bms_estimator.sources.recording import Recording
+from bms_estimator.sources.replay import RawCapture
+from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
+
+STATE, HEALTH, AVAILABILITY = "bms/pack/state", "bms/pack/health", "bms/pack/sensor/availability"
+ONLINE = AVAILABILITY, b"online"
+
+
+def settings(broker: Broker, **source: object) -> Settings:
+    """Of a pack whose JK-BMS an ESPHome node publishes."""
+    jk = {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms", "interval_s": 0.5}
+    return Settings.model_validate(
+        {
+            "pack": {"cell": "lfp", "capacity_ah": 100.0, "series": 16},
+            "source": jk | source,
+            "mqtt": {"url": broker.url},
+            "publish": {"rate_hz": 10.0},
+        }
+    )
+
+
+async def publish(broker: Broker, voltage: str, current: str) -> None:
+    """What the node says of each value: retained, as ESPHome does by default."""
+    values = {"cell_voltage_1": "3.301", "temperature_sensor_1": "21.5", "total_voltage": voltage, "current": current}
+    async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+        for name, value in values.items():
+            await client.publish(f"jk-bms/sensor/jk-bms_{name}/state", value, qos=1, retain=True)
+
+
+@contextlib.asynccontextmanager
+async def publishing(broker: Broker, voltage: str, current: str) -> AsyncIterator[None]:
+    """So again and again, whatever becomes of the broker."""
+
+    async def on() -> None:
+        while True:
+            with contextlib.suppress(aiomqtt.MqttError):
+                await publish(broker, voltage, current)
+            await asyncio.sleep(0.02)
+
+    task = asyncio.create_task(on())
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def serving(told: Settings, tap: Recording | None = None) -> AsyncIterator[None]:
+    stop = asyncio.Event()
+    service = asyncio.create_task(serve(told, load_cell("lfp", 100.0).pack(16, 1), stop=stop, tap=tap))
+    try:
+        yield
+    finally:
+        stop.set()
+        await asyncio.wait_for(service, LONG_S)
+
+
+async def test_what_a_node_publishes_is_estimated_through_all_that_happens(broker: Broker, tmp_path: Path) -> None:
+    await publish(broker, "40.00", "99.0")  # of yesterday: the broker keeps it
+    told, path = settings(broker), tmp_path / "heard.raw"
+    with Recording(path, header_of(told.sensor, told.source)) as recording:
+        async with serving(told, recording):
+            async with Listener(broker, "bms/#") as listener:
+                await estimated(broker, listener)
+                await silent(listener)
+                await garbled(broker, listener)
+            broker.stop()
+            broker.start()
+            async with Listener(broker, "bms/#") as listener, publishing(broker, "52.00", "3.5"):
+                state = await listener.wait_json(STATE, lambda s: s["voltage_v"] == 52.0)
+                assert state["current_a"] == -3.5
+                await listener.wait_json(HEALTH, lambda h: h["reconnects"] >= 1)
+    assert min(block["voltage_v"].min() for block in RawCapture(path)) == 52.0
+
+
+async def estimated(broker: Broker, listener: Listener) -> None:
+    """What comes is told, what the broker had kept is not."""
+    await listener.wait_json(HEALTH, lambda h: h["line"]["retained"] == 4)
+    async with publishing(broker, "53.00", "-12.5"):
+        state = await listener.wait_json(STATE)
+        assert (state["voltage_v"], state["current_a"], state["temperature_c"]) == (53.0, 12.5, 21.5)
+        assert state["cell_lowest_v"] == 3.301
+        await listener.wait_json(HEALTH, lambda h: h["sensor_online"])
+
+
+async def silent(listener: Listener) -> None:
+    """Nobody publishes any more."""
+    online = max(i for i, (topic, payload, _) in enumerate(listener.messages) if (topic, payload) == ONLINE)
+    await listener.wait(AVAILABILITY, lambda payload: payload == b"offline", skip=online)
+    health = await listener.wait_json(HEALTH, lambda h: not h["sensor_online"], skip=online)
+    assert health["sensor_message"]
+
+
+async def garbled(broker: Broker, listener: Listener) -> None:
+    """Payloads that tell no number are counted, and the reason is said."""
+    skip = len(listener.messages)
+    await publish(broker, "unavailable", "nan")
+    reason = f"esphome-jk jk-bms by MQTT, {broker.url}: voltage: jk-bms/sensor/jk-bms_total_voltage/state: no number: "
+    health = await listener.wait_json(HEALTH, lambda h: (h["sensor_message"] or "").startswith(reason), skip=skip)
+    assert health["line"]["no_number"] >= 2
+    assert not health["sensor_online"]
+
+
+async def test_a_publisher_that_must_be_asked_is_asked(broker: Broker) -> None:
+    told = settings(broker, profile="venus", prefix="c0619ab", instance="1", ask_s=0.1)
+
+    async def answer() -> None:
+        """As the device does: what is asked for is published, and nothing else."""
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            await client.subscribe("R/c0619ab/#")
+            async for message in client.messages:
+                for name, value in (("Dc/0/Voltage", 52.5), ("Dc/0/Current", -4.0), ("Dc/0/Temperature", None)):
+                    if message.topic.value.endswith(name):
+                        payload = '{"value":%s}' % ("null" if value is None else value)
+                        await client.publish(f"N/c0619ab/battery/1/{name}", payload)
+
+    async with Listener(broker) as listener, serving(told):
+        device = asyncio.create_task(answer())
+        try:
+            state = await listener.wait_json(STATE)
+            assert (state["voltage_v"], state["current_a"], state["temperature_c"]) == (52.5, 4.0, None)
+            keepalive = await listener.wait("R/c0619ab/keepalive")
+            assert keepalive == b'{"keepalive-options":["suppress-republish"]}'
+        finally:
+            device.cancel()
+            await asyncio.gather(device, return_exceptions=True)

@@ -1,0 +1,312 @@
+"""What other projects publish of a battery, each in its own form: one sample of it, and what is wrong with it said.
+
+The payloads are those of the projects named in ``model/mqtt_profiles.py``, with numbers of ours.
+"""
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bms_estimator.model.mqtt_source_settings import MqttSource
+from bms_estimator.model.settings import Settings
+from bms_estimator.sources.assembly import Assembly
+from bms_estimator.sources.payload import NoNumberError, many, one
+
+Messages = list[tuple[str, str]]
+
+
+def source(**settings: Any) -> MqttSource:
+    return MqttSource.model_validate({"kind": "mqtt"} | settings)
+
+
+def own(**settings: Any) -> MqttSource:
+    """By hand, one payload for all."""
+    return source(**{"topic": "home/pack", "voltage": "u", "current": "i"} | settings)
+
+
+def told(assembly: Assembly, messages: Messages, at_s: float = 0.0, *, retained: bool = False) -> list[dict[str, Any]]:
+    """The samples that messages make, and what follows of them after the time to settle."""
+    lines = []
+    for topic, payload in messages:
+        assembly.take(topic, payload.encode(), at_s, retained=retained)
+        lines.append(assembly.line(at_s))
+    lines.append(assembly.line(at_s + 0.5))
+    return [json.loads(line) for line in lines if line]
+
+
+def esphome(node: str, voltage: str, current: str, temperature: str, cell: str) -> Messages:
+    """As a node publishes its sensors, one after the other."""
+    cells = [(cell.format(n), f"3.3{n:02}") for n in range(1, 17)]
+    values = [*cells, (temperature, "21.5"), (voltage, "52.98"), (current, "-12.34"), ("balancing_current", "0.000")]
+    return [(f"{node}/sensor/{node}_{name}/state", value) for name, value in values]
+
+
+SIXTEEN = [round(3.3 + n / 1000, 3) for n in range(1, 17)]
+PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
+    "batmon-ha": (
+        {"profile": "batmon-ha", "prefix": "jk_bms"},
+        [
+            ("jk_bms/soc/total_voltage", "52.98"),
+            ("jk_bms/soc/current", "12.34"),
+            ("jk_bms/soc/balance_current", "0.0"),
+            ("jk_bms/soc/soc_percent", "80.0"),
+            ("jk_bms/cell_voltages/1", "3.301"),
+            ("jk_bms/cell_voltages/2", "3.302"),
+            ("jk_bms/cell_voltages/min", "3.301"),
+            ("jk_bms/temperatures/1", "21.5"),
+        ],
+        {"voltage_v": 52.98, "current_a": 12.34},
+        "discharge_positive",
+    ),
+    "esphome-jk": (
+        {"profile": "esphome-jk", "prefix": "jk-bms"},
+        esphome("jk-bms", "total_voltage", "current", "temperature_sensor_1", "cell_voltage_{}"),
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN},
+        "charge_positive",
+    ),
+    "esphome-jbd": (
+        {"profile": "esphome-jbd", "prefix": "jbd-bms-ble"},
+        esphome("jbd-bms-ble", "total_voltage", "current", "temperature_1", "cell_voltage_{}"),
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN},
+        "charge_positive",
+    ),
+    "esphome-daly": (
+        {"profile": "esphome-daly", "prefix": "daly-bms"},
+        [
+            ("daly-bms/sensor/battery_voltage/state", "53.0"),
+            ("daly-bms/sensor/battery_current/state", "-12.3"),
+            ("daly-bms/sensor/cell_1_voltage/state", "3.301"),
+        ],
+        {"voltage_v": 53.0, "current_a": -12.3},
+        "charge_positive",
+    ),
+    "venus": (
+        {"profile": "venus", "prefix": "c0619ab12345", "instance": "1"},
+        [
+            ("N/c0619ab12345/battery/1/Voltages/Cell1", '{"value":3.301}'),
+            ("N/c0619ab12345/battery/1/Dc/0/Temperature", '{"value":21.5}'),
+            ("N/c0619ab12345/battery/1/Dc/0/Voltage", '{"value":52.98}'),
+            ("N/c0619ab12345/battery/1/Dc/0/Current", '{"value":-12.34}'),
+            ("N/c0619ab12345/battery/2/Dc/0/Current", '{"value":-99.0}'),
+        ],
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": [3.301]},
+        "charge_positive",
+    ),
+    "battery-emulator": (
+        {"profile": "battery-emulator"},
+        [
+            ("BE/spec_data", '{"cell_voltages":[3.701,3.702,3.700],"cell_balancing":[false,false,true]}'),
+            (
+                "BE/info",
+                '{"bms_status":"ACTIVE","SOC":81.5,"temperature_max":21.5,"battery_current":-12.3,"battery_voltage":355.2}',
+            ),
+        ],
+        {"voltage_v": 355.2, "current_a": -12.3, "temperature_c": 21.5, "cells_v": [3.701, 3.702, 3.7]},
+        "charge_positive",
+    ),
+    "opendtu": (
+        {"profile": "opendtu"},
+        [
+            ("solar/battery/BatteryTempOneCelsius", "21"),
+            ("solar/battery/Cell1MilliVolt", "3301"),
+            ("solar/battery/CellMinMilliVolt", "3301"),
+            ("solar/battery/voltage", "52.98"),
+            ("solar/battery/current", "-12.34"),
+        ],
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.0, "cells_v": [3.301]},
+        "charge_positive",
+    ),
+    "tasmota": (
+        {"profile": "tasmota", "prefix": "shunt"},
+        [
+            (
+                "tele/shunt/SENSOR",
+                '{"Time":"2026-11-11T21:57:38","INA219":{"Voltage":13.28,"Current":2.510,"Power":33.3}}',
+            )
+        ],
+        {"voltage_v": 13.28, "current_a": 2.51},
+        "discharge_positive",
+    ),
+    "tasmota energy": (
+        {"profile": "tasmota", "prefix": "shunt", "instance": "ENERGY"},
+        [("tele/shunt/SENSOR", '{"Time":"2026-11-11T21:57:38","ENERGY":{"Power":33,"Voltage":13,"Current":2.510}}')],
+        {"voltage_v": 13.0, "current_a": 2.51},
+        "discharge_positive",
+    ),
+    "zigbee2mqtt": (
+        {"profile": "zigbee2mqtt", "prefix": "garage/meter"},
+        [("zigbee2mqtt/garage/meter", '{"voltage":52.1,"linkquality":34,"power":167,"current":3.2,"state":"ON"}')],
+        {"voltage_v": 52.1, "current_a": 3.2},
+        "discharge_positive",
+    ),
+}
+
+
+@pytest.mark.parametrize("project", PROJECTS)
+def test_what_a_project_publishes_is_a_sample(project: str) -> None:
+    table, messages, sample, sign = PROJECTS[project]
+    assembly = Assembly(source(**table))
+    first = told(assembly, messages)
+    assert first == [sample]
+    assert told(assembly, messages, 10.0)[0]["current_a"] == sample["current_a"]
+    assert assembly.fault is None
+    assert set(assembly.counters.values()) == {0}
+    settings = Settings.model_validate({"source": {"kind": "mqtt"} | table})
+    assert settings.sensor.current_sign == sign
+
+
+def test_a_batch_that_ends_with_cells_tells_them_with_the_next_sample() -> None:
+    table, messages, _, _ = PROJECTS["batmon-ha"]
+    assembly = Assembly(source(**table))
+    told(assembly, messages)
+    assert told(assembly, messages, 5.0)[0]["cells_v"] == [3.301, 3.302]
+
+
+@pytest.mark.parametrize(
+    ("where", "payload", "sample"),
+    [
+        ({}, '{"u": 52.1, "i": "-3.25"}', {"voltage_v": 52.1, "current_a": -3.25}),
+        (
+            {"voltage": {"path": "p.0.mv", "unit": "mV"}, "current": {"path": "p.1", "unit": "mA", "scale": -1}},
+            '{"p": [{"mv": 52100}, 3250]}',
+            {"voltage_v": 52.1, "current_a": -3.25},
+        ),
+        (
+            {"temperature": {"path": "t", "unit": "F"}, "current": {"path": "i", "scale": 0.1, "offset": -3000}},
+            '{"u": 52.1, "i": 29967.5, "t": 70.7}',
+            {"voltage_v": 52.1, "current_a": -3.25, "temperature_c": 21.5},
+        ),
+        (
+            {"cells": {"path": "cells.C{cell}.v", "unit": "mV"}, "temperature": {"path": "t", "unit": "K"}},
+            '{"u": 6.6, "i": 1, "t": 294.65, "cells": {"C01": {"v": 3301}, "C03": {"v": 3302}, "sum": 1}}',
+            {"voltage_v": 6.6, "current_a": 1.0, "temperature_c": 21.5, "cells_v": [3.301, None, 3.302]},
+        ),
+        (
+            {"cells": "c", "time": {"path": "t", "unit": "iso"}},
+            '{"u": 6.6, "i": 1, "t": "2026-11-11T21:57:38Z", "c": [3.301, null, "3.302"]}',
+            {"voltage_v": 6.6, "current_a": 1.0, "time_s": 1794434258.0, "cells_v": [3.301, None, 3.302]},
+        ),
+        (
+            {"time": {"path": "t", "unit": "ms"}},
+            '{"u": 6.6, "i": 1, "t": 12500}',
+            {"voltage_v": 6.6, "current_a": 1.0, "time_s": 12.5},
+        ),
+    ],
+)
+def test_paths_units_scales_and_times(where: dict[str, Any], payload: str, sample: dict[str, Any]) -> None:
+    assert told(Assembly(own(**where)), [("home/pack", payload)]) == [sample]
+
+
+def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ever() -> None:
+    assembly = Assembly(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
+    assert told(assembly, [("v", "52")]) == []
+    assert assembly.fault == "current: nothing comes on i"
+    assert told(assembly, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
+    assembly.take("i", b"2", 20.0, retained=False)
+    assert assembly.line(20.4) == b""
+    assert assembly.wait_s(20.4) == pytest.approx(0.1)
+    assert json.loads(assembly.line(20.5)) == {"voltage_v": 51.0, "current_a": 2.0}
+    assert assembly.wait_s(20.5) is None
+    assert told(assembly, [("i", "3")], 40.0) == []
+    assert assembly.counters["stale"] == 2
+    assert assembly.fault == "voltage: nothing on v for 30 s"
+    assert told(assembly, [("v", "50")], 41.0) == [{"voltage_v": 50.0, "current_a": 3.0}]
+    assert assembly.fault is None
+
+
+def test_temperature_and_cells_may_be_older() -> None:
+    assembly = Assembly(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature={"topic": "t"}))
+    both = [("v", "52"), ("i", "1")]
+    told(assembly, [("t", "21.5")])
+    assert told(assembly, both, 299.0)[0]["temperature_c"] == 21.5
+    assert "temperature_c" not in told(assembly, both, 301.0)[0]
+
+
+def test_what_the_broker_had_kept_is_not_taken() -> None:
+    assembly = Assembly(own(availability_topic="home/status"))
+    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
+    assert assembly.counters["retained"] == 1
+    assert assembly.fault == "nothing comes on home/pack, but what the broker has kept from earlier"
+    told(assembly, [("home/status", "offline")], retained=True)
+    assert assembly.fault == "the publisher says offline on home/status"
+    told(assembly, [("home/status", '{"state":"online"}')])
+    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    assert assembly.fault is None
+
+
+@pytest.mark.parametrize(
+    ("payload", "kind", "said"),
+    [
+        ('{"i": 1}', "missing", "voltage: home/pack: u: not in {'i': 1}"),
+        ('{"u": "unavailable", "i": 1}', "no_number", "no number: 'unavailable'"),
+        ('{"u": null, "i": 1}', "no_number", "no number: None"),
+        ('{"u": NaN, "i": 1}', "no_number", "no number: 'NaN'"),
+        ('{"u": true, "i": 1}', "no_number", "no number: True"),
+        ('{"u": [], "i": 1}', "no_number", "no number: []"),
+        ('{"u": 1e999, "i": 1}', "no_number", "no number: inf"),
+        ('{"u": 1%s, "i": 1}' % (400 * "0"), "no_number", "no number: 1000"),
+        ("unavailable", "no_number", "no JSON: 'unavailable'"),
+        ("", "no_number", "no JSON: ''"),
+        ("3_9", "no_number", "no JSON: '3_9'"),
+        ("42", "missing", "u: not in 42"),
+        (5000 * "[", "no_number", "no JSON: '[[["),
+    ],
+)
+def test_a_payload_that_tells_nothing_is_counted_and_said(payload: str, kind: str, said: str) -> None:
+    assembly = Assembly(own())
+    assert told(assembly, [("home/pack", payload)]) == []
+    assert assembly.counters[kind] >= 1
+    assert said in (assembly.fault or "")
+    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+
+
+@given(st.binary() | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode))
+def test_no_payload_makes_it_raise(payload: bytes) -> None:
+    settings = own(cells="c.{cell}", temperature={"path": "0.1"}, time={"path": "t", "unit": "iso"})
+    assembly = Assembly(settings)
+    assembly.take("home/pack", payload, 0.0, retained=False)
+    assembly.line(1.0)
+    for name, place in settings.places():
+        for way in (one, many):
+            try:
+                way(payload, place, name)
+            except NoNumberError:
+                continue
+
+
+def test_it_subscribes_to_nothing_twice() -> None:
+    jk = source(profile="esphome-jk", prefix="jk-bms")
+    assert Assembly(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
+    assert Assembly(own()).topics == ["home/pack"]
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({}, "voltage: missing; tell where it is found, or a profile: batmon-ha"),
+        ({"profile": "venus"}, "profile venus: prefix: missing (VRM portal ID"),
+        ({"profile": "tasmota"}, "profile tasmota: prefix: missing (Topic of the device"),
+        ({"voltage": "u", "current": "i"}, "voltage.topic: missing, and there is no topic for all of them"),
+        (
+            {"topic": "t", "voltage": {"path": "u", "unit": "A"}, "current": "i"},
+            "voltage.unit = A: must be one of V, mV",
+        ),
+        ({"topic": "t", "voltage": {"path": "u", "scale": 0}, "current": "i"}, "voltage.scale = 0: must not be 0"),
+        ({"topic": "t", "voltage": "u", "current": "i", "username": "me"}, "are for a broker at url"),
+    ],
+)
+def test_settings_that_cannot_be_are_said(table: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match="mqtt") as caught:
+        Settings.model_validate({"source": {"kind": "mqtt"} | table})
+    assert said in str(caught.value)
+
+
+def test_what_is_told_goes_before_the_profile() -> None:
+    told_too = source(profile="battery-emulator", current={"scale": -1}, temperature="temperature_min", interval_s=2)
+    assert told_too.current.topics == ("{prefix}/info{instance}",)
+    assert (told_too.current.path, told_too.current.scale) == ("battery_current", -1.0)
+    assert told_too.temperature.path == "temperature_min"
+    assert (told_too.prefix, told_too.period_s) == ("BE", 2.0)
