@@ -45,7 +45,7 @@ folder = "{tmp_path / "state"}"
             )
             try:
                 state = await listener.wait_json("bms/pack/state", lambda s: s["frames_received"] >= SAMPLES)
-                assert await listener.wait("bms/pack/sensor/availability") == b"online"
+                await listener.wait("bms/pack/sensor/availability", lambda p: p == b"online")
             finally:
                 with contextlib.suppress(ProcessLookupError):
                     process.send_signal(signal.SIGTERM)
