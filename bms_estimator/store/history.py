@@ -14,7 +14,7 @@ from typing import Self, TypeVar
 from bms_estimator.model.estimate import Estimate, Snapshot
 from bms_estimator.model.event import Event, events
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.minute import MINUTE_S, Minute, OpenMinute, epoch_s, minute_of
+from bms_estimator.store.minute import MINUTE_S, Minute, OpenMinute, epoch_s, minute_of, seen
 
 MINUTES_A_DAY = 1440
 WAITING_MINUTES = 2 * MINUTES_A_DAY
@@ -62,6 +62,7 @@ class History:
         self._database, self._most = database, days * MINUTES_A_DAY
         self._before: Snapshot | None = None
         self._last: Estimate | None = None
+        self._span_s = 0.0  # to it from the one before
         self._open: OpenMinute | None = None
         self._minutes: deque[tuple[int, Minute]] = deque(maxlen=WAITING_MINUTES)  # with their numbers
         self._events: deque[tuple[int, Event]] = deque(maxlen=WAITING_EVENTS)
@@ -102,8 +103,9 @@ class History:
         if self._open is None or self._open.time_s != time_s:
             self._close_minute()
             self._open = OpenMinute(time_s)
-        self._open.add(estimate, self._last.board_time_s if self._last else None)
-        self._last = estimate
+        span_s = estimate.board_time_s - self._last.board_time_s if self._last else 0.0
+        self._open.add(estimate, seen(span_s, self._span_s))
+        self._last, self._span_s = estimate, span_s
 
     def _close_minute(self) -> None:
         row = self._open.row() if self._open else None

@@ -9,7 +9,9 @@ from bms_estimator.model.estimate import Estimate
 
 MINUTE_S = 60
 LONGEST_S = 30.0
-"""Between two publications; longer is a gap, over which no charge is counted [s]."""
+"""Between two publications; longer may be a gap, over which no charge is counted [s]."""
+GAP_RATIO = 3.0
+"""It is one where it is so many times as long as the time before: a slow source makes none. As between samples."""
 
 
 class Minute(NamedTuple):
@@ -72,17 +74,15 @@ class OpenMinute:
     _energy_ws: list[float] = field(default_factory=lambda: [0.0, 0.0])
     _seen_s: float = 0.0
 
-    def add(self, estimate: Estimate, before_s: float | None) -> None:
-        """Take a publication; ``before_s`` is the board's time at the one before [s], None when there was none."""
+    def add(self, estimate: Estimate, seen_s: float) -> None:
+        """Take a publication; ``seen_s`` is the time since the one before, as ``seen`` has it [s]."""
         self._voltage.add(estimate.voltage_v)
         self._current.add(estimate.current_a)
         self._temperature.add(estimate.temperature_c)
         self._last = estimate
-        span_s = estimate.board_time_s - before_s if before_s is not None else 0.0
-        if 0.0 < span_s <= LONGEST_S:
-            self._seen_s += span_s
-            self._charge_as[estimate.current_a < 0.0] += abs(estimate.current_a) * span_s
-            self._energy_ws[estimate.power_w < 0.0] += abs(estimate.power_w) * span_s
+        self._seen_s += seen_s
+        self._charge_as[estimate.current_a < 0.0] += abs(estimate.current_a) * seen_s
+        self._energy_ws[estimate.power_w < 0.0] += abs(estimate.power_w) * seen_s
 
     def row(self) -> Minute | None:
         """What it came to; None when nothing was published."""
@@ -94,6 +94,16 @@ class OpenMinute:
         temperature = self._temperature.values if self._temperature.count else (None, None, None)
         sums = charge_out, charge_in, energy_out, energy_in, self._seen_s, self._voltage.count
         return Minute._make((self.time_s, *measured, *temperature, self._last.soc, self._last.soc_std, *sums))
+
+
+def seen(span_s: float, before_s: float) -> float:
+    """How much of the time between two publications was measured [s]: nothing of a gap.
+
+    Args:
+        span_s: From one to the other on the board's clock [s].
+        before_s: The same of the two before [s].
+    """
+    return span_s if 0.0 < span_s <= max(LONGEST_S, GAP_RATIO * before_s) else 0.0
 
 
 def epoch_s(time: str) -> float:

@@ -73,6 +73,11 @@ async def test_a_gap_counts_no_charge(path):
     assert sum(row.seen_s for row in rows(path)) == 2.0
 
 
+async def test_a_source_that_tells_once_in_a_minute_makes_no_gaps(path):
+    await keep(path, [at(60.0 * i, 6.0) for i in range(11)])
+    assert sum(row.charge_out_ah for row in rows(path)) == pytest.approx(0.9)  # the first step cannot be told from one
+
+
 async def test_a_service_started_again_goes_on_with_its_minute(path):
     whole = [
         at(float(s), s / 10, 3.0 + s / 100, soc_std=s / 1e3, temperature_c=20.0 + s if s % 2 else None)
