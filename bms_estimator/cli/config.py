@@ -96,6 +96,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
+        settings = settings.model_copy(update={"mqtt": mqtt})
     if settings.page is not None:
         unread, unseen = _unread("page", settings.page, "token_file")
         warnings += unseen
@@ -105,7 +106,6 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
         warnings += unseen
         target(settings.influx.model_copy(update=dict.fromkeys(unread)))
-        settings = settings.model_copy(update={"mqtt": mqtt})
     make_bringer(settings)  # says what of [source] cannot be used, or is not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
