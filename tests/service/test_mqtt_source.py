@@ -24,7 +24,7 @@ ONLINE = AVAILABILITY, b"online"
 
 def settings(broker: Broker, **source: object) -> Settings:
     """Of a pack whose JK-BMS an ESPHome node publishes."""
-    jk = {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms", "interval_s": 0.5}
+    jk = {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms", "interval_s": 0.2}
     return Settings.model_validate(
         {
             "pack": {"cell": "lfp", "capacity_ah": 100.0, "series": 16},
