@@ -123,7 +123,7 @@ async def _found(settings: Settings, cell: PackModel, source: Replay) -> Found:
     for each in raised:
         each.latched = each.ended_s is None and each.alarm in latched
     known, names = {a.name for a in publisher.snapshot.alarms}, {each.alarm for each in raised}
-    watched = publisher.alarms.names()
+    watched = publisher.watch.alarms.names()
     quiet = [name for name in watched if name in known and name not in names]
     return Found(raised, quiet, [name for name in watched if name not in known])
 

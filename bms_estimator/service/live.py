@@ -103,7 +103,7 @@ async def run_live(
         on_alarm=hooks.tell,
     )
     _restore_alarms(publisher, ledger.alarms)
-    hooks.begin(publisher.alarms.active)
+    hooks.begin(publisher.watch.alarms.active)
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
     every_s = settings.state.checkpoint_s
@@ -230,7 +230,7 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clo
 
 def _restore_alarms(publisher: Publisher, kept: str) -> None:
     try:
-        publisher.alarms.restore(kept)
+        publisher.watch.alarms.restore(kept)
     except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
         log.warning("the checkpoint's alarms cannot be: none is taken up", reason=str(error))
 
@@ -304,9 +304,9 @@ def _offer(
 
 async def _acknowledge_alarm(publisher: Publisher, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Somebody knows of the alarm ``name``, or of all."""
-    name, watched = arguments.get("name"), publisher.alarms.names()
+    name, watched = arguments.get("name"), publisher.watch.alarms.names()
     if name is not None and name not in watched:
         raise UserError(f"name = {reprlib.repr(name)}: must be one of {', '.join(watched)}, or left out for all")
-    known = publisher.acknowledge(name)
+    known = publisher.watch.acknowledge(name)
     log.info("alarms acknowledged on request", alarms=known)
     return {"acknowledged": known}

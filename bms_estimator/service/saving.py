@@ -53,7 +53,7 @@ class Saving:
         self.every_s = every_s
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
         self._tally, self._restarts = tally, restarts
-        self._alarms = publisher.alarms.kept  # as the disk has them
+        self._alarms = publisher.watch.alarms.kept  # as the disk has them
         publisher.kept = tally.flow
         self._saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
@@ -66,7 +66,7 @@ class Saving:
         while True:
             await asyncio.sleep(min(LOOK_S, self.every_s))
             moved = self._saved is None or abs(self._estimator.state["soc"][0] - self._saved[1]) >= SAVED_SOC
-            moved = moved or self._alarms != self._publisher.alarms.kept
+            moved = moved or self._alarms != self._publisher.watch.alarms.kept
             if loop.time() >= saved_s + self.every_s or (moved and not failed):
                 failed = not await self._save()
                 saved_s = loop.time()
@@ -107,7 +107,7 @@ class Saving:
         return lambda: self._checkpoint.mark(ledger)
 
     def _ledger(self, *, clean: bool) -> Ledger:
-        return Ledger(self._restarts, self._tally.total, clean, self._publisher.alarms.kept)
+        return Ledger(self._restarts, self._tally.total, clean, self._publisher.watch.alarms.kept)
 
     async def _write_with(self, ledger: Ledger, write: Callable[[], None]) -> bool:
         """As ``_write``; then the disk has the alarms, too."""

@@ -11,7 +11,7 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
-from bms_estimator.model.alarm_limits import out_of_range
+from bms_estimator.model.alarm_limits import out_of_range, watched
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
@@ -98,6 +98,7 @@ async def serve(
             outbox,
             sample_period_s=settings.sensor.sample_period_s,
             home_assistant=settings.home_assistant,
+            alarms=[each.name for each in watched(settings, cell)],
         )
         all_sinks.append(mqtt)
         say = mqtt.say

@@ -1,10 +1,11 @@
 """What goes to a broker: from what it got last and a snapshot to messages. Pure: no connection, no clock."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
+from bms_estimator.model.alarm_settings import ALARMS
 from bms_estimator.model.estimate import Health, Report, Snapshot
 from bms_estimator.model.event import events
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
@@ -42,6 +43,7 @@ class Messages:
         device: Name of the pack.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
         home_assistant: How the pack is to stand there.
+        alarms: Those that are watched: what a broker keeps of others, from other settings, is removed.
 
     Attributes:
         root: Of all topics.
@@ -57,7 +59,9 @@ class Messages:
         device: str,
         sample_period_s: float = 0.0,
         home_assistant: HomeAssistantSettings | None = None,
+        alarms: Collection[str] = ALARMS,
     ) -> None:
+        self._unwatched = [name for name in ALARMS if name not in alarms]
         self.root = f"{base_topic}/{device}"
         self.commands: tuple[str, ...] = ()
         self._home = home_assistant or HomeAssistantSettings()
@@ -67,7 +71,8 @@ class Messages:
 
     def greeting(self) -> list[Message]:
         """What a broker is told first."""
-        return [self._retained(AVAILABILITY, b"online"), self._retained("schema", self._schema)]
+        removed = [self._retained(f"alarm/{name}", b"") for name in self._unwatched]
+        return [self._retained(AVAILABILITY, b"online"), self._retained("schema", self._schema), *removed]
 
     def farewell(self) -> list[Message]:
         """What it is told last; the last of these is the will, too."""

@@ -8,11 +8,12 @@ how a broker is reached in ``link``.
 import asyncio
 import contextlib
 import secrets
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Self
 
 import structlog
 
+from bms_estimator.model.alarm_settings import ALARMS
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
 from bms_estimator.model.settings import MqttSettings
@@ -51,6 +52,7 @@ class MqttSink:
         connect: Makes a connection; over TCP when left out.
         sample_period_s: Between two samples, where that may be longer than the publish period [s].
         home_assistant: How the pack is to stand there.
+        alarms: Those that are watched.
         first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
         birth_delay_s: From Home Assistant's birth message to the retained messages [s].
         echo_s: Until a broker has given back ``online`` [s].
@@ -70,6 +72,7 @@ class MqttSink:
         connect: Connect | None = None,
         sample_period_s: float = 0.0,
         home_assistant: HomeAssistantSettings | None = None,
+        alarms: Collection[str] = ALARMS,
         first_delay_s: float = FIRST_DELAY_S,
         birth_delay_s: float = BIRTH_DELAY_S,
         echo_s: float = ECHO_S,
@@ -78,7 +81,7 @@ class MqttSink:
         self._refusals = Refusals(delivery, self._say_again, first_delay_s)
         self._backlog = Backlog(outbox, delivery, self._refusals, first_delay_s)
         self._birth_delay_s = birth_delay_s
-        self._messages = Messages(settings.base_topic, device, sample_period_s, home_assistant)
+        self._messages = Messages(settings.base_topic, device, sample_period_s, home_assistant, alarms)
         self._birth_topic = (home_assistant or HomeAssistantSettings()).status_topic
         identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.farewell()[-1]
         hello = Hello(identifier, will, lambda kind, topic: requests.refuse(kind, topic[:MOST_SHOWN]))

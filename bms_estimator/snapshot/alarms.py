@@ -7,18 +7,19 @@ sensors say counts as it came, also what the estimator takes for a glitch; the d
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.sample_step import GAP_RATIO
+from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.alarm_limits import Watched
 from bms_estimator.model.alarm_settings import AlarmName
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Alarm
-from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
+from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock, SampleStatus
 from bms_estimator.model.suspect import Suspect
 from bms_estimator.snapshot.alarm_state import AlarmState, Floats, Raising, Turn
 from bms_estimator.snapshot.alarm_text import alarm_text
@@ -27,6 +28,8 @@ SENSOR_SUSPECTS = Suspect.SIGN_OF_CURRENT | Suspect.OFFSET | Suspect.OUTLIERS
 MODEL_SUSPECTS = Suspect.CAPACITY | Suspect.OCV
 ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """These are watched before anything was measured."""
+WAITING_ROWS = 256
+"""Room for so many samples to begin with."""
 SHARE_S = 1.0
 """Lost and unusable samples are set against the good ones of so long at least [s]."""
 
@@ -87,15 +90,26 @@ class _Steps:
         return passed_s, seen_s
 
 
-@dataclass
-class _Waiting:
-    """Samples that are not judged yet."""
+class _Rows:
+    """Rows of one dtype that wait: written in place, since to join hundreds of short structured arrays takes milliseconds."""
 
-    samples: list[SampleBlock] = field(default_factory=list)
-    traces: list[TraceBlock] = field(default_factory=list)
-    lowest_v: list[Floats] = field(default_factory=list)
-    highest_v: list[Floats] = field(default_factory=list)
-    rows: int = 0
+    def __init__(self, dtype: Any, columns: tuple[int, ...] = ()) -> None:
+        self._rows = np.zeros((WAITING_ROWS, *columns), dtype=dtype)
+        self.size = 0
+
+    def add(self, values: Any, count: int) -> None:
+        """Append ``count`` rows."""
+        end = self.size + count
+        if end > len(self._rows):
+            more = np.zeros((end, *self._rows.shape[1:]), dtype=self._rows.dtype)
+            self._rows = np.concatenate((self._rows, more))
+        self._rows[self.size : end] = values
+        self.size = end
+
+    def take(self) -> Any:
+        """All of them; valid until the next call of ``add``."""
+        rows, self.size = self._rows[: self.size], 0
+        return rows
 
 
 class Alarms:
@@ -115,7 +129,7 @@ class Alarms:
         self._states = {each.name: AlarmState(each) for each in watched}
         self._charging_a = charging_a
         self._sampled, self._traced, self._shared = _Steps(gap_s), _Steps(gap_s), _Steps(math.inf)
-        self._waiting = _Waiting()
+        self._samples, self._traces, self._extremes = _Rows(SAMPLE), _Rows(TRACE), _Rows(np.float64, (2,))
         self._counts: Counts | None = None
         self._counted_s = -math.inf
         self._at_s = 0.0  # of the last sample
@@ -128,17 +142,13 @@ class Alarms:
     @property
     def rows(self) -> int:
         """Samples that wait to be judged."""
-        return self._waiting.rows
+        return self._samples.size
 
     def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock) -> None:
         """Take a block, what the estimator made of it, and the cells beside it; ``judge`` looks at them."""
-        waiting = self._waiting
-        waiting.samples.append(block.copy())
-        waiting.traces.append(trace.copy())
-        lowest_v, highest_v = _extremes(cells, block.size)
-        waiting.lowest_v.append(lowest_v)
-        waiting.highest_v.append(highest_v)
-        waiting.rows += block.size
+        self._samples.add(block, block.size)
+        self._traces.add(trace, trace.size)
+        self._extremes.add(_extremes(cells) if len(cells) == block.size else math.nan, block.size)
 
     def judge(self, arrival_s: float, counts: Counts, suspects: Suspect, suspicions: Sequence[str]) -> None:
         """Judge all that waits.
@@ -149,18 +159,17 @@ class Alarms:
             suspects: What the identifier suspects now.
             suspicions: The same in sentences.
         """
-        if not self._waiting.rows:
+        if not self.rows:
             return
-        waiting, self._waiting = self._waiting, _Waiting()
-        samples = np.concatenate(waiting.samples)
+        samples, trace, extremes_v = self._samples.take(), self._traces.take(), self._extremes.take()
         known = np.isfinite(samples["time_s"])
-        lowest_v, highest_v = np.concatenate(waiting.lowest_v)[known], np.concatenate(waiting.highest_v)[known]
-        samples, trace = samples[known], np.concatenate(waiting.traces)
+        if not known.all():
+            samples, extremes_v = samples[known], extremes_v[known]
         self._suspect("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._suspect("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
         if samples.size:
             wall_s = arrival_s - float(samples["time_s"][-1])
-            self._judge_samples(samples, lowest_v, highest_v, wall_s)
+            self._judge_samples(samples, extremes_v[:, 0], extremes_v[:, 1], wall_s)
             self._judge_share(float(samples["time_s"][-1]), counts, suspects, wall_s)
         if trace.size:
             self._judge_estimates(trace, suspects, arrival_s - float(trace["time_s"][-1]))
@@ -333,9 +342,6 @@ def _alarm(watched: Watched, told: Told) -> Alarm:
     )
 
 
-def _extremes(cells: CellBlock, rows: int) -> tuple[Floats, Floats]:
-    """Lowest and highest cell voltage of each sample [V], NaN where none was told. Shape (rows,) each."""
-    if cells.size == 0 or cells.shape[0] != rows:
-        nothing = np.full(rows, np.nan)
-        return nothing, nothing
-    return np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1)
+def _extremes(cells: CellBlock) -> Floats:
+    """Lowest and highest cell voltage of each sample [V], NaN where none was told. Shape (n, 2)."""
+    return np.stack((np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1)), axis=1)

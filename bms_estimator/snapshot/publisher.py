@@ -7,19 +7,17 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.model.alarm_limits import charging_a, watched
-from bms_estimator.model.alarm_settings import AlarmName
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.estimate import Estimate, Health, Info, LoopHealth, RecordingHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
-from bms_estimator.model.suspect import Suspect
 from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
-from bms_estimator.snapshot.alarms import Alarms, Change, Counts
+from bms_estimator.snapshot.alarm_watch import AlarmWatch
+from bms_estimator.snapshot.alarms import Change
 from bms_estimator.snapshot.flow import Flow
-from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters, suspicions
+from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
 from bms_estimator.snapshot.impossible import impossible_sample
 from bms_estimator.snapshot.latency import Latency
 from bms_estimator.snapshot.parameters import parameter_report
@@ -34,10 +32,6 @@ log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
 """Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
-UNUSABLE = "not_finite", "range", "saturated"
-"""Kinds of dropped samples that tell of a fault of the sensor."""
-JUDGE_S, JUDGE_ROWS = 0.1, 1024
-"""Alarms look at samples this often [s], or once there are so many: at each block it would take as long as the estimate."""
 UNTENDED_S = 20.0
 """A source that has not looked after its line for so long hangs: it tries a port that is missing each 10 s at least [s]."""
 
@@ -61,7 +55,7 @@ class Publisher:
         on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
 
     Attributes:
-        alarms: What is watched, and what is raised.
+        watch: Its alarms.
         checkpoint: What became of the last checkpoint.
         disk_free_mib: Where it is [MiB].
         log_lines_lost: Since start.
@@ -100,15 +94,12 @@ class Publisher:
         self._flow = Flow()  # as it was told last
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
-        gap_s = float(estimator.settings["gap_s"][0])
-        self.alarms, self._on_alarm = Alarms(watched(settings, cell), charging_a(cell), gap_s), on_alarm
-        self._arrival_s, self._judged_s = clock.wall(), -math.inf
+        self.watch = AlarmWatch(settings, cell, estimator, source, clock, on_alarm)
         self._suspects = 0  # bits of ``Suspect``, as logged
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._sample_s = -math.inf  # monotonic, of the last accepted sample
-        self._heard_s = self._started_s  # monotonic, of the last sample, be it accepted or not
         self._impossible = ""  # why the last sample that was dropped is none, where that can be said
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
@@ -135,12 +126,9 @@ class Publisher:
             self._sample_s = now_s
         if trace.size < block.size:
             self._impossible = impossible_sample(block, self._estimator.settings[0]) or ""
-        self.alarms.add(block, trace, self._source.cells)
-        self._heard_s, self._arrival_s = now_s, self._clock.wall()
+        self.watch.add(block, trace, now_s)
         if now_s >= self._due_s:
             self.publish()
-        elif now_s - self._judged_s >= JUDGE_S or self.alarms.rows >= JUDGE_ROWS:
-            self._judge(now_s)
 
     def add_lag(self, lag_s: float) -> None:
         """Take by how much the loop woke too late [s]."""
@@ -152,7 +140,7 @@ class Publisher:
         self._due_s += self.period_s
         if self._due_s <= now_s:  # behind: do not catch up
             self._due_s = now_s + self.period_s
-        self._judge(now_s)
+        self.watch.judge(now_s)
         self.snapshot = self._next_snapshot(now_s)
         if self.snapshot.estimate is not None:
             self.latest = self.snapshot.estimate
@@ -166,37 +154,6 @@ class Publisher:
         """Publish the end, all of it made anew."""
         self._slow_s = -math.inf
         self.publish()
-
-    def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
-        """Somebody knows of an alarm; None: of all. Returns of which."""
-        known = self.alarms.acknowledge(name)
-        self._tell_of_alarms()
-        return known
-
-    def _judge(self, now_s: float) -> None:
-        """Look for alarms in what has come since the last time, and in that nothing came."""
-        self._judged_s = now_s
-        record = self._estimator.record[0]
-        suspects = Suspect(int(record["checks"]["suspects"]))
-        said = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
-        self.alarms.judge(self._arrival_s, self._counts(), suspects, said)
-        self.alarms.silent(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
-        self._tell_of_alarms()
-
-    def _counts(self) -> Counts:
-        """A damaged frame is missing in the sequence, too, where there is one."""
-        line, samples = self._source.counters, sample_counters(self._estimator.state[0])
-        lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
-        return Counts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))
-
-    def _tell_of_alarms(self) -> None:
-        for change in self.alarms.changes():
-            alarm = change.alarm
-            if alarm.active:
-                log.warning("alarm raised", alarm=alarm.name, severity=alarm.severity, reason=alarm.text)
-            else:
-                log.info("alarm cleared", alarm=alarm.name)
-            self._on_alarm(change)
 
     @property
     def alive(self) -> bool:
@@ -221,7 +178,7 @@ class Publisher:
         now_s = self._slow_s = self._started_s
         parameters = parameter_report(self._estimator, self._started_wall_s)
         return Snapshot(
-            None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info(), self.alarms.report()
+            None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info(), self.watch.alarms.report()
         )
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
@@ -237,7 +194,7 @@ class Publisher:
         if old or health.sensor_online != (message is None):
             health = self._health(now_s, message)
             self._log_suspicions(health)
-        return Snapshot(estimate, parameters, health, info, self.alarms.report())
+        return Snapshot(estimate, parameters, health, info, self.watch.alarms.report())
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         remaining = remaining_charge(self._estimator, window.current_a)

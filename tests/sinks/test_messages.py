@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.model.alarm_settings import ALARMS
 from bms_estimator.model.estimate import Alarm
 from bms_estimator.sinks.messages import Message, Messages, Sent
 from bms_estimator.sinks.payloads import schema
@@ -144,3 +145,11 @@ def test_an_alarm_is_said_when_it_changes_and_all_of_them_to_a_broker_that_got_n
     assert set(told) == set(schema()["alarm"]["properties"])
     assert [json.loads(m.payload)["name"] for m in MESSAGES.kept(before, after)[:-1]] == ["alarm_raised"]
     assert [json.loads(m.payload)["name"] for m in MESSAGES.kept(after, before)[:-1]] == ["alarm_cleared"]
+
+
+def test_what_a_broker_keeps_of_an_alarm_that_is_not_watched_any_more_is_removed():
+    assert not [m for m in MESSAGES.greeting() if "alarm" in m.topic]
+    [message] = [
+        m for m in Messages("bms", "pack", alarms=[a for a in ALARMS if a != "soc_low"]).greeting() if not m.payload
+    ]
+    assert (message.topic, message.qos, message.retain) == ("bms/pack/alarm/soc_low", 1, True)

@@ -100,10 +100,10 @@ async def replayed(
     publisher = Publisher(
         told, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
     )
-    publisher.alarms.restore(kept)
+    publisher.watch.alarms.restore(kept)
     async for block in source:
         now_s = float(block["time_s"][-1])
         publisher.add(block, estimator.run(block))
     publisher.publish_last()
-    result.snapshots, result.kept = sink.snapshots, publisher.alarms.kept
+    result.snapshots, result.kept = sink.snapshots, publisher.watch.alarms.kept
     return result

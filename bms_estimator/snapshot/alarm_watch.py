@@ -1,0 +1,98 @@
+"""Looks for alarms while samples come, and while none does; the log hears of each, and whoever else wants to."""
+
+import math
+from collections.abc import Callable
+
+import structlog
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.model.alarm_limits import charging_a, watched
+from bms_estimator.model.alarm_settings import AlarmName
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import Settings
+from bms_estimator.model.suspect import Suspect
+from bms_estimator.snapshot.alarms import Alarms, Change, Counts
+from bms_estimator.snapshot.health import sample_counters, suspicions
+from bms_estimator.sources import Source
+
+UNUSABLE = "not_finite", "range", "saturated"
+"""Kinds of dropped samples that tell of a fault of the sensor."""
+JUDGE_S, JUDGE_ROWS = 0.1, 1024
+"""Samples are looked at so often [s], or once there are so many: at each block it would take as long as the estimate."""
+
+log = structlog.get_logger(__name__)
+
+
+class AlarmWatch:
+    """The alarms of one pack as the service has them.
+
+    Args:
+        settings: The pack's settings.
+        cell: The pack as one object.
+        estimator: Read only.
+        source: Its counters, cells and message are read.
+        clock: The clocks.
+        on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
+
+    Attributes:
+        alarms: What is watched, and what is raised.
+
+    Raises:
+        UserError: As ``watched``.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        cell: PackModel,
+        estimator: Estimator,
+        source: Source,
+        clock: Clock,
+        on_alarm: Callable[[Change], object],
+    ) -> None:
+        self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
+        gap_s = float(estimator.settings["gap_s"][0])
+        self.alarms = Alarms(watched(settings, cell), charging_a(cell), gap_s)
+        self._heard_s, self._arrival_s = clock.monotonic(), clock.wall()  # of the last sample, accepted or not
+        self._judged_s = -math.inf
+
+    def add(self, block: SampleBlock, trace: TraceBlock, now_s: float) -> None:
+        """Take a block and what the estimator made of it at ``now_s`` of the monotonic clock [s]."""
+        self.alarms.add(block, trace, self._source.cells)
+        self._heard_s, self._arrival_s = now_s, self._clock.wall()
+        if now_s - self._judged_s >= JUDGE_S or self.alarms.rows >= JUDGE_ROWS:
+            self.judge(now_s)
+
+    def judge(self, now_s: float) -> None:
+        """Look at what has come since the last time, and at that nothing came, at ``now_s`` of the monotonic clock [s]."""
+        self._judged_s = now_s
+        record = self._estimator.record[0]
+        suspects = Suspect(int(record["checks"]["suspects"]))
+        said = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
+        self.alarms.judge(self._arrival_s, self._counts(), suspects, said)
+        self.alarms.silent(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
+        self._tell()
+
+    def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
+        """Somebody knows of an alarm; None: of all. Returns of which."""
+        known = self.alarms.acknowledge(name)
+        self._tell()
+        return known
+
+    def _counts(self) -> Counts:
+        """A damaged frame is missing in the sequence, too, where there is one."""
+        line, samples = self._source.counters, sample_counters(self._estimator.state[0])
+        lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
+        return Counts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))
+
+    def _tell(self) -> None:
+        for change in self.alarms.changes():
+            alarm = change.alarm
+            if alarm.active:
+                log.warning("alarm raised", alarm=alarm.name, severity=alarm.severity, reason=alarm.text)
+            else:
+                log.info("alarm cleared", alarm=alarm.name)
+            self._on_alarm(change)
