@@ -37,11 +37,12 @@ class Profile(NamedTuple):
 def _esphome(voltage: str, current: str, temperature: str, cell: str) -> dict[str, Any]:
     """ESPHome: ``<topic_prefix>/sensor/<object_id>/state``, a plain number; the object id is the sensor's name.
 
-    esphome/components/mqtt/mqtt_component.cpp. The examples begin each name with that of the node; without it is taken, too.
+    esphome/components/mqtt/mqtt_component.cpp. The examples begin each name with that of the node, which is the prefix unless
+    ``instance`` says another; names without it are taken, too.
     """
 
     def topics(name: str) -> dict[str, Any]:
-        return {"topic": [f"{{prefix}}/sensor/{{prefix}}_{name}/state", f"{{prefix}}/sensor/{name}/state"]}
+        return {"topic": [f"{{prefix}}/sensor/{begin}{name}/state" for begin in ("{prefix}_", "{instance}_", "")]}
 
     return {
         "voltage": topics(voltage),

@@ -48,8 +48,8 @@ class MqttReports(Bringer):
         check(mqtt)
         self._settings, self._monotonic = settings, monotonic
         self._assembly = Assembly(settings)
-        self._brokers = itertools.cycle(brokers(mqtt))
-        self._broker = next(self._brokers)
+        found = brokers(mqtt)
+        self._broker, self._brokers = found[0], itertools.cycle(found)
         self._connect = connect or Dial(mqtt)
         self._lost: Counter[str] = Counter({"too_long": 0, "overflow": 0})
         self._hello = Hello(f"bms-source-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
@@ -75,6 +75,7 @@ class MqttReports(Bringer):
         Raises:
             NothingComesError: The broker cannot be reached, was lost, or does not let us read.
         """
+        self._broker = next(self._brokers)
         try:
             async with self._connect(self._broker, self._hello) as connection:
                 for topic, why in (await connection.subscribe(None, self._assembly.topics)).items():
@@ -84,8 +85,6 @@ class MqttReports(Bringer):
                     yield line
         except LinkError as error:
             raise NothingComesError(str(error)) from None
-        finally:
-            self._broker = next(self._brokers)
 
     async def _lines(self, connection: Connection) -> AsyncGenerator[bytes, None]:
         """Raises ``LinkError`` when the connection is lost."""

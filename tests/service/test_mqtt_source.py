@@ -6,14 +6,16 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import aiomqtt
+from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.serve import serve
+from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.replay import RawCapture
-from tests.mosquitto import Broker, Listener
+from tests.mosquitto import Broker, Listener, free_port
 from tests.patience import LONG_S
 
 STATE, HEALTH, AVAILABILITY = "bms/pack/state", "bms/pack/health", "bms/pack/sensor/availability"
@@ -22,7 +24,7 @@ ONLINE = AVAILABILITY, b"online"
 
 def settings(broker: Broker, **source: object) -> Settings:
     """Of a pack whose JK-BMS an ESPHome node publishes."""
-    jk = {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms", "interval_s": 0.5}
+    jk = {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms", "interval_s": 0.2}
     return Settings.model_validate(
         {
             "pack": {"cell": "lfp", "capacity_ah": 100.0, "series": 16},
@@ -139,3 +141,18 @@ async def test_a_publisher_that_must_be_asked_is_asked(broker: Broker) -> None:
         finally:
             device.cancel()
             await asyncio.gather(device, return_exceptions=True)
+
+
+async def test_the_next_broker_is_tried_and_the_one_that_is_not_there_is_named(broker: Broker) -> None:
+    dead = f"mqtt://127.0.0.1:{free_port()}"
+    source = open_reports(settings(broker, url=[dead, broker.url]))
+    assert source
+    with capture_logs() as lines:
+        async with asyncio.timeout(LONG_S), source, publishing(broker, "53.00", "-12.5"):
+            async for block in source:
+                assert block["voltage_v"][0] == 53.0
+                break
+    reasons = [line["reason"] for line in lines if line["event"] == "no samples"]
+    assert len(reasons) == 1
+    assert reasons[0].startswith(f"esphome-jk jk-bms by MQTT, {dead}: ")
+    assert reasons[0].endswith("; trying again")

@@ -277,6 +277,16 @@ def test_no_payload_makes_it_raise(payload: bytes) -> None:
                 continue
 
 
+@pytest.mark.parametrize(
+    ("prefix", "instance", "begin"), [("jk-bms", "", "jk-bms_"), ("jk-bms", "", ""), ("home/bms", "jk-bms", "jk-bms_")]
+)
+def test_a_node_may_have_another_prefix_and_leave_its_name_away(prefix: str, instance: str, begin: str) -> None:
+    assembly = Assembly(source(profile="esphome-jk", prefix=prefix, instance=instance))
+    values = [("total_voltage", "52.98"), ("current", "-12.34"), ("balancing_current", "1")]
+    sample = told(assembly, [(f"{prefix}/sensor/{begin}{name}/state", value) for name, value in values])
+    assert sample == [{"voltage_v": 52.98, "current_a": -12.34}]
+
+
 def test_it_subscribes_to_nothing_twice() -> None:
     jk = source(profile="esphome-jk", prefix="jk-bms")
     assert Assembly(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
