@@ -94,11 +94,11 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     if settings.mqtt is not None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
+        settings = settings.model_copy(update={"mqtt": mqtt})
     if settings.influx is not None:
         unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
         warnings += unseen
         target(settings.influx.model_copy(update=dict.fromkeys(unread)))
-        settings = settings.model_copy(update={"mqtt": mqtt})
     make_bringer(settings)  # says what of [source] cannot be used, or is not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
