@@ -25,8 +25,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.live import new_estimator
+from bms_estimator.snapshot.alarm_watch import AlarmWatch
 from bms_estimator.snapshot.alarms import Change
-from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources.replay import Replay, open_capture
 from bms_estimator.sources.standard_input import standard_input
 
@@ -114,18 +114,18 @@ async def _found(settings: Settings, cell: PackModel, source: Replay) -> Found:
     with compiling_shown():
         estimator = new_estimator(settings, cell)
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # only the capture's matters
-    publisher = Publisher(settings, cell, estimator, source=source, sinks=(), clock=clock, on_alarm=changes.append)
+    watch = AlarmWatch(settings, cell, estimator, source, clock, changes.append)
     async for block in source:
         now_s = max(now_s, float(block["time_s"][-1]))
-        publisher.add(block, estimator.run(block))
-    publisher.publish_last()
-    raised, latched = _paired(changes), {a.name for a in publisher.snapshot.alarms if a.latched}
+        watch.add(block, estimator.run(block), now_s)
+    watch.judge(now_s)
+    shown = watch.alarms.report()
+    raised, latched = _paired(changes), {alarm.name for alarm in shown if alarm.latched}
     for each in raised:
         each.latched = each.ended_s is None and each.alarm in latched
-    known, names = {a.name for a in publisher.snapshot.alarms}, {each.alarm for each in raised}
-    watched = publisher.watch.alarms.names()
-    quiet = [name for name in watched if name in known and name not in names]
-    return Found(raised, quiet, [name for name in watched if name not in known])
+    known, names = {alarm.name for alarm in shown}, {each.alarm for each in raised}
+    quiet = [name for name in watch.alarms.names() if name in known and name not in names]
+    return Found(raised, quiet, [name for name in watch.alarms.names() if name not in known])
 
 
 def _paired(changes: list[Change]) -> list[Raised]:
