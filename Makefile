@@ -5,6 +5,7 @@ BIN     := $(VENV)/bin
 PYTHON  ?= python3
 READY   := $(VENV)/.ready
 COMPARE := .venv-compare
+BLE     := .venv-ble
 AUDIT   := .venv-audit
 NODE    := .node
 ARGS    ?=
@@ -12,10 +13,10 @@ HOME_ASSISTANT ?= 2025.2.5
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # What the tests start for real: compiler and simulator of the board, a broker, systemd's own checks.
-APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere resolution unseen soak nats chapter5 ablation learning fuelcell load fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -48,6 +49,11 @@ nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part t
 home-assistant: apt venv ## tests with the real Home Assistant, which is made first, once: two minutes
 	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)"
 	HOME_ASSISTANT=$(HOME_ASSISTANT) $(BIN)/python -m pytest -n0 tests/home_assistant $(ARGS)
+
+ble: ## a BMS over Bluetooth, against a simulated BlueZ; its extra needs another Python: make ble PYTHON=python3.12
+	@[ -x $(BLE)/bin/python ] || $(PYTHON) -m venv $(BLE)
+	@$(BLE)/bin/pip install --quiet --disable-pip-version-check -e '.[ble]' pytest pytest-asyncio pytest-timeout
+	$(BLE)/bin/python -m pytest -o addopts= --noconftest -rs tests/sources/test_ble.py tests/sources/test_ble_bms.py $(ARGS)
 
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)
@@ -92,6 +98,12 @@ audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 
 	@[ -x $(AUDIT)/bin/python ] || $(PYTHON) -m venv $(AUDIT)
 	@$(AUDIT)/bin/pip install --quiet --disable-pip-version-check pip-audit==2.10.1
 	@$(AUDIT)/bin/python .ci/audit.py
+
+page: apt venv ## what the live page costs a real Chromium at 10 Hz, e.g. make page ARGS=60: minutes
+	@$(BIN)/python -m tests.benchmarks.page $(ARGS)
+
+screenshots: apt venv ## the pictures of the live page in docs
+	@$(BIN)/python -m tests.page.screenshots
 
 simulate: venv ## the whole service simulated: make simulate SEED=5, or many, e.g. make simulate ARGS="--seeds 1000": minutes
 	@$(BIN)/python -m tests.world $(if $(SEED),--seed $(SEED)) $(ARGS)

@@ -19,7 +19,9 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.export_settings import InfluxSettings
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.model.settings import MqttSettings, SensorSettings, Settings
+from bms_estimator.page.guard import guard_of
 from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
@@ -95,6 +97,11 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         mqtt, unseen = _here(settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
         settings = settings.model_copy(update={"mqtt": mqtt})
+    if settings.page is not None:
+        unread, unseen = _unread("page", settings.page, "token_file")
+        warnings += unseen
+        if not unread:
+            guard_of(settings.page)
     if settings.influx is not None:
         unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
         warnings += unseen
@@ -154,7 +161,9 @@ def _here(mqtt: MqttSettings) -> tuple[MqttSettings, list[str]]:
     return mqtt.model_copy(update=dict.fromkeys(without)), warnings
 
 
-def _unread(section: str, settings: MqttSettings | InfluxSettings, *keys: str) -> tuple[set[str], list[str]]:
+def _unread(
+    section: str, settings: MqttSettings | InfluxSettings | PageSettings, *keys: str
+) -> tuple[set[str], list[str]]:
     """The keys of files that only the running service can read, and a warning for each."""
     files = {key: getattr(settings, key) for key in keys}
     unread = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}

@@ -78,7 +78,6 @@ def filter_settings(
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0
     p["unmeasured_s"] = unmeasured_s(sampling)
     p["current_step_a"], p["dead_band_a"] = sampling.current_resolution_a, sampling.current_dead_band_a
-    p["delay_s"] = sampling.delay_s
     noise = Noise(r_std=r_std)
     if identifier.current_offset_std_a is not None:
         noise = replace(noise, offset_c=identifier.current_offset_std_a / cell.cell.capacity_ah)

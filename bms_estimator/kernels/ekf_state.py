@@ -104,7 +104,6 @@ EKF_SETTINGS = np.dtype(
         ("unmeasured_s", "f8"),  # over a longer step nobody measured the current [s]
         ("current_step_a", "f8"),  # of the current that is shown [A]; 0: none
         ("dead_band_a", "f8"),  # a smaller one is shown as 0 [A]
-        ("delay_s", "f8"),  # between voltage and current of a sample [s]
         *[(field.name, "f8") for field in fields(Noise)],  # volts as of the pack
     ],
     align=True,

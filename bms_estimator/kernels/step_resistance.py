@@ -36,7 +36,7 @@ def watch_steps(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: f
     step, least_a = s.step, LEAST_C * p.capacity_as / 3600.0
     before, step.phase = step.phase, UNHELD
     step.variance += SHAPE_STD**2 * abs(s.current_a) * dt_s / p.capacity_as
-    if dt_s > LONGEST_S or dt_s < p.delay_s:
+    if dt_s > LONGEST_S:
         return
     stepped_a = abs(s.current_a - step.current_a)
     if before == STEPPED and stepped_a >= least_a and abs(change_a) <= HELD_SHARE * stepped_a:

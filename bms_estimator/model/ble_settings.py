@@ -48,5 +48,4 @@ class BleSource(ReportSource):
             "current_sign": "charge_positive",
             "voltage_resolution_v": STEP_V,
             "current_resolution_a": STEP_A,
-            "period_s": self.poll_s,
         }

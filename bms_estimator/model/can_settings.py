@@ -147,4 +147,4 @@ class CanSource(ReportSource):
         sign = {"current_sign": "charge_positive"} if self.profile else {}
         volts = {} if self.voltage.signal else {"voltage_resolution_v": abs(self.voltage.scale)}
         amperes = {} if self.current.signal else {"current_resolution_a": abs(self.current.scale)}
-        return {**sign, **volts, **amperes, "period_s": self.interval_s}
+        return {**sign, **volts, **amperes}

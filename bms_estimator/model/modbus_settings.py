@@ -140,4 +140,4 @@ class ModbusSource(ReportSource):
         sign = {"current_sign": "charge_positive"} if self.profile else {}
         volts = {} if self.voltage.type == "float32" else {"voltage_resolution_v": abs(self.voltage.scale)}
         amperes = {} if self.current.type == "float32" else {"current_resolution_a": abs(self.current.scale)}
-        return {**sign, **volts, **amperes, "period_s": self.poll_s}
+        return {**sign, **volts, **amperes}

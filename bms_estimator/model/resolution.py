@@ -24,8 +24,6 @@ class Resolution:
     """One step of the current [A]."""
     current_dead_band_a: float | None = None
     """Smaller currents are shown as 0 [A]."""
-    delay_s: float | None = None
-    """So far apart may be the moments of the voltage and the current of one sample [s]."""
 
 
 CHARGE = "charge_positive"
@@ -41,11 +39,11 @@ RESOLUTIONS: Mapping[str, Resolution] = {
     # Steps of 10 mV and 10 mA in one frame with both. One showed nothing below 0.7 A (github.com/syssi/esphome-jk-bms, issue 243).
     "jk": Resolution(115_200, CHARGE, 1.0, 0.01, 0.01, 0.7),
     # The text has steps of 1 mV and 1 mA; the data sheets of BMV and SmartShunt promise 10 mV and 10 mA.
-    "vedirect": Resolution(19_200, CHARGE, 1.0, 0.01, 0.01, 0.0, 0.5),
+    "vedirect": Resolution(19_200, CHARGE, 1.0, 0.01, 0.01),
     # Steps of 10 mV and 10 mA in the protocol; of the current the makers promise 0.1 A.
-    "junctek": Resolution(115_200, CHARGE, 1.0, 0.01, 0.1, 0.0, 1.0),
+    "junctek": Resolution(115_200, CHARGE, 1.0, 0.01, 0.1),
     # Steps of 1 mV and 1 mA in the table. Of public captures the smallest current that is not 0 is 149 mA, beside many of 0.
-    "pylontech": Resolution(115_200, CHARGE, 2.0, 0.001, 0.01, 0.1, 1.0),
+    "pylontech": Resolution(115_200, CHARGE, 2.0, 0.001, 0.01, 0.1),
 }
 """By ``sensor.protocol``."""
 
@@ -60,8 +58,6 @@ class Sampling:
     """One step of the current [A]; 0: as good as none."""
     current_dead_band_a: float = 0.0
     """Smaller currents are shown as 0 [A]."""
-    delay_s: float = 0.0
-    """So far apart may be the moments of the voltage and the current of one sample [s]."""
 
 
 BOARD = Sampling()

@@ -92,9 +92,6 @@ class SensorSettings(Strict):
     period_s: Positive | None = Field(
         default=None, description="between two samples, where they come at their own pace; a device's when left out"
     )
-    delay_s: NotNegative | None = Field(
-        default=None, description="between the moments of voltage and current of one sample; a device's when left out"
-    )
 
     @model_validator(mode="wrap")
     @classmethod
@@ -326,9 +323,7 @@ class Settings(Strict):
     def sampling(self) -> Sampling:
         """What the source tells of the current, and how often."""
         s = self.sensor
-        return Sampling(
-            s.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0, s.delay_s or 0.0
-        )
+        return Sampling(s.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0)
 
 
 def load_settings(path: Path) -> Settings:

@@ -4,6 +4,7 @@ Home Assistant keeps a row for each change of each entity. So it gets topics of 
 (``home_assistant_values``); what only a researcher looks at is there but disabled until he enables it.
 """
 
+import math
 from typing import NamedTuple
 
 from bms_estimator.model.estimate import Info
@@ -34,6 +35,8 @@ class Entity(NamedTuple):
     state_class: str | None = "measurement"
     signed: bool = False
     """Its sign is that of the current."""
+    jump: float = math.inf
+    """A change by so much is shown at once: somebody has set it."""
 
 
 def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
@@ -70,7 +73,7 @@ ESTIMATE = {
     "sample_rate_hz": _raw("Sample rate", "Hz", 1, "frequency"),
 }
 OF_CHARGE = {
-    "soc_percent": Entity(None, "%", 1, 0.2, "battery", main=True),
+    "soc_percent": Entity(None, "%", 1, 0.2, "battery", main=True, jump=2.0),
     "soc_std_percent": Entity("State of charge, standard deviation", "%", 1, 0.2, main=True),
     "remaining_capacity_ah": Entity("Remaining capacity", "Ah", 2, 0.02, main=True),
     "remaining_energy_wh": Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", main=True),

@@ -67,7 +67,7 @@ def _rounded(snapshot: Snapshot, shows: Mapping[str, Entity], sign: float) -> di
         value = values.get(key)
         if value is not None and entity.signed:
             value *= sign
-        rounded[key] = None if value is None else round(value, entity.decimals) + 0.0  # no -0.0
+        rounded[key] = None if value is None else round(value, entity.decimals or None) or 0  # an integer, and no -0.0
     return rounded
 
 
@@ -96,9 +96,7 @@ def _moved(shown: Shown, key: str, value: float | None, entity: Entity, now_s: f
     """Whether a value is to be shown anew."""
     if key not in shown.values:
         return True
-    if now_s - shown.changed_s[key] < entity.pace_s:
-        return False
-    before = shown.values[key]
+    before, rested = shown.values[key], now_s - shown.changed_s[key] >= entity.pace_s
     if value is None or before is None:
-        return value is not before
-    return round(abs(value - before), entity.decimals) >= entity.step
+        return rested and value is not before
+    return round(abs(value - before), entity.decimals) >= (entity.step if rested else entity.jump)

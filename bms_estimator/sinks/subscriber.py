@@ -69,7 +69,13 @@ class Subscriber:
 
     @property
     def lost_since(self) -> float | None:
-        """Since when there is no broker, seconds since 1970; None while there is one."""
+        """Since when there is no broker, seconds since 1970; None while there is one.
+
+        Raises:
+            Exception: A callback's, which has ended the work: let it be seen.
+        """
+        if self._task is not None and self._task.done() and not self._task.cancelled():
+            self._task.result()
         return self._lost_since
 
     @property

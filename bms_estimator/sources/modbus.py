@@ -55,7 +55,7 @@ class ModbusBringer(Bringer):
 
     def __init__(self, settings: ModbusSource) -> None:
         logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # what it says is said here, once
-        self._settings = settings
+        self._settings, self._values = settings, values_of(settings)
         self._requests: Sequence[Request] = ()
         self._refused: set[str] = set()
         self._counters = {"refused": 0, "not_measured": 0}
@@ -78,7 +78,7 @@ class ModbusBringer(Bringer):
 
     async def bring(self) -> AsyncGenerator[bytes, None]:
         """One line for each poll. After a late or missing answer the line is opened anew: no answer is taken for another's."""
-        self._requests = plan(values_of(self._settings))
+        self._requests = plan(self._values)
         client = _client(self._settings)
         try:
             await self._connect(client)
@@ -106,7 +106,7 @@ class ModbusBringer(Bringer):
 
     def _line(self, words: Mapping[tuple[Table, int], int]) -> bytes | None:
         """What the registers say; None where it is not voltage and current."""
-        reading = reading_of(self._settings, words)
+        reading = reading_of(self._values, words)
         if reading is None:
             self._counters["not_measured"] += 1
             self._fault = "it answers, but measures no voltage or no current (absent, or not a number)"

@@ -100,10 +100,10 @@ def decode(register: Register, words: Words) -> float:
     return math.nan if raw == register.absent or not math.isfinite(value) else round(value, DECIMALS)
 
 
-def reading_of(settings: ModbusSource, words: Words) -> Reading | None:
+def reading_of(values: Sequence[Value], words: Words) -> Reading | None:
     """What the registers say, the current as the device counts it; None where they tell no voltage or no current."""
     found: dict[str, list[float]] = {}
-    for quantity, register in values_of(settings):
+    for quantity, register in values:
         found.setdefault(quantity, []).append(decode(register, words))
     (voltage_v,), (current_a,), (temperature_c,) = (
         found.get(name, [math.nan]) for name in ("voltage", "current", "temperature")

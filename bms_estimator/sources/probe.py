@@ -67,6 +67,7 @@ def probe(port: str, baud: int | None = None) -> Found | str:
     """
     rates = _rates() if baud is None else {baud: list(DIALECTS)}
     silence = "silent"
+    BoardDialect().feed(0.0, b"\0\n")  # loads its kernel: nothing compiles while an answer is waited for
     try:
         with open_port(port, next(iter(rates)), READ_S) as line:
             for rate, protocols in rates.items():

@@ -46,7 +46,7 @@ class Source:
     ampere_step: float = 0.01
     dead_band_a: float = 0.0
     delay_s: float = 0.0
-    """The current of a sample is so much older than its voltage."""
+    """The current of a sample is so much older than its voltage; below 0: the voltage is."""
     volt_step: float = 1e-3
     """Of one cell."""
     capacity_ah: float = 3.0
@@ -61,7 +61,7 @@ class Source:
         rate = f"{self.rate_hz:g} Hz" if self.rate_hz >= 1.0 else f"{period_s:g} s"
         parts = [f"{self.capacity_ah:g} Ah", rate, f"{1e3 * self.ampere_step:g} mA"]
         parts += [f"{1e3 * self.volt_step:g} mV"] * (self.volt_step != Source.volt_step)
-        parts += [f"delay {self.delay_s:g} s"] * (self.delay_s > 0.0)
+        parts += [f"{'I' if self.delay_s > 0.0 else 'V'} {abs(self.delay_s):g} s late"] * (self.delay_s != 0.0)
         parts += ["house"] * self.house
         parts += [f"nothing below {self.dead_band_a:g} A, standby {self.standby_a:g} A"] * (self.dead_band_a > 0.0)
         return ", ".join(parts)
@@ -69,13 +69,17 @@ class Source:
     @property
     def sampling(self) -> Sampling:
         """What the estimator is told of it."""
-        return Sampling(1.0 / self.rate_hz, self.ampere_step, self.dead_band_a, self.delay_s)
+        return Sampling(1.0 / self.rate_hz, self.ampere_step, self.dead_band_a)
 
 
 RATES_HZ = (100.0, 1.0, 0.1, 1.0 / 60.0)
 SOURCES = (
     *(Source(rate, step) for step in (0.01, 0.1) for rate in RATES_HZ),
-    *(Source(rate, 0.01, delay_s=1.0) for rate in RATES_HZ),
+    *(Source(rate, delay_s=delay_s) for delay_s in (1.0, -1.0) for rate in RATES_HZ),
+    *(
+        Source(rate, delay_s=delay_s)
+        for delay_s, rate in ((3.0, 1.0), (-3.0, 1.0), (10.0, 1.0 / 60.0), (-10.0, 1.0 / 60.0))
+    ),
     *(Source(rate, step, capacity_ah=100.0) for step in (0.01, 0.1) for rate in (1.0, 0.1, 1.0 / 60.0)),
     Source(1.0, 0.1, volt_step=0.01),
     Source(1.0 / 60.0, 0.1, volt_step=0.01),
@@ -171,7 +175,9 @@ def seen(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
     at = at[: int(np.argmax(empty))] if empty.any() else at
     samples = np.zeros(at.size, dtype=SAMPLE)
     samples["time_s"] = at / rate_hz
-    shown_a = current_a[at - late] + rng.normal(0.0, 2e-3 * source.capacity_ah / 3.0, at.size)
+    shown_a = current_a[np.clip(at - late, 0, current_a.size - 1)] + rng.normal(
+        0.0, 2e-3 * source.capacity_ah / 3.0, at.size
+    )
     shown_a[np.abs(shown_a) < source.dead_band_a] = 0.0
     samples["current_a"] = np.round(shown_a / source.ampere_step) * source.ampere_step
     samples["voltage_v"] = (

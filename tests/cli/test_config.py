@@ -111,6 +111,8 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "number, without quotes"]),
         ("[observer]\nlambda = -1\n", ["observer.lambda = -1", "greater than 0"]),
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),
+        ('[page]\nlisten = "0.0.0.0:8765"\n', ["page: listen", "open to other machines: name a token_file"]),
+        ('[page]\nlisten = "8765"\n', ["page.listen = '8765'", "host:port"]),
         ('[pack]\ncell = ""\n', ["pack.cell = ''", "at least 1 character", "shipped cell's name"]),
         ("[pack]\nparallel = 20000\n", ["pack.parallel = 20000", "less than or equal to 10000"]),
         ("[sensor]\nbaud = 20_000_000\n", ["sensor.baud = 20000000", "less than or equal to 10000000"]),

@@ -2,10 +2,12 @@
 
 import asyncio
 import contextlib
+import json
 import re
 from datetime import datetime
 from types import SimpleNamespace
 
+import aiohttp
 import aiomqtt
 import pytest
 
@@ -44,12 +46,15 @@ async def listening(port):
 async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
     if board == "firmware" and not FirmwareBoard.is_built(FIRMWARE_BUILD):
         pytest.skip("the firmware is not built (make firmware)")
-    port = free_port()
-    async with demo("--seconds", 4, "--port", port, *(["--python-board"] if board == "python" else [])) as process:
+    port, page = free_port(), free_port()
+    where = ("--port", port, "--page-port", page)
+    async with demo("--seconds", 4, *where, *(["--python-board"] if board == "python" else [])) as process:
         listener = await listening(port)
         try:
             assert await listener.wait("bms/demo/availability") == b"online"
             state = await listener.wait_json("bms/demo/state", lambda s: s["frames_received"] > 100)
+            async with aiohttp.ClientSession(f"http://127.0.0.1:{page}") as browser, browser.get("/events") as events:
+                first = [await events.content.readline() for _ in range(3)]
             parameters = await listener.wait_json("bms/demo/parameters")
             info = await listener.wait_json("bms/demo/info", lambda i: i.get("board"))
             assert await listener.wait("bms/demo/sensor/availability", lambda p: p == b"online")
@@ -67,6 +72,8 @@ async def test_a_client_of_its_broker_sees_the_service_come_work_and_go(board):
     assert set(parameters["a"]) == {f"a{i}" for i in range(1, 22)}
     assert (info["device"], info["cell"], info["board"]["sample_rate_hz"]) == ("demo", "chen_mora", "100")
     assert health["line"]
+    assert {"demo/state", "demo/health", "demo/info"} <= json.loads(first[-1].removeprefix(b"data: ")).keys()
+    assert f"live page: http://127.0.0.1:{page}/" in out
     assert f"mosquitto_sub -p {port} -t 'bms/#' -v" in out
     assert ("firmware in simavr" if board == "firmware" else "board in Python") in out
     assert re.search(r" soc \d+\.\d\d ± \d+\.\d\d %  true \d+\.\d\d %  ", out)

@@ -52,7 +52,7 @@ def test_it_names_the_ports_that_are_there_and_no_others(capsys):
 @pytest.mark.parametrize(
     ("options", "answer"),
     [
-        (("--rate-hz", "50"), r"board, firmware 0\.1\.0, serial 0*1, 50 Hz"),
+        (("--rate-hz", "50"), r"board, firmware 0\.2\.0, serial 0*1, 50 Hz"),
         (("--text", "--load", "constant", "--current-a", "0"), r"prints text, [34]\S* V, \S+ A"),
     ],
 )

@@ -110,6 +110,8 @@ def test_it_ends_by_itself_after_the_seconds_of_its_time():
         ("--current-a", "inf"),
         ("--soc", "nan"),
         ("--speed", "inf"),
+        ("--protocol", "nonsense"),
+        ("--protocol", "jbd", "--series", "40"),
     ],
 )
 def test_what_there_is_not_is_named(arguments, capsys):

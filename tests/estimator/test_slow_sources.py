@@ -88,7 +88,7 @@ def test_a_board_is_as_it_was() -> None:
 
 def test_what_a_source_resolves_comes_from_its_protocol_unless_it_is_told() -> None:
     shunt = Settings.model_validate({"sensor": {"protocol": "pylontech", "current_dead_band_a": 0.0}})
-    assert shunt.sampling == Sampling(2.0, 0.01, 0.0, 1.0)
+    assert shunt.sampling == Sampling(2.0, 0.01, 0.0)
     assert Settings().sampling == Sampling(0.01)
     minute = Settings.model_validate({"sensor": {"protocol": "text", "period_s": 60}})
-    assert minute.sampling.period_s == minute.sample_period_s == 60.0
+    assert minute.sampling.period_s == minute.sensor.sample_period_s == 60.0

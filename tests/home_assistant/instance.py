@@ -1,19 +1,17 @@
 """A real Home Assistant on the loopback: its own folder, its own Python, asked over its REST and WebSocket API."""
 
-import asyncio
 import contextlib
-import itertools
 import json
 import os
 import sqlite3
 import subprocess
 import time
 import urllib.request
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import websockets
+from websockets.sync.client import connect
 
 from tests.mosquitto import free_port
 from tests.patience import LONG_S
@@ -35,6 +33,7 @@ homeassistant:
   unit_system: metric
   currency: EUR
   country: DE
+  language: de
 http:
   server_host: 127.0.0.1
   server_port: {port}
@@ -67,7 +66,6 @@ class HomeAssistant:
         (folder / "dashboard.yaml").symlink_to(dashboard)
         self._process: subprocess.Popen[bytes] | None = None
         self._token = ""
-        self._numbers = itertools.count(1)
 
     def start(self) -> None:
         """Until it answers; the first start makes an owner."""
@@ -83,7 +81,7 @@ class HomeAssistant:
                 break
             except OSError:
                 time.sleep(0.1)
-        if not all(step["done"] for step in steps):
+        if not steps[0]["done"]:
             self._onboard()
 
     def stop(self) -> None:
@@ -97,12 +95,6 @@ class HomeAssistant:
         code = self.ask("/api/onboarding/users", owner, authorized=False)["auth_code"]
         form = f"grant_type=authorization_code&code={code}&client_id={CLIENT}".encode()
         self._token = self._call("/auth/token", form)["access_token"]
-        for step, body in (
-            ("core_config", {}),
-            ("analytics", {}),
-            ("integration", {"client_id": CLIENT, "redirect_uri": CLIENT}),
-        ):
-            self.ask(f"/api/onboarding/{step}", body)
 
     def ask(self, path: str, body: Mapping[str, Any] | None = None, *, authorized: bool = True) -> Any:
         """What its REST API answers; with a ``body`` by POST."""
@@ -131,32 +123,24 @@ class HomeAssistant:
         """Call a service, such as ``number.set_value``."""
         self.ask(f"/api/services/{service.replace('.', '/')}", data)
 
-    async def until(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    def until(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """The states, once they are wanted."""
         deadline = time.monotonic() + LONG_S
-        while not wanted(states := await asyncio.to_thread(self.states)):
+        while not wanted(states := self.states()):
             assert time.monotonic() < deadline, {name: state["state"] for name, state in states.items()}
-            await asyncio.sleep(0.1)
+            time.sleep(0.1)
         return states
 
-    @contextlib.asynccontextmanager
-    async def socket(self) -> AsyncIterator[Callable[..., Any]]:
-        """Its WebSocket API: gives a function that sends a command and returns its result."""
-        async with websockets.connect(f"ws://127.0.0.1:{self._port}/api/websocket", max_size=None) as connection:
-            await connection.recv()
-            await connection.send(json.dumps({"type": "auth", "access_token": self._token}))
-            assert json.loads(await connection.recv())["type"] == "auth_ok"
-
-            async def command(kind: str, **arguments: Any) -> Any:
-                number = next(self._numbers)
-                await connection.send(json.dumps({"id": number, "type": kind, **arguments}))
-                while True:
-                    answer = json.loads(await connection.recv())
-                    if answer["id"] == number and answer["type"] == "result":
-                        assert answer["success"], answer
-                        return answer["result"]
-
-            yield command
+    def command(self, kind: str, **arguments: Any) -> Any:
+        """The result of a command of its WebSocket API."""
+        with connect(f"ws://127.0.0.1:{self._port}/api/websocket", max_size=None) as connection:
+            connection.recv()
+            connection.send(json.dumps({"type": "auth", "access_token": self._token}))
+            assert json.loads(connection.recv())["type"] == "auth_ok"
+            connection.send(json.dumps({"id": 1, "type": kind, **arguments}))
+            answer = json.loads(connection.recv())
+            assert answer["success"], answer
+            return answer["result"]
 
     @property
     def log(self) -> str:
@@ -164,11 +148,11 @@ class HomeAssistant:
         file = self.folder / "home-assistant.log"
         return file.read_text() if file.exists() else (self.folder / "console.log").read_text()
 
-    def rows(self, after_s: float = 0.0) -> list[tuple[str, float, str | None]]:
-        """Rows of its recorder: entity, when it was written [s since 1970], state."""
+    def rows(self, entities: str) -> list[tuple[str, str | None]]:
+        """Entity and state of its recorder's rows, of entities whose names are ``LIKE`` that, in their order."""
         query = (
-            "SELECT entity_id, last_updated_ts, state FROM states JOIN states_meta USING (metadata_id)"
-            " WHERE last_updated_ts > ? ORDER BY last_updated_ts"
+            "SELECT states_meta.entity_id, state FROM states JOIN states_meta USING (metadata_id)"
+            " WHERE states_meta.entity_id LIKE ? ORDER BY state_id"
         )
         with contextlib.closing(sqlite3.connect(self.folder / "home-assistant_v2.db")) as database:
-            return list(database.execute(query, (after_s,)))
+            return list(database.execute(query, (entities,)))

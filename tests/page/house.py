@@ -16,14 +16,16 @@ from tests.serial_line import Line
 
 Values = dict[str, Any]
 """What a board prints."""
-CELL, SERIES, CAPACITY_AH = "ncr18650", 14, 33.0
+CELL, SERIES, PARALLEL = "ncr18650", 14, 10
+PACK = f'cell = "{CELL}"\nseries = {SERIES}\nparallel = {PARALLEL}\ninitial_soc = 0.6'
+"""Of the simulated pack, as its file has it."""
 UNEVEN_V = [1e-3 * d for d in (2, -1, 3, 0, -4, 1, 5, -2, 1, 2, -17, 1, 4, 5)]
 """How far the cells of a simulated pack are from their mean [V]."""
 
 
 def simulated(load_a: float = 24.0, soc: float = 0.66) -> Callable[[float], Values]:
     """A pack of a bicycle's size under changing loads; the eleventh cell is weak."""
-    pack = SimulatedPack(load_cell(CELL, CAPACITY_AH).pack(SERIES, 1), random_steps(load_a, 4), soc=soc)
+    pack = SimulatedPack(load_cell(CELL).pack(SERIES, PARALLEL), random_steps(load_a, 4), soc=soc)
 
     def at(time_s: float) -> Values:
         reading = pack(time_s)
@@ -68,7 +70,7 @@ class Service:
         broker: Where it publishes.
         port: Of its page.
         board: What the board prints, by the time since it began [s].
-        series: Cells in series.
+        pack: What it is, as its file has it.
         name: Of the pack.
         rate_hz: How often the board prints and the service publishes.
     """
@@ -80,7 +82,7 @@ class Service:
         port: int,
         board: Callable[[float], Values],
         *,
-        series: int = SERIES,
+        pack: str = PACK,
         name: str = "attic",
         rate_hz: float = 10.0,
     ) -> None:
@@ -91,10 +93,7 @@ class Service:
         self._settings = f"""
 [pack]
 name = "{name}"
-cell = "{CELL}"
-capacity_ah = {CAPACITY_AH}
-series = {series}
-initial_soc = 0.6
+{pack}
 [sensor]
 port = "{self._line.path}"
 protocol = "text"

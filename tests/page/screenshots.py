@@ -20,13 +20,14 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Snapshot
 from tests.mosquitto import Broker, free_port
 from tests.page.chromium import PHONE, Tab, chromium, tab
-from tests.page.house import CAPACITY_AH, SERIES, Service, simulated
+from tests.page.house import SERIES, Service, simulated
 from tests.sinks.snapshots import ONE
 from tests.store.test_history import keep
 
 DOCS = Path(__file__).parents[2] / "docs"
 LEARN_S = 60.0
-SOC = 0.66
+SOC, CAPACITY_AH = 0.66, 30.0
+"""Of the pack, at the end of its day, roughly."""
 ALARMS = """
 [alarms]
 cell_imbalance = {limit_v = 0.02, delay_s = 1, severity = "critical"}
@@ -43,7 +44,7 @@ def yesterday() -> list[Snapshot]:
     snapshots = []
     for time_s, current_a, moved in zip(times, currents, socs, strict=True):
         soc = SOC + moved - socs[-1]
-        voltage_v = SERIES * (3.35 + 0.75 * soc - 2e-3 * current_a)
+        voltage_v = SERIES * (3.35 + 0.75 * soc - 5e-3 * current_a)
         told = {
             "time": iso_utc(time_s),
             "board_time_s": time_s,
@@ -52,7 +53,7 @@ def yesterday() -> list[Snapshot]:
             "power_w": voltage_v * current_a,
             "soc": soc,
             "soc_std": 0.012,
-            "temperature_c": 22.0 - 0.5 * current_a,
+            "temperature_c": 24.0 - 0.5 * current_a,
         }
         snapshots.append(ONE._replace(estimate=ONE.estimate.model_copy(update=told)))
     return snapshots
@@ -61,7 +62,7 @@ def yesterday() -> list[Snapshot]:
 def _current_a(time_s: float) -> float:
     """Of a house: 8 h of sun."""
     hour = time_s % 86_400 / 3600.0
-    return 1.2 + 0.4 * math.sin(time_s / 700.0) - 6.0 * max(0.0, 1.0 - ((hour - 12.5) / 4.0) ** 2)
+    return 0.9 + 0.3 * math.sin(time_s / 700.0) - 4.0 * max(0.0, 1.0 - ((hour - 12.5) / 4.0) ** 2)
 
 
 async def shoot(opened: Tab, name: str, part: str = "") -> None:

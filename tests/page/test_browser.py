@@ -17,6 +17,9 @@ import pytest_asyncio
 from playwright.async_api import Browser
 
 from bms_estimator.model.estimate import Alarm
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.model.settings import MqttSettings
+from bms_estimator.page.dashboard import dashboard
 from tests.mosquitto import MOSQUITTO, Broker, Listener, free_port
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, starting
@@ -27,6 +30,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 
 MINUS = "\N{MINUS SIGN}"
+PACK = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
 CELLS = (3.311, 3.325, 3.318, 3.322)
 CELLAR = "bms/cellar"
 ODD = {
@@ -116,7 +120,7 @@ def board(_time_s: float) -> dict[str, Any]:
 async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
     await keep(folder / "cellar.sqlite", [])
     port = free_port()
-    async with Service(folder, broker, free_port(), board, series=4) as service, Listener(broker) as live:
+    async with Service(folder, broker, free_port(), board, pack=PACK) as service, Listener(broker) as live:
         arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
         process = await starting(folder, "dashboard", *arguments, port=port)
         await publish(live, "availability", b"online")
@@ -338,11 +342,10 @@ async def test_it_is_stale_while_the_broker_is_away_until_new_values_come(browse
 
 
 async def test_beyond_this_machine_it_asks_for_the_token(browser: Browser, folder: Path, broker: Broker) -> None:
-    port, token = free_port(), folder / "token"
+    token = folder / "token"
     token.write_text("0123456789abcdef")
-    arguments = ("--mqtt", broker.url, "--listen", f"0.0.0.0:{port}", "--token-file", token, "--no-browser")
-    process = await starting(folder, "dashboard", *arguments, port=port)
-    async with tab(browser, f"http://127.0.0.1:{port}/") as opened:
+    settings = PageSettings(listen=f"0.0.0.0:{free_port()}", token_file=token)
+    async with dashboard(MqttSettings(url=broker.url), settings, folder) as url, tab(browser, url) as opened:
         assert await opened.page.locator("#pack").count() == 0
         await opened.page.get_by_label("Token").fill("0123456789abcdef")
         await opened.page.keyboard.press("Enter")
@@ -350,8 +353,6 @@ async def test_beyond_this_machine_it_asks_for_the_token(browser: Browser, folde
         assert "token" not in opened.page.url
         await opened.page.reload()
         await opened.page.locator("#pack").wait_for()
-    process.terminate()
-    assert await process.wait() == 0
 
 
 @pytest.mark.parametrize("size", [PHONE, {"width": 320, "height": 600}, {"width": 1920, "height": 1080}], ids=str)

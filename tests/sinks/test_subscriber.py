@@ -116,6 +116,18 @@ async def test_before_there_is_a_broker_it_is_lost_since_the_start(broker: Broke
         await watch.until(lambda: watch.links == [None])
 
 
+async def test_a_fault_of_who_is_called_is_seen(broker: Broker) -> None:
+    def fail(_: Heard) -> None:
+        raise ZeroDivisionError
+
+    subscriber = Subscriber(MqttSettings(url=broker.url), fail)
+    with pytest.RaisesGroup(ZeroDivisionError, flatten_subgroups=True):
+        async with subscriber, Listener(broker) as other:
+            await until(lambda: subscriber.lost_since is None)
+            await other.publish("bms/pack/state", b"1", qos=1)
+            await until(lambda: subscriber.lost_since is not None)
+
+
 @pytest.fixture
 def broker_with_passwords(tmp_path: Path) -> Iterator[Broker]:
     if MOSQUITTO is None:

@@ -90,7 +90,7 @@ def test_no_frames_make_signals_of_a_dbc_file_raise(named: CanSource, frames: li
 def test_a_known_bus_is_read() -> None:
     given = source(profile="pylontech-can")
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
-    assert given.sensor == {"current_sign": "charge_positive", **steps, "period_s": 1.0}
+    assert given.sensor == {"current_sign": "charge_positive", **steps}
     map_ = CanMap(given)
     assert map_.places == (Place(0x356, False),)
     assert map_.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"

@@ -76,12 +76,12 @@ def test_a_refused_request_is_split_by_quantity_and_without_gaps() -> None:
 def test_readings_of_known_devices() -> None:
     victron = source(profile="victron-gx")
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
-    assert victron.sensor == {"current_sign": "charge_positive", **steps, "period_s": 1.0}
+    assert victron.sensor == {"current_sign": "charge_positive", **steps}
     told = words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
-    assert reading_of(victron, told) == (52.34, -12.3, -2.5, (), pytest.approx(math.nan, nan_ok=True))
+    assert reading_of(values_of(victron), told) == (52.34, -12.3, -2.5, (), pytest.approx(math.nan, nan_ok=True))
     seplos = source(profile="seplos-v3")
     held = {0x1000: 5320, 0x1001: 0xFF38, 0x1009: 2961} | {0x1100 + i: 3325 + i for i in range(16)}
-    reading = reading_of(seplos, {("input", address): word for address, word in held.items()})
+    reading = reading_of(values_of(seplos), {("input", address): word for address, word in held.items()})
     assert reading is not None
     assert reading[:3] == (53.2, -2.0, 22.95)
     assert reading.cells_v == tuple(round(3.325 + i / 1000, 3) for i in range(16))
@@ -92,11 +92,11 @@ def test_a_float_that_is_no_number_is_not_measured(raw: float) -> None:
     register = {"address": 0, "type": "float32"}
     given = source(voltage=register, current=register | {"address": 2}, temperature=register | {"address": 4})
     held = words(13.0, "float32") | words(1.5, "float32", address=2) | words(raw, "float32", address=4)
-    reading = reading_of(given, held)
+    reading = reading_of(values_of(given), held)
     assert reading is not None
     assert math.isnan(reading.temperature_c)
-    assert reading_of(given, held | words(raw, "float32")) is None
-    assert reading_of(given, held | words(raw, "float32", address=2)) is None
+    assert reading_of(values_of(given), held | words(raw, "float32")) is None
+    assert reading_of(values_of(given), held | words(raw, "float32", address=2)) is None
 
 
 def test_a_value_beyond_all_numbers_is_not_measured() -> None:
@@ -112,12 +112,12 @@ def test_what_stands_for_nothing_measured_is_nothing_measured() -> None:
         cells={"address": 3, "count": 2, "absent": 0, "scale": 0.001},
     )
     held = {("holding", i): word for i, word in enumerate([1300, 0xFFFF, 32767, 3300, 0])}
-    reading = reading_of(given, held)
+    reading = reading_of(values_of(given), held)
     assert reading is not None
     assert (reading.current_a, reading.cells_v[0]) == (-1.0, 3.3)
     assert math.isnan(reading.temperature_c)
     assert math.isnan(reading.cells_v[1])
-    none = reading_of(given, held | {("holding", 3): 0})
+    none = reading_of(values_of(given), held | {("holding", 3): 0})
     assert none is not None
     assert none.cells_v == ()
 

@@ -46,7 +46,7 @@ function times(plot, splits) {
 }
 
 const axis = { stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif" };
-const thin = { points: { show: false }, spanGaps: false };
+const thin = { points: { show: false }, pxAlign: 0 };
 const minus = (text) => text.replace("-", "−");
 
 /** A range that no noise fills: at least `least` high. */

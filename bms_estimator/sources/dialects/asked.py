@@ -12,14 +12,13 @@ from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
 PACE_S = 1.0
-"""A round of questions begins so often [s]; these devices measure two to ten times a second."""
+"""A round of questions begins so often [s]: as dbus-serialbattery asks them."""
 GAP_S = 0.22
 """Between two questions: the longest answer, 48 cells of a Daly at 9600 baud, takes so long on the line [s]."""
 UNANSWERED_ROUNDS = 3
 """After so many the other way of asking is tried, where there is one."""
 NOISE_BYTES = 64
 """So much without a frame is no single glitch."""
-
 LONGEST_START = 4
 """No frame begins with more bytes that are always the same."""
 FAULTS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs")

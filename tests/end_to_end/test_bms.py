@@ -1,0 +1,62 @@
+"""A BMS in place of a board: simulated pack -> JK-BMS -> serial line -> the real program -> the real broker."""
+
+import asyncio
+import contextlib
+import math
+import signal
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.simulation.simulated_bms import SPREAD_V, SimulatedBms
+from bms_estimator.simulation.simulated_pack import SimulatedPack, constant
+from tests.command_line import PROGRAM
+from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
+
+CELLS, LOAD_A, START_SOC = 16, 20.0, 0.6
+SAMPLES = 5
+
+
+async def test_soc_and_cells_of_a_jk_are_published(tmp_path: Path, broker: Broker) -> None:
+    signal_of_pack = SimulatedPack(load_cell("lfp", 100.0).pack(CELLS, 1), constant(LOAD_A), soc=START_SOC)
+    bms = SimulatedBms("jk", signal_of_pack, cells=CELLS, soc=lambda: signal_of_pack.soc)
+    pack = tmp_path / "pack.toml"
+    with bms:
+        pack.write_text(f"""
+[pack]
+cell = "lfp"
+capacity_ah = 100.0
+series = {CELLS}
+initial_soc = {START_SOC}
+[sensor]
+port = "{bms.path}"
+protocol = "jk"
+[mqtt]
+url = "{broker.url}"
+[state]
+folder = "{tmp_path / "state"}"
+""")
+        speaking = asyncio.create_task(bms.run())
+        async with Listener(broker, "bms/#") as listener:
+            process = await asyncio.create_subprocess_exec(
+                str(PROGRAM), "run", str(pack), stdout=asyncio.subprocess.DEVNULL
+            )
+            try:
+                state = await listener.wait_json("bms/pack/state", lambda s: s["frames_received"] >= SAMPLES)
+                assert await listener.wait("bms/pack/sensor/availability") == b"online"
+            finally:
+                with contextlib.suppress(ProcessLookupError):
+                    process.send_signal(signal.SIGTERM)
+                assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+        speaking.cancel()
+        await asyncio.gather(speaking, return_exceptions=True)
+    assert state["current_a"] == pytest.approx(LOAD_A, abs=0.01)
+    assert state["soc"] == pytest.approx(signal_of_pack.soc, abs=0.02)
+    assert state["temperature_c"] == 25.0
+    assert len(state["cells_v"]) == CELLS
+    assert math.fsum(state["cells_v"]) == pytest.approx(state["voltage_v"], abs=0.02)
+    assert max(state["cells_v"]) - min(state["cells_v"]) < 2 * SPREAD_V + 1e-3
+    assert state["cells_v"][state["cell_lowest"] - 1] == min(state["cells_v"])
+    assert (state["frames_lost"], state["crc_errors"]) == (0, 0)

@@ -1,0 +1,45 @@
+"""One Home Assistant, one broker and one service for all of these tests."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.home_assistant.instance import ENVIRONMENT, MISSING, HomeAssistant
+from tests.home_assistant.packs import Packs
+from tests.mosquitto import MOSQUITTO, Broker
+
+DASHBOARD = Path(__file__).parents[2] / "deploy/home-assistant/dashboard.yaml"
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    if not (ENVIRONMENT / "ready").exists():
+        pytest.skip(MISSING)
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    broker = Broker(tmp_path_factory.mktemp("broker")).start()
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture(scope="module")
+def packs(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Packs]:
+    packs = Packs(tmp_path_factory.mktemp("packs"), broker)
+    packs.start()
+    yield packs
+    packs.close()
+
+
+@pytest.fixture(scope="module")
+def home(packs: Packs, broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[HomeAssistant]:
+    """With all entities of both packs."""
+    home = HomeAssistant(tmp_path_factory.mktemp("home"), DASHBOARD)
+    try:
+        home.start()
+        home.add_mqtt(broker.port)
+        home.until(lambda states: {"sensor.bms_pack_cell_lowest", "sensor.bms_bench_voltage_v"} <= set(states))
+        home.until(lambda states: states["sensor.bms_pack_cell_lowest"]["state"] == "3")
+        yield home
+    finally:
+        home.stop()

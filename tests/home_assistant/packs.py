@@ -1,0 +1,111 @@
+"""The real service with two packs: a board that prints text with its cells, and one of the firmware's kind."""
+
+import asyncio
+import contextlib
+import json
+import os
+import subprocess
+import threading
+from pathlib import Path
+from typing import Any
+
+from bms_estimator.simulation.virtual_board import Reading, VirtualBoard
+from tests.command_line import PROGRAM
+from tests.mosquitto import Broker
+from tests.patience import LONG_S
+from tests.serial_line import Line
+
+COMMANDS = ("set_soc", "current_zero", "acknowledge_alarm", "publish_rate")
+SETTINGS = """
+[pack]
+name = "{name}"
+{cell}
+initial_soc = 0.5
+[sensor]
+port = "{port}"
+protocol = "{protocol}"
+[publish]
+rate_hz = 5
+[mqtt]
+url = "{url}"
+commands = {commands}
+"""
+LFP = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4'
+SOC_LOW = "[alarms]\nsoc_low = {limit = 0.1, clear = 0.2, delay_s = 0, clear_delay_s = 0}\n"
+PRINTED_S = 0.1
+
+
+class Packs:
+    """A service, and what its boards measure.
+
+    Attributes:
+        printed: What the board with cells prints, ...
+        silent: ... unless this is set.
+    """
+
+    def __init__(self, folder: Path, broker: Broker) -> None:
+        self._folder = folder
+        self._line = Line(folder / "printing-board")
+        self._board = VirtualBoard(lambda _: Reading(0.0, 3.7, 25.0), rate_hz=10)
+        self._ended = threading.Event()
+        self.silent = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+        cells_v = [3.301, 3.302, 3.28, 3.303]
+        self.printed: dict[str, Any] = {"voltage": sum(cells_v), "current": 2.0, "temp": 21.5, "cells": cells_v}
+        common = {"url": broker.url, "commands": list(COMMANDS)}
+        self._line.plug()
+        self._board.__enter__()
+        texts = {
+            "pack": SETTINGS.format(name="pack", cell=LFP, port=self._line.path, protocol="text", **common) + SOC_LOW,
+            "bench": SETTINGS.format(
+                name="bench", cell='cell = "chen_mora"', port=self._board.path, protocol="binary", **common
+            ),
+        }
+        self._files = [folder / f"{name}.toml" for name in texts]
+        for file, text in zip(self._files, texts.values(), strict=True):
+            file.write_text(text)
+        self._threads = [threading.Thread(target=self._print), threading.Thread(target=self._sample)]
+        for thread in self._threads:
+            thread.start()
+
+    def start(self) -> None:
+        environment = os.environ | {"XDG_STATE_HOME": str(self._folder)}
+        with (self._folder / "service.log").open("ab") as log:
+            command = [str(PROGRAM), "run", *map(str, self._files)]
+            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
+
+    def kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait(LONG_S)
+            self._process = None
+
+    def close(self) -> None:
+        self.kill()
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(LONG_S)
+        self._line.unplug()
+        self._board.__exit__()
+
+    @property
+    def log(self) -> str:
+        return (self._folder / "service.log").read_text()
+
+    def _print(self) -> None:
+        with contextlib.suppress(OSError):  # nobody has opened it yet
+            self._line.heard()  # leaves its end such that a full line holds nobody up
+        while not self._ended.wait(PRINTED_S):
+            with contextlib.suppress(OSError):  # it is full, or nobody has opened it
+                if not self.silent.is_set():
+                    self._line.write(json.dumps(self.printed).encode() + b"\r\n")
+
+    def _sample(self) -> None:
+        async def sample() -> None:
+            running = asyncio.create_task(self._board.run())
+            while not self._ended.is_set():  # noqa: ASYNC110 - of another thread
+                await asyncio.sleep(PRINTED_S)
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+
+        asyncio.run(sample())
