@@ -264,7 +264,7 @@ class Alarms:
         }
         for name, of in values.items():
             self._take(name, times_s, seen_s, of, wall_s)
-        self._take("link_lost", times_s, passed_s, passed_s, wall_s)
+        self._take("link_lost", times_s, passed_s, np.where(seen_s < passed_s, passed_s, 0.0), wall_s)
 
     def _judge_share(self, at_s: float, counts: Counts, suspects: Suspect, wall_s: float) -> None:
         """Of samples that are lost or unusable among all."""

@@ -26,6 +26,8 @@ from tests.store.test_history import keep
 
 DOCS = Path(__file__).parents[2] / "docs"
 LEARN_S = 60.0
+TOP = 500
+"""So much of the page shows what an alarm, or stale values, look like [px]."""
 SOC, CAPACITY_AH = 0.66, 30.0
 """Of the pack, at the end of its day, roughly."""
 ALARMS = """
@@ -65,12 +67,12 @@ def _current_a(time_s: float) -> float:
     return 0.9 + 0.3 * math.sin(time_s / 700.0) - 4.0 * max(0.0, 1.0 - ((hour - 12.5) / 4.0) ** 2)
 
 
-async def shoot(opened: Tab, name: str, part: str = "") -> None:
+async def shoot(opened: Tab, name: str, part: str = "", *, top: bool = False) -> None:
     path = DOCS / f"page-{name}.png"
     if part:
         await opened.page.locator(part).screenshot(path=path)
     else:
-        await opened.page.screenshot(path=path)
+        await opened.page.screenshot(path=path, clip={"x": 0, "y": 0, "width": 1280, "height": TOP} if top else None)
     sys.stdout.write(f"{path.relative_to(DOCS.parent)}: {path.stat().st_size / 1e3:.0f} kB\n")
 
 
@@ -91,18 +93,18 @@ async def shoot_all(service: Service, browser: Browser) -> None:
         await opened.page.get_by_text("Day", exact=True).click()
         await opened.page.get_by_role("img", name="Voltage, last day: from").wait_for()
         await shoot(opened, "day", ".curves")
-    async with shown(browser, service, size=PHONE, device_scale_factor=2) as opened:
+    async with shown(browser, service, size=PHONE, device_scale_factor=1.5) as opened:
         await shoot(opened, "phone")
     async with shown(browser, service, color_scheme="dark") as opened:
         await shoot(opened, "dark")
         await service.kill()
         await opened.until_status("stale since")
-        await shoot(opened, "stale")
+        await shoot(opened, "stale", top=True)
     await service.start(ALARMS)
     async with shown(browser, service) as opened:
         await opened.page.locator(".alarm").nth(1).wait_for()
         await asyncio.sleep(LEARN_S / 2)
-        await shoot(opened, "alarm")
+        await shoot(opened, "alarm", top=True)
 
 
 async def main() -> None:
