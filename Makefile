@@ -16,7 +16,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check test demo benchmark compare home-assistant real-home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -36,7 +36,7 @@ check: venv ## style and types, in seconds
 	$(BIN)/mypy
 
 test: apt venv ## all there is to check: packages, style, types, firmware, pytest
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant
 	$(BIN)/python -m pytest --numprocesses=2 --dist=loadfile $(ARGS)
 
 demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
@@ -45,6 +45,9 @@ demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--
 
 nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)
+
+real-home-assistant:
+	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)" || echo "no real Home Assistant here: its tests are skipped"
 
 home-assistant: apt venv ## tests with the real Home Assistant, which is made first, once: two minutes
 	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)"
