@@ -16,7 +16,7 @@ from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.replay import RawCapture
 from tests.mosquitto import Broker, Listener, free_port
-from tests.patience import LONG_S
+from tests.patience import LONG_S, end
 
 STATE, HEALTH, AVAILABILITY = "bms/pack/state", "bms/pack/health", "bms/pack/sensor/availability"
 ONLINE = AVAILABILITY, b"online"
@@ -57,8 +57,7 @@ async def publishing(broker: Broker, voltage: str, current: str) -> AsyncIterato
     try:
         yield
     finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+        await end(task)
 
 
 @contextlib.asynccontextmanager
@@ -139,8 +138,7 @@ async def test_a_publisher_that_must_be_asked_is_asked(broker: Broker) -> None:
             keepalive = await listener.wait("R/c0619ab/keepalive")
             assert keepalive == b'{"keepalive-options":["suppress-republish"]}'
         finally:
-            device.cancel()
-            await asyncio.gather(device, return_exceptions=True)
+            await end(device)
 
 
 async def test_the_next_broker_is_tried_and_the_one_that_is_not_there_is_named(broker: Broker) -> None:
