@@ -152,11 +152,11 @@ class Reports:
 
     async def __aexit__(self, *_: object) -> None:
         """Have no more brought."""
-        tasks = {task for task in (self._watcher, self._task) if task is not None}
+        tasks: set[asyncio.Task[None]] = {task for task in (self._watcher, self._task) if task is not None}
         while tasks:  # wait_for of Python 3.11, in what a bringer calls, may swallow that it is to end
             for task in tasks:
                 task.cancel()
-            _, tasks = await asyncio.wait(tasks, timeout=LOOK_S)
+            _done, tasks = await asyncio.wait(tasks, timeout=LOOK_S)
 
     async def __aiter__(self) -> AsyncIterator[SampleBlock]:
         """Blocks as lines come. What the tap gets is what has been yielded."""
