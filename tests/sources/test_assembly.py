@@ -81,7 +81,7 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
             ("daly-bms/sensor/cell_1_voltage/state", "3.301"),
         ],
         {"voltage_v": 53.0, "current_a": -12.3},
-        "charge_positive",
+        "discharge_positive",
     ),
     "venus": (
         {"profile": "venus", "prefix": "c0619ab12345", "instance": "1"},
