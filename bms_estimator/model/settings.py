@@ -42,6 +42,10 @@ class PackSettings(Strict):
     initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
 
 
+NO_DEVICE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
+"""What ``[sensor]`` may say of a device on a serial line beside ``[source]``: no more than a file with all defaults does."""
+
+
 def _filled(sensor: dict[str, object]) -> dict[str, object]:
     """The table ``[sensor]`` with what it leaves out, as ``RESOLUTIONS`` has it of the device."""
     protocol = sensor.get("protocol")
@@ -306,7 +310,11 @@ class Settings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _sensor_of_the_source(cls, tables: object) -> object:
-        """What a source that is no serial line makes of ``[sensor]``: it hands on lines of text."""
+        """What a source that is no serial line makes of ``[sensor]``: it hands on lines of text.
+
+        Raises:
+            ValueError: The table is of a serial device.
+        """
         if not isinstance(tables, dict) or tables.get("source") is None:
             return tables
         sensor = tables.get("sensor", {})
@@ -317,6 +325,9 @@ class Settings(Strict):
             return tables
         if not isinstance(told, dict):
             return tables
+        if serial := [name for name, none in NO_DEVICE.items() if told.get(name, none[0]) not in none]:
+            names = ", ".join(f"sensor.{name}" for name in serial)
+            raise ValueError(f"{names}: tells of a serial device, and [source] is none: take that away, or [source]")
         return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **told, "protocol": "text"}}
 
     @property

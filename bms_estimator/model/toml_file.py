@@ -87,7 +87,7 @@ def _line(path: Path, model: type[BaseModel], table: object, detail: Any) -> str
         return f"{path}: {where}: unknown key"
     message = detail["msg"].removeprefix("Value error, ")
     if isinstance(detail["input"], dict):
-        return f"{path}: {where}: {message}"
+        return ": ".join(filter(None, (str(path), where, message)))
     return f"{path}: {where} = {without_secrets(repr(detail['input']))}: {message}{hint}"
 
 

@@ -61,10 +61,13 @@ class _Frame:
     """Of the DBC file, where one of the signals is named."""
 
     def values(self, data: bytes) -> Iterator[tuple[Key, float | None]]:
-        """In V, A or degC; NaN where one is absent, None where ``data`` does not hold it."""
+        """In V, A or degC; NaN where one is absent, None where ``data`` is too short; not those of another multiplexer value."""
         named = _named(self.message, data) if self.message is not None else {}
+        in_turns = bool(named) and self.message is not None and self.message.is_multiplexed()
         for key, signal in self.signals:
             raw = bits_of(signal, data) if signal.signal is None else named.get(signal.signal.split(".")[-1])
+            if raw is None and in_turns:
+                continue
             if raw is None:
                 yield key, None
             elif raw == signal.absent or not math.isfinite(value := raw * signal.scale + signal.offset):

@@ -4,7 +4,7 @@ import asyncio
 import errno
 from collections.abc import AsyncGenerator, Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from bms_estimator.model.linux_settings import LinuxSource
 from bms_estimator.model.settings import Settings
@@ -46,6 +46,7 @@ class LinuxSensor(Bringer):
     def __init__(self, settings: LinuxSource, root: Path = SYS, hung_s: float = HUNG_S) -> None:
         self._settings, self._root, self._hung_s = settings, root, hung_s
         self._thread = DiskThread("sysfs")
+        self._left: asyncio.Future[Any] | None = None  # a call that hung: there is none beside it
         self._counters = {"read_errors": 0, "value_errors": 0}
         self._fault: str | None = None
 
@@ -83,13 +84,23 @@ class LinuxSensor(Bringer):
 
     async def _read(self, call: Callable[[], T]) -> T:
         """What a call says that may wait for the bus."""
+        if self._left is not None:
+            await self._wait(self._left)
+            self._left = None
         future = asyncio.get_running_loop().run_in_executor(self._thread, call)
+        try:
+            await self._wait(future)
+        except NothingComesError:
+            future.add_done_callback(lambda late: late.exception())  # nobody asks for it any more
+            self._left = future
+            raise
+        return future.result()
+
+    async def _wait(self, future: asyncio.Future[T]) -> None:
+        """Raises: NothingComesError: The bus hangs."""
         done, _ = await asyncio.wait({future}, timeout=self._hung_s)
         if not done:
-            future.cancel()
-            self._thread = DiskThread("sysfs")  # the one before waits still
             raise NothingComesError(f"the bus has not answered for {self._hung_s:g} s")
-        return future.result()
 
     def _find(self) -> _Chip:
         """In the thread."""

@@ -13,6 +13,9 @@ from serial.tools.list_ports_common import ListPortInfo
 
 BY_ID = Path("/dev/serial/by-id")
 
+WRITE_S = 1.0
+"""A device that takes nothing for so long is given up; a serial line takes the longest question in a tenth [s]."""
+
 ANY_PRODUCT = range(0x10000)
 BRIDGE_CHIPS: Mapping[int, Collection[int]] = {
     0x0403: (0x6001, 0x6010, 0x6011, 0x6014, 0x6015),  # FTDI FT232, FT2232, FT4232, FT232H, FT231X
@@ -104,7 +107,7 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
         NoPortError: It cannot be opened.
     """
     try:
-        return serial.Serial(path, baud, timeout=timeout_s, exclusive=True)
+        return serial.Serial(path, baud, timeout=timeout_s, write_timeout=WRITE_S, exclusive=True)
     except (OSError, termios.error, ValueError, OverflowError) as error:  # a port may die while it is opened
         if isinstance(error, OSError) and error.errno in (errno.EBUSY, errno.EAGAIN):
             raise HeldPortError(path) from None

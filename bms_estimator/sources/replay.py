@@ -64,7 +64,13 @@ class RawCapture:
     def __init__(
         self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
     ) -> None:
-        told = sensor or sensor_of(path)
+        recorded = sensor_of(path)
+        told = sensor or recorded
+        if told.protocol != recorded.protocol:
+            raise UserError(
+                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {told.protocol!r}: "
+                "give settings with that protocol, or none"
+            )
         self.decoder = make_dialect(told.model_copy(update={"current_sign": current_sign or told.current_sign}))
         self.damaged, self.unread_bytes = False, 0
         self._path = path

@@ -122,6 +122,10 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
         ('[mqtt]\nbase_topic = "home/bms/"\n', ["mqtt.base_topic = 'home/bms/'", "no / at either end"]),
         ("[source]\nchip = 5\n", ["source.kind", "missing"]),
         (
+            '[sensor]\nport = "/dev/ttyUSB0"\nprotocol = "jbd"\n[source]\nkind = "linux"\n',
+            ["sensor.port, sensor.protocol: ", "take that away, or [source]"],
+        ),
+        (
             '[source]\nkind = "linux"\nshunt_ohm = 0\n',
             ["source.shunt_ohm = 0: ", "greater than 0", "shunt that is fitted"],
         ),

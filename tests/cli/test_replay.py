@@ -337,3 +337,13 @@ def test_the_battery_data_format_keeps_its_sign_whatever_the_board_has(capture, 
         pack.write_text(f'[sensor]\ncurrent_sign = "{sign}"\n')
         assert currents(capsys, out, bdf, "--pack", pack) == [-1.0, 0.0]
     assert currents(capsys, out, bdf, "--pack", pack, "--current-sign", "discharge_positive") == [0.0, 1.0]
+
+
+def test_a_recording_of_another_protocol_than_that_of_the_settings_is_named(tmp_path, capsys):
+    capture, pack = tmp_path / "meter.bmsraw", tmp_path / "pack.toml"
+    with CaptureWriter(capture, CaptureHeader("junctek", "/dev/ttyUSB0", 115_200, "charge_positive")) as writer:
+        writer.write(0.0, b":r50=1,34,5166,1030,109337,11738441,62100651,48663,125,0,99,0,644,9117,\r\n")
+    pack.write_text("")
+    code, _, err = run(capsys, "replay", capture, "--pack", pack)
+    assert code == 2
+    assert "recorded from protocol 'junctek', and sensor.protocol is 'binary'" in err

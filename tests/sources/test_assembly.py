@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from bms_estimator.model.mqtt_source_settings import MqttSource
 from bms_estimator.model.settings import Settings
 from bms_estimator.sources.assembly import Assembly
-from bms_estimator.sources.payload import NoNumberError, many, one
+from bms_estimator.sources.dialects.text import TextDialect
+from bms_estimator.sources.payload import MOST_CELLS, NoNumberError, many, one
 
 Messages = list[tuple[str, str]]
 
@@ -81,7 +82,7 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
             ("daly-bms/sensor/cell_1_voltage/state", "3.301"),
         ],
         {"voltage_v": 53.0, "current_a": -12.3},
-        "charge_positive",
+        "discharge_positive",
     ),
     "venus": (
         {"profile": "venus", "prefix": "c0619ab12345", "instance": "1"},
@@ -198,6 +199,14 @@ def test_a_batch_that_ends_with_cells_tells_them_with_the_next_sample() -> None:
 )
 def test_paths_units_scales_and_times(where: dict[str, Any], payload: str, sample: dict[str, Any]) -> None:
     assert told(Assembly(own(**where)), [("home/pack", payload)]) == [sample]
+
+
+def test_a_pack_with_as_many_cells_as_are_taken_is_a_sample_of_the_dialect() -> None:
+    assembly, dialect = Assembly(own(cells="c")), TextDialect()
+    payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MOST_CELLS})
+    assembly.take("home/pack", payload.encode(), 0.0, retained=False)
+    assert dialect.feed(0.0, assembly.line(0.0)).size == 1
+    assert dialect.cells.shape == (1, MOST_CELLS)
 
 
 def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ever() -> None:

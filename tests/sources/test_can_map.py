@@ -154,7 +154,9 @@ def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
     assert map_.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
     assert map_.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
     assert map_.feed(0.0, 0x501, False, bytes([1, 0xE6, 0x0C])) is None
+    assert map_.counters["short_frames"] == 0  # a multiplexer tells some of them at a time
     assert map_.feed(0.0, 0x501, False, bytes([7, 0, 0])) is None
+    assert map_.counters["short_frames"] == 1
     reading = map_.feed(0.0, 0x500, False, (4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
     assert reading is not None
     assert reading[:4] == (400.1, 12.3, 25.0, (3.3, 3.301, 3.302))

@@ -1,6 +1,7 @@
 """Sensors by sysfs: a folder that looks like it, its values in SI, files that fail, vanish, hang or hold junk."""
 
 import os
+import threading
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from pathlib import Path
@@ -13,6 +14,7 @@ from bms_estimator.sources.linux_sensor import LinuxSensor
 from bms_estimator.sources.report_line import CONNECTED
 from bms_estimator.sources.reports import NothingComesError
 from bms_estimator.sources.text_line import Reading, read_line
+from tests.patience import LONG_S
 from tests.sources.sysfs_folder import hwmon, iio
 
 INA226 = {"in0_input": 25, "in1_input": 13280, "curr1_input": -2510, "shunt_resistor": 10000, "update_interval": 2}
@@ -138,15 +140,22 @@ async def test_a_file_that_fails_or_holds_junk_costs_a_sample_and_is_counted_and
             await _drain(lines)
 
 
-async def test_a_bus_that_hangs_holds_up_nothing_and_is_left(tmp_path: Path):
+async def test_a_bus_that_hangs_holds_up_nothing_and_is_left_until_it_answers(tmp_path: Path):
     folder = hwmon(tmp_path, **INA226)
     (folder / "curr1_input").unlink()
     os.mkfifo(folder / "curr1_input")  # opening it waits for somebody who writes
     ina = sensor(tmp_path)
-    for _ in range(2):
+    before = set(threading.enumerate())
+    for _ in range(3):
         with pytest.raises(NothingComesError, match=r"the bus has not answered for 0.05 s"):
             await first(ina.bring())
-    os.close(os.open(folder / "curr1_input", os.O_RDWR | os.O_NONBLOCK))  # lets go who waits
+    assert len(set(threading.enumerate()) - before) == 1
+    writer = os.open(folder / "curr1_input", os.O_RDWR | os.O_NONBLOCK)
+    (folder / "curr1_input").unlink()
+    (folder / "curr1_input").write_text("1500\n")
+    os.close(writer)  # lets go who waits
+    ina._hung_s = LONG_S
+    assert (await first(ina.bring())).current_a == 1.5
 
 
 async def test_a_temperature_that_fails_costs_no_sample(tmp_path: Path):

@@ -213,6 +213,37 @@ def test_a_junctek_is_asked_once_a_second_and_after_the_port_was_opened_anew() -
     assert dialect.due(1.1) == ASK
 
 
+def test_cells_that_a_console_has_not_told_for_long_stand_beside_no_sample() -> None:
+    dialect = PylontechDialect()
+    dialect.feed(1.0, bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + US2000_PWR)
+    assert dialect.cells.shape == (1, 30)
+    dialect.feed(60.0, bat(1, US2000_CELLS) + US2000_PWR)
+    assert dialect.cells.shape == (1, 30)
+    assert dialect.feed(100.0, US2000_PWR).size == 1
+    assert dialect.cells.size == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("vedirect", BMV_NOW[40:] + BMV_NEXT),
+        ("junctek", KH_CHARGING[20:] + KG_DISCHARGING),
+        ("pylontech", bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + b"\rpyl" + US2000_PWR),
+    ],
+)
+def test_a_port_that_was_opened_anew_changes_no_sample_since_no_recording_tells_of_it(name: str, data: bytes) -> None:
+    reads = [(0.01 * n, data[n : n + 7]) for n in range(0, len(data), 7)]
+    sensor = SensorSettings.model_validate({"protocol": name})
+    live, replayed = make_dialect(sensor), make_dialect(sensor)
+    for arrival_s, read in reads:
+        live.opened()
+        blocks = live.feed(arrival_s, read), replayed.feed(arrival_s, read)
+        assert repr(blocks[0].tolist()) == repr(blocks[1].tolist())  # NaN is no number, and equals none
+        assert live.cells.tolist() == replayed.cells.tolist()
+    assert live.counters == replayed.counters
+    assert live.counters["frames_received"] > 0
+
+
 FRAMES = {
     "vedirect": [BMV_NOW, BMV_HISTORY, BMV_WARM, HEX],
     "junctek": [KH_CHARGING, KG_CHARGING, b":R50=1,2,1,\r\n", b":r00=1,217,2140,110,6,\r\n"],

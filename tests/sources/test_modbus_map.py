@@ -159,3 +159,19 @@ def test_what_is_told_goes_before_the_profile() -> None:
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_profile_is_whole(profile: str) -> None:
     assert source(profile=profile).sensor["current_sign"] == "charge_positive"
+
+
+@pytest.mark.parametrize(
+    ("registers", "measured"),
+    [((2659, -25, 210), (26.59, -2.5, 21.0)), ((2659, 0, 0), (26.59, 0.0, None)), ((0, 0, 0), None)],
+)
+def test_what_a_gx_device_does_not_measure_reads_0_and_is_no_reading(
+    registers: tuple[int, int, int], measured: tuple[float, float, float | None] | None
+) -> None:
+    voltage, current, temperature = registers
+    read = words(voltage, "uint16", address=259) | words(current, "int16", address=261)
+    reading = reading_of(values_of(source(profile="victron-gx")), read | words(temperature, "int16", address=262))
+    assert (reading is None) is (measured is None)
+    if reading is not None and measured is not None:
+        warm_c = None if math.isnan(reading.temperature_c) else reading.temperature_c
+        assert (reading.voltage_v, reading.current_a, warm_c) == measured

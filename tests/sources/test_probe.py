@@ -1,5 +1,6 @@
 """Who is on a port is found without doing harm: devices of all protocols are asked by questions alone."""
 
+import contextlib
 import os
 import tty
 
@@ -9,7 +10,7 @@ from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources import probe
+from bms_estimator.sources import ports, probe
 from bms_estimator.sources.dialects import daly, jbd, jk, junctek
 from bms_estimator.sources.dialects.pylontech import PylontechDialect
 from bms_estimator.sources.probe import Found
@@ -90,3 +91,18 @@ def test_a_silent_device_is_sent_questions_alone(monkeypatch: pytest.MonkeyPatch
     for question in questions:
         sent = sent.replace(question, b"")
     assert sent == b""
+
+
+def test_a_device_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ports, "WRITE_S", 0.05)
+    master, slave = os.openpty()
+    try:
+        tty.setraw(slave)
+        os.set_blocking(slave, False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(slave, b"x")
+        assert probe.probe(os.ttyname(slave), 115_200) == "lost: Write timeout"
+    finally:
+        os.close(slave)
+        os.close(master)

@@ -69,7 +69,7 @@ def test_the_first_line_that_says_nothing_is_shown_as_it_came(sent: bytes, shown
 
 
 def test_bytes_that_are_no_text_are_called_a_wrong_baud_rate() -> None:
-    dialect, _, _ = fed(bytes(range(128, 256)) * 10, [])
+    dialect, _, _ = fed(bytes(range(128, 256)) * (LINE_BYTES // 100), [])
     assert "wrong baud rate" in (dialect.fault or "")
 
 

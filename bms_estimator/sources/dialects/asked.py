@@ -23,7 +23,7 @@ LONGEST_START = 4
 """No frame begins with more bytes that are always the same."""
 FAULTS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs")
 FRESH_S = 3.0
-"""Cell voltages that are older stand beside no sample [s]."""
+"""What came in an answer of its own, and is older, stands beside no sample [s]."""
 
 
 class Look(Enum):
@@ -175,18 +175,3 @@ class AskedDialect(MeterDialect):
         there = [probe_c for probe_c in probes_c if LEAST_C <= probe_c <= MOST_C]
         self._counts["implausible"] += len(probes_c) - len(there)
         return sum(there) / len(there) if there else math.nan
-
-
-class Beside:
-    """Cell voltages that came in an answer of their own, for the sample that comes next."""
-
-    def __init__(self) -> None:
-        self._arrival_s, self._cells_v = -math.inf, tuple[float, ...]()
-
-    def keep(self, arrival_s: float, cells_v: Sequence[float]) -> None:
-        """Those that came now."""
-        self._arrival_s, self._cells_v = arrival_s, tuple(cells_v)
-
-    def at(self, arrival_s: float) -> tuple[float, ...]:
-        """Of the round of a sample; none where their answer has not come."""
-        return self._cells_v if arrival_s - self._arrival_s < FRESH_S else ()

@@ -9,7 +9,8 @@ import re
 import struct
 from collections.abc import Sequence
 
-from bms_estimator.sources.dialects.asked import AskedDialect, Beside, Look
+from bms_estimator.sources.dialects.asked import FRESH_S, AskedDialect, Look
+from bms_estimator.sources.dialects.meter import Beside
 from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
@@ -44,7 +45,7 @@ class JbdDialect(AskedDialect):
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__("JBD BMS", re.compile(b"\xdd"), current_sign)
-        self._beside = Beside()
+        self._beside = Beside(FRESH_S)
         self._model = ""
         self._cells: int | None = None
 

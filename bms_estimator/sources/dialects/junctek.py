@@ -49,8 +49,8 @@ class JunctekDialect(MeterDialect):
         return f"Junctek battery monitor, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
     def opened(self) -> None:
-        """What comes next may begin anywhere in a line; the device is asked at once."""
-        self._rest, self._overlong, self._in_step, self._asked_s = b"", False, False, -math.inf
+        """Ask at once. What was decoded stays: a recording does not tell of openings."""
+        self._asked_s = -math.inf
 
     def due(self, now_s: float) -> bytes:
         """The question, once a second."""

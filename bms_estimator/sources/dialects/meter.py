@@ -1,7 +1,8 @@
 """Devices that tell of the pack reading by reading: what their dialects have in common."""
 
+import math
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ class MeterDialect(Dialect):
     def __init__(self, current_sign: CurrentSign, faults: Iterable[str]) -> None:
         self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
         self._counts = dict.fromkeys(("bytes_received", "frames_received", *faults, "implausible"), 0)
-        self._first_s = self._last_s = float("nan")
+        self._first_s = self._last_s = math.nan
         self._wrong: str | None = None
         self._good: Reading | None = None
 
@@ -77,3 +78,23 @@ class MeterDialect(Dialect):
         times = self._last_s + (arrival_s - self._last_s) * steps - self._first_s
         self._last_s = arrival_s
         return times
+
+
+class Beside:
+    """Cell voltages that came in an answer of their own, for the sample that comes next.
+
+    Args:
+        fresh_s: Older ones stand beside no sample [s].
+    """
+
+    def __init__(self, fresh_s: float) -> None:
+        self._fresh_s = fresh_s
+        self._arrival_s, self._cells_v = -math.inf, tuple[float, ...]()
+
+    def keep(self, arrival_s: float, cells_v: Sequence[float]) -> None:
+        """Those that came now."""
+        self._arrival_s, self._cells_v = arrival_s, tuple(cells_v)
+
+    def at(self, arrival_s: float) -> tuple[float, ...]:
+        """For a sample of this time; none where their answer has not come of late."""
+        return self._cells_v if arrival_s - self._arrival_s < self._fresh_s else ()

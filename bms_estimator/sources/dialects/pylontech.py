@@ -5,11 +5,12 @@ and then its prompt. Voltages in mV, currents in mA and positive on charge, temp
 There is no checksum: a table is taken that ended with the word of success, and each of whose rows can be read.
 """
 
+import itertools
 import math
 import re
 from collections.abc import Iterator, Sequence
 
-from bms_estimator.sources.dialects.meter import MeterDialect
+from bms_estimator.sources.dialects.meter import Beside, MeterDialect
 from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
@@ -24,6 +25,8 @@ ECHO = re.compile(r"\bbat\s+([0-9]{1,2})\b")
 SUCCESS = "Command completed"
 BATTERIES = 16
 CELLS = 32
+CELLS_S = 90.0
+"""Two turns of 16 batteries, and some answers that were lost: cell voltages that are older stand beside no sample [s]."""
 DIGITS = 9
 ABSENT = "-"
 
@@ -31,7 +34,7 @@ ABSENT = "-"
 class PylontechDialect(MeterDialect):
     """The tables of a console to samples: mean voltage, sum of the currents, mean temperature of the cells.
 
-    Cells are those of all batteries one after the other, each battery's as it told them last.
+    Cells are those of all batteries one after the other, each battery's as it told them last, if that was of late.
 
     Args:
         current_sign: As the device has it: positive on charge.
@@ -40,7 +43,7 @@ class PylontechDialect(MeterDialect):
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__(current_sign, ("text_errors", "length_errors"))
         self._rest = b""
-        self._cells: dict[int, tuple[float, ...]] = {}
+        self._cells = dict[int, Beside]()
         self._batteries: tuple[int, ...] = ()
         self._answers = 0
         self._round_s = self._asked_s = -math.inf
@@ -58,8 +61,7 @@ class PylontechDialect(MeterDialect):
         return f"Pylontech, {batteries}, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
     def opened(self) -> None:
-        """The console is asked anew; its batteries may be others."""
-        self._rest, self._cells, self._batteries = b"", {}, ()
+        """Ask at once. What was decoded stays: a recording does not tell of openings."""
         self._round_s = self._asked_s = -math.inf
         self._asked = b""
 
@@ -80,18 +82,21 @@ class PylontechDialect(MeterDialect):
         self._asked, self._asked_s, self._asked_at = command, now_s, self._answers
         return command
 
-    def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - a table's clock is not ours
+    def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
         self._rest += data
         *answers, self._rest = PROMPT.split(self._rest)
         for answer in answers:
             self._answers += 1
-            if len(answer) <= ANSWER_BYTES and (reading := self._of(answer.decode("ascii", "replace"))) is not None:
+            if (
+                len(answer) <= ANSWER_BYTES
+                and (reading := self._of(arrival_s, answer.decode("ascii", "replace"))) is not None
+            ):
                 yield reading
         if len(self._rest) > ANSWER_BYTES:
             self._rest = b""
             self._blame("length_errors", "bytes come, but no prompt of a Pylontech console: it has 115200 baud")
 
-    def _of(self, answer: str) -> Reading | None:
+    def _of(self, arrival_s: float, answer: str) -> Reading | None:
         """What the answer to ``pwr`` says; that to ``bat`` is kept for the next."""
         lines = [line.split() for line in re.split(r"[\r\n]+", answer) if line.strip()]
         header = next((n for n, line in enumerate(lines) if line[:2] in (["Power", "Volt"], ["Battery", "Volt"])), None)
@@ -105,22 +110,23 @@ class PylontechDialect(MeterDialect):
             return None
         try:
             if lines[header][0] == "Battery":
-                self._keep_cells(answer, rows)
+                self._keep_cells(arrival_s, answer, rows)
                 return None
-            return self._stack(lines[header], rows)
+            return self._stack(arrival_s, lines[header], rows)
         except (ValueError, LookupError):
             self._blame("text_errors", "a table with a row that cannot be read")
             return None
 
-    def _keep_cells(self, answer: str, rows: Sequence[Sequence[str]]) -> None:
+    def _keep_cells(self, arrival_s: float, answer: str, rows: Sequence[Sequence[str]]) -> None:
         """Raises ValueError or LookupError: A row cannot be read."""
         echo = ECHO.search(answer)
         battery = int(echo[1]) if echo else 1
         if not 1 <= battery <= BATTERIES or len(rows) > CELLS:
             raise ValueError(answer)
-        self._cells[battery] = tuple(1e-3 * _whole(row[1]) for row in rows)
+        cells_v = [1e-3 * _whole(row[1]) for row in rows]
+        self._cells.setdefault(battery, Beside(CELLS_S)).keep(arrival_s, cells_v)
 
-    def _stack(self, names: Sequence[str], rows: Sequence[Sequence[str]]) -> Reading | None:
+    def _stack(self, arrival_s: float, names: Sequence[str], rows: Sequence[Sequence[str]]) -> Reading | None:
         """All batteries as one.
 
         Raises:
@@ -136,8 +142,8 @@ class PylontechDialect(MeterDialect):
         told = [[row[low], row[high]] if ABSENT not in (row[low], row[high]) else [row[warm]] for row in present]
         temperatures_c = [1e-3 * _whole(text) for texts in told for text in texts]
         self._batteries = tuple(int(row[0]) for row in present)
-        all_told = all(battery in self._cells for battery in self._batteries)
-        cells_v = tuple(v for battery in self._batteries for v in self._cells[battery]) if all_told else ()
+        told_v = [self._cells[battery].at(arrival_s) if battery in self._cells else () for battery in self._batteries]
+        cells_v = tuple(itertools.chain(*told_v)) if all(told_v) else ()
         return Reading(_mean(voltages_v), sum(currents_a), _mean(temperatures_c), cells_v)
 
 

@@ -11,8 +11,8 @@ from bms_estimator.sources.frames import PRINTABLE, CurrentSign
 from bms_estimator.sources.text_line import Reading, read_line
 from bms_estimator.sources.told_clock import ToldClock
 
-LINE_BYTES = 1024
-"""A longer line is noise: 96 cells of seven characters fit."""
+LINE_BYTES = 4096
+"""A longer line is noise: 400 cells of seven characters fit."""
 SHOWN_BYTES = 60
 """So much of a line that says nothing is shown."""
 

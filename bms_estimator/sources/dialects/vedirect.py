@@ -41,10 +41,6 @@ class VeDirectDialect(MeterDialect):
             return None
         return f"VE.Direct battery monitor {self._product}, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
-    def opened(self) -> None:
-        """What comes next may begin anywhere in a block."""
-        self._rest, self._in_step = b"", False
-
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - the block carries no time
         self._rest += data
         while (at := self._rest.find(END)) >= 0 and len(self._rest) > at + len(END):
