@@ -20,7 +20,8 @@ from bms_estimator.service.serve import state_folder
 
 def dashboard(
     pack: Annotated[
-        Path | None, typer.Argument(help="settings of a pack, whose [mqtt] and [page] are taken", show_default=False)
+        Path | None,
+        typer.Argument(help="settings of a pack, whose \\[mqtt] and \\[page] are taken", show_default=False),
     ] = None,
     mqtt: Annotated[
         str | None, typer.Option(help="broker, mqtt://host:port; else that of PACK, or mqtt://localhost:1883")

@@ -30,7 +30,7 @@ REDRAW_S = 0.25
 def record(
     out: Annotated[Path, typer.Argument(help="new file", show_default=False)],
     pack: Annotated[
-        Path | None, typer.Option(help="settings of the pack, for its [sensor] or [source]", show_default=False)
+        Path | None, typer.Option(help="settings of the pack, for its \\[sensor] or \\[source]", show_default=False)
     ] = None,
     port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
     baud: Annotated[int | None, typer.Option(parser=whole(1200), help="in place of sensor.baud")] = None,

@@ -27,7 +27,7 @@ STEPS = {"next": 1, "previous": -1}
 
 def top(
     pack: Annotated[
-        Path | None, typer.Argument(help="pack file whose [mqtt] says where the broker is", show_default=False)
+        Path | None, typer.Argument(help="pack file whose \\[mqtt] says where the broker is", show_default=False)
     ] = None,
     mqtt: Annotated[
         str | None, typer.Option(help="broker, mqtt://host:port; without a pack file: localhost", show_default=False)
