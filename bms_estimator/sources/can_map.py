@@ -18,6 +18,8 @@ DECIMALS = 5
 """Of V, A and degC: 5234 times 0.01 is 52.34."""
 KEPT_S = 30.0
 """What came longer ago than this is no part of a reading [s]: batteries send temperatures and cells every few seconds."""
+APART_PERIODS = 3.0
+"""Voltage and current that came further apart than so many periods belong to two loads."""
 
 SHOWN = 20
 """So many names of a DBC file are shown."""
@@ -94,6 +96,7 @@ class CanMap:
         for key, signal in _signals(settings):
             self._want(key, signal, database)
         self._cells = sum(cells.count for cells in settings.cells)
+        self._apart_s = min(APART_PERIODS * settings.interval_s, KEPT_S)
         self._newest: dict[Key, tuple[float, float]] = {}  # arrival [s], value
         self._fresh: set[str] = set()
         self._short = self._absent = 0
@@ -162,16 +165,16 @@ class CanMap:
     def _reading(self, now_s: float) -> Reading:
         cells_v = tuple(self._get("cells", now_s, number) for number in range(self._cells))
         return Reading(
-            self._get("voltage", now_s),
-            self._get("current", now_s),
+            self._get("voltage", now_s, kept_s=self._apart_s),
+            self._get("current", now_s, kept_s=self._apart_s),
             self._get("temperature", now_s),
             () if all(map(math.isnan, cells_v)) else cells_v,
         )
 
-    def _get(self, quantity: str, now_s: float, number: int = 0) -> float:
+    def _get(self, quantity: str, now_s: float, number: int = 0, kept_s: float = KEPT_S) -> float:
         """The newest value; NaN where there is none, or an old one."""
         came_s, value = self._newest.get((quantity, number), (-math.inf, math.nan))
-        return value if now_s - came_s <= KEPT_S else math.nan
+        return value if now_s - came_s <= kept_s else math.nan
 
 
 def _signals(settings: CanSource) -> Iterator[tuple[Key, Signal]]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 from bms_estimator.model.linux_settings import LinuxSource
 from bms_estimator.model.settings import Settings
 from bms_estimator.sources.report_line import CONNECTED, report_line
-from bms_estimator.sources.reports import Bringer, NothingComesError
+from bms_estimator.sources.reports import SILENT_PERIODS, Bringer, NothingComesError
 from bms_estimator.sources.sysfs import SYS, Channel, JunkError, find_channel, find_chip, read_number
 from bms_estimator.store.disk_thread import DiskThread
 
@@ -133,11 +133,17 @@ class LinuxSensor(Bringer):
             ) from None
 
     def _own_interval_s(self) -> float:
-        """As the chip is set, at least 0.1 s; else the default [s]."""
+        """As the chip is set, at least 0.1 s; else the default [s].
+
+        Raises:
+            NothingComesError: It is so long that the estimator would take it for gaps.
+        """
         try:
             own_s = 1e-3 * read_number(find_chip(self._settings.chip, self._root) / "update_interval")
         except (OSError, JunkError):
             return self._settings.period_s
+        if own_s > SILENT_PERIODS * self._settings.period_s:
+            raise NothingComesError(f"the chip measures each {own_s:g} s only; say so by source.interval_s = {own_s:g}")
         return max(own_s, LEAST_INTERVAL_S)
 
     def _sample(self, chip: _Chip) -> bytes:

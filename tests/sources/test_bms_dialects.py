@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.model.settings import SensorSettings
-from bms_estimator.sources.dialects import jbd, jk
+from bms_estimator.sources.dialects import daly, jbd, jk
 from bms_estimator.sources.dialects.asked import GAP_S, PACE_S, UNANSWERED_ROUNDS, AskedDialect
 from bms_estimator.sources.dialects.daly import sealed
 from bms_estimator.sources.dialects.table import make_dialect
@@ -289,6 +289,14 @@ def test_what_is_known_is_not_asked_again() -> None:
     asked = [question for _, question in questions(dialect("jbd"), 10.0, A_ROUND["jbd"])]
     assert asked.count(jbd.question(jbd.NAME)) == 1
     assert asked.count(jbd.question(jbd.BASIC)) == 10
+
+
+def test_what_may_be_another_pack_is_asked_anew_how_many_cells_it_has() -> None:
+    device = dialect("daly")
+    status = daly.question(daly.HOSTS[0], daly.STATUS)
+    assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
+    device.opened()
+    assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
 
 
 def test_silence_makes_it_try_the_other_ways_of_asking() -> None:

@@ -133,9 +133,13 @@ def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest(
     assert map_.feed(2.0, 2, False, b"\xff") is None
     assert map_.counters["not_measured"] == 1
     assert map_.feed(3.0, 1, False, b"\x83") is None
-    assert map_.feed(4.0 + KEPT_S, 2, False, b"\x05") is None  # the voltage is too old
-    assert map_.feed(5.0 + KEPT_S, 1, False, b"\x83") is None
-    late = map_.feed(5.5 + KEPT_S, 2, False, b"\x05")
+    assert map_.feed(6.1, 2, False, b"\x05") is None  # more than three periods apart
+    assert map_.feed(7.0, 1, False, b"\x83") is None
+    assert map_.feed(10.0, 2, False, b"\x05") is not None
+    assert map_.feed(11.0, 1, False, b"\x83") is None
+    assert map_.feed(12.0 + KEPT_S, 2, False, b"\x05") is None
+    assert map_.feed(13.0 + KEPT_S, 1, False, b"\x83") is None
+    late = map_.feed(13.5 + KEPT_S, 2, False, b"\x05")
     assert late is not None
     assert (late.voltage_v, late.cells_v) == (13.1, ())
     assert math.isnan(late.temperature_c)

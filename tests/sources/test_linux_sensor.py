@@ -172,3 +172,10 @@ def test_it_is_polled_as_fast_as_the_chip_is_set_but_not_faster_than_anybody_nee
 ):
     hwmon(tmp_path, **INA226 | {"update_interval": update_interval})
     assert sensor(tmp_path, interval_s=None)._find().interval_s == interval_s
+
+
+async def test_a_chip_slower_than_it_is_taken_for_says_what_to_set(tmp_path: Path):
+    hwmon(tmp_path, **INA226 | {"update_interval": "17000"})
+    with pytest.raises(NothingComesError, match=r"measures each 17 s only; .*source\.interval_s = 17$"):
+        await first(sensor(tmp_path, interval_s=None).bring())
+    assert await first(sensor(tmp_path, interval_s=17.0).bring())

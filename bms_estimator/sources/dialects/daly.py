@@ -50,7 +50,7 @@ class DalyDialect(AskedDialect):
         super().__init__("Daly BMS", re.compile(b"\xa5"), current_sign, address)
         self._cells: int | None = None
         self._probes: int | None = None
-        self._told = False
+        self._told = self._known = False  # whether a sample has come, and since the port was opened the number of cells
         self._first = 1  # number of the frame with cell 1
         self._cells_v: dict[int, Sequence[float]] = {}  # by the frame's number
         self._probes_c: dict[int, Sequence[float]] = {}
@@ -61,10 +61,15 @@ class DalyDialect(AskedDialect):
         """How many cells it has, once that and a sample have come."""
         return f"Daly BMS, {self._cells} cells" if self._told and self._cells is not None else None
 
+    def opened(self) -> None:
+        """As all; it may be another pack's, with more cells."""
+        super().opened()
+        self._known = False
+
     def _ways(self) -> Sequence[Sequence[bytes]]:
         if self.probing:
             return [[question(host, command) for host in HOSTS for command in (STATUS, CELLS, PACK)]]
-        commands = (CELLS, PROBES, PACK) if self._cells is not None else (STATUS, CELLS, PROBES, PACK)
+        commands = (CELLS, PROBES, PACK) if self._known else (STATUS, CELLS, PROBES, PACK)
         return [[question(host, command) for command in commands] for host in HOSTS]
 
     def _look(self, data: bytes, at: int) -> int | Look:
@@ -85,7 +90,7 @@ class DalyDialect(AskedDialect):
         if command == PACK:
             return self._pack(arrival_s, data)
         if command == STATUS:
-            self._cells, self._probes = data[0] or None, data[1]
+            self._cells, self._probes, self._known = data[0] or None, data[1], True
         elif command in (CELLS, PROBES) and data[0] > MOST_FRAMES:
             self._blame("length_errors", f"a frame with number {data[0]} comes, and there are at most {MOST_FRAMES}")
         elif command == CELLS:
