@@ -1,6 +1,7 @@
 """Reading a TOML file into a pydantic model, with errors that name file, key, value and what is allowed."""
 
 import tomllib
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -53,6 +54,15 @@ class Strict(BaseModel):
 
 
 T = TypeVar("T", bound=BaseModel)
+FEW = 12
+"""So many keys of a section are listed when one is unknown."""
+
+
+MESSAGES = {
+    "model_type": "must be a table, {key = value}",
+    "string_pattern_mismatch": "is not of the form that it must have",
+}
+"""By pydantic's kind of error, where its own words are those of a programmer."""
 
 
 def read_toml(path: Path, model: type[T]) -> T:
@@ -84,8 +94,12 @@ def _line(path: Path, model: type[BaseModel], table: object, detail: Any) -> str
     if detail["type"] in ("missing", "union_tag_not_found"):
         return f"{path}: {where}: missing{hint}"
     if detail["type"] == "extra_forbidden":
-        return f"{path}: {where}: unknown key"
-    message = detail["msg"].removeprefix("Value error, ")
+        return f"{path}: {where}: unknown key{_meant(model, keys)}"
+    if detail["type"] == "union_tag_invalid":
+        return f"{path}: {where}.{_discriminator(detail)} = {detail['ctx']['tag']!r}: must be one of {detail['ctx']['expected_tags']}"
+    message = MESSAGES.get(detail["type"], detail["msg"].removeprefix("Value error, "))
+    if detail["type"] == "string_pattern_mismatch" and not hint:
+        message = detail["msg"]
     if isinstance(detail["input"], dict):
         return f"{path}: {where}: {message}"
     return f"{path}: {where} = {without_secrets(repr(detail['input']))}: {message}{hint}"
@@ -101,9 +115,32 @@ def _keys(table: object, detail: Any) -> list[str]:
         elif isinstance(table, list) and isinstance(key, int):
             keys.append(str(key))
             table = table[key] if key < len(table) else None
-    kind = [detail["ctx"]["discriminator"].strip("'")] if detail["type"] == "union_tag_not_found" else []
+    kind = [_discriminator(detail)] if detail["type"] == "union_tag_not_found" else []
     last = [] if detail["type"] == "value_error" and way and not _has(table, way[-1]) else way[-1:]
     return [*keys, *map(str, last), *kind]
+
+
+def _discriminator(detail: Any) -> str:
+    """The key that tells which of several models is meant."""
+    return str(detail["ctx"]["discriminator"]).strip("'")
+
+
+def _meant(model: type[BaseModel], keys: list[str]) -> str:
+    """Which key an unknown one may be, or which there are where these are few; empty else."""
+    models = _within(model, keys[:-1])
+    known = list(dict.fromkeys(field.alias or name for m in models for name, field in m.model_fields.items()))
+    if close := get_close_matches(keys[-1], known, n=1):
+        return f"; is {close[0]} meant?"
+    return f"; there are {', '.join(known)}" if len(models) == 1 and 0 < len(known) <= FEW else ""
+
+
+def _within(model: type[BaseModel], keys: list[str]) -> list[type[BaseModel]]:
+    """The models to which keys lead."""
+    current = [model]
+    for key in keys:
+        fields = [field for m in current for name, field in m.model_fields.items() if key in (name, field.alias)]
+        current = [inner for field in fields for inner in _models(field.annotation)]
+    return current
 
 
 def _has(table: object, key: object) -> bool:
