@@ -189,7 +189,10 @@ def target(settings: InfluxSettings) -> Target:
 def _token(settings: InfluxSettings) -> dict[str, str]:
     if settings.token_file is None:
         return {}
-    return {"Authorization": f"Token {_secret('token_file', settings.token_file)}"}
+    token = _secret("token_file", settings.token_file)
+    if not token.isascii():
+        raise UserError(f"influx.token_file = {settings.token_file}: must hold ASCII: no header can hold the rest")
+    return {"Authorization": f"Token {token}"}
 
 
 def _basic(settings: InfluxSettings) -> dict[str, str]:
@@ -237,13 +240,21 @@ def _post(settings: InfluxSettings, body: str) -> None:
         with opener.open(request, timeout=ANSWER_S):
             return
     except urllib.error.HTTPError as error:
-        with error:
-            why = _shown(error.read(MOST_SHOWN * 4))
-        raise RefusedError(f"{error.code} {error.reason}: {why}", for_now=error.code not in NEVER) from None
+        why = f"{error.code} {error.reason}: {_shown(_answer(error))}"
+        raise RefusedError(why, for_now=error.code not in NEVER) from None
     except urllib.error.URLError as error:
         raise RefusedError(str(error.reason), for_now=True) from None
-    except (OSError, http.client.HTTPException, UserError) as error:
+    except (OSError, http.client.HTTPException, UnicodeError, UserError) as error:  # Unicode: of a host that cannot be
         raise RefusedError(str(error) or type(error).__name__, for_now=True) from None
+
+
+def _answer(error: urllib.error.HTTPError) -> bytes:
+    """The first of what it says; nothing where that does not come."""
+    try:
+        with error:
+            return error.read(MOST_SHOWN * 4)
+    except (OSError, http.client.HTTPException):
+        return b""
 
 
 def _shown(answer: bytes) -> str:

@@ -167,6 +167,38 @@ async def test_a_server_that_never_answers_stops_nobody(monkeypatch: pytest.Monk
         assert writing.waiting == 20
 
 
+async def test_an_answer_that_breaks_off_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bms_estimator.sinks.influx.CLOSING_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def answer() -> None:
+            connection, _ = listening.accept()
+            with connection:
+                connection.sendall(b"HTTP/1.1 503 Busy\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n")
+                connection.shutdown(socket.SHUT_WR)
+                while connection.recv(65_536):
+                    pass
+
+        with structlog.testing.capture_logs() as logs:
+            async with sink(f"http://127.0.0.1:{listening.getsockname()[1]}") as writing:
+                answered = asyncio.create_task(asyncio.to_thread(answer))
+                writing.publish(at(0))
+                await answered
+                await until(lambda: logs)
+                writing.publish(at(1))
+        assert logs[0]["reason"].startswith("503 Busy")
+        assert writing.waiting == 2
+
+
+async def test_a_name_that_no_host_can_have_stops_nobody() -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with sink("http://influx..local:8086") as writing:
+            writing.publish(at(0))
+            await until(lambda: logs)
+            writing.publish(at(1))
+    assert "label empty or too long" in logs[0]["reason"]
+
+
 @pytest.mark.parametrize(
     ("told", "said"),
     [
@@ -184,6 +216,9 @@ def test_settings_that_cannot_be(told: dict[str, Any], said: str) -> None:
 def test_a_file_that_cannot_be_used_is_said_at_start(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"influx\.token_file = .*none: cannot be read: No such file"):
         InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "none"))
+    (tmp_path / "token").write_text("t\N{EURO SIGN}ken", encoding="utf-8")
+    with pytest.raises(UserError, match=r"influx\.token_file = .*token: must hold ASCII"):
+        InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "token"))
     (tmp_path / "ca").write_text("nonsense")
     with pytest.raises(UserError, match=r"influx\.ca_file = .*: no certificates"):
         InfluxSink(InfluxSettings(url="https://house", bucket="b", ca_file=tmp_path / "ca"))
