@@ -45,7 +45,9 @@ class PrometheusSink(Collector):
         registry = CollectorRegistry(auto_describe=False)
         registry.register(self)
         try:
-            self._serving = start_http_server(self._settings.port, self._settings.host, registry)
+            self._serving = await asyncio.to_thread(  # it asks for the host's name, and the DNS may take its time
+                start_http_server, self._settings.port, self._settings.host, registry
+            )
         except OSError as error:
             told = f"prometheus.listen = {self._settings.listen}: {error.strerror}"
             raise UserError(f"{told}; each pack needs an address of its own") from None

@@ -2,7 +2,9 @@
 
 import asyncio
 import shutil
+import socket
 import subprocess
+import threading
 import urllib.request
 from typing import Any
 
@@ -12,6 +14,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate, Health, Snapshot
 from bms_estimator.model.export_settings import PrometheusSettings
 from tests.mosquitto import free_port
+from tests.patience import LONG_S
 from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW, STACK, snapshot
 
 pytest.importorskip("prometheus_client", reason="prometheus-client is not installed: pip install prometheus-client")
@@ -114,3 +117,23 @@ def test_an_address_that_is_none_is_refused(listen: str) -> None:
 def test_addresses_of_both_kinds() -> None:
     told: Any = [PrometheusSettings(listen=listen) for listen in ("127.0.0.1:9108", "[::1]:1")]
     assert [(each.host, each.port) for each in told] == [("127.0.0.1", 9108), ("::1", 1)]
+
+
+async def test_a_slow_name_service_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, answer = threading.Event(), threading.Event()
+
+    def slow(_name: str = "") -> str:
+        asked.set()
+        assert answer.wait(LONG_S)
+        return "pi"
+
+    monkeypatch.setattr(socket, "getfqdn", slow)
+
+    async def turn() -> None:
+        await asyncio.to_thread(asked.wait, LONG_S)
+        answer.set()
+
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(turn())
+        async with PrometheusSink(PrometheusSettings(listen=f"127.0.0.1:{free_port()}")):
+            pass
