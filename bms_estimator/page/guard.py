@@ -56,11 +56,11 @@ class Guard:
 
     def knows_token(self, token: str) -> bool:
         """Whether it is the token, or none is asked for; takes as long whatever is wrong with it."""
-        return self._token is None or hmac.compare_digest(token.encode(), self._token)
+        return self._token is None or hmac.compare_digest(_bytes(token), self._token)
 
     def knows_cookie(self, cookie: str) -> bool:
         """Whether it is what was given in place of the token."""
-        return self._token is None or hmac.compare_digest(cookie.encode(), self.cookie.encode())
+        return self._token is None or hmac.compare_digest(_bytes(cookie), self.cookie.encode())
 
 
 def guard_of(settings: PageSettings) -> Guard:
@@ -88,6 +88,11 @@ def _token(settings: PageSettings) -> str | None:
             f"`openssl rand -hex 16 > {name}` makes one"
         )
     return token
+
+
+def _bytes(shown: str) -> bytes:
+    """As they came: what is no UTF-8 in a header, aiohttp hands on as surrogates."""
+    return shown.encode(errors="surrogateescape")
 
 
 def _is_address(host: str) -> bool:

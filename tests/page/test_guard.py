@@ -54,6 +54,8 @@ def test_a_token_is_known_with_its_newline_off(tmp_path):
     guard = guard_of(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
     assert guard.knows_token(TOKEN)
     assert not any(guard.knows_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
+    assert not guard.knows_token("\udcff" * 16)  # as aiohttp has a header that is no UTF-8
+    assert not guard.knows_cookie("\udcff" * 64)
     assert guard.knows_cookie(guard.cookie)
     assert not guard.knows_cookie(TOKEN)
     assert TOKEN not in guard.cookie
