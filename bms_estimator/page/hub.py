@@ -60,10 +60,13 @@ class Hub:
         """
         if topic not in SHOWN and not topic.startswith(ALARM):
             return
-        text = _json(value)
+        try:
+            text = _json(value)
+        except RecursionError:  # somebody else's: deeper than it could be written
+            return
         topics = self._newest.setdefault(pack, {})
         if value is None:
-            topics.pop(topic, None)
+            self._forget(pack, topic)
         else:
             topics[topic] = text
         if topic == STATE and isinstance(value, dict):
@@ -101,6 +104,14 @@ class Hub:
             known[f"{pack}/{RECENT}"] = _json(_columns(self._recent.get(pack, ())))
             known[f"{pack}/{ELEMENTS}"] = _json(self._learned.get(pack, {}))
         return known
+
+    def _forget(self, pack: str, topic: str) -> None:
+        """A topic was emptied; with its last one a pack is gone."""
+        topics = self._newest[pack]
+        topics.pop(topic, None)
+        if not topics:
+            for of_packs in (self._newest, self._recent, self._learned):
+                of_packs.pop(pack, None)
 
     def _remember(self, pack: str, state: Mapping[str, Any]) -> None:
         """Keep what the curves show, once a second; a state that comes late is left out."""

@@ -1,6 +1,7 @@
 """What the page's hub keeps: the newest of each topic, for readers of any speed."""
 
 import json
+import sys
 
 import pytest
 
@@ -45,6 +46,30 @@ async def test_a_slow_reader_finds_the_newest_alone_however_much_came():
     assert hub.readers == 0
 
 
+async def test_of_a_pack_that_has_emptied_its_topics_nothing_is_kept():
+    hub = Hub()
+    hub.put("attic", "availability", "online")
+    hub.put("attic", "state", state(0.0))
+    hub.put("attic", "parameters", {"soc": 0.5, "elements": {"r_s_ohm": {"value": 1.0, "std": 0.1, "valid": True}}})
+    for topic in ("state", "parameters", "availability"):
+        assert hub.packs == ["attic"]
+        hub.put("attic", topic, None)
+    assert hub.packs == []
+    hub.put("attic", "availability", "online")
+    with hub.reading() as reader:
+        found = await read(reader)
+    assert found["attic/recent"]["time_s"] == []
+    assert found["attic/elements"] == {}
+
+
+def test_what_is_too_deep_to_be_written_is_left_out():
+    hub, deep = Hub(), 0
+    for _ in range(sys.getrecursionlimit() + 1):
+        deep = [deep]
+    hub.put("attic", "state", deep)
+    assert hub.packs == []
+
+
 async def test_a_reader_ends_when_the_hub_closes():
     hub = Hub()
     with hub.reading() as reader:
@@ -62,6 +87,7 @@ async def test_what_is_not_shown_is_not_kept(topic):
 
 async def test_a_topic_that_was_emptied_is_gone_and_readers_hear_of_it():
     hub = Hub()
+    hub.put("attic", "availability", "online")
     hub.put("attic", "alarm/soc_low", {"active": True})
     with hub.reading() as reader:
         await read(reader)
