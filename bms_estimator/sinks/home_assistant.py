@@ -23,6 +23,14 @@ ALARM_CLASSES = {
     "charging_below_freezing": "cold",
 }
 """Where it is not "problem"."""
+FORMER = {
+    "soc_std": "sensor",
+    "time_to_empty_s": "sensor",
+    "sensor_silent": "binary_sensor",
+    "suspicion": "binary_sensor",
+    "lock_lost": "binary_sensor",
+}
+"""What versions before this one have told of, and on which platform."""
 NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
 """All that ``[home_assistant.names]`` may name."""
 
@@ -36,6 +44,8 @@ class Described(NamedTuple):
     alarms: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
     """That are allowed."""
+    unwatched: tuple[str, ...] = ()
+    """Alarms that are not, whatever comes: other settings may have had them."""
 
 
 def check_names(settings: HomeAssistantSettings) -> None:
@@ -101,8 +111,16 @@ def discovery(
         "components": {
             key: component | _identity(info.device, key, component["platform"]) | _named(names, key)
             for key, component in components.items()
-        },
+        }
+        | _removed(described),
     }
+
+
+def _removed(described: Described) -> dict[str, dict[str, str]]:
+    """What it may know from before: by its platform alone it goes, what is left out stays."""
+    platforms = FORMER | {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
+    platforms |= {name: made("")["platform"] for name, made in _COMMANDS.items() if name not in described.commands}
+    return {key: {"platform": platform} for key, platform in platforms.items()}
 
 
 def _cell_names(settings: HomeAssistantSettings, cells: int) -> dict[str, str]:

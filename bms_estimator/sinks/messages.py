@@ -61,7 +61,7 @@ class Messages:
         home_assistant: HomeAssistantSettings | None = None,
         alarms: Collection[str] = ALARMS,
     ) -> None:
-        self._unwatched = [name for name in ALARMS if name not in alarms]
+        self._unwatched = tuple(name for name in ALARMS if name not in alarms)
         self.root = f"{base_topic}/{device}"
         self.commands: tuple[str, ...] = ()
         self._home = home_assistant or HomeAssistantSettings()
@@ -129,7 +129,8 @@ class Messages:
         """Cells that were measured once stay."""
         cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
         known = sent.described.cells if sent.described else 0
-        return Described(snapshot.info, max(cells, known), tuple(a.name for a in snapshot.alarms), self.commands)
+        alarms = tuple(alarm.name for alarm in snapshot.alarms)
+        return Described(snapshot.info, max(cells, known), alarms, self.commands, self._unwatched)
 
     def _home_assistant(
         self, before: Shown, snapshot: Snapshot, described: Described, now_s: float

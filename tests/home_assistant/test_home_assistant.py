@@ -23,6 +23,7 @@ from tests.home_assistant.packs import Packs
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.sinks.test_home_assistant import CELLS, MOST_ROWS_PER_MIN, noisy, restless, rows
+from tests.sinks.test_home_assistant import described as shown
 
 SOC, SET_SOC, LOW = "sensor.bms_pack_soc_percent", "number.bms_pack_set_soc", "binary_sensor.bms_pack_alarm_soc_low"
 NOT_OURS = ("Skipping pip installation", "zlib_ng and isal are not available")
@@ -48,7 +49,7 @@ def told(broker: Broker, topic: str, wanted: Callable[[Any], bool] = bool) -> An
 def test_all_entities_are_there_as_they_were_told(home: HomeAssistant, broker: Broker) -> None:
     registry = {entry["entity_id"]: entry for entry in home.command("config/entity_registry/list")}
     states = home.states()
-    components = told(broker, "homeassistant/device/bms_pack/config")["components"]
+    components = shown(told(broker, "homeassistant/device/bms_pack/config"))
     for component in components.values():
         entity = component["default_entity_id"]
         assert registry[entity]["entity_category"] == component.get("entity_category")
@@ -166,6 +167,22 @@ def play(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], 
     home.until(lambda states: number(states, voltage) == last["voltage_v"])
 
 
+def test_what_a_pack_has_no_more_is_removed(home: HomeAssistant, broker: Broker) -> None:
+    info = next(noisy(1.0))[1].info.model_copy(update={"device": "changed"})
+    topic, entity = "homeassistant/device/bms_changed/config", "number.bms_changed_set_soc"
+
+    async def tell(told: Described) -> None:
+        payload = json.dumps(discovery(HomeAssistantSettings(), told, "bms/changed", 0.0))
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            await client.publish(topic, payload, 1, retain=True)
+
+    asyncio.run(tell(Described(info, commands=("set_soc",))))
+    home.until(lambda states: entity in states)
+    asyncio.run(tell(Described(info)))
+    home.until(lambda states: entity not in states and "sensor.bms_changed_voltage_v" in states)
+    assert entity not in {entry["entity_id"] for entry in home.command("config/entity_registry/list")}
+
+
 @pytest.mark.parametrize(("device", "stream"), [("noisy", noisy), ("restless", restless)])
 def test_its_recorder_writes_at_most_20_rows_a_minute_for_a_pack(
     home: HomeAssistant, broker: Broker, device: str, stream: Callable[[float], Iterator[tuple[float, Snapshot]]]
@@ -174,9 +191,7 @@ def test_its_recorder_writes_at_most_20_rows_a_minute_for_a_pack(
     play(broker, device, stream(60.0 * minutes), home)
     info = next(stream(1.0))[1].info
     described = Described(info, CELLS if stream is restless else 0)
-    wanted = len(
-        rows(stream(60.0 * minutes), discovery(HomeAssistantSettings(), described, "bms/pack", 0.0)["components"])
-    )
+    wanted = len(rows(stream(60.0 * minutes), shown(discovery(HomeAssistantSettings(), described, "bms/pack", 0.0))))
     assert 100 < wanted <= MOST_ROWS_PER_MIN * minutes
     deadline = time.monotonic() + LONG_S
     while (written := changes(home, device)) < wanted:  # it writes a moment later

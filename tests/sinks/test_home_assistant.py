@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.fuel_cell import KEYS
+from bms_estimator.model.alarm_settings import ALARMS
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Alarm, Parameter, Snapshot
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
@@ -17,12 +18,19 @@ from tests.sinks.snapshots import ONE, STACK
 
 ROOT = "bms/pack"
 HOME = HomeAssistantSettings()
-COMPONENTS = discovery(HOME, Described(ONE.info), ROOT, 0.0)["components"]
+
+
+def described(found: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The components of a discovery message, without those that it removes."""
+    return {key: component for key, component in found["components"].items() if set(component) != {"platform"}}
+
+
+COMPONENTS = described(discovery(HOME, Described(ONE.info), ROOT, 0.0))
 SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
 MOST_ROWS_PER_MIN = 20
 
 
-OF_STACK = discovery(HOME, Described(STACK.info), ROOT, 0.0)["components"]
+OF_STACK = described(discovery(HOME, Described(STACK.info), ROOT, 0.0))
 
 
 def with_values(**values: float | None) -> Snapshot:
@@ -105,9 +113,7 @@ def rows(
 def test_home_assistant_records_at_most_20_rows_in_any_minute(
     stream: Callable[[float], Iterator[tuple[float, Snapshot]]],
 ) -> None:
-    components = (
-        discovery(HOME, Described(ONE.info, CELLS), ROOT, 0.0)["components"] if stream is restless else COMPONENTS
-    )
+    components = described(discovery(HOME, Described(ONE.info, CELLS), ROOT, 0.0)) if stream is restless else COMPONENTS
     written = np.array(rows(stream(900.0), components))
     assert written.size > 100
     assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
@@ -239,7 +245,7 @@ def test_cells_are_there_from_the_first_sample_that_has_them_and_stay() -> None:
 
 def test_commands_are_there_where_they_are_allowed() -> None:
     [none] = discoveries(ONE)
-    assert {c["platform"] for c in none["components"].values()} == {"sensor"}
+    assert {c["platform"] for c in described(none).values()} == {"sensor"}
     [some] = discoveries(ONE, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate"))
     platforms = {key: c["platform"] for key, c in some["components"].items() if "command_topic" in c}
     assert platforms == {
@@ -247,6 +253,26 @@ def test_commands_are_there_where_they_are_allowed() -> None:
         "current_zero": "button",
         "acknowledge_alarm": "button",
         "publish_rate": "number",
+    }
+
+
+def test_what_is_not_there_any_more_is_removed() -> None:
+    messages = Messages("bms", "pack", alarms=[name for name in ALARMS if name != "soc_low"])
+    messages.commands = ("set_soc",)
+    due, _ = messages.due(Sent(), ONE, 0.0)
+    [found] = [json.loads(m.payload) for m in due if m.topic.endswith("/device/bms_pack/config")]
+    removed = {key: c["platform"] for key, c in found["components"].items() if key not in described(found)}
+    assert removed == {
+        "alarm_soc_low": "binary_sensor",
+        "current_zero": "button",
+        "acknowledge_alarm": "button",
+        "publish_rate": "number",
+        # of versions before
+        "soc_std": "sensor",
+        "time_to_empty_s": "sensor",
+        "sensor_silent": "binary_sensor",
+        "suspicion": "binary_sensor",
+        "lock_lost": "binary_sensor",
     }
 
 
@@ -273,7 +299,7 @@ def test_the_names_are_home_assistants_or_the_users_and_the_ids_the_same_in_any_
     cells = with_values(cells_v=[3.3])
     [english] = discoveries(cells)
     [german] = discoveries(cells, name="Hausbatterie", names={"voltage_v": "Klemmenspannung", "cell_v": "Zelle"})
-    parts, named = english["components"], german["components"]
+    parts, named = described(english), described(german)
     assert {key for key, component in parts.items() if "name" not in component} == {
         "voltage_v",
         "current_a",
