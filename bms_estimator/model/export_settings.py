@@ -59,7 +59,8 @@ class PrometheusSettings(Strict):
         return int(self.listen.rpartition(":")[2])
 
     @model_validator(mode="after")
-    def _a_port(self) -> Self:
+    def _an_address(self) -> Self:
         if not 0 < self.port < 65536:
             raise ValueError("port: must be 1 to 65535")
+        self.host.encode("idna")  # as the resolver has it
         return self

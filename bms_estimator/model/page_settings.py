@@ -37,6 +37,7 @@ def parse_listen(text: str) -> Listen:
     try:
         url = urlsplit(f"//{text}")
         host, port = url.hostname, url.port
+        (host or "").encode("idna")  # as the resolver has it
     except ValueError as error:
         raise ValueError(f"must be host:port: {error}") from None
     if not host or port is None or url.netloc != text or "@" in text:

@@ -25,7 +25,7 @@ def test_an_address_is_read(text, host, port, loopback):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "8765", "127.0.0.1", "127.0.0.1:x", "127.0.0.1:99999", "a@b:1", "a:1/x", "::1:80"]
+    "text", ["", "8765", "127.0.0.1", "127.0.0.1:x", "127.0.0.1:99999", "a@b:1", "a:1/x", "::1:80", "x..y:80"]
 )
 def test_what_is_no_address_is_refused(text):
     with pytest.raises(ValueError, match="host:port"):

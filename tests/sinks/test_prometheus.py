@@ -108,9 +108,11 @@ def test_a_field_s_unit_becomes_that_of_prometheus() -> None:
     assert named("nussbaum_gain") == ("bms_nussbaum_gain", 1.0)
 
 
-@pytest.mark.parametrize("listen", ["9108", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:65536", "a b:1", "http://x:1"])
+@pytest.mark.parametrize(
+    "listen", ["9108", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:65536", "a b:1", "http://x:1", "x..y:1"]
+)
 def test_an_address_that_is_none_is_refused(listen: str) -> None:
-    with pytest.raises(ValueError, match=r"listen|port"):
+    with pytest.raises(ValueError, match=r"listen|port|label empty"):
         PrometheusSettings(listen=listen)
 
 
