@@ -184,7 +184,12 @@ class Alarms:
             reason: Why, as far as that is known.
         """
         state = self._states.get("link_lost")
-        if state is not None and state.raising is None and silent_s >= state.watched.limit:
+        if state is None or silent_s < state.watched.limit:
+            return
+        if state.gone:  # it latches, and is back
+            state.gone = False
+            self._keep()
+        if state.raising is None:
             self._reasons["link_lost"] = Reasons(Suspect(0), (reason,) if reason else ())
             self._note(state, state.raise_at(self._at_s, Raising(now_s, silent_s)))
             self._keep()
@@ -237,6 +242,8 @@ class Alarms:
                 continue
             since_s, value = float(told["since_s"]), told["value"]
             iso_utc(since_s)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name}: value = {value}")
             raising = Raising(since_s, None if value is None else float(value))
             state.restore(raising, gone=bool(told["gone"]), acknowledged=bool(told["acknowledged"]))
         self._keep()

@@ -1,6 +1,7 @@
 """Each alarm is raised and ends on a capture; what holds whatever the alarm is."""
 
 import itertools
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -225,6 +226,25 @@ async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
     (change,) = alarms.changes()
     assert (change.alarm.name, change.at_s, change.alarm.value) == ("discharge_over_current", 0.1, None)
     assert change.alarm.since == iso_utc(WALL_S)
+
+
+def test_silence_that_is_back_is_the_cause_of_a_latched_link_lost_again() -> None:
+    alarms = Alarms(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0)
+    kept = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
+    alarms.restore(json.dumps({"link_lost": kept}))
+    alarms.silent(1.0, WALL_S, "")
+    assert json.loads(alarms.kept)["link_lost"]["gone"]
+    alarms.silent(1000.0, WALL_S, "")
+    assert json.loads(alarms.kept)["link_lost"] == kept | {"gone": False}
+    assert alarms.acknowledge(None) == ["link_lost"]
+    assert alarms.active == ("link_lost",), "the cause is there"
+
+
+def test_an_alarm_that_was_kept_with_a_value_that_is_none_is_refused() -> None:
+    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0)
+    kept = {"since_s": WALL_S, "value": math.inf, "gone": False, "acknowledged": False}
+    with pytest.raises(ValueError, match="pack_over_voltage: value = inf"):
+        alarms.restore(json.dumps({"pack_over_voltage": kept}))
 
 
 @pytest.mark.parametrize(
