@@ -203,7 +203,7 @@ class _Switched(_Hook):
         before = bool(self._active)
         (self._active.add if alarm.active else self._active.discard)(alarm.name)
         if bool(self._active) != before:
-            log.warning("relay", dry_run=self._hook.dry_run, level=self._what, alarm=alarm.name, state=_state(alarm))
+            log.warning("relay", dry_run=self._hook.dry_run, hook=self._what, alarm=alarm.name, state=_state(alarm))
             self._wake.set()
 
     def begin(self, active: Collection[str]) -> None:
@@ -217,11 +217,11 @@ class _Switched(_Hook):
             try:
                 await self._switch(self._wanted)
                 if self._trouble:
-                    log.info("the board takes its relay's level again", level=self._what)
+                    log.info("the board takes its relay's level again", hook=self._what)
                 self._trouble = ""
             except UserError as error:
                 if str(error) != self._trouble:
-                    log.warning("the board does not take its relay's level", level=self._what, reason=str(error))
+                    log.warning("the board does not take its relay's level", hook=self._what, reason=str(error))
                 self._trouble = str(error)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(RETRY_S if self._trouble else RELAY_S):

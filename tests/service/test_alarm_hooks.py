@@ -136,7 +136,7 @@ async def test_a_dry_run_says_what_would_be_done_and_does_nothing(tmp_path: Path
     with capture_logs() as lines:
         async with hooks(*({**each, "dry_run": True} for each in told), say=said.append, switch=said.append) as made:
             made.tell(Change(0.0, RAISED))
-    assert [line.get("would") or line.get("level") for line in lines] == [
+    assert [line.get("would") or line.get("hook") for line in lines] == [
         "relay pin high",
         f"run {tell}",
         "publish on load/set",
