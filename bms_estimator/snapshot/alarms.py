@@ -238,7 +238,7 @@ class Alarms:
         """
         for name, told in json.loads(kept or "{}").items():
             state = self._states.get(name)
-            if state is None or not state.watched.latch:
+            if state is None or (told["gone"] and not state.watched.latch):
                 continue
             since_s, value = float(told["since_s"]), told["value"]
             iso_utc(since_s)
@@ -325,11 +325,11 @@ class Alarms:
         return _alarm(state.watched, Told(state.raising, gone=state.gone, reasons=reasons))
 
     def _keep(self) -> None:
-        """Those that latch outlive a restart."""
+        """What is raised outlives a restart: a relay that has cut the load must not let it on again for that."""
         kept = {
             name: {**state.raising._asdict(), "gone": state.gone, "acknowledged": state.acknowledged}
             for name, state in self._states.items()
-            if state.raising is not None and state.watched.latch
+            if state.raising is not None
         }
         self.kept = json.dumps(kept) if kept else ""
 

@@ -202,7 +202,7 @@ async def test_a_gap_between_samples_counts_for_no_delay_and_slow_sampling_is_no
     assert told.turns("over_temperature") == [(80.0, True)]
 
 
-async def test_what_latches_outlives_a_restart_and_the_rest_does_not(tmp_path: Path) -> None:
+async def test_what_latches_outlives_a_restart(tmp_path: Path) -> None:
     before = await replayed(record(tmp_path / "one.bms", CAPTURES["pack_over_voltage"][0]), settings())
     assert '"pack_over_voltage"' in before.kept
     well = record(tmp_path / "two.bms", [Line(30)])
@@ -214,6 +214,16 @@ async def test_what_latches_outlives_a_restart_and_the_rest_does_not(tmp_path: P
     assert "alarm_raised" not in named, "the run before has told of it"
     off = await replayed(well, settings({"pack_over_voltage": {"latch": False}}), kept=before.kept)
     assert not any(alarm.active for alarm in off.snapshots[-1].alarms)
+
+
+async def test_what_is_raised_outlives_a_restart_and_ends_where_it_would_have_ended(tmp_path: Path) -> None:
+    low = record(tmp_path / "one.bms", [Line(30), Line(20, voltage_v=5.3)])
+    before = await replayed(low, settings())
+    better = record(tmp_path / "two.bms", [Line(30, voltage_v=5.7), Line(60)])  # above its limit, below where it ends
+    after = await replayed(better, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    assert after.snapshots[0].alarms != ()
+    assert after.turns("pack_under_voltage") == [(60.0, False)]
+    assert json.loads(after.kept).keys() & {"pack_under_voltage"} == set()
 
 
 async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
