@@ -3,7 +3,7 @@ import * as f from "./format.js";
 import { Curve, OverSoc, Ring, gaps, scaled } from "./charts.js";
 
 const DRAW_MS = 250, CURVES_MS = 500, DESCRIBE_MS = 10_000, HISTORY_MS = 60_000;
-const SILENT_MS = 16_000; // the server says something each 5 s
+const SILENT_MS = 16_000; // it speaks each 5 s
 const SPANS = { live: 300, hour: 3600, day: 86400, month: 30 * 86400 }; // [s]
 const ROWS = 3600; // five minutes at 10 Hz, and some
 const COLUMNS = ["voltage_v", "voltage_estimate_v", "current_a", "soc", "soc_std", "innovation_v"];
@@ -17,7 +17,7 @@ const packs = new Map();
 const ui = { pack: null, span: "live", element: null, drawn: 0, curves: -Infinity, described: -Infinity, due: false };
 const stream = { open: false, heard: 0, link: null, linkSince: 0 };
 
-// ---- what came last
+// what came last
 
 class Pack {
 	constructor(name) {
@@ -27,7 +27,7 @@ class Pack {
 		this.learned = {}; // element -> percent of SOC -> [value, std]
 		this.events = [];
 		this.history = {}; // span -> { at, data } or { at, reason }
-		this.stateAt = 0; // when a state came, by this browser's clock
+		this.stateAt = 0; // of its last state, by our clock
 		this.since = null; // stale since
 	}
 	take(topic, value) {
@@ -91,14 +91,14 @@ function connect() {
 	};
 	source.onerror = () => {
 		lost();
-		if (source.readyState === EventSource.CLOSED) again(2000); // refused: too many readers, or a new token
+		if (source.readyState === EventSource.CLOSED) again(2000); // refused: too many, or a new token
 	};
 	const watch = setInterval(() => {
 		if (stream.open && Date.now() - stream.heard > SILENT_MS) { lost(); again(0); } // a line that swallows all
 	}, 1000);
 }
 
-// ---- drawing
+// drawing
 
 function drawSoon() {
 	if (ui.due) return;
@@ -106,7 +106,7 @@ function drawSoon() {
 	setTimeout(() => requestAnimationFrame(draw), Math.max(0, ui.drawn + DRAW_MS - performance.now()));
 }
 
-/** Texts and attributes are set only where they change: nothing is laid out anew for nothing. */
+/** Set only where it changes: nothing is laid out anew for nothing. */
 function text(element, value) {
 	if (element.said === value) return;
 	element.said = value;
@@ -243,7 +243,7 @@ function drawScale(s) {
 	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %; stop discharging at ${f.percent(stop, 0)} %`);
 }
 
-// ---- cells
+// cells
 
 function drawCells(s) {
 	const cells = Array.isArray(s.cells_v) ? s.cells_v : [], known = cells.filter(number), count = known.length;
@@ -276,7 +276,7 @@ function drawCells(s) {
 	put("celldev", f.millivolts(Math.sqrt(known.reduce((a, b) => a + (b - mean) ** 2, 0) / count)));
 }
 
-// ---- parameters, health, events
+// parameters, health, events
 
 const ELEMENTS = {
 	r_s_ohm: ["Rₛ", 1e3, "mΩ"], r_ts_ohm: ["Rₜₛ", 1e3, "mΩ"], c_ts_farad: ["Cₜₛ", 1, "F"], r_tl_ohm: ["Rₜₗ", 1e3, "mΩ"],
@@ -332,7 +332,7 @@ function drawEvents(pack) {
 		node("time", { datetime: e.time }, f.when(new Date(e.time))), node("b", {}, words(e.name)), node("span", {}, e.text))));
 }
 
-// ---- curves
+// curves
 
 let curves = null;
 
@@ -412,7 +412,7 @@ function describe(pack) {
 	attribute($("elementchart"), "aria-label", `${name} over state of charge, now ${value} ${unit}${std && `, standard deviation ${std} ${unit}`}`);
 }
 
-// ---- elements over SOC: the functions (2.5)-(2.9), and what was learned with its error where the pack has been
+// elements over SOC: the functions (2.5)-(2.9), and what was learned with its error where the pack has been
 
 const FORM = { r_ts_ohm: [1, 1], r_tl_ohm: [4, 1], c_ts_farad: [7, -1], c_tl_farad: [10, -1], r_s_ohm: [13, 1] };
 const GRID = Array.from({ length: 101 }, (_, i) => i);
@@ -449,7 +449,7 @@ function curveOf(a, name, factor) {
 	return GRID.map((i) => (value(i / 100) > 0 ? factor * value(i / 100) : null));
 }
 
-// ---- what people do
+// what people do
 
 function redrawAll() { ui.curves = ui.described = -Infinity; drawSoon(); }
 
