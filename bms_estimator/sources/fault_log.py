@@ -7,8 +7,8 @@ import structlog
 
 JUNK_LOG_S = 30.0
 """Faults are logged no more often than this [s]."""
-_NO_FAULTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects")
-"""Bytes and samples before the hello are usual where opening the port does not reset the board."""
+_NO_FAULTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects", "retained")
+"""Bytes and samples before the hello are usual where opening the port does not reset the board; so is what a broker has kept."""
 
 log = structlog.get_logger(__name__)
 
