@@ -8,6 +8,9 @@ STUCK_S = 10.0
 """A time that stays the same for so long, while samples come, tells nothing [s]."""
 SLOWEST = 0.01
 """No device's clock is slower than the host's by more than this, relative."""
+LAG_S, LAG_STEPS = 60.0, 3
+"""A clock that has fallen behind so far, by so many steps that were each below half of what passed, is slow: samples that
+waited would have come at once [s]."""
 
 
 class ToldClock:
@@ -15,7 +18,8 @@ class ToldClock:
 
     Samples that waited come late, and at once: their own times place them. A time that steps back, or one that lies
     ahead of the arrivals, is one of a clock that was set or of a device that began anew: there the arrival counts, and so
-    it does where the clock stands still.
+    it does where the clock stands still. One that is slow, as of a device that sleeps or of milliseconds where seconds
+    come, would lose charge without a word: what it lost counts with one step, and arrivals from then on.
 
     Attributes:
         jumps: So often were times not believed.
@@ -26,6 +30,7 @@ class ToldClock:
         self._last_s = 0.0
         self._told_s = self._arrival_s = math.nan  # the latter when the told time was another last
         self._least_late_s = math.inf
+        self._lag_s, self._lags, self._slow = 0.0, 0, False
 
     def place(self, arrival_s: float, told_s: float) -> float:
         """Time of a sample [s].
@@ -38,8 +43,11 @@ class ToldClock:
         passed_s = 0.0 if math.isnan(self._arrival_s) else max(arrival_s - self._arrival_s, 0.0)
         if step_s == 0.0 and passed_s < STUCK_S:
             return self._last_s
-        if step_s > 0.0 and late_s >= self._least_late_s - EARLY_S:
+        if self._slow:
+            step_s = passed_s
+        elif step_s > 0.0 and late_s >= self._least_late_s - EARLY_S:
             self._least_late_s = min(self._least_late_s + SLOWEST * step_s, late_s)
+            step_s += self._lost(step_s, passed_s)
         else:
             self.jumps += not math.isnan(step_s)
             self._least_late_s = math.inf if math.isnan(late_s) else late_s
@@ -47,3 +55,14 @@ class ToldClock:
         self._told_s, self._arrival_s = told_s, arrival_s
         self._last_s += step_s
         return self._last_s
+
+    def _lost(self, step_s: float, passed_s: float) -> float:
+        """What a clock has not told of that turns out to be slow [s]; else 0."""
+        if 2.0 * step_s >= passed_s:
+            self._lag_s, self._lags = 0.0, 0
+            return 0.0
+        self._lag_s, self._lags = self._lag_s + passed_s - step_s, self._lags + 1
+        if self._lag_s < LAG_S or self._lags < LAG_STEPS:
+            return 0.0
+        self._slow, self.jumps = True, self.jumps + 1
+        return self._lag_s

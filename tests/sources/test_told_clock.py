@@ -1,5 +1,6 @@
 """Times that a device tells place its samples, unless they cannot be right."""
 
+import itertools
 from math import nan
 
 import pytest
@@ -7,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.sources.dialects.text import TextDialect
-from bms_estimator.sources.told_clock import ToldClock
+from bms_estimator.sources.told_clock import LAG_S, ToldClock
 
 
 @pytest.mark.parametrize(
@@ -25,6 +26,21 @@ def test_times(stamps: list[tuple[float, float]], placed: list[float], jumps: in
     clock = ToldClock()
     assert [clock.place(*stamp) for stamp in stamps] == placed
     assert clock.jumps == jumps
+
+
+def test_a_clock_that_is_slow_loses_no_time():
+    clock = ToldClock()
+    placed = [clock.place(float(second), 1e-3 * second) for second in range(200)]
+    assert placed[-1] == pytest.approx(199.0)
+    assert max(b - a for a, b in itertools.pairwise(placed)) <= LAG_S + 2.0
+    assert clock.jumps == 1
+
+
+def test_samples_that_came_in_bursts_are_no_slow_clock():
+    clock = ToldClock()
+    placed = [clock.place(100.0 * (second // 100 + 1), float(second)) for second in range(1000)]
+    assert placed == [float(second) for second in range(1000)]
+    assert clock.jumps == 0
 
 
 @given(st.lists(st.tuples(st.floats(0, 10), st.floats() | st.just(1.0))))
