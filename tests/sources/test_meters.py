@@ -186,18 +186,6 @@ def test_a_charger_is_no_battery_monitor() -> None:
     assert "product 0xA042 is no battery monitor" in (dialect.fault or "")
 
 
-def test_what_talks_but_is_no_pylontech_is_not_called_silent() -> None:
-    dialect = PylontechDialect()
-    dialect.opened()
-    assert dialect.due(0.0) == b"pwr\n"
-    assert dialect.due(5.0) == b"pwr\n"
-    assert dialect.fault is None, "nothing has come"
-    assert list(dialect.feed(6.0, b"PID\t0xA389\r\nV\t53334\r\n")) == []
-    assert dialect.due(10.0) == b"pwr\n"
-    assert dialect.fault is not None
-    assert "another sensor.protocol" in dialect.fault
-
-
 def test_cells_of_all_batteries_stand_beside_the_stack_once_all_have_told_them() -> None:
     dialect = PylontechDialect()
     dialect.feed(1.0, bat(1, US2000_CELLS) + US2000_PWR)

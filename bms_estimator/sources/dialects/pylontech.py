@@ -23,7 +23,6 @@ ANSWER_BYTES = 16384
 PROMPT = re.compile(rb"pylon\w*>")
 ECHO = re.compile(r"\bbat\s+([0-9]{1,2})\b")
 SUCCESS = "Command completed"
-NO_PROMPT = "bytes come, but no prompt of a Pylontech console: it has 115200 baud; or another sensor.protocol?"
 BATTERIES = 16
 CELLS = 32
 CELLS_S = 90.0
@@ -49,7 +48,6 @@ class PylontechDialect(MeterDialect):
         self._answers = 0
         self._round_s = self._asked_s = -math.inf
         self._asked_at = -1  # answers when it was asked last
-        self._asked_bytes = 0  # bytes that had come by then
         self._asked = b""
         self._turn = 0  # whose cells are next
 
@@ -72,8 +70,6 @@ class PylontechDialect(MeterDialect):
         waits = self._asked and self._answers == self._asked_at
         if waits and now_s - self._asked_s < ANSWER_S:
             return b""
-        if waits and self._counts["bytes_received"] > self._asked_bytes:
-            self._blame("length_errors", NO_PROMPT)
         if now_s - self._round_s >= ROUND_S or waits:
             self._round_s = now_s
             return self._ask(b"pwr\n", now_s)
@@ -84,7 +80,6 @@ class PylontechDialect(MeterDialect):
 
     def _ask(self, command: bytes, now_s: float) -> bytes:
         self._asked, self._asked_s, self._asked_at = command, now_s, self._answers
-        self._asked_bytes = self._counts["bytes_received"]
         return command
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
@@ -99,7 +94,7 @@ class PylontechDialect(MeterDialect):
                 yield reading
         if len(self._rest) > ANSWER_BYTES:
             self._rest = b""
-            self._blame("length_errors", NO_PROMPT)
+            self._blame("length_errors", "bytes come, but no prompt of a Pylontech console: it has 115200 baud")
 
     def _of(self, arrival_s: float, answer: str) -> Reading | None:
         """What the answer to ``pwr`` says; that to ``bat`` is kept for the next."""
