@@ -63,6 +63,10 @@ EXTRAS = {
     "cantools": "can",
     "aiobmsble": "ble",
     "bleak": "ble",
+    "nats": "fleet",
+    "duckdb": "fleet",
+    "dask": "fleet",
+    "nkeys": "fleet",
 }
 """Optional package -> the extra that brings it."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)

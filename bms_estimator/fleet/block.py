@@ -1,0 +1,113 @@
+"""A block on its way from an edge: a header, and a pack's samples of about a minute, packed without loss.
+
+Layout, little-endian::
+
+    0  magic   4s  b"BMSB"
+    4  version u1  1
+    5  -       u1  0
+    6  count   u2  samples, 1..65535
+    8  store   u8  when the edge's store was made [ns since 1970]: a later store takes the place of the one before
+    16 number  u8  of this block, from 1, one more for each block of a store
+    24 oldest  u8  the oldest number that the edge can still send: what is before it and has not come never will
+    32 arrival f8  wall clock at the arrival of the last sample [s since 1970]
+    40 body        zlib of the columns time_s, current_a, voltage_v, temperature_c (f8), status (u4)
+
+``time_s`` is the edge's clock: seconds since its store was made, never decreasing within one. Its bits are written as
+differences of 64-bit integers, which are nearly all the same at an even pace.
+"""
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+
+_HEADER = struct.Struct("<4sBxHQQQd")
+_MAGIC, _VERSION = b"BMSB", 1
+MOST_SAMPLES = 65_535
+"""Of a block."""
+MOST_NUMBER = 2**63
+"""Of stores and blocks."""
+_COLUMNS = tuple((name, np.dtype(SAMPLE[name]).newbyteorder("<")) for name in SAMPLE.names or ())
+_SAMPLE_BYTES = sum(dtype.itemsize for _, dtype in _COLUMNS)
+
+
+class BlockError(ValueError):
+    """What is wrong with the bytes of a block."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """What an edge sends at once.
+
+    Attributes:
+        store: When the edge's store was made [ns since 1970].
+        number: Of this block, from 1.
+        oldest: The oldest number that the edge can still send; at most ``number``.
+        arrival_s: Wall clock at the arrival of the last sample [s since 1970].
+        samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MOST_SAMPLES`` of them.
+    """
+
+    store: int
+    number: int
+    oldest: int
+    arrival_s: float
+    samples: SampleBlock
+
+
+def encode(block: Block) -> bytes:
+    """The bytes of a block.
+
+    Raises:
+        ValueError: It holds no sample, or more than ``MOST_SAMPLES``.
+    """
+    if not 1 <= block.samples.size <= MOST_SAMPLES:
+        raise ValueError(f"{block.samples.size} samples in a block: must be 1 to {MOST_SAMPLES}")
+    header = _HEADER.pack(
+        _MAGIC, _VERSION, block.samples.size, block.store, block.number, block.oldest, block.arrival_s
+    )
+    columns = [np.ascontiguousarray(block.samples[name], dtype=dtype) for name, dtype in _COLUMNS]
+    columns[0] = _differences(columns[0].view("<u8"))
+    return header + zlib.compress(b"".join(column.tobytes() for column in columns))
+
+
+def decode(data: bytes) -> Block:
+    """The block in ``data``.
+
+    Raises:
+        BlockError: It is none, or damaged.
+    """
+    if len(data) < _HEADER.size or data[:4] != _MAGIC:
+        raise BlockError(f"{len(data)} bytes that do not begin as a block does")
+    _, version, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
+    if version != _VERSION:
+        raise BlockError(f"version {version}; this program reads version {_VERSION}")
+    if not (1 <= oldest <= number < MOST_NUMBER and 0 < store < MOST_NUMBER and math.isfinite(arrival_s)):
+        raise BlockError(f"store {store}, number {number}, oldest {oldest}, arrival {arrival_s}: cannot be")
+    return Block(store, number, oldest, arrival_s, _samples(data[_HEADER.size :], count))
+
+
+def _samples(body: bytes, count: int) -> SampleBlock:
+    size = count * _SAMPLE_BYTES
+    unpacker = zlib.decompressobj()
+    try:
+        raw = unpacker.decompress(body, size + 1)  # no more, whatever a damaged one would become
+    except zlib.error as error:
+        raise BlockError(str(error)) from None
+    if len(raw) != size or count == 0 or not unpacker.eof:
+        raise BlockError(f"its body is not that of {count} samples")
+    samples = np.zeros(count, dtype=SAMPLE)
+    offset = 0
+    for name, dtype in _COLUMNS:
+        samples[name] = np.frombuffer(raw, dtype, count, offset)
+        offset += count * dtype.itemsize
+    samples["time_s"] = np.cumsum(samples["time_s"].view("u8"), dtype="u8").view("f8")
+    return samples
+
+
+def _differences(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    return np.diff(values, prepend=values.dtype.type(0))

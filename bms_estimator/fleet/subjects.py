@@ -1,0 +1,67 @@
+"""Names on the server, within the account of one tenant. An MQTT topic is the subject with / for the dots.
+
+===========================  ================================================================================
+``raw.<pack>``               an edge's blocks, ``block``; mapped by the server to ...
+``p.<partition>.raw.<pack>`` ... this, which the stream ``RAW`` keeps
+``edge.<pack>.awaits``       to the edge: which block a worker awaits next, ``Awaits``
+``bms.<pack>.<topic>``       estimates, as ``run`` publishes them
+``hours.<pack>``             what a worker sums up each hour, kept by the stream ``HOURS``
+``fleet.worker.<id>``        each second, from each worker: that it lives, what it holds, how far it lags
+===========================  ================================================================================
+"""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+RAW_STREAM, HOURS_STREAM = "RAW", "HOURS"
+PACKS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "checkpoints", "states"
+"""Key-value: settings by pack; the last checkpoint by partition. Objects: what checkpoints hold."""
+PARTITIONS = 64
+"""Unless told otherwise when the streams are made; never changed afterwards."""
+
+
+def raw(pack: str) -> str:
+    """Where an edge publishes."""
+    return f"raw.{pack}"
+
+
+def kept(partition: int, pack: str = "*") -> str:
+    """Where the stream ``RAW`` has what came of a pack."""
+    return f"p.{partition}.raw.{pack}"
+
+
+def mapping(partitions: int) -> tuple[str, str]:
+    """What the server maps, and to what."""
+    return "raw.*", f"p.{{{{partition({partitions},1)}}}}.raw.{{{{wildcard(1)}}}}"
+
+
+def awaits(pack: str) -> str:
+    """Where a worker answers an edge."""
+    return f"edge.{pack}.awaits"
+
+
+def published(pack: str, topic: str) -> str:
+    """Where estimates go."""
+    return f"bms.{pack}.{topic}"
+
+
+def hours(pack: str = "*") -> str:
+    """Where the summaries of a pack's hours go."""
+    return f"hours.{pack}"
+
+
+def worker(name: str = "*") -> str:
+    """Where a worker says how it is."""
+    return f"fleet.worker.{name}"
+
+
+class Awaits(BaseModel):
+    """To an edge: all blocks of ``store`` before ``number`` are safe and may be forgotten."""
+
+    model_config = ConfigDict(frozen=True)
+
+    store: Annotated[int, Field(ge=0)]
+    number: Annotated[int, Field(ge=1)]
+    resend: bool
+    """A later one came first: send this one, and all after it, again."""
