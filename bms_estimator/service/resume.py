@@ -86,7 +86,8 @@ def _is_shorter(known: tuple[int, ...], field: tuple[int, ...], axes: int) -> bo
 def _open_curve(estimator: Estimator) -> None:
     """Of the error of the OCV nothing is known where it was no state of the filter before."""
     f, c = estimator.record[0]["filter"], estimator.record[0]["checks"]
-    for mean, covariance in zip(f["mean"], f["covariance"], strict=True):
+    count = int(f["count"])
+    for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
         forget_curve(mean, covariance)
     keep(c, f)
 
