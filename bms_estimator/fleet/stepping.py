@@ -14,7 +14,6 @@ from bms_estimator.fleet.pack_state import PACK_STATE, Fields
 from bms_estimator.fleet.pack_type import Digest, PackType
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import PackSettings
 from bms_estimator.service.checkpoint import fields, without_observer
 from bms_estimator.service.resume import resume
 from bms_estimator.snapshot.flow import Flow, Last
@@ -72,18 +71,18 @@ class Stepping:
             self._counters["begun_anew"] += known
         d["made_of"], d["meaning"] = of_type.made_of, of_type.meaning
 
-    def step(self, block: Block, of_type: PackType, settings: PackSettings) -> Published:
+    def step(self, pack: str, block: Block, of_type: PackType) -> Published:
         """Take the pack's next block.
 
         Args:
+            pack: Its name.
             block: It; time stamps that cannot be become NaN.
             of_type: The pack's type; its estimator works on the bench.
-            settings: Of the pack.
         """
         record, estimator = self._record[0], of_type.estimator
         d, sums, observer = record["delivery"], self._record["hour"], record["estimator"]["observer"]
         self._check_times(block.samples)
-        rows, turned = self._turn_hour(block, of_type, settings)
+        rows, turned = self._turn_hour(pack, block, of_type)
         if int(d["clock"]) != block.store and observer["started"]:
             estimator.resume(self._unseen_s(block))
         before_s = float(observer["time_s"]) if observer["started"] else math.nan
@@ -129,9 +128,7 @@ class Stepping:
         passed_s = (block.store - int(d["clock"])) / 1e9 + (float(known_s[0]) - float(d["last_s"]))
         return passed_s if passed_s >= 0.0 else math.inf
 
-    def _turn_hour(
-        self, block: Block, of_type: PackType, settings: PackSettings
-    ) -> tuple[tuple[tuple[str, bytes], ...], bool]:
+    def _turn_hour(self, pack: str, block: Block, of_type: PackType) -> tuple[tuple[tuple[str, bytes], ...], bool]:
         """Where a block is of a later hour: the row of the one before, if anything came in it, and begin the new one."""
         d, sums = self._record[0]["delivery"], self._record["hour"]
         present, before = hour.hour_of(block), int(d["hour"])
@@ -139,8 +136,9 @@ class Stepping:
             return (), False
         rows: tuple[tuple[str, bytes], ...] = ()
         if before:
+            settings = of_type.settings.model_copy(update={"name": pack})
             row = hour.row(settings, before, sums, of_type.estimator)
-            rows = ((f"{settings.name}.{before}", row.model_dump_json().encode()),)
+            rows = ((f"{pack}.{before}", row.model_dump_json().encode()),)
         hour.begin(sums, self._record[0]["estimator"])
         d["hour"] = present
         return rows, True
