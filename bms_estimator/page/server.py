@@ -20,6 +20,7 @@ FILES = {
     "/": File(STATIC / "index.html", "text/html"),
     "/style.css": File(STATIC / "style.css", "text/css"),
     "/page.js": File(STATIC / "page.js", "text/javascript"),
+    "/live.js": File(STATIC / "live.js", "text/javascript"),
     "/format.js": File(STATIC / "format.js", "text/javascript"),
     "/charts.js": File(STATIC / "charts.js", "text/javascript"),
     "/uplot.js": File(STATIC / "uplot.js", "text/javascript"),
