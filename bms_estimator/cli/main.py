@@ -1,31 +1,16 @@
-"""``bms-estimator``: the table of commands, and what becomes of errors.
-
-A command's module is imported when the command runs: ``--help`` stays fast, and a missing optional package
-hurts only the command that needs it.
-"""
+"""``bms-estimator``: the table of commands, and what becomes of errors."""
 
 import errno
-import importlib
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import typer
-from typer.core import TyperCommand, TyperGroup
 
 from bms_estimator import __version__
+from bms_estimator.cli.lazy import Entry, LazyGroup
 from bms_estimator.model.errors import UserError
-
-
-class Entry(NamedTuple):
-    """A command that has not been imported yet."""
-
-    target: str
-    """``module:name`` of a function or a ``Typer``."""
-    help: str
-
 
 COMMANDS = {
     "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
@@ -50,6 +35,7 @@ COMMANDS = {
     "validate": Entry("bms_estimator.cli.validate:validate_command", "A cell's model against a capture, open loop."),
     "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
     "asyncapi": Entry("bms_estimator.cli.asyncapi:asyncapi", "What is published, as an AsyncAPI document."),
+    "fleet": Entry("bms_estimator.cli.fleet:app", "Many packs: a server, workers, questions to all of them."),
     "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
 }
 
@@ -73,36 +59,11 @@ DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """What a disk that is full or broken says. It may have room again: systemd is to start a service anew that ends so."""
 
 
-class LazyGroup(TyperGroup):
-    """Lists commands from ``COMMANDS`` and imports the one that is called."""
-
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 - the signature is the base's
-        """Names of all commands, in the order in which one meets them."""
-        return list(COMMANDS)
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Enough of a command to be listed."""
-        entry = COMMANDS.get(cmd_name)
-        return TyperCommand(cmd_name, help=entry.help) if entry else None
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that is called, imported."""
-        name, listed, rest = super().resolve_command(ctx, args)
-        return name, _import(name) if name in COMMANDS else listed, rest
+class _Commands(LazyGroup):
+    entries = COMMANDS
 
 
-def _import(name: str) -> Any:
-    module, attribute = COMMANDS[name].target.split(":")
-    target = getattr(importlib.import_module(module), attribute)
-    if not isinstance(target, typer.Typer):
-        function, target = target, typer.Typer(add_completion=False)
-        target.command(name, help=COMMANDS[name].help if not function.__doc__ else None)(function)
-    command = typer.main.get_command(target)
-    command.name = name
-    return command
-
-
-app = typer.Typer(cls=LazyGroup, no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(cls=_Commands, no_args_is_help=True, pretty_exceptions_enable=False)
 
 
 def _print_version(wanted: bool) -> None:

@@ -98,7 +98,7 @@ def _samples(body: bytes, count: int) -> SampleBlock:
         raw = unpacker.decompress(body, size + 1)  # no more, whatever a damaged one would become
     except zlib.error as error:
         raise BlockError(str(error)) from None
-    if len(raw) != size or count == 0 or not unpacker.eof:
+    if len(raw) != size or count == 0 or not unpacker.eof or unpacker.unused_data:
         raise BlockError(f"its body is not that of {count} samples")
     samples = np.zeros(count, dtype=SAMPLE)
     offset = 0

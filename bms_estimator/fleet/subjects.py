@@ -15,8 +15,8 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 RAW_STREAM, HOURS_STREAM = "RAW", "HOURS"
-PACKS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "checkpoints", "states"
-"""Key-value: settings by pack; the last checkpoint by partition. Objects: what checkpoints hold."""
+PACKS_BUCKET, CELLS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "cells", "checkpoints", "states"
+"""Key-value: settings by pack; cell files by name; the last checkpoint by partition. Objects: what checkpoints hold."""
 PARTITIONS = 64
 """Unless told otherwise when the streams are made; never changed afterwards."""
 

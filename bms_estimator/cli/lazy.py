@@ -1,0 +1,46 @@
+"""Commands that are imported when they run: ``--help`` stays fast, and a missing optional package hurts only what needs it."""
+
+import importlib
+from typing import Any, ClassVar, NamedTuple
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+
+class Entry(NamedTuple):
+    """A command that has not been imported yet."""
+
+    target: str
+    """``module:name`` of a function or a ``Typer``."""
+    help: str
+
+
+class LazyGroup(TyperGroup):
+    """Lists commands from ``entries``, which a subclass has, and imports the one that is called."""
+
+    entries: ClassVar[dict[str, Entry]]
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 - the signature is the base's
+        """Names of all commands, in the order in which one meets them."""
+        return list(self.entries)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
+        """Enough of a command to be listed."""
+        entry = self.entries.get(cmd_name)
+        return TyperCommand(cmd_name, help=entry.help) if entry else None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is called, imported."""
+        name, listed, rest = super().resolve_command(ctx, args)
+        return name, _import(name, self.entries[name]) if name in self.entries else listed, rest
+
+
+def _import(name: str, entry: Entry) -> Any:
+    module, attribute = entry.target.split(":")
+    target = getattr(importlib.import_module(module), attribute)
+    if not isinstance(target, typer.Typer):
+        function, target = target, typer.Typer(add_completion=False)
+        target.command(name, help=entry.help if not function.__doc__ else None)(function)
+    command = typer.main.get_command(target)
+    command.name = name
+    return command

@@ -1,0 +1,159 @@
+"""The real nats-server of the environment, as ``fleet serve`` configures it: one node, or three in a cluster."""
+
+import contextlib
+import json
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
+from tests.mosquitto import free_port
+from tests.patience import LONG_S
+
+BINARY = Path(sys.executable).parent / "nats-server"
+
+
+class Engine:
+    """The nodes, numbered from 0; ``kill`` is SIGKILL.
+
+    Args:
+        folder: For their files; those of an engine that was there are taken up.
+        nodes: 1 or 3.
+        partitions, accounts, tls: As ``Node`` has them.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        nodes: int = 1,
+        *,
+        partitions: int = 64,
+        accounts: Accounts | None = None,
+        tls: Tls | None = None,
+    ) -> None:
+        routes = tuple(f"127.0.0.1:{free_port()}" for _ in range(nodes))
+        self._folder = folder
+        self.nodes = [
+            Node(
+                name=f"n{i}",
+                store=folder / f"n{i}",
+                nats=f"127.0.0.1:{free_port()}",
+                mqtt=f"127.0.0.1:{free_port()}",
+                monitor=f"127.0.0.1:{free_port()}",
+                cluster=Cluster(routes[i], routes) if nodes > 1 else None,
+                tls=tls,
+                accounts=accounts,
+                partitions=partitions,
+                disk_bytes=100 << 30,
+                memory_bytes=1 << 30,
+            )
+            for i in range(nodes)
+        ]
+        self._processes: list[subprocess.Popen[bytes] | None] = [None] * nodes
+
+    @property
+    def url(self) -> str:
+        """Of the first node."""
+        return self.urls[0]
+
+    @property
+    def urls(self) -> list[str]:
+        return [f"nats://{node.nats}" for node in self.nodes]
+
+    @property
+    def mqtt_port(self) -> int:
+        """Of the first node."""
+        return self.mqtt_ports[0]
+
+    @property
+    def mqtt_ports(self) -> list[int]:
+        return [int(node.mqtt.rpartition(":")[2]) for node in self.nodes]
+
+    def pid(self, i: int) -> int:
+        process = self._processes[i]
+        assert process
+        return process.pid
+
+    def start(self, i: int, *, wait: bool = True) -> None:
+        """Start node ``i`` as it was; return when it has what the others have."""
+        file = self._folder / f"n{i}.conf"
+        file.write_text(configuration(self.nodes[i]))
+        self._processes[i] = subprocess.Popen([BINARY, "-c", file, "-l", self.log(i)], stderr=subprocess.DEVNULL)
+        if wait:
+            self.wait_ready(i)
+
+    def kill(self, i: int) -> None:
+        process, self._processes[i] = self._processes[i], None
+        if process is not None:
+            process.kill()
+            process.wait(LONG_S)
+
+    def accounts_changed(self, accounts: Accounts) -> None:
+        """Other claims, from the next start on."""
+        self.nodes = [replace(node, accounts=accounts) for node in self.nodes]
+
+    def log(self, i: int) -> Path:
+        return self._folder / f"n{i}.log"
+
+    def wait_ready(self, i: int) -> None:
+        """Until streams can be used at node ``i``, and what it keeps is as the others have it."""
+        deadline = time.monotonic() + LONG_S
+        while not self._is_ready(i):
+            process = self._processes[i]
+            assert process, f"node {i} does not run"
+            assert process.poll() is None, f"node {i} has ended: {self.log(i).read_text()[-2000:]}"
+            assert time.monotonic() < deadline, f"node {i} does not start: {self.log(i).read_text()[-2000:]}"
+            time.sleep(0.02)
+
+    def leader(self, stream: str, account: str = "") -> int:
+        """Number of the node that leads a stream of ``account``, of any where it is empty; -1 where none does."""
+        for i, process in enumerate(self._processes):
+            if process is None:
+                continue
+            with contextlib.suppress(OSError):
+                for found in self.ask(i, "jsz?accounts=true&streams=true").get("account_details", []):
+                    for detail in found.get("stream_detail", []):
+                        if detail["name"] == stream and account in ("", found["name"]):
+                            name = detail.get("cluster", {}).get("leader", "n0" if len(self.nodes) == 1 else "")
+                            if name:
+                                return int(name[1:])
+        return -1
+
+    def ask(self, i: int, what: str) -> Any:
+        """What the monitor of node ``i`` says, such as ``varz``."""
+        with urllib.request.urlopen(f"http://{self.nodes[i].monitor}/{what}", timeout=LONG_S) as answer:
+            return json.load(answer)
+
+    def _is_ready(self, i: int) -> bool:
+        with contextlib.suppress(OSError):
+            alone = len(self.nodes) == 1
+            return self.ask(i, "healthz")["status"] == "ok" and (
+                alone or "leader" in self.ask(i, "jsz")["meta_cluster"]
+            )
+        return False
+
+
+@contextlib.contextmanager
+def running(folder: Path, nodes: int = 1, **more: Any) -> Iterator[Engine]:
+    """An engine whose nodes are ready; they are killed at the end.
+
+    Args:
+        folder: For their files.
+        nodes: 1 or 3.
+        more: As ``Engine`` takes it.
+    """
+    engine = Engine(folder, nodes, **more)
+    try:
+        for i in range(nodes):
+            engine.start(i, wait=False)
+        for i in range(nodes):
+            engine.wait_ready(i)
+        yield engine
+    finally:
+        for i in range(nodes):
+            engine.kill(i)
