@@ -40,7 +40,7 @@ def dashboard(
     """Serve the live page of all packs that publish to a broker, until SIGINT or SIGTERM."""
     settings = load_settings(pack) if pack else Settings()
     broker = (with_broker(settings, mqtt) if mqtt else settings).mqtt or MqttSettings()
-    page = _page(settings.page or PageSettings(), listen=listen, token_file=token_file)
+    page = page_settings(settings.page or PageSettings(), listen=listen, token_file=token_file)
     configure_logs()
     with drained():
         asyncio.run(_serve(broker, page, folder or state_folder(settings), browser=browser))
@@ -55,7 +55,7 @@ async def _serve(broker: MqttSettings, page: PageSettings, folder: Path, *, brow
         await stop.wait()
 
 
-def _page(settings: PageSettings, **given: Any) -> PageSettings:
+def page_settings(settings: PageSettings, **given: Any) -> PageSettings:
     """With what the command line says.
 
     Raises:

@@ -7,6 +7,7 @@
 ``bms.<pack>.<topic>``       estimates, as ``run`` publishes them
 ``hours.<pack>``             what a worker sums up each hour, kept by the stream ``HOURS``
 ``fleet.worker.<id>``        each second, from each worker: that it lives, what it holds, how far it lags
+``fleet.unknown.<pack>``     from a worker: blocks of a pack come that no table knows
 ===========================  ================================================================================
 """
 
@@ -54,6 +55,11 @@ def hours(pack: str = "*") -> str:
 def worker(name: str = "*") -> str:
     """Where a worker says how it is."""
     return f"fleet.worker.{name}"
+
+
+def unknown(pack: str = "*") -> str:
+    """Where a worker says that it does not know a pack."""
+    return f"fleet.unknown.{pack}"
 
 
 class Awaits(BaseModel):
