@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.browser import open_browser
-from bms_estimator.cli.dashboard import page_settings
+from bms_estimator.cli.page_options import page_settings
 from bms_estimator.fleet.page import fleet_page
 from bms_estimator.fleet.page_feed import Server
 from bms_estimator.model.page_settings import PageSettings
