@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 _HEADER = struct.Struct("<4sBxHQQQd")
+_OLDEST = 24
+"""Where it stands in the header."""
 _MAGIC, _VERSION = b"BMSB", 1
 MOST_SAMPLES = 65_535
 """Of a block."""
@@ -73,6 +75,11 @@ def encode(block: Block) -> bytes:
     columns = [np.ascontiguousarray(block.samples[name], dtype=dtype) for name, dtype in _COLUMNS]
     columns[0] = _differences(columns[0].view("<u8"))
     return header + zlib.compress(b"".join(column.tobytes() for column in columns))
+
+
+def with_oldest(data: bytes, oldest: int) -> bytes:
+    """The bytes of a block with another ``oldest``."""
+    return data[:_OLDEST] + oldest.to_bytes(8, "little") + data[_OLDEST + 8 :]
 
 
 def decode(data: bytes) -> Block:
