@@ -98,6 +98,14 @@ def decode(data: bytes) -> Block:
     return Block(store, number, oldest, arrival_s, _samples(data[_HEADER.size :], count))
 
 
+def glance(data: bytes) -> tuple[int, float]:
+    """How many samples a block says it holds, and when it arrived [s since 1970]; none, and for ever, of what is no block."""
+    if len(data) < _HEADER.size or data[:4] != _MAGIC:
+        return 0, math.inf
+    _, _, count, *_, arrival_s = _HEADER.unpack_from(data)
+    return count, arrival_s if math.isfinite(arrival_s) else math.inf
+
+
 def _samples(body: bytes, count: int) -> SampleBlock:
     size = count * _SAMPLE_BYTES
     unpacker = zlib.decompressobj()

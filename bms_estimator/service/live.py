@@ -12,6 +12,7 @@ import numpy as np
 import structlog
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
@@ -145,20 +146,8 @@ async def run_live(
 
 def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
     """The estimator of a pack, its kernels loaded: nothing compiles once samples come."""
-
-    def make() -> Estimator:
-        return Estimator(
-            cell,
-            settings.observer,
-            identifier=settings.identifier,
-            voltage_resolution_v=settings.sensor.voltage_resolution_v,
-            voltage_noise_v=settings.sensor.voltage_noise_v,
-            initial_soc=settings.pack.initial_soc,
-            sampling=settings.sampling,
-        )
-
-    make().run(np.zeros(1, dtype=SAMPLE))
-    return make()
+    estimator_of(settings, cell).run(np.zeros(1, dtype=SAMPLE))
+    return estimator_of(settings, cell)
 
 
 async def _estimate(
