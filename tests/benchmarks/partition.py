@@ -27,7 +27,7 @@ SETTINGS, PACK = Settings(), load_cell(CELL)
 
 
 def rows() -> Iterator[Row]:
-    """Processor time, the least of some rounds: others may use the machine."""
+    """Processor time; of parts the least of some rounds."""
     samples = pulses(MINUTES * SAMPLES, rate_hz=1)
     blocks = [_block(samples, minute) for minute in range(MINUTES)]
     partition = Partition(0, lambda _: (SETTINGS, PACK))
@@ -57,7 +57,7 @@ def _block(samples: SampleBlock, minute: int) -> bytes:
 
 
 def _whole(partition: Partition, blocks: list[bytes]) -> float:
-    """Of one block, among those of all packs in turn [us]; the least of all minutes but the first, with a share of the hours."""
+    """Of one block, among those of all packs in turn [us]: the median of all minutes, and a share of the full hour."""
     minutes_s, sequence = [], 0
     for data in blocks:
         begin_s = time.process_time()
@@ -72,7 +72,7 @@ def _whole(partition: Partition, blocks: list[bytes]) -> float:
 
 def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
     """Each part on the state that the last block found."""
-    stepping, bench, of_type = partition._stepping, partition._bench, partition._known["pack0"]
+    bench, of_type = partition._bench, partition._known["pack0"]
     estimator, wall_s = of_type.estimator, STORE / 1e9 + samples.size
     packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
     bench.put(packed)
@@ -94,7 +94,7 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
     yield "the state unpacked", _us(lambda: bench.put(packed))
     yield "the estimator", _us(step) - put_back_us
     yield "the hour's sums", _us(lambda: hour.add(bench.record["hour"], trace, block, estimator))
-    yield "what has flowed", _us(lambda: stepping._flow(trace, of_type.meter))
+    yield "what has flowed", _us(lambda: (of_type.meter.add(trace), of_type.meter.flow))
     yield "topic state", _us(state)
     yield "the state packed", _us(bench.take)
     parameters_us = _us(lambda: parameter_report(estimator, wall_s).model_dump_json())
