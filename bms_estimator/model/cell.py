@@ -329,8 +329,11 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
             raise UserError(f"{text} is a generic cell: give its capacity, capacity_ah of [pack] or --capacity-ah")
         return _scaled(_packaged(f"cells/generic/{text}.toml"), 1, capacity_ah)
     cell = _packaged(f"cells/{text}.toml") if text in shipped_cells() else read_toml(existing(text), CellModel)
-    if capacity_ah is None:
-        return cell
+    return cell if capacity_ah is None else with_capacity(cell, capacity_ah)
+
+
+def with_capacity(cell: CellModel, capacity_ah: float) -> CellModel:
+    """The same cell, which holds another charge [Ah]; its resistances stay as they were measured."""
     return cell.model_copy(
         update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": None})}
     )

@@ -72,10 +72,23 @@ def read_toml(path: Path, model: type[T]) -> T:
         UserError: File missing, not TOML, or a value not allowed; one line per wrong key.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: not valid TOML: {error}") from None
+    return parse_toml(text, model, str(path))
+
+
+def parse_toml(text: str, model: type[T], path: str) -> T:
+    """Check the text of a TOML file; ``path`` is what messages call it.
+
+    Raises:
+        UserError: Not TOML, or a value not allowed; one line per wrong key.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
         raise UserError(f"{path}: not valid TOML: {error}") from None
     except RecursionError:
         raise UserError(f"{path}: not valid TOML: nested too deeply") from None
@@ -85,7 +98,7 @@ def read_toml(path: Path, model: type[T]) -> T:
         raise UserError("\n".join(_line(path, model, table, detail) for detail in error.errors())) from None
 
 
-def _line(path: Path, model: type[BaseModel], table: object, detail: Any) -> str:
+def _line(path: str, model: type[BaseModel], table: object, detail: Any) -> str:
     """One wrong key: ``pack.toml: cell.capacity_ah = -6.6: must be above 0 (rated capacity ...)``."""
     keys = _keys(table, detail)
     where = ".".join(keys)
@@ -101,7 +114,7 @@ def _line(path: Path, model: type[BaseModel], table: object, detail: Any) -> str
     if detail["type"] == "string_pattern_mismatch" and not hint:
         message = detail["msg"]
     if isinstance(detail["input"], dict):
-        return ": ".join(filter(None, (str(path), where, message)))
+        return ": ".join(filter(None, (path, where, message)))
     return f"{path}: {where} = {without_secrets(repr(detail['input']))}: {message}{hint}"
 
 

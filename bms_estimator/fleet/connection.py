@@ -1,0 +1,80 @@
+"""The connection of a service of the fleet to the server: made again without end, and what is wrong with it said once."""
+
+import ssl
+import time
+from pathlib import Path
+
+import structlog
+from nats.aio.client import Client
+
+from bms_estimator.fleet.reasons import reason
+from bms_estimator.model.errors import UserError
+
+SERVER = "nats://127.0.0.1:4222"
+RETRY_S = 1
+"""Between two attempts to connect [s]."""
+SAID_S = 30.0
+"""The same trouble is logged no more often [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+async def connect(servers: str, name: str, *, creds: Path | None = None, ca: Path | None = None) -> Client:
+    """Connect, however long that takes; later on, connect again whenever the connection breaks.
+
+    Args:
+        servers: ``nats://`` or ``tls://`` and host:port; several with commas between.
+        name: Of this connection, in the server's lists.
+        creds: File of the tenant's credentials, as ``fleet serve`` made it; None: the server asks for none.
+        ca: Certificate of the authority that has signed the server's; None: those of the system.
+
+    Raises:
+        UserError: ``ca`` cannot be read, or an address is none.
+    """
+    nc = Client()
+    said = _Said(nc, servers)
+    try:
+        await nc.connect(
+            servers=[each.strip() for each in servers.split(",")],
+            name=name,
+            user_credentials=str(creds) if creds else None,
+            tls=_context(ca) if ca else None,
+            max_reconnect_attempts=-1,
+            reconnect_time_wait=RETRY_S,
+            error_cb=said.trouble,
+            disconnected_cb=said.gone,
+            reconnected_cb=said.back,
+        )
+    except ValueError as error:
+        raise UserError(f"--server {servers}: {error}") from error
+    return nc
+
+
+def _context(ca: Path) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=ca)
+    except (OSError, ssl.SSLError) as error:
+        raise UserError(f"--ca {ca}: {error.strerror or error}") from error
+
+
+class _Said:
+    """Logs what becomes of a connection."""
+
+    def __init__(self, nc: Client, servers: str) -> None:
+        self._nc, self._servers = nc, servers
+        self._last: tuple[str, float] = ("", 0.0)
+
+    async def trouble(self, error: Exception) -> None:
+        text, now_s = reason(error), time.monotonic()
+        if (text, True) != (self._last[0], now_s < self._last[1] + SAID_S):
+            self._last = text, now_s
+            log.warning("trouble with the server", server=self._servers, reason=text)
+
+    async def gone(self) -> None:
+        if self._nc.is_closed:  # by us
+            return
+        log.warning("the connection to the server is gone; trying again", server=self._servers)
+
+    async def back(self) -> None:
+        self._last = ("", 0.0)
+        log.info("the server is back", server=self._servers)

@@ -1,0 +1,47 @@
+"""What a worker says of itself each second on ``subjects.worker``."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+HEARTBEAT_S = 1.0
+"""Between two [s]."""
+DEAD_S = 3.0
+"""A worker that has said nothing for so long is taken for dead [s]."""
+
+
+class Heartbeat(BaseModel):
+    """A worker lives, holds these partitions and has done so much since it was started."""
+
+    model_config = ConfigDict(frozen=True)
+
+    id: str
+    started_s: float
+    """Wall clock [s since 1970]."""
+    leaving: bool = False
+    """It gives its partitions back and ends."""
+    partitions: tuple[int, ...] = ()
+    """That the server has pinned to it."""
+    packs: int = 0
+    """In those partitions."""
+    blocks: int = 0
+    samples: int = 0
+    lag_s: float | None = None
+    """From the arrival of a block's last sample at the edge to when the block was taken: the worst since the heartbeat before;
+    None: no block was taken [s]."""
+    counters: dict[str, int] = Field(default_factory=dict)
+    """Of the partitions, by name: resends, gaps, lost blocks, damaged ..."""
+    unknown_count: int = 0
+    """Packs that the table does not know."""
+    unknown: tuple[str, ...] = ()
+    """The first few of them."""
+    waiting: int = 0
+    """Messages given by the server and not taken yet."""
+    hours_waiting: int = 0
+    """Summaries that the server has not acknowledged yet."""
+    checkpoint_age_s: float | None = None
+    """Of the oldest of its partitions' last checkpoints; None: there is none [s]."""
+    cpu_s: float = 0.0
+    """Of the process since it was started [s]."""
+    rss_mib: float = 0.0
+    """Memory of the process [MiB]."""
+    trouble: str = ""
+    """What does not work now, in words; empty: nothing."""

@@ -1,0 +1,148 @@
+"""What a fleet is told of one pack: a row of its table, and what the estimator makes of it.
+
+On the server a row stands under its pack's name as JSON without that name, so that packs of one kind have the same bytes.
+"""
+
+import tomllib
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+
+from bms_estimator.model.cell import (
+    CellModel,
+    generic_cells,
+    shipped_cells,
+    shipped_fuel_cells,
+    with_capacity,
+)
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
+from bms_estimator.model.settings import (
+    DeviceName,
+    Fraction,
+    NotNegative,
+    PackSettings,
+    Positive,
+    SensorSettings,
+    Settings,
+)
+from bms_estimator.model.toml_file import Strict, parse_toml
+
+Protocol = Literal["text", "jbd", "daly", "jk", "vedirect", "junctek", "pylontech"]
+CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
+"""Of a cell; one of a pack has more in it than the pack's."""
+_COUNT = Field(ge=1, le=10_000)
+
+
+class PackKind(Strict):
+    """What packs have in common that differ by their names alone; as ``[pack]`` and ``[sensor]`` of a pack's file."""
+
+    cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
+        description="lfp, nmc, nca, lco, lmo, lto: generic, give capacity_ah; else a shipped cell's name, or a cell "
+        "file's beside the table, which must end in .toml"
+    )
+    capacity_ah: Positive | None = Field(
+        default=None, description="what one cell-file object holds; that of the cell file when left out"
+    )
+    series: Annotated[int, _COUNT] = Field(default=1, description="cell-file objects in series")
+    parallel: Annotated[int, _COUNT] = Field(default=1, description="cell-file objects in parallel")
+    initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
+    protocol: Protocol = Field(
+        default="text", description="the BMS or meter that measures: what it resolves, where no column says otherwise"
+    )
+    voltage_resolution_v: Positive | None = Field(default=None, description="one step of the pack's voltage")
+    voltage_noise_v: NotNegative | None = Field(
+        default=None, description="standard deviation of one voltage sample; half a step when left out"
+    )
+    current_resolution_a: NotNegative | None = Field(default=None, description="one step of the current")
+    current_dead_band_a: NotNegative | None = Field(default=None, description="smaller currents are shown as 0")
+    period_s: Positive | None = Field(default=None, description="between two samples; 1 s when left out")
+
+
+class PackRow(PackKind):
+    """One pack."""
+
+    pack: DeviceName = Field(description="device in topic names: 1 to 64 letters, digits, _ and -")
+
+    @property
+    def kind(self) -> PackKind:
+        """All but the name."""
+        return PackKind.model_validate(self.model_dump(exclude={"pack"}, exclude_unset=True))
+
+
+COLUMNS = ("pack", *PackKind.model_fields)
+"""Of a table, in the order in which it is written."""
+
+
+def stored(kind: PackKind) -> bytes:
+    """What the server keeps of a pack; the same bytes for the same values."""
+    return kind.model_dump_json(exclude_defaults=True).encode()
+
+
+def kind_of(data: bytes) -> PackKind:
+    """What ``stored`` made.
+
+    Raises:
+        ValueError: It did not; the message says what is wrong.
+    """
+    try:
+        return PackKind.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        message = first["msg"].removeprefix("Value error, ")
+        raise ValueError(f"{where}: {message}" if where else message) from None
+
+
+def settings_of(row: PackKind) -> Settings:
+    """The settings of a pack; of a kind, its name is the default one."""
+    told = row.model_dump(exclude_none=True)
+    if isinstance(row, PackRow):
+        told["name"] = row.pack
+    pack, sensor = (
+        {name: told[name] for name in section.model_fields if name in told}
+        for section in (PackSettings, SensorSettings)
+    )
+    return Settings(pack=PackSettings.model_validate(pack), sensor=SensorSettings.model_validate(sensor))
+
+
+def known_cells() -> tuple[str, ...]:
+    """Names of all cells that come with the package."""
+    return (*shipped_cells(), *generic_cells(), *shipped_fuel_cells())
+
+
+def model_of(kind: PackKind, cell_file: str | None) -> PackModel:
+    """The pack as one object.
+
+    Args:
+        kind: Names the cell, and says what it holds and how many there are.
+        cell_file: The text of the loaded file of that name; None: there is none. A cell of the package goes before.
+
+    Raises:
+        UserError: There is no such cell, or a value in it that is not allowed; a capacity that is missing or cannot be.
+    """
+    return cell_of(kind, cell_file).pack(kind.series, kind.parallel)
+
+
+def cell_of(kind: PackKind, cell_file: str | None) -> PackModel:
+    """One of the objects that the pack is made of; as ``model_of``."""
+    name = kind.cell
+    if name in known_cells():
+        return load_any(name, kind.capacity_ah)
+    if cell_file is None:
+        raise UserError(
+            f"{name}: no cell file of this name was loaded, and the package's are {', '.join(known_cells())}"
+        )
+    if not _is_fuel_cell(cell_file):
+        cell = parse_toml(cell_file, CellModel, f"cell {name}")
+        return cell if kind.capacity_ah is None else with_capacity(cell, kind.capacity_ah)
+    if kind.capacity_ah is not None:
+        raise UserError(f"{name} is a fuel cell, which has no capacity: leave out capacity_ah")
+    return parse_toml(cell_file, FuelCellModel, f"cell {name}")
+
+
+def _is_fuel_cell(cell_file: str) -> bool:
+    try:
+        return "fuel_cell" in tomllib.loads(cell_file)
+    except (ValueError, RecursionError):
+        return False  # whoever reads it as a cell says what is wrong
