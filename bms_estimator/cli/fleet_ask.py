@@ -12,6 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server, Where
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
@@ -21,8 +22,9 @@ FOLDER = Path("hours")
 
 
 def collect(
-    server: Annotated[str, typer.Option(help="of the fleet, nats://host:port")] = "nats://127.0.0.1:4222",
-    credentials: Annotated[Path | None, typer.Option(help="file of the tenant's user", show_default=False)] = None,
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
     folder: Annotated[Path, typer.Option(help="of the Parquet files")] = FOLDER,
     period: Annotated[float, typer.Option(min=0.0, help="a row waits at most so long for its file [s]")] = 300.0,
 ) -> None:
@@ -32,21 +34,26 @@ def collect(
 
     configure_logs()
     with drained(), only_collector(folder):
-        asyncio.run(_collect(server, credentials, folder, period))
+        asyncio.run(_collect((server, creds, ca), folder, period))
 
 
-async def _collect(server: str, credentials: Path | None, folder: Path, period_s: float) -> None:
-    import nats  # noqa: PLC0415
-    from nats.errors import Error  # noqa: PLC0415
-
+async def _collect(where: Where, folder: Path, period_s: float) -> None:
     from bms_estimator.fleet.collector import Collector  # noqa: PLC0415
+    from bms_estimator.fleet.connection import connect  # noqa: PLC0415
     from bms_estimator.service.interrupt import stop_on_signal  # noqa: PLC0415
 
+    server, creds, ca = where
     stop = stop_on_signal()
-    try:
-        nc = await nats.connect(server, user_credentials=credentials, max_reconnect_attempts=-1, name="collector")
-    except (Error, OSError) as error:
-        raise UserError(f"--server {server}: {error}") from error
+    connecting, stopping = (
+        asyncio.ensure_future(connect(server, "collector", creds=creds, ca=ca)),
+        asyncio.ensure_future(stop.wait()),
+    )
+    await asyncio.wait((connecting, stopping), return_when=asyncio.FIRST_COMPLETED)
+    if not connecting.done():  # told to stop before a server was there
+        connecting.cancel()
+        await asyncio.wait((connecting,))
+        return
+    nc = connecting.result()
     try:
         await Collector(nc, folder, period_s=period_s).run(stop)
     finally:
