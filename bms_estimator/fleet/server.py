@@ -1,6 +1,6 @@
-"""A nats-server as a child: started, waited for, given its streams, told what we are told, outlived by nobody.
+"""A nats-server as a child: started, waited for, given its streams, told what signals tell us.
 
-It is not started again: systemd does that, or who has started us.
+It is not started again, and only systemd ends it where we are killed: that is the work of who has started us.
 """
 
 import asyncio
@@ -136,7 +136,7 @@ async def serve(place: Place, read: Callable[[], Told], say: Callable[[str], Non
     _write(place.folder / CONFIGURATION, configuration(node_of(place, told)))
     async with _running(binary, place.folder / CONFIGURATION) as (process, asked_to_end):
         ended = asyncio.create_task(process.wait())
-        made = asyncio.create_task(_make_ready(place, told, say))
+        made = asyncio.create_task(_make_ready(place, told, process.pid, say))
         reloading = asyncio.create_task(_reload_on_signal(place, read, process, made, say))
         try:
             await asyncio.wait((ended, made), return_when=asyncio.FIRST_COMPLETED)
@@ -184,7 +184,9 @@ async def _reload_on_signal(
 @contextlib.asynccontextmanager
 async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subprocess.Process, asyncio.Event]]:
     """The server as a child, which ends with us, and whether a signal has asked it to."""
-    process = await asyncio.create_subprocess_exec(binary, "-c", file)
+    for left in file.parent.glob("*.ports"):  # of one that was killed
+        left.unlink()
+    process = await asyncio.create_subprocess_exec(binary, "-c", file, "--ports_file_dir", file.parent)
     asked, loop = asyncio.Event(), asyncio.get_running_loop()
 
     def pass_on(number: signal.Signals) -> None:
@@ -204,10 +206,14 @@ async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subp
             loop.remove_signal_handler(number)
 
 
-async def _make_ready(place: Place, told: Told, say: Callable[[str], None]) -> None:
-    """Wait for the server, say where it is, then for a quorum, and make the streams of all tenants."""
+async def _make_ready(place: Place, told: Told, pid: int, say: Callable[[str], None]) -> None:
+    """Wait for the server, say where it is, then for a quorum, and make the streams of all tenants.
+
+    Not any server that answers is ours: it writes a file with its number once it listens, and then has its ports.
+    """
     node = node_of(place, told)
-    await _wait(node, "healthz", _listens)
+    while not list(place.folder.glob(f"*_{pid}.ports")):  # noqa: ASYNC110 - it has no other way to tell
+        await asyncio.sleep(ASK_AGAIN_S)
     secure = "s" if node.tls else ""
     say(f"edges: mqtt{secure}://{node.mqtt}  workers: {_scheme(node)}://{node.nats}  monitor: http://{node.monitor}")
     if node.cluster:
@@ -268,11 +274,6 @@ def _own_certificate(tls: Tls) -> ssl.SSLContext:
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
     context.check_hostname = False
     return context
-
-
-def _listens(health: Mapping[str, object]) -> bool:
-    """Whether clients are heard; in a cluster there may be no leader yet."""
-    return "status" in health
 
 
 def _has_streams(health: Mapping[str, object]) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator import __version__
+from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import PAYLOAD_VERSION, Estimate, Info
@@ -42,7 +43,7 @@ def estimate_report(
         flow: What has gone through the terminals.
         capacity_ah: Of the pack, rated; None of a fuel cell.
     """
-    last = window.last
+    last = dict(zip(TRACE.names or (), window.last.item(), strict=True))
     soc = finite(last["soc"])
     return Estimate(
         time=iso_utc(window.arrival_s),
@@ -84,7 +85,7 @@ def estimate_report(
 
 def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
     """What is told of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
-    if not np.isfinite(cells_v).any():
+    if not (cells_v.size and np.isfinite(cells_v).any()):
         return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))
     lowest, highest = int(np.nanargmin(cells_v)), int(np.nanargmax(cells_v))
     return {
