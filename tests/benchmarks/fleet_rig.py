@@ -62,9 +62,10 @@ class Rig:
         if process.wait(10 * LONG_S):
             raise RuntimeError((self.folder / "load.log").read_text())
 
-    def simulate(self, packs: int, *, seed: int, begin: str, speed: float, blocks: int) -> subprocess.Popen[bytes]:
-        """Be their edges."""
-        arguments = ["--packs", packs, "--seed", seed, "--begin", begin, "--speed", speed, "--blocks", blocks]
+    def simulate(self, packs: int, *, seed: int, begin: str, speed: float, blocks: int | None = None) -> subprocess.Popen[bytes]:
+        """Be their edges, for so many blocks each, or until it is stopped."""
+        arguments = ["--packs", packs, "--seed", seed, "--begin", begin, "--speed", speed]
+        arguments += ["--blocks", blocks] if blocks else []
         return self.run("simulate", "--server", self._mqtt, *map(str, arguments), log="edges")
 
     def run(self, *arguments: str, log: str) -> subprocess.Popen[bytes]:
