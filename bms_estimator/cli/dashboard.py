@@ -2,14 +2,13 @@
 
 import asyncio
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
 from bms_estimator.cli.browser import open_browser
 from bms_estimator.cli.pack import with_broker
-from bms_estimator.model.errors import UserError
+from bms_estimator.cli.page_options import page_settings
 from bms_estimator.model.page_settings import DEFAULT_LISTEN, PageSettings
 from bms_estimator.model.settings import MqttSettings, Settings, load_settings
 from bms_estimator.page.dashboard import dashboard as serving
@@ -40,7 +39,7 @@ def dashboard(
     """Serve the live page of all packs that publish to a broker, until SIGINT or SIGTERM."""
     settings = load_settings(pack) if pack else Settings()
     broker = (with_broker(settings, mqtt) if mqtt else settings).mqtt or MqttSettings()
-    page = _page(settings.page or PageSettings(), listen=listen, token_file=token_file)
+    page = page_settings(settings.page or PageSettings(), listen=listen, token_file=token_file)
     configure_logs()
     with drained():
         asyncio.run(_serve(broker, page, folder or state_folder(settings), browser=browser))
@@ -53,17 +52,3 @@ async def _serve(broker: MqttSettings, page: PageSettings, folder: Path, *, brow
         if browser:
             open_browser(url)
         await stop.wait()
-
-
-def _page(settings: PageSettings, **given: Any) -> PageSettings:
-    """With what the command line says.
-
-    Raises:
-        UserError: It cannot be.
-    """
-    told = {name: value for name, value in given.items() if value is not None}
-    try:
-        return PageSettings.model_validate(settings.model_dump() | told)
-    except ValidationError as error:
-        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-        raise UserError(f"--listen {told.get('listen', settings.listen)}: {reason}") from None

@@ -1,19 +1,15 @@
-"""The newest payload of each topic of each pack, and who reads them. No connection, no clock of its own.
+"""The newest payload of each topic of each pack. No connection, no clock of its own."""
 
-A reader who is slow finds only the newest of what came meanwhile: what waits for one is at most a payload for each topic.
-"""
-
-import asyncio
 import json
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from bms_estimator.page.newest import Newest
 from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.store.minute import epoch_s
 
-STATE, PARAMETERS, RECENT, ELEMENTS, LINK = "state", "parameters", "recent", "elements", "link"
+STATE, PARAMETERS, RECENT, ELEMENTS = "state", "parameters", "recent", "elements"
 """Topics of the estimate and of the parameters, and what there is here beside the topics of MQTT."""
 SHOWN = frozenset({STATE, PARAMETERS, "health", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY})
 ALARM = "alarm/"
@@ -27,28 +23,22 @@ _Row = tuple[float, tuple[float | None, ...]]
 """Seconds since 1970, and what ``RECENT_FIELDS`` were."""
 
 
-class Hub:
+class Hub(Newest):
     """What is known of all packs.
 
     Keys are ``<pack>/<topic>``, values JSON as text in one line.
     """
 
     def __init__(self) -> None:
-        self._newest: dict[str, dict[str, str]] = {}
+        super().__init__()
+        self._topics: dict[str, dict[str, str]] = {}
         self._recent: dict[str, deque[_Row]] = {}
         self._learned: dict[str, dict[str, dict[int, tuple[float, float]]]] = {}
-        self._readers: set[Reader] = set()
-        self._link: str | None = None
 
     @property
     def packs(self) -> list[str]:
         """Names of the packs, as they came."""
-        return list(self._newest)
-
-    @property
-    def readers(self) -> int:
-        """How many read now."""
-        return len(self._readers)
+        return list(self._topics)
 
     def put(self, pack: str, topic: str, value: Any) -> None:
         """Take what a pack publishes, of the topics that are shown.
@@ -64,7 +54,7 @@ class Hub:
             text = _json(value)
         except RecursionError:  # somebody else's: deeper than it could be written
             return
-        topics = self._newest.setdefault(pack, {})
+        topics = self._topics.setdefault(pack, {})
         if value is None:
             self._forget(pack, topic)
         else:
@@ -73,33 +63,12 @@ class Hub:
             self._remember(pack, value)
         if topic == PARAMETERS and isinstance(value, dict):
             self._learn(pack, value)
-        self._hand_on(f"{pack}/{topic}", text)
+        self.hand_on(f"{pack}/{topic}", text)
 
-    def say_link(self, trouble: str | None) -> None:
-        """Whether what fills this hub is connected: why not, or None when it is."""
-        text = json.dumps({"up": trouble is None, "reason": trouble})
-        if text != self._link:
-            self._link = text
-            self._hand_on(LINK, text)
-
-    @contextmanager
-    def reading(self) -> Iterator["Reader"]:
-        """A reader, who finds all that is known first."""
-        reader = Reader(self._all())
-        self._readers.add(reader)
-        try:
-            yield reader
-        finally:
-            self._readers.discard(reader)
-
-    def close(self) -> None:
-        """Let all readers end."""
-        for reader in self._readers:
-            reader.close()
-
-    def _all(self) -> dict[str, str]:
-        known = {LINK: self._link} if self._link else {}
-        for pack, topics in self._newest.items():
+    def known(self) -> dict[str, str]:
+        """What a new reader finds."""
+        known = super().known()
+        for pack, topics in self._topics.items():
             known |= {f"{pack}/{topic}": text for topic, text in topics.items()}
             known[f"{pack}/{RECENT}"] = _json(_columns(self._recent.get(pack, ())))
             known[f"{pack}/{ELEMENTS}"] = _json(self._learned.get(pack, {}))
@@ -107,10 +76,10 @@ class Hub:
 
     def _forget(self, pack: str, topic: str) -> None:
         """A topic was emptied; with its last one a pack is gone."""
-        topics = self._newest[pack]
+        topics = self._topics[pack]
         topics.pop(topic, None)
         if not topics:
-            for of_packs in (self._newest, self._recent, self._learned):
+            for of_packs in (self._topics, self._recent, self._learned):
                 of_packs.pop(pack, None)
 
     def _remember(self, pack: str, state: Mapping[str, Any]) -> None:
@@ -133,46 +102,6 @@ class Hub:
             value, std = _number(of.get("value")), _number(of.get("std"))
             if of.get("valid") is True and value is not None and std is not None:
                 self._learned.setdefault(pack, {}).setdefault(name, {})[round(100.0 * soc)] = value, std
-
-    def _hand_on(self, key: str, text: str) -> None:
-        for reader in self._readers:
-            reader.put(key, text)
-
-
-class Reader:
-    """What waits for one who reads.
-
-    Args:
-        known: What is there at first.
-    """
-
-    def __init__(self, known: Mapping[str, str]) -> None:
-        self._waiting = dict(known)
-        self._due = asyncio.Event()
-        self._due.set()
-        self.closed = False
-
-    def put(self, key: str, text: str) -> None:
-        """Have the newest wait."""
-        self._waiting[key] = text
-        self._due.set()
-
-    def close(self) -> None:
-        """Nothing more will come."""
-        self.closed = True
-        self._due.set()
-
-    async def next(self, longest_s: float) -> str:
-        """All that waits as one JSON object; empty when nothing came in ``longest_s``, or when it is closed."""
-        try:
-            async with asyncio.timeout(longest_s):
-                await self._due.wait()
-        except TimeoutError:
-            return ""
-        self._due.clear()
-        waiting, self._waiting = self._waiting, {}
-        parts = ",".join(f"{json.dumps(key)}:{text}" for key, text in waiting.items())
-        return f"{{{parts}}}" if parts else ""
 
 
 def _columns(rows: Iterable[_Row]) -> dict[str, list[float | None]]:

@@ -1,60 +1,35 @@
-"""The HTTP server of the live page: its files, the stream of what is new, history; nothing can be changed through it."""
+"""The server of the live page of packs: a hub, and what was."""
 
 import asyncio
-import hashlib
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, Self
 
-import structlog
 from aiohttp import web
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.page_settings import Listen, PageSettings
-from bms_estimator.page.guard import HEADERS, Guard, guard_of
+from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.page.hub import Hub
 from bms_estimator.page.past import SPANS, Past
+from bms_estimator.page.web import File, WebServer
 
-PING_S = 5.0
-"""A reader who hears nothing for so long hears that all is well: the page takes three times that for a lost line [s]."""
-WRITE_S = 30.0
-"""One who takes nothing for so long is gone [s]."""
-MOST_READERS = 32
-"""At a time, of all packs together."""
 HISTORY_S = 10.0
 """A disk that has not answered by then hangs [s]."""
-AGAIN_S = 10.0
-"""Before an address that is taken is tried again [s]."""
-CLOSING_S = 1.0
 
 STATIC = Path(__file__).with_name("static")
 FILES = {
-    "/": ("index.html", "text/html"),
-    "/style.css": ("style.css", "text/css"),
-    "/page.js": ("page.js", "text/javascript"),
-    "/format.js": ("format.js", "text/javascript"),
-    "/charts.js": ("charts.js", "text/javascript"),
-    "/uplot.js": ("uplot.js", "text/javascript"),
-    "/icon.svg": ("icon.svg", "image/svg+xml"),
+    "/": File(STATIC / "index.html", "text/html"),
+    "/style.css": File(STATIC / "style.css", "text/css"),
+    "/page.js": File(STATIC / "page.js", "text/javascript"),
+    "/live.js": File(STATIC / "live.js", "text/javascript"),
+    "/format.js": File(STATIC / "format.js", "text/javascript"),
+    "/charts.js": File(STATIC / "charts.js", "text/javascript"),
+    "/uplot.js": File(STATIC / "uplot.js", "text/javascript"),
+    "/icon.svg": File(STATIC / "icon.svg", "image/svg+xml"),
 }
 """All that is served, by its path."""
-ASK = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>bms_estimator</title><form action="/" method="get">
-<p><label>Token <input name="token" type="password" autofocus autocomplete="off"></label> <button>Open</button></p>
-<p>It stands in the file that page.token_file of pack.toml names.</p></form></html>"""
-
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-
-log = structlog.get_logger(__name__)
 
 
-class _File(NamedTuple):
-    body: bytes
-    kind: str
-    tag: str
-
-
-class PageServer:
+class PageServer(WebServer):
     """Serves a hub while the context lasts.
 
     Args:
@@ -77,107 +52,9 @@ class PageServer:
         opened: Callable[[str], object] = str,
         patient: bool = True,
     ) -> None:
-        self._hub, self._past, self._opened, self._patient = hub, past, opened, patient
-        self._guard: Guard = guard_of(settings)
-        self._wanted, self._listening = settings.address, settings.address
-        self._files = {path: _read(*file) for path, file in FILES.items()}
+        super().__init__(settings, FILES, hub, {"/history": self._history}, opened=opened, patient=patient)
+        self._past = past
         self._histories = asyncio.Semaphore(4)
-        self._runner: web.AppRunner | None = None
-        self._task: asyncio.Task[None] | None = None
-
-    @property
-    def url(self) -> str:
-        """Where a browser on this machine finds it."""
-        host, port = self._listening
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 - told, and with a token only
-        return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
-
-    async def __aenter__(self) -> Self:
-        """Listen.
-
-        Raises:
-            UserError: The address cannot be had, and we are not patient.
-        """
-        app = web.Application(middlewares=[self._check], client_max_size=1024)
-        app.on_response_prepare.append(_protect)
-        for path in FILES:
-            app.router.add_get(path, self._file)
-        app.router.add_get("/events", self._events)
-        app.router.add_get("/history", self._history)
-        self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=CLOSING_S)
-        await self._runner.setup()
-        try:
-            await self._listen(self._runner)
-        except OSError as error:
-            if not self._patient:
-                await self._runner.cleanup()
-                raise UserError(f"page.listen = {_text(self._wanted)}: {error.strerror}; name another one") from None
-            log.warning("the page is not served yet", listen=_text(self._wanted), reason=error.strerror)
-            self._task = asyncio.create_task(self._listen_later(self._runner), name="page")
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        """Part from all browsers."""
-        if self._task:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
-        self._hub.close()
-        if self._runner:
-            await self._runner.cleanup()
-
-    async def _listen(self, runner: web.AppRunner) -> None:
-        """Take the address.
-
-        Raises:
-            OSError: It cannot be had.
-        """
-        site = web.TCPSite(runner, self._wanted.host, self._wanted.port)
-        await site.start()
-        port = runner.addresses[0][1]
-        self._listening = self._wanted._replace(port=port)
-        log.info("live page", url=self.url)
-        self._opened(self.url)
-
-    async def _listen_later(self, runner: web.AppRunner) -> None:
-        while True:
-            await asyncio.sleep(AGAIN_S)
-            try:
-                return await self._listen(runner)
-            except OSError:  # said already
-                continue
-
-    @web.middleware
-    async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Whose name is asked for, and whether the token was shown."""
-        if not self._guard.knows_host(request.headers.get("Host", "")):
-            raise web.HTTPForbidden(text="not under this name: add it to page.hosts of pack.toml\n")
-        shown = request.query.get("token")
-        if shown is not None and self._guard.knows_token(shown):
-            return self._let_in()
-        given = request.headers.get("Authorization", "")
-        if self._guard.knows_cookie(request.cookies.get(self._cookie, "")):
-            return await handler(request)
-        if given.startswith("Bearer ") and self._guard.knows_token(given.removeprefix("Bearer ")):
-            return await handler(request)
-        raise web.HTTPUnauthorized(text=ASK, content_type="text/html", headers={"WWW-Authenticate": "Bearer"})
-
-    @property
-    def _cookie(self) -> str:
-        """Cookies are of a host, whatever the port."""
-        return f"bms_page_{self._listening.port}"
-
-    def _let_in(self) -> web.Response:
-        """Have the browser keep a cookie, and leave the address with the token behind."""
-        response = web.Response(status=303, headers={"Location": "/"})
-        response.set_cookie(self._cookie, self._guard.cookie, max_age=31_536_000, httponly=True, samesite="Strict")
-        return response
-
-    async def _file(self, request: web.Request) -> web.StreamResponse:
-        file = self._files[request.path]
-        headers = {"ETag": file.tag, "Cache-Control": "no-cache"}
-        if request.headers.get("If-None-Match") == file.tag:
-            return web.Response(status=304, headers=headers)
-        return web.Response(body=file.body, content_type=file.kind, charset="utf-8", headers=headers)
 
     async def _history(self, request: web.Request) -> web.StreamResponse:
         pack, span = request.query.get("pack", ""), request.query.get("span", "")
@@ -192,36 +69,3 @@ class PageServer:
         except TimeoutError:
             raise web.HTTPServiceUnavailable(text="the disk does not answer\n") from None
         return web.Response(body=body, content_type="application/json", headers={"Cache-Control": "no-store"})
-
-    async def _events(self, request: web.Request) -> web.StreamResponse:
-        """What is known, then what is new, until either side goes."""
-        if self._hub.readers >= MOST_READERS:
-            raise web.HTTPServiceUnavailable(text=f"{MOST_READERS} browsers read already\n")
-        response = web.StreamResponse(
-            headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        )
-        with self._hub.reading() as reader:
-            await response.prepare(request)
-            await response.write(b"retry: 1000\n\n")
-            while not reader.closed:
-                text = await reader.next(PING_S)
-                try:
-                    async with asyncio.timeout(WRITE_S):
-                        await response.write(f"data: {text or '{}'}\n\n".encode())
-                except (TimeoutError, ConnectionError):
-                    break
-        return response
-
-
-async def _protect(_: web.Request, response: web.StreamResponse) -> None:
-    response.headers.update(HEADERS)
-    response.headers.pop("Server", None)
-
-
-def _read(name: str, kind: str) -> _File:
-    body = (STATIC / name).read_bytes()
-    return _File(body, kind, f'"{hashlib.sha256(body).hexdigest()[:16]}"')
-
-
-def _text(listen: Listen) -> str:
-    return f"{listen.host}:{listen.port}"

@@ -11,7 +11,7 @@ import pytest
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.page_settings import PageSettings
-from bms_estimator.page import server as of_server
+from bms_estimator.page import web as of_server
 from bms_estimator.page.hub import Hub
 from bms_estimator.page.past import Past
 from bms_estimator.page.server import FILES, STATIC, PageServer
@@ -54,7 +54,7 @@ async def messages(response: aiohttp.ClientResponse) -> AsyncIterator[dict[str, 
 
 
 def test_all_that_a_browser_is_given_is_small_and_comes_from_here():
-    given = [STATIC / name for name, _ in FILES.values()]
+    given = [file.path for file in FILES.values()]
     assert sorted(given) == sorted(STATIC.iterdir())
     assert sum(path.stat().st_size for path in given) <= MOST_BYTES
     own = [path.read_text() for path in given if path.name != "uplot.js"]
@@ -63,10 +63,10 @@ def test_all_that_a_browser_is_given_is_small_and_comes_from_here():
 
 async def test_files_come_with_their_kind_protected_and_once(hub, past):
     async with browsing(hub, past) as session:
-        for path, (name, kind) in FILES.items():
+        for path, (file, kind) in FILES.items():
             async with session.get(path) as response:
                 assert (response.status, response.content_type) == (200, kind)
-                assert await response.read() == (STATIC / name).read_bytes()
+                assert await response.read() == file.read_bytes()
                 assert "default-src 'none'" in response.headers["Content-Security-Policy"]
                 assert response.headers["X-Content-Type-Options"] == "nosniff"
             async with session.get(path, headers={"If-None-Match": response.headers["ETag"]}) as again:

@@ -1,9 +1,9 @@
-// The live page. What comes is kept by pack; the screen is drawn from that four times a second at most, curves twice.
+// The live page: what comes is kept by pack, and drawn four times a second at most, curves twice.
 import * as f from "./format.js";
+import { attribute, changed, hide, listen, node, text } from "./live.js";
 import { Curve, OverSoc, Ring, gaps, scaled } from "./charts.js";
 
 const DRAW_MS = 250, CURVES_MS = 500, DESCRIBE_MS = 10_000, HISTORY_MS = 60_000;
-const SILENT_MS = 16_000; // it speaks each 5 s
 const SPANS = { live: 300, hour: 3600, day: 86400, month: 30 * 86400 }; // [s]
 const ROWS = 3600; // five minutes at 10 Hz, and some
 const COLUMNS = ["voltage_v", "voltage_estimate_v", "current_a", "soc", "soc_std", "innovation_v"];
@@ -15,21 +15,19 @@ const words = (name) => name.replaceAll("_", " ").replace("soc", "SOC");
 const clip = (x) => Math.min(Math.max(x, 0), 1);
 const packs = new Map();
 const ui = { pack: null, span: "live", element: null, drawn: 0, curves: -Infinity, described: -Infinity, due: false };
-const stream = { open: false, heard: 0, link: null, linkSince: 0 };
+let stream, link = null, linkSince = 0;
 
 // what came last
 
 class Pack {
-	constructor(name) {
-		this.name = name;
-		this.topics = {};
-		this.recent = new Ring(1 + COLUMNS.length, ROWS);
-		this.learned = {}; // element -> percent of SOC -> [value, std]
-		this.events = [];
-		this.history = {}; // span -> { at, data } or { at, reason }
-		this.stateAt = 0; // of its last state, by our clock
-		this.since = null; // stale since
-	}
+	topics = {};
+	recent = new Ring(1 + COLUMNS.length, ROWS);
+	learned = {}; // element -> percent of SOC -> [value, std]
+	events = [];
+	history = {}; // span -> { at, data } or { at, reason }
+	stateAt = 0; // of its last state, by our clock
+	since = null; // stale since
+	constructor(name) { this.name = name; }
 	take(topic, value) {
 		if (topic === "recent") {
 			this.recent.clear();
@@ -59,10 +57,10 @@ class Pack {
 	get trouble() {
 		const { availability, "sensor/availability": sensor, health, state } = this.topics;
 		if (!stream.open) return "the page's server does not answer";
-		if (stream.link && !stream.link.up) return stream.link.reason;
+		if (link && !link.up) return link.reason;
 		if ((availability ?? "online") !== "online") return "the service is offline";
 		if ((sensor ?? "online") !== "online") return health?.sensor_message || "the sensor is offline";
-		return state && this.stateAt < stream.linkSince ? "no value since the broker was lost" : "";
+		return state && this.stateAt < linkSince ? "no value since the broker was lost" : "";
 	}
 }
 
@@ -70,32 +68,13 @@ function take(message) {
 	for (const [key, value] of Object.entries(message)) {
 		const slash = key.indexOf("/"), name = key.slice(0, slash);
 		if (key === "link") {
-			if (value.up && stream.link?.up === false && packs.size) stream.linkSince = Date.now();
-			stream.link = value;
+			if (value.up && link?.up === false && packs.size) linkSince = Date.now();
+			link = value;
 		} else {
 			if (!packs.has(name)) { packs.set(name, new Pack(name)); listPacks(); }
 			packs.get(name).take(key.slice(slash + 1), value);
 		}
 	}
-}
-
-function connect() {
-	const source = new EventSource("/events");
-	const again = (ms) => { clearInterval(watch); source.close(); setTimeout(connect, ms); };
-	const lost = () => { stream.open = false; drawSoon(); };
-	source.onmessage = (event) => {
-		stream.heard = Date.now();
-		stream.open = true;
-		take(JSON.parse(event.data));
-		drawSoon();
-	};
-	source.onerror = () => {
-		lost();
-		if (source.readyState === EventSource.CLOSED) again(2000); // refused: too many, or a new token
-	};
-	const watch = setInterval(() => {
-		if (stream.open && Date.now() - stream.heard > SILENT_MS) { lost(); again(0); } // a line that swallows all
-	}, 1000);
 }
 
 // drawing
@@ -104,23 +83,6 @@ function drawSoon() {
 	if (ui.due) return;
 	ui.due = true;
 	setTimeout(() => requestAnimationFrame(draw), Math.max(0, ui.drawn + DRAW_MS - performance.now()));
-}
-
-/** Set only where it changes: nothing is laid out anew for nothing. */
-function text(element, value) {
-	if (element.said === value) return;
-	element.said = value;
-	element.textContent = value;
-}
-function attribute(element, name, value) { if (element.getAttribute(name) !== value) element.setAttribute(name, value); }
-function hide(element, hidden) { if (element.hidden !== hidden) element.hidden = hidden; }
-function changed(element, key) { return element.key !== key && ((element.key = key), true); }
-
-function node(name, attributes, ...children) {
-	const element = document.createElement(name);
-	for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-	element.append(...children);
-	return element;
 }
 
 const slots = {};
@@ -133,7 +95,7 @@ function draw() {
 	const now = performance.now(), pack = packs.get(ui.pack);
 	ui.drawn = now;
 	drawStatus(pack);
-	hide($("empty"), Boolean(pack));
+	hide($("empty"), !!pack);
 	hide($("pack"), !pack);
 	if (!pack) return;
 	const state = pack.topics.state ?? {};
@@ -156,8 +118,8 @@ function draw() {
 }
 
 function drawStatus(pack) {
-	const { state } = pack?.topics ?? {}, trouble = pack ? pack.trouble : stream.link?.reason ?? "";
-	let kind = "wait", said = !pack ? (stream.open ? "waiting for a pack" : "connecting") : "waiting for a sample";
+	const { state } = pack?.topics ?? {}, trouble = pack ? pack.trouble : link?.reason ?? "";
+	let kind = "wait", said = pack ? "waiting for a sample" : stream.open ? "waiting for a pack" : "connecting";
 	if (trouble) {
 		kind = "stale";
 		said = "no value yet";
@@ -355,7 +317,7 @@ function drawCurves(pack) {
 	const reason = live ? "" : past?.reason ?? (past?.data?.time_s.length ? "" : past?.data ? "Nothing was kept of this span yet." : "reading…");
 	text($("nohistory"), reason);
 	hide($("nohistory"), !reason);
-	hide($("curves"), Boolean(reason));
+	hide($("curves"), !!reason);
 	if (reason) return;
 	const columns = live ? liveColumns(pack) : (past.columns ??= pastColumns(past.data));
 	const { time } = columns, end = live ? time.at(-1) ?? Date.now() / 1e3 : Date.now() / 1e3;
@@ -487,4 +449,4 @@ matchMedia("(prefers-color-scheme: dark)").onchange = () => {
 	for (const chart of [...Object.values(curves ?? {}), overSoc]) chart?.plot.redraw(false, true);
 };
 setInterval(drawSoon, 1000); // a state that ends, too, is to be seen
-connect();
+stream = listen(take, drawSoon);

@@ -1,0 +1,49 @@
+"""``bms-estimator fleet page``: the page of all packs of a fleet."""
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.browser import open_browser
+from bms_estimator.cli.page_options import page_settings
+from bms_estimator.fleet.page import fleet_page
+from bms_estimator.fleet.page_feed import Server
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.service.interrupt import stop_on_signal
+from bms_estimator.service.logs import configure_logs, drained
+
+DEFAULT_LISTEN = "127.0.0.1:8080"
+
+
+def page(
+    server: Annotated[
+        str, typer.Option(help="of the fleet, nats://host:port or tls://; several with commas between")
+    ] = "nats://127.0.0.1:4222",
+    listen: Annotated[str, typer.Option(help="host:port of the page")] = DEFAULT_LISTEN,
+    creds: Annotated[
+        Path | None, typer.Option(help="file with what opens the server's door", show_default=False)
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="file with the token that a browser must show", show_default=False)
+    ] = None,
+    host: Annotated[
+        list[str] | None, typer.Option(help="a further name under which browsers reach it", show_default=False)
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open it where there is a desktop")] = True,
+) -> None:
+    """Serve the page of all packs of a fleet, until SIGINT or SIGTERM."""
+    settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
+    configure_logs()
+    with drained():
+        asyncio.run(_serve(Server(server, creds), settings, browser=browser))
+
+
+async def _serve(server: Server, settings: PageSettings, *, browser: bool) -> None:
+    stop = stop_on_signal()
+    async with fleet_page(server, settings) as url:
+        typer.echo(f"page of the fleet: {url}")
+        if browser:
+            open_browser(url)
+        await stop.wait()

@@ -1,0 +1,260 @@
+"""All packs of a fleet as its page shows them: who is alive, how they are spread, who needs attention. Pure.
+
+Of each pack the bytes of its newest state are kept, and what is ranked by in columns; the rest is decoded when somebody asks.
+"""
+
+import bisect
+import math
+import zlib
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic_core import from_json
+
+from bms_estimator.model.suspect import Suspect
+
+ALIVE_S = 180.0
+"""A pack that sends a block a minute is silent when it has not been heard for so long [s]."""
+LISTED = 20
+"""Packs of a list, at most."""
+MOST_TYPES = 8
+"""That are told apart; the rarer ones are taken together."""
+OTHER, UNLISTED = "other types", "not in the table"
+SOC_EDGES = np.linspace(0.0, 1.0, 21)
+STD_EDGES = np.array([0.0, 0.01, 0.02, 0.04, 0.06, 0.08, 0.12, 0.16, 0.20, 0.30, 0.40, 0.60, math.inf]) / 2.0
+"""Of bins. The page shows two standard deviations."""
+
+ROW = np.dtype(
+    [
+        ("heard_s", "f8"),  # when the newest state came, the page's clock; -inf: never
+        ("soc", "f8"),  # 0..1; nan: not known, as in all
+        ("soc_std", "f8"),
+        ("margin", "f8"),  # stability_margin
+        ("suspects", "u2"),  # bits of Suspect, of its last hour
+        ("type", "u2"),  # place in the list of types
+        ("listed", "?"),  # in the fleet's table
+    ]
+)
+_NEW = np.array([(-math.inf, math.nan, math.nan, math.nan, 0, 0, False)], dtype=ROW)
+FIELDS = {"soc": "soc", "soc_std": "soc_std", "margin": "stability_margin"}
+"""Of a row: of a state."""
+
+Rows = NDArray[np.void]
+Mask = NDArray[np.bool_]
+
+
+class Concern(NamedTuple):
+    """Why a pack needs attention."""
+
+    column: str
+    """What is ranked by."""
+    falls: bool
+    """The smallest first."""
+    limit: float
+    """Beyond it a pack is counted."""
+
+
+CONCERNS = {
+    "margin": Concern("margin", falls=True, limit=0.05),
+    "soc": Concern("soc", falls=True, limit=0.1),
+    "uncertain": Concern("soc_std", falls=False, limit=0.05),
+}
+"""Of packs that are alive."""
+
+
+class FleetPacks:
+    """What is known of all packs; all times are of one clock that never goes back [s]."""
+
+    def __init__(self) -> None:
+        self._places: dict[str, int] = {}
+        self._names: list[str] = []
+        self._sorted: list[str] = []
+        self._rows = np.repeat(_NEW, 1024)
+        self._states: list[bytes] = []
+        self._parameters: dict[str, bytes] = {}
+        self._types: dict[str, int] = {UNLISTED: 0}
+        self.states, self.damaged = 0, 0
+        """Heard so far; those that were no JSON object."""
+
+    def list_pack(self, name: str, kind: str | None) -> None:
+        """A pack is in the fleet's table as of a type, such as ``lfp 16s2p``; None: it is no more."""
+        row = self._row(name)
+        row["listed"] = kind is not None
+        row["type"] = self._types.setdefault(kind or UNLISTED, min(len(self._types), 65_535))
+
+    def hear_state(self, name: str, state: bytes, now_s: float) -> None:
+        """Take what a pack has published."""
+        self.states += 1
+        values = _object(state)
+        if values is None:
+            self.damaged += 1
+            return
+        row = self._row(name)
+        row["heard_s"] = now_s
+        for column, field in FIELDS.items():
+            row[column] = _number(values.get(field))
+        self._states[self._places[name]] = state
+
+    def hear_parameters(self, name: str, parameters: bytes) -> None:
+        """Take what a pack has published; it is kept small, since an hour's is of some kilobytes."""
+        self._row(name)
+        self._parameters[name] = zlib.compress(parameters, 1)
+
+    def hear_hour(self, name: str, hour: bytes) -> None:
+        """Take the summary of a pack's hour."""
+        values = _object(hour)
+        suspects = values.get("suspects") if values else None
+        if isinstance(suspects, int) and 0 <= suspects < 65_536:
+            self._row(name)["suspects"] = suspects
+
+    def find(self, prefix: str) -> list[str]:
+        """The first names that begin so, in order."""
+        if len(self._sorted) != len(self._names):
+            self._sorted = sorted(self._names)
+        first = bisect.bisect_left(self._sorted, prefix)
+        return [name for name in self._sorted[first : first + LISTED] if name.startswith(prefix)]
+
+    def one(self, name: str, now_s: float) -> dict[str, Any] | None:
+        """All that is known of a pack; None: it is not known."""
+        place = self._places.get(name)
+        if place is None:
+            return None
+        row, packed = self._rows[place], self._parameters.get(name)
+        return {
+            "pack": name,
+            "type": list(self._types)[row["type"]],
+            "heard_s": _ago(float(row["heard_s"]), now_s),
+            "suspects": Suspect(int(row["suspects"])).text,
+            "state": _object(self._states[place]),
+            "parameters": _object(zlib.decompress(packed)) if packed else None,
+        }
+
+    def picture(self, now_s: float, since_s: float) -> dict[str, Any]:
+        """The fleet at a glance.
+
+        Args:
+            now_s: The clock.
+            since_s: Since when states are heard without a break: who was not heard before then may not be silent.
+
+        Returns:
+            ``packs`` (counts), ``types`` (of each: how many, and how they are spread), ``soc_std_edges`` (of bins, the last is
+            open), ``concerns`` (of each kind: how many
+            packs, and those that are worst), ``attention`` (how many packs are in any).
+        """
+        rows = self._rows[: len(self._names)]
+        alive = rows["heard_s"] > now_s - ALIVE_S
+        known = rows["listed"] | (rows["heard_s"] > -math.inf)
+        silent = known & ~alive & (now_s - since_s > ALIVE_S)
+        return {
+            "packs": {
+                "known": int(known.sum()),
+                "alive": int(alive.sum()),
+                "silent": int(silent.sum()),
+                "unlisted": int((known & ~rows["listed"]).sum()),
+            },
+            "types": self._spreads(rows, known, alive),
+            "soc_std_edges": STD_EDGES[:-1].tolist(),
+            **self._concerns(rows, alive, silent, now_s),
+        }
+
+    def _row(self, name: str) -> Any:
+        """Of a pack, made where it is heard of first."""
+        place = self._places.get(name)
+        if place is None:
+            place = self._places[name] = len(self._names)
+            if place == self._rows.size:
+                self._rows = np.concatenate((self._rows, np.repeat(_NEW, place)))
+            self._names.append(name)
+            self._states.append(b"")
+        return self._rows[place]
+
+    def _spreads(self, rows: Rows, known: Mask, alive: Mask) -> list[dict[str, Any]]:
+        counts = np.bincount(rows["type"][known], minlength=len(self._types))
+        names = list(self._types)
+        found = sorted((-int(counts[place]), names[place], int(place)) for place in np.flatnonzero(counts))
+        often = [place for _, _, place in found[:MOST_TYPES]]
+        masks: list[tuple[str, Mask]] = [(names[place], known & (rows["type"] == place)) for place in often]
+        rest = known & ~np.isin(rows["type"], often)
+        if rest.any():
+            masks.append((OTHER, rest))
+        return [{"type": name, "packs": int(mask.sum()), **_spread(rows[mask & alive])} for name, mask in masks]
+
+    def _concerns(self, rows: Rows, alive: Mask, silent: Mask, now_s: float) -> dict[str, Any]:
+        """Each kind, and how many packs there are in any."""
+        found, attention = {}, silent | (rows["suspects"] > 0)
+        for name, concern in CONCERNS.items():
+            sign = 1.0 if concern.falls else -1.0
+            column = sign * rows[concern.column]
+            beyond = alive & (column < sign * concern.limit)
+            listed = [[self._names[i], sign * value] for i, value in _extremes(column, alive & np.isfinite(column))]
+            found[name] = {"count": int(beyond.sum()), "limit": concern.limit, "packs": listed}
+            attention |= beyond
+        suspected = _extremes(-np.bitwise_count(rows["suspects"]).astype("f8"), rows["suspects"] > 0)
+        found["suspects"] = {
+            "count": int(np.count_nonzero(rows["suspects"])),
+            "packs": [[self._names[i], _named(int(rows["suspects"][i]))] for i, _ in suspected],
+        }
+        found["silent"] = {
+            "count": int(silent.sum()),
+            "packs": [[self._names[i], _ago(heard, now_s)] for i, heard in _extremes(rows["heard_s"], silent)],
+        }
+        return {"concerns": found, "attention": int(attention.sum())}
+
+
+def _named(suspects: int) -> str:
+    """In a word or two each."""
+    return ", ".join((suspect.name or "").replace("_", " ").lower() for suspect in Suspect(suspects))
+
+
+def _extremes(column: NDArray[np.float64], mask: Mask) -> list[tuple[int, float]]:
+    """Places and values of the smallest where ``mask`` is, in order."""
+    places = np.flatnonzero(mask)
+    values = column[places]
+    if places.size > LISTED:
+        few = np.argpartition(values, LISTED)[:LISTED]
+        places, values = places[few], values[few]
+    order = np.argsort(values, kind="stable")
+    return [(int(places[i]), float(values[i])) for i in order]
+
+
+def _spread(rows: Rows) -> dict[str, Any]:
+    """Of packs that are alive."""
+    return {
+        "alive": int(rows.size),
+        "soc": _histogram(rows["soc"], SOC_EDGES),
+        "soc_std": _histogram(rows["soc_std"], STD_EDGES),
+        "soc_median": _median(rows["soc"]),
+        "soc_std_median": _median(rows["soc_std"]),
+    }
+
+
+def _histogram(values: NDArray[np.float64], edges: NDArray[np.float64]) -> list[int]:
+    """How many are in each bin; what lies beyond the ends is in the first and the last."""
+    values = values[np.isfinite(values)]
+    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
+    return [int(n) for n in np.bincount(bins, minlength=edges.size - 1)]
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if values.size else None
+
+
+def _ago(heard_s: float, now_s: float) -> float | None:
+    return now_s - heard_s if heard_s > -math.inf else None
+
+
+def _number(value: Any) -> float:
+    """As it is; nan where it is no number."""
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if real and math.isfinite(value) else math.nan
+
+
+def _object(data: bytes) -> dict[str, Any] | None:
+    """A JSON object; None: it is none."""
+    try:
+        value = from_json(data, allow_inf_nan=False)
+    except ValueError:
+        return None
+    return value if isinstance(value, dict) else None

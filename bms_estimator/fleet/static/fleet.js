@@ -1,0 +1,338 @@
+// The page of a fleet: pictures of it come each 2 s, and are drawn as they come; a pack is asked for when it is chosen.
+import * as f from "./format.js";
+import { attribute, changed, hide, listen, node, text } from "./live.js";
+
+const REFRESH_MS = 5000; // of the pack that is shown
+const LAG_S = 60, LISTED = 20, COLOURS = 8;
+const $ = (id) => document.getElementById(id);
+const number = (x) => typeof x === "number";
+const count = (n) => n.toLocaleString("en");
+const many = (n, one, more = `${one}s`) => `${count(n)} ${n === 1 ? one : more}`;
+const ago = (s) => (number(s) ? f.duration(s) : "");
+const short = (s) => (number(s) ? (s < 9.95 ? `${f.fixed(s, 1)} s` : f.duration(s)) : "–");
+const rate = (x) => (number(x) ? count(x < 9.95 ? Math.round(10 * x) / 10 : Math.round(x)) : "");
+
+const ui = { fleet: null, link: null, at: 0, upAt: 0, since: null, type: null, kind: "all", pack: null };
+
+function take(message) {
+	if (message.link) {
+		if (message.link.up && !ui.link?.up) ui.upAt = Date.now();
+		ui.link = message.link;
+	}
+	if (message.fleet) [ui.fleet, ui.at] = [message.fleet, Date.now()];
+}
+
+/** Why the values are not what is now; "" when they are. */
+function trouble() {
+	if (!stream.open) return ui.fleet ? "the page's server does not answer" : "";
+	if (ui.link && !ui.link.up) return ui.link.reason;
+	return "";
+}
+
+// drawing
+
+const slots = {};
+for (const element of document.querySelectorAll("[data-q]")) slots[element.dataset.q] = element;
+const put = (name, value) => text(slots[name], value);
+
+function draw() {
+	drawStatus();
+	hide($("empty"), !!ui.fleet);
+	hide($("fleet"), !ui.fleet);
+	if (!ui.fleet) return;
+	const { packs, types, soc_std_edges, concerns, time } = ui.fleet;
+	text($("what"), `${many(packs.known, "pack")} of ${many(types.length, "type")} · as of ${f.clock(new Date(time))}`);
+	drawTiles(ui.fleet);
+	drawTypes(types);
+	drawSpread(types, soc_std_edges);
+	drawConcerns(concerns);
+	drawWorkers(ui.fleet);
+}
+
+function drawStatus() {
+	const why = trouble(), waits = !why && (!ui.fleet || ui.at < ui.upAt);
+	let kind = waits ? "wait" : "live", said = !stream.open ? "connecting" : waits ? "waiting" : "live";
+	if (why) {
+		kind = "stale";
+		if (ui.fleet) ui.since ??= new Date(ui.fleet.time);
+		said = ui.since ? `stale since ${f.clock(ui.since)}` : "no value yet";
+	} else if (!waits) ui.since = null;
+	else if (ui.fleet) kind = "stale"; // greyed until a new value has come
+	text($("status").lastElementChild, said);
+	attribute($("status"), "data-state", kind);
+	attribute(document.body, "data-state", kind);
+	text($("why"), why);
+	hide($("why"), !why);
+	const known = ui.fleet?.packs, title = [kind === "stale" && "stale", known && `${count(known.alive)} of ${count(known.known)} alive`, "Fleet"];
+	if (changed(document.head, title.join())) document.title = title.filter(Boolean).join(" · ");
+}
+
+function tile(id, state) { attribute($(id), "class", `card ${state}`); }
+
+function drawTiles({ packs, holders, unheld, twice, lag_s, workers, states_per_s, concerns, attention, listening_s }) {
+	const missing = packs.known - packs.alive, unsure = missing - packs.silent;
+	put("alive", count(packs.alive));
+	put("known", `of ${count(packs.known)}`);
+	put("silent", packs.silent ? `${count(packs.silent)} silent for 3 min or more` : unsure ? `${count(unsure)} not heard yet, listening for ${ago(listening_s)}` : packs.known ? "none is silent" : "none was heard of yet");
+	$("aliveshare").style.transform = `scaleX(${packs.known ? packs.alive / packs.known : 0})`;
+	tile("alive", packs.silent > 0.01 * packs.known ? "wrong" : packs.silent ? "low" : unsure || !packs.known ? "" : "fine");
+
+	const alive = workers.filter((w) => w.alive).length;
+	put("held", count(holders.length - unheld.length));
+	put("partitions", `of ${holders.length}`);
+	put("unheld", unheld.length ? `unheld: ${ranges(unheld)}` : twice.length ? `held twice: ${ranges(twice)}` : `by ${many(alive, "worker")}`);
+	tile("held", unheld.length ? "wrong" : twice.length ? "low" : "fine");
+
+	put("lag", short(lag_s));
+	const samples = workers.map((w) => w.samples_per_s).filter(number);
+	put("rates", [`${rate(states_per_s) || 0} states/s`, samples.length && `${rate(samples.reduce((a, b) => a + b))} samples/s`].filter(Boolean).join(" · "));
+	tile("lag", !number(lag_s) ? "" : lag_s > LAG_S ? "wrong" : "fine");
+
+	const counted = KINDS.filter(([kind]) => concerns[kind]?.count).map(([kind, name]) => [concerns[kind].count, name]);
+	put("attention", count(attention));
+	put("attentionwhy", counted.length ? counted.sort((a, b) => b[0] - a[0]).map(([n, name]) => `${count(n)} ${name.toLowerCase().replace("soc", "SOC")}`).join(" · ") : "no pack does");
+	tile("attention", concerns.margin?.count || concerns.suspects?.count ? "wrong" : counted.length ? "low" : "fine");
+}
+
+/** 1, 2, 3, 7 as 1–3, 7. */
+function ranges(numbers) {
+	const found = [];
+	for (const n of numbers) {
+		if (found.length && n === found.at(-1)[1] + 1) found.at(-1)[1] = n;
+		else found.push([n, n]);
+	}
+	return found.map(([a, b]) => (a === b ? a : `${a}–${b}`)).join(", ");
+}
+
+// types and spreads
+
+function drawTypes(types) {
+	if (!changed($("types"), JSON.stringify([types, ui.type]))) return;
+	const focused = document.activeElement?.dataset.type;
+	$("types").replaceChildren(...types.map((t) => {
+		const button = node("button", { type: "button", "data-type": t.type, "aria-pressed": String(t.type === ui.type) }, t.type);
+		button.onclick = () => { ui.type = ui.type === t.type ? null : t.type; draw(); };
+		return node("tr", t.type === ui.type ? { class: "chosen" } : {}, node("td", {}, button),
+			...[count(t.packs), count(t.alive), pc(t.soc_median), pc(2 * t.soc_std_median, t.soc_std_median)].map((said) => node("td", {}, said)));
+	}));
+	if (focused) [...$("types").querySelectorAll("button")].find((b) => b.dataset.type === focused)?.focus();
+}
+
+const pc = (x, known = x) => (number(known) ? `${f.percent(x)} %` : "–");
+function drawSpread(types, edges) {
+	const shown = types.find((t) => t.type === ui.type), some = shown ? [shown] : types, of = shown ? ` · ${shown.type}` : "";
+	const sum = (name) => some.reduce((all, t) => all.map((n, i) => n + t[name][i]), some[0]?.[name].map(() => 0) ?? []);
+	const soc = sum("soc"), std = sum("soc_std"), at = (i) => Math.round(200 * (edges[i] ?? 0.5)), range = (i) => (i < edges.length - 1 ? `${at(i)}–${at(i + 1)}` : `>${at(i)}`);
+	bins($("soc"), soc, (i) => `${5 * i} to ${5 * i + 5} %`, (i) => (i < 2 ? "bad" : i < 4 ? "low" : ""), "State of charge");
+	bins($("std"), std, (i) => `± ${range(i).replace("–", " to ")} %`, (i) => (at(i) >= 20 ? "bad" : at(i) >= 10 ? "low" : ""), "Uncertainty");
+	if (changed($("stdedges"), "made")) $("stdedges").append(...std.map((_, i) => node("li", {}, range(i))));
+	put("socmedian", soc.some(Boolean) ? `median ${f.fixed(median(soc, (i) => 5 * i), 0)} %${of}` : "");
+	put("stdmedian", std.some(Boolean) ? `median ± ${f.fixed(median(std, at), 1)} %${of}` : "");
+}
+
+/** Of what is in bins with such edges, as if each were evenly filled. */
+function median(counts, edge) {
+	let rest = counts.reduce((a, b) => a + b, 0) / 2;
+	const i = counts.findIndex((n) => (rest -= n) <= 0);
+	return edge(i) + (1 + rest / counts[i]) * (edge(i + 1) - edge(i));
+}
+
+function bins(list, counts, name, kind, title) {
+	const most = Math.max(...counts, 1);
+	while (list.childElementCount < counts.length) list.append(node("li", {}, node("i", {})));
+	counts.forEach((n, i) => {
+		const item = list.children[i], height = n ? `${Math.max((100 * n) / most, 1.5).toFixed(1)}%` : "0";
+		if (changed(item.firstChild, height)) item.firstChild.style.height = height;
+		attribute(item, "class", kind(i));
+		attribute(item, "title", `${name(i)}: ${many(n, "pack")}`);
+	});
+	const top = counts.map((n, i) => [n, i]).filter(([n]) => n).sort((a, b) => b[0] - a[0]).slice(0, 3);
+	attribute(list, "aria-label", `${title}: ${top.length ? top.map(([n, i]) => `${many(n, "pack")} ${name(i)}`).join(", ") : "no pack"}`);
+}
+
+// who needs attention
+
+const KINDS = [
+	["margin", "Small margin", (v) => `stability margin ${f.percent(v)} %`],
+	["suspects", "Suspected", (v) => v],
+	["uncertain", "Uncertain", (v) => `SOC known to ± ${f.percent(2 * v)} %`],
+	["soc", "Low SOC", (v) => `SOC ${f.percent(v)} %`],
+	["silent", "Silent", (v) => (number(v) ? `not heard for ${ago(v)}` : "never heard")],
+	["unknown", "Unknown", (v) => `not in the table, its blocks are held${number(v) ? `; last ${ago(v)} ago` : ""}`],
+];
+const NOTES = {
+	all: "The worst of each kind in turn.", margin: "Of packs alive, the smallest first; counted below 5 %: there the model is about to lose its meaning, stop discharging.",
+	suspects: "What the identifier suspects of the input, by the summary of the last hour.", uncertain: "Of packs alive, the widest band first; counted above ± 10 %.",
+	soc: "Of packs alive, the lowest first; counted below 10 %.", silent: "Not heard for three minutes or more.", unknown: "Load them with fleet packs load.",
+};
+const beyond = (kind, c, v) => !("limit" in c) || (kind === "uncertain" ? v > c.limit : v < c.limit);
+
+/** Rows of [pack, [kind, value] ...]: the worst of each kind in turn, each pack once with all its reasons. */
+function ranked(concerns) {
+	const rows = new Map();
+	for (let rank = 0; rank < LISTED; rank += 1) {
+		for (const [kind] of KINDS) {
+			const c = concerns[kind], [pack, value] = c?.packs[rank] ?? [];
+			if (pack === undefined || !beyond(kind, c, value)) continue;
+			if (!rows.has(pack)) rows.set(pack, []);
+			rows.get(pack).push([kind, value]);
+		}
+	}
+	return [...rows].slice(0, LISTED);
+}
+
+function drawConcerns(concerns) {
+	drawKinds(concerns);
+	const rows = ui.kind === "all" ? ranked(concerns) : (concerns[ui.kind]?.packs ?? []).map(([pack, value]) => [pack, [[ui.kind, value]]]);
+	text($("concernnote"), rows.length ? NOTES[ui.kind] : "No pack.");
+	if (!changed($("concerns"), JSON.stringify([ui.kind, rows]))) return;
+	const focused = document.activeElement?.dataset.pack;
+	$("concerns").replaceChildren(...rows.map(([pack, reasons]) => {
+		const mild = !reasons.some(([kind, value]) => beyond(kind, concerns[kind], value));
+		const said = reasons.map(([kind, value]) => {
+			const [, name, say] = KINDS.find(([k]) => k === kind);
+			return node("p", {}, node("span", { class: `tag ${mild ? "" : kind}` }, name), " ", say(value));
+		});
+		return node("tr", mild ? { class: "mild" } : {}, node("th", { scope: "row" }, chooser(pack)), node("td", {}, ...said));
+	}));
+	if (focused) [...$("concerns").querySelectorAll("button")].find((b) => b.dataset.pack === focused)?.focus();
+}
+
+function drawKinds(concerns) {
+	const all = [["all", "All"], ...KINDS];
+	if (changed($("kinds"), "made")) {
+		$("kinds").append(...all.map(([kind, name]) => node("label", {}, node("input", { type: "radio", name: "kind", value: kind, ...(kind === ui.kind && { checked: "" }) }), node("span", {}, name, node("small", { "data-count": kind })))));
+	}
+	for (const [kind] of KINDS) text($("kinds").querySelector(`[data-count=${kind}]`), concerns[kind]?.count ? count(concerns[kind].count) : "");
+}
+
+function chooser(pack) {
+	const button = node("button", { type: "button", "data-pack": pack }, pack);
+	button.onclick = () => choose(pack);
+	return button;
+}
+
+// workers
+
+function drawWorkers({ workers, holders, unheld }) {
+	const alive = workers.filter((w) => w.alive).length;
+	put("workers", `${count(alive)} alive${workers.length > alive ? `, ${count(workers.length - alive)} gone` : ""}`);
+	attribute($("holders"), "aria-label", `${holders.length} partitions: ${unheld.length ? `${ranges(unheld)} held by nobody` : "all held"}`);
+	if (changed($("holders"), JSON.stringify([holders, workers.map((w) => w.id)]))) {
+		$("holders").replaceChildren(...holders.map((place, n) => node("li", {
+			class: place < 0 ? "unheld" : `c${place % COLOURS}`, title: `partition ${n}: ${place < 0 ? "nobody" : workers[place].id}`,
+		})));
+	}
+	if (!changed($("workers"), JSON.stringify(workers))) return;
+	$("workers").replaceChildren(...workers.map((w, i) => {
+		const said = w.alive ? [count(w.partitions), count(w.packs), short(w.lag_s), rate(w.samples_per_s) || "–"] : ["–", "–", `gone ${ago(w.heard_s)}`, "–"];
+		const name = node("td", {}, node("i", { class: `swatch c${i % COLOURS}` }), w.id, w.leaving ? " (leaving)" : "");
+		if (w.trouble) name.append(node("p", { class: "bad" }, w.trouble));
+		return node("tr", w.alive ? {} : { class: "gone" }, name, ...said.map((s) => node("td", {}, s)));
+	}));
+}
+
+// a pack
+
+const STATE = [
+	["State of charge", (s) => pc(s.soc)], ["±, two standard deviations", (s) => pc(2 * s.soc_std, s.soc_std)], ["Stability margin", (s) => pc(s.stability_margin)],
+	["Voltage", (s) => f.volts(s.voltage_v)], ["estimated", (s) => f.volts(s.voltage_estimate_v)], ["Current", (s) => f.amperes(s.current_a)], ["Power", (s) => f.watts(s.power_w)],
+	["Temperature", (s) => f.celsius(s.temperature_c)], ["Charge left", (s) => f.ampereHours(s.remaining_capacity_ah)], ["Energy left", (s) => f.wattHours(s.remaining_energy_wh)],
+	["To empty", (s) => ago(s.time_to_empty_s)], ["To full", (s) => ago(s.time_to_full_s)], ["Innovation", (s) => f.millivolts(s.innovation_v)],
+	["Energy out", (s) => (number(s.energy_out_kwh) ? f.wattHours(1e3 * s.energy_out_kwh) : "")], ["Energy in", (s) => (number(s.energy_in_kwh) ? f.wattHours(1e3 * s.energy_in_kwh) : "")],
+	["Cycles", (s) => f.digits(s.equivalent_cycles, 3)], ["Measured", (s) => (s.time ? f.when(new Date(s.time)) : "")],
+];
+
+async function choose(name) {
+	ui.pack = name;
+	history.replaceState(null, "", `#${encodeURIComponent(name)}`);
+	text($("packname"), name);
+	for (const id of ["packwhat", "packsuspects"]) text($(id), "");
+	drawFacts({});
+	drawParameters(null, false);
+	if (!$("one").open) $("one").showModal();
+	await refresh();
+}
+
+async function refresh() {
+	const name = ui.pack;
+	let found = null, said = "The page's server does not answer.";
+	try {
+		const answer = await fetch(`/pack?name=${encodeURIComponent(name)}`);
+		if (answer.ok) found = await answer.json();
+		else if (answer.status === 404) said = "Nothing was heard of this pack yet, and it is not in the table.";
+	} catch { /* said */ }
+	if (ui.pack !== name) return;
+	text($("packwhat"), found ? [found.type, number(found.heard_s) ? `heard ${ago(found.heard_s)} ago` : "not heard yet since this page is served"].join(" · ") : said);
+	text($("packsuspects"), found?.suspects ?? "");
+	if (!found) return;
+	drawFacts(found.state ?? {});
+	drawParameters(found.parameters, !!found.state);
+}
+
+function drawFacts(state) {
+	const facts = STATE.map(([name, say]) => [name, say(state)]).filter(([, said]) => said && said !== "–");
+	$("packstate").replaceChildren(...facts.map(([name, said]) => node("div", {}, node("dt", {}, name), node("dd", {}, said))));
+}
+
+const NAMES = {
+	r_s_ohm: ["Rₛ", 1e3, "mΩ"], r_ts_ohm: ["Rₜₛ", 1e3, "mΩ"], c_ts_farad: ["Cₜₛ", 1, "F"], r_tl_ohm: ["Rₜₗ", 1e3, "mΩ"], c_tl_farad: ["Cₜₗ", 1, "F"], e_o_v: ["E₀", 1, "V"],
+	capacity: ["Capacity, of new", 100, "%"], r_s: ["Rₛ, of new", 100, "%"], current_offset_a: ["Current offset", 1e3, "mA"],
+};
+
+function drawParameters(report, known = true) {
+	hide($("packparameters"), !report);
+	hide($("noparameters"), !!report || !known);
+	if (!report) return;
+	const all = [...Object.entries(report.state_of_health ?? {}), ...Object.entries(report.elements ?? {})];
+	$("parameters").replaceChildren(...all.map(([key, p]) => {
+		const [name, factor, unit] = NAMES[key] ?? [key, 1, ""], [value, std] = f.withError(p.value, p.std, factor);
+		return node("tr", {}, node("th", { scope: "row" }, name), node("td", {}, `${value} ${unit}`), node("td", {}, std), node("td", p.valid ? { class: "good" } : { title: p.reason ?? "" }, p.valid ? "✓ yes" : "no"));
+	}));
+}
+
+$("one").onclose = () => {
+	ui.pack = null;
+	history.replaceState(null, "", location.pathname);
+};
+$("one").onclick = (event) => { if (event.target === $("one")) $("one").close(); }; // beside it
+
+// what people do
+
+let asked = 0;
+async function find() {
+	const prefix = $("prefix").value.trim(), mine = (asked += 1);
+	if (!prefix) return hide($("found"), true);
+	let names = null;
+	try {
+		const answer = await fetch(`/packs?prefix=${encodeURIComponent(prefix)}`);
+		names = answer.ok ? await answer.json() : null;
+	} catch { /* said below */ }
+	if (mine !== asked) return; // somebody types on
+	const rows = names?.map((name) => node("li", {}, chooser(name))) ?? [];
+	$("found").replaceChildren(...(rows.length ? rows : [node("li", {}, node("p", {}, names ? "No pack's name begins so." : "The page's server does not answer."))]));
+	hide($("found"), false);
+}
+
+$("prefix").oninput = find;
+$("find").onsubmit = (event) => {
+	event.preventDefault();
+	$("found").querySelector("button")?.click();
+};
+$("find").onkeydown = (event) => {
+	const places = [$("prefix"), ...$("found").querySelectorAll("button")], here = places.indexOf(document.activeElement);
+	const next = { ArrowDown: here + 1, ArrowUp: here - 1 }[event.key];
+	if (event.key === "Escape") hide($("found"), true);
+	if (next === undefined || !places[next]) return;
+	event.preventDefault();
+	places[next].focus();
+};
+document.addEventListener("click", (event) => { if (!$("find").contains(event.target)) hide($("found"), true); });
+$("found").addEventListener("click", () => hide($("found"), true));
+$("kinds").onchange = (event) => { ui.kind = event.target.value; draw(); };
+setInterval(() => { if (ui.pack !== null) refresh(); }, REFRESH_MS);
+
+const stream = listen(take, () => draw());
+draw();
+const wanted = decodeURIComponent(location.hash.slice(1));
+if (wanted) choose(wanted);

@@ -1,0 +1,76 @@
+"""States of many packs, as workers publish them: spread as those of a fleet are, the same for the same seed."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from nats.aio.client import Client
+
+from bms_estimator.fleet import subjects
+from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.pack_bucket import write_bucket
+from bms_estimator.fleet.pack_row import PackKind, stored
+from tests.sinks.snapshots import ONE
+
+HOME, VAN, PLANT = (
+    PackKind(cell="lfp", capacity_ah=280.0, series=16),
+    PackKind(cell="ncr18650", series=14, parallel=10),
+    PackKind(cell="nmc", capacity_ah=50.0, series=96),
+)
+SHARES = {"home": (HOME, 0.7), "van": (VAN, 0.25), "plant": (PLANT, 0.05)}
+_MARK = 0.123456789012345
+
+
+class Pack(NamedTuple):
+    """A pack, and what is said of it."""
+
+    name: str
+    kind: PackKind
+    state: bytes
+
+
+def state(**values: Any) -> bytes:
+    """A state as it is published, with these values."""
+    assert ONE.estimate
+    return ONE.estimate.model_copy(update=values).model_dump_json().encode()
+
+
+def many(count: int, seed: int = 1) -> list[Pack]:
+    """So many packs."""
+    rng = np.random.default_rng(seed)
+    names = rng.choice(list(SHARES), count, p=[share for _, share in SHARES.values()])
+    soc = np.where(names == "plant", rng.beta(9, 7, count), rng.beta(3.2, 1.9, count))
+    std = rng.lognormal(np.where(names == "home", -4.1, -4.6), 0.45)
+    lowest = rng.uniform(0.01, 0.09, count)
+    marks = {"soc": _MARK, "soc_std": _MARK + 1.0, "stability_margin": _MARK + 2.0}
+    begin, of_soc, of_std, end = _parts(state(**marks), *marks.values())
+    packs = []
+    for i, name in enumerate(names):
+        values = (f"{soc[i]:.6f}", f"{std[i]:.6f}", f"{soc[i] - lowest[i]:.6f}")
+        data = begin + values[0].encode() + of_soc + values[1].encode() + of_std + values[2].encode() + end
+        packs.append(Pack(f"{name}-{i:06d}", SHARES[name][0], data))
+    return packs
+
+
+def _parts(data: bytes, *marks: float) -> list[bytes]:
+    parts = []
+    for mark in marks:
+        before, _, data = data.partition(str(mark).encode())
+        parts.append(before)
+    return [*parts, data]
+
+
+async def publish(nc: Client, pack: str, data: bytes) -> None:
+    """A pack's state."""
+    await nc.publish(subjects.published(pack, "state"), data)
+
+
+async def beat(nc: Client, worker: str, partitions: range, **values: Any) -> None:
+    """A worker's heartbeat."""
+    heartbeat = Heartbeat(id=worker, started_s=0.0, partitions=tuple(partitions), **values)
+    await nc.publish(subjects.worker(worker), heartbeat.model_dump_json().encode())
+
+
+async def load(nc: Client, packs: list[Pack]) -> None:
+    """Let the table have them."""
+    rows = {kind: stored(kind) for kind in (HOME, VAN, PLANT)}
+    await write_bucket(nc, subjects.PACKS_BUCKET, {pack.name: rows[pack.kind] for pack in packs})
