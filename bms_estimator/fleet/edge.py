@@ -26,7 +26,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.backlog import Sending
-from bms_estimator.sinks.brokers import Broker, brokers, check
+from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connect, Connection, Hello
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.link import Link
@@ -89,9 +89,11 @@ class Edge:
         self.delivery, self.unread = Delivery(), 0
         self._refusals = Refusals(self.delivery, lambda: None, first_delay_s)
         self._sending = Sending(self.store, self.delivery, self._refusals, first_delay_s)
-        mqtt, found = _brokers(settings)
+        for warning in check_edge(settings):
+            log.warning("a secret that is none", reason=warning)
+        mqtt = _mqtt(settings)
         hello = Hello(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._lose)
-        self._link = Link(found, hello, connect or Dial(mqtt), self._serve, self.delivery, first_delay_s)
+        self._link = Link(brokers(mqtt), hello, connect or Dial(mqtt), self._serve, self.delivery, first_delay_s)
         self._times: EdgeClock | None = None
         self._overdue: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
@@ -187,17 +189,22 @@ def _topic(subject: str) -> str:
     return subject.replace(".", "/")
 
 
-def _brokers(settings: EdgeSettings) -> tuple[MqttSettings, list[Broker]]:
-    """The servers, and what opens their doors.
+def check_edge(settings: EdgeSettings) -> list[str]:
+    """Whether addresses, password and certificates can be used.
+
+    Returns:
+        A sentence for each secret that every user of this machine may read.
 
     Raises:
         UserError: One cannot be used.
     """
-    doors = ("url", "username", "password_file", "ca_file", "cert_file", "key_file")
-    mqtt = MqttSettings(**{name: getattr(settings, name) for name in doors})
     try:
-        for warning in check(mqtt):
-            log.warning("a secret that is none", reason=warning.replace("mqtt.", "edge.", 1))
-        return mqtt, brokers(mqtt)
+        return [warning.replace("mqtt.", "edge.", 1) for warning in check(_mqtt(settings))]
     except UserError as error:
         raise UserError(str(error).replace("mqtt.", "edge.")) from None
+
+
+def _mqtt(settings: EdgeSettings) -> MqttSettings:
+    """The servers, and what opens their doors, as all connections have them."""
+    doors = ("url", "username", "password_file", "ca_file", "cert_file", "key_file")
+    return MqttSettings(**{name: getattr(settings, name) for name in doors})

@@ -123,3 +123,17 @@ def test_settings_that_cannot_be_are_named(
     code, _, err = run(capsys, "edge", path)
     assert code == 2
     assert said in err
+
+
+def test_config_check_looks_at_what_opens_the_servers_door(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, token = tmp_path / "pack.toml", tmp_path / "token"
+    path.write_text(f'[edge]\nusername = "a"\npassword_file = "{token}"\n')
+    assert run(capsys, "config", "check", path)[::2] == (
+        2,
+        f"error: edge.password_file = {token}: cannot be read: No such file or directory\n",
+    )
+    token.write_text("secret")
+    token.chmod(0o644)
+    code, _, said = run(capsys, "config", "check", path)
+    assert code == 0
+    assert f"edge.password_file = {token}: every user of this machine may read it" in said
