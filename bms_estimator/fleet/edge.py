@@ -39,8 +39,8 @@ OVERDUE = 1.5
 """After so many of its lengths a block is sent though no sample has ended it."""
 HANDOVER_S = 2.0
 """At the end: how long what is not sent may still take [s]."""
-CLOSING_S = 3.0
-"""How long the end may take in all [s]."""
+PARTING_S = 1.0
+"""How long parting from the server may take [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -58,6 +58,7 @@ class Edge:
         most_samples: Of a block.
         first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
         retry_s: Before a disk that failed is tried again [s].
+        handover_s: At the end, how long what is not sent may still take [s].
 
     Attributes:
         delivery: What became of the blocks.
@@ -79,8 +80,9 @@ class Edge:
         most_samples: int = MOST_SAMPLES,
         first_delay_s: float = FIRST_DELAY_S,
         retry_s: float = RETRY_S,
+        handover_s: float = HANDOVER_S,
     ) -> None:
-        self._clock, self._steady = clock or Clock(), steady
+        self._clock, self._steady, self._handover_s = clock or Clock(), steady, handover_s
         self._block_s, self._gathering = settings.block_s, Gathering(settings.block_s, most_samples)
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
         self._hear_topic = _topic(subjects.awaits(pack))
@@ -127,7 +129,7 @@ class Edge:
         self._end_block()
         if self._task is not None:
             self._link.closing.set()
-            done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
+            done, _ = await asyncio.wait([self._task], timeout=self._handover_s + PARTING_S)
             if not done:
                 self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -161,7 +163,7 @@ class Edge:
                 ]
                 await self._link.closing.wait()
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(HANDOVER_S):
+                    async with asyncio.timeout(self._handover_s):
                         await self._sending.emptied()
                 for task in others:
                     task.cancel()
