@@ -43,6 +43,9 @@ LONGEST_AWAY_S = 2.0
 QUIET_S = 10.0
 """After the last kill edges send on for so long: what was lost is asked for again when the next block comes."""
 
+MOST_WRONG = 20
+"""Lines about what is wrong."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -108,15 +111,25 @@ def main() -> None:
         began_s = time.monotonic()
         plan = Plan(nodes, arguments.kills, arguments.packs, arguments.seed)
         outcome = run(plan, lambda line: print(line, flush=True))
-        print(f"{nodes} node{'s' if nodes > 1 else ''}, seed {plan.seed}, {time.monotonic() - began_s:.0f} s\n{outcome}")
+        print(
+            f"{nodes} node{'s' if nodes > 1 else ''}, seed {plan.seed}, {time.monotonic() - began_s:.0f} s\n{outcome}"
+        )
         print("\n".join(outcome.wrong[:20]))
         wrong += len(outcome.wrong)
     sys.exit(wrong > 0)
 
 
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
 def run(plan: Plan, said: Callable[[str], object] = lambda _: None) -> Outcome:
     """Run a plan; ``said`` hears of each kill."""
-    with tempfile.TemporaryDirectory() as folder, rig(Path(folder), plan.nodes, partitions=plan.partitions) as fleet_rig:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        rig(Path(folder), plan.nodes, partitions=plan.partitions) as fleet_rig,
+    ):
         return asyncio.run(_run(fleet_rig, plan, said))
 
 
@@ -216,7 +229,9 @@ def _differences(pack: str, numbers: Counter[int], state: np.void, estimator: Es
     if sorted(numbers) != list(range(1, blocks + 1)):
         wrong.append(f"{pack}: not in the stream: {sorted(set(range(1, max(numbers))) - set(numbers))[:10]}")
     if (delivery["blocks"], delivery["awaited"], delivery["lost_blocks"]) != (blocks, blocks + 1, 0):
-        wrong.append(f"{pack}: {blocks} blocks in the stream, taken {delivery['blocks']}, lost {delivery['lost_blocks']}")
+        wrong.append(
+            f"{pack}: {blocks} blocks in the stream, taken {delivery['blocks']}, lost {delivery['lost_blocks']}"
+        )
     if state["estimator"].tobytes() != estimator.record.tobytes():
         wrong.append(f"{pack}: its estimator's record is another")
     return wrong
