@@ -17,7 +17,7 @@ from bms_estimator.service.warm_up import load_kernels
 
 def demo(
     packs: Annotated[int, typer.Option(parser=whole(1, 100_000), help="simulated, each with its edge")] = 1000,
-    seconds: Annotated[float, typer.Option(parser=decimal(10.0), help="how long edges send")] = 45.0,
+    seconds: Annotated[float, typer.Option(parser=decimal(3.0), help="how long edges send")] = 45.0,
     page_port: Annotated[
         int | None, typer.Option(parser=whole(1, 65535), help="of the page; else a free one", show_default=False)
     ] = None,
@@ -27,7 +27,7 @@ def demo(
 ) -> None:
     """Server, simulated packs, two workers and the fleet's page in one terminal; one worker is killed. About a minute.
 
-    All are real processes on the loopback, with free ports and a folder that goes at the end. The edges run at 20 times
+    All are real processes on the loopback, with free ports and a folder that goes at the end. The edges run at ten times
     the speed. What is said comes from the workers' heartbeats and from estimates beside the simulated packs' true SOC.
     """
     with compiling_shown():

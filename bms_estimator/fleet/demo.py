@@ -27,8 +27,8 @@ from bms_estimator.fleet.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.errors import UserError
 
 LOOPBACK = "127.0.0.1"
-SPEED = 20.0
-"""The packs' seconds per second: their minute is over in 3 s."""
+SPEED = 10.0
+"""The packs' seconds per second: their minute is over in 6 s."""
 SEED = 7
 LISTENED = 100
 """Packs whose estimates are compared with the truth."""
@@ -65,6 +65,11 @@ class Seen:
         """Workers that were heard within ``DEAD_S``."""
         now_s = time.monotonic()
         return {name: beat for name, (heard_s, beat) in self.workers.items() if now_s - heard_s < DEAD_S}
+
+    @property
+    def done(self) -> int:
+        """Blocks that all workers have stepped, what one did again that another had lost among them."""
+        return sum(beat.blocks for _, beat in self.workers.values())
 
     @property
     def taken(self) -> int:
@@ -142,7 +147,7 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
 
 async def _tell(demo: Demo, seen: Seen, processes: "Processes", stop: asyncio.Event) -> None:
     """Say how it goes; in the middle of it kill a worker."""
-    begin_s, kill_s, gone_s, spoke, taken = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
+    begin_s, kill_s, gone_s, spoke, done = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
     while not stop.is_set() and (now_s := time.monotonic() - begin_s) < demo.seconds:
         processes.check()
         if now_s >= kill_s:
@@ -156,17 +161,17 @@ async def _tell(demo: Demo, seen: Seen, processes: "Processes", stop: asyncio.Ev
             demo.say(f"{now_s:4.0f} s  {_WORKERS[1]} has all partitions, {now_s - gone_s:.1f} s after the kill")
             gone_s = math.inf
         if now_s >= spoke * SAID_S:
-            demo.say(f"{now_s:4.0f} s  {_line(seen, taken)}")
-            spoke, taken = spoke + 1, seen.taken
+            demo.say(f"{now_s:4.0f} s  {_line(seen, done)}")
+            spoke, done = spoke + 1, seen.done
             seen.errors.clear()
             seen.worst_s = 0.0
         await asyncio.sleep(0.1)
 
 
-def _line(seen: Seen, taken: int) -> str:
+def _line(seen: Seen, done: int) -> str:
     who = ", ".join(f"{name} {len(beat.partitions)}" for name, beat in sorted(seen.alive.items()))
     error = f", SOC {100.0 * float(np.mean(np.abs(seen.errors))):.1f} % off on average" if seen.errors else ""
-    rate = f"{max(0, seen.taken - taken) / SAID_S:,.0f} blocks/s"
+    rate = f"{(seen.done - done) / SAID_S:,.0f} blocks/s"
     return f"{rate}, lag at most {seen.worst_s:.1f} s; partitions: {who}{error}"
 
 
