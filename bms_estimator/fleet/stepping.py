@@ -2,13 +2,13 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.fleet import hour
 from bms_estimator.fleet.block import Block
 from bms_estimator.fleet.pack_state import PACK_STATE, Fields
@@ -18,7 +18,7 @@ from bms_estimator.model.estimate import Report
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.service.checkpoint import fields, without_observer
 from bms_estimator.service.resume import resume
-from bms_estimator.snapshot.flow import Flow, Meter
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.topics import estimate_report
@@ -28,6 +28,8 @@ LONGEST_STORE_S = 1e9
 """No store is in use for so long: a sample that is told to be later has no time [s]."""
 LAST_WALL_S = 2.0**34
 """No wall clock shows a later time: the year 2514 [s since 1970]."""
+AT_ONCE = 4096
+"""Samples: what the estimator says of each takes 200 bytes, for each type of pack in each partition."""
 Published = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
 """Topics ``state`` and ``parameters``, and the rows of finished hours, each with an id."""
 
@@ -60,17 +62,13 @@ class Stepping:
         self._settle(of_type, former, block)
         rows, turned = self._turn_hour(pack, block, of_type)
         self._follow_clock(of_type.estimator, block)
-        before_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
-        trace = self._estimate(block, of_type.estimator)
-        flow = self._flow(trace, of_type.meter)
+        self._window.before_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
         self._note_clock(block)
-        if not trace.size:
-            return None, None, rows
         arrival_s, now_s = self._arrival_s(block), self._wall()
-        self._window.before_s = before_s
-        self._window.add(trace, arrival_s)
-        state = self._state(of_type, flow, now_s)
-        return state, self._parameters(of_type.estimator, arrival_s, now_s) if turned else None, rows
+        self._estimate(block, of_type, arrival_s)
+        state = self._state(of_type, now_s)
+        told = turned and state is not None
+        return state, self._parameters(of_type.estimator, arrival_s, now_s) if told else None, rows
 
     def _settle(self, of_type: PackType, former: Fields | None, block: Block) -> None:
         """Make the pack one of its type: as it is, or taken over from other settings or from another version."""
@@ -102,19 +100,26 @@ class Stepping:
         ):  # else it awaits another clock already
             estimator.resume(self._unseen_s(block))
 
-    def _estimate(self, block: Block, estimator: Estimator) -> TraceBlock:
-        observer, steps_back = self._observer, int(self._observer["time_steps_back"])
-        trace = estimator.run(block.samples)
-        hour.add(self._record["hour"], trace, block, estimator)
-        self._counters["blocks"] += 1
-        self._counters["samples"] += block.samples.size
-        self._counters["dropped_samples"] += block.samples.size - trace.size
-        self._counters["time_steps_back"] += int(observer["time_steps_back"]) - steps_back
-        return trace
+    def _estimate(self, block: Block, of_type: PackType, arrival_s: float) -> None:
+        """Take the samples to the estimator, and what it makes of them to hour, meter and window."""
+        observer, counters = self._observer, self._counters
+        accepted, steps_back = int(observer["samples"]), int(observer["time_steps_back"])
+        of_type.meter.go_on(Flow(*(float(self._flows[name]) for name in Flow._fields)))
+        for part in _parts(block):
+            trace = of_type.estimator.run(part.samples)
+            hour.add(self._record["hour"], trace, part, of_type.estimator)
+            of_type.meter.add(trace)
+            self._window.add(trace, arrival_s)
+        counters["blocks"] += 1
+        counters["samples"] += block.samples.size
+        counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted)
+        counters["time_steps_back"] += int(observer["time_steps_back"]) - steps_back
 
-    def _state(self, of_type: PackType, flow: Flow, now_s: float) -> bytes | None:
-        """Topic ``state`` of the window."""
-        window, d = self._window.take(), self._delivery
+    def _state(self, of_type: PackType, now_s: float) -> bytes | None:
+        """Topic ``state`` of the window; None when no sample was accepted."""
+        flow, window, d = of_type.meter.flow, self._window.take(), self._delivery
+        for name, value in zip(Flow._fields, flow, strict=True):
+            self._flows[name] = value
         if window is None:
             return None
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
@@ -154,16 +159,6 @@ class Stepping:
         self._delivery["hour"] = present
         return rows, True
 
-    def _flow(self, trace: TraceBlock, meter: Meter) -> Flow:
-        """What has flowed, with a block."""
-        f = self._flows
-        meter.go_on(Flow(*(float(f[name]) for name in Flow._fields)))
-        meter.add(trace)
-        flow = meter.flow
-        for name, value in zip(Flow._fields, flow, strict=True):
-            f[name] = value
-        return flow
-
     def _note_clock(self, block: Block) -> None:
         known_s = _known(block.samples)
         if known_s.size:
@@ -175,6 +170,15 @@ class Stepping:
             return block.arrival_s
         self._counters["no_arrival"] += 1
         return block.store / 1e9 + float(self._delivery["last_s"])
+
+
+def _parts(block: Block) -> Iterator[Block]:
+    """A block in parts of at most ``AT_ONCE`` samples."""
+    if block.samples.size <= AT_ONCE:
+        yield block
+        return
+    for first in range(0, block.samples.size, AT_ONCE):
+        yield replace(block, samples=block.samples[first : first + AT_ONCE])
 
 
 def _known(samples: SampleBlock) -> NDArray[np.float64]:

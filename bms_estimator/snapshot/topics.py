@@ -43,12 +43,15 @@ def estimate_report(
         flow: What has gone through the terminals.
         capacity_ah: Of the pack, rated; None of a fuel cell.
     """
-    last = dict(zip(TRACE.names or (), window.last.item(), strict=True))
-    soc = finite(last["soc"])
+    values = zip(
+        TRACE.names or (), window.last.item(), strict=True
+    )  # plain numbers: a field of a record costs as much as a sum
+    last = {name: value if math.isfinite(value) else None for name, value in values}
+    soc = last["soc"]
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
-        board_time_s=float(last["time_s"]),
+        board_time_s=last["time_s"],
         voltage_v=window.voltage_v,
         current_a=window.current_a,
         power_w=window.power_w,
@@ -56,9 +59,9 @@ def estimate_report(
         **_cells(window.cells_v),
         soc=soc,
         soc_percent=None if soc is None else 100.0 * soc,
-        soc_std=finite(last["soc_std"]),
-        soc_coulomb=finite(last["soc_coulomb"]),
-        soc_ocv=finite(last["soc_ocv"]),
+        soc_std=last["soc_std"],
+        soc_coulomb=last["soc_coulomb"],
+        soc_ocv=last["soc_ocv"],
         remaining_capacity_ah=finite(remaining.capacity_ah),
         usable_capacity_ah=finite(remaining.usable_ah),
         remaining_energy_wh=finite(remaining.energy_wh),
@@ -66,14 +69,14 @@ def estimate_report(
         time_to_full_s=finite(remaining.time_to_full_s),
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
-        voltage_estimate_v=finite(last["voltage_estimate_v"]),
-        innovation_v=finite(last["innovation_v"]),
-        tracking_error_v=finite(last["tracking_error_v"]),
-        delta_1=finite(last["delta_1"]),
-        delta_2=finite(last["delta_2"]),
-        stability_margin=finite(last["stability_margin"]),
-        adaptive_gain_k=finite(last["k"]),
-        nussbaum_gain=finite(last["nussbaum_gain"]),
+        voltage_estimate_v=last["voltage_estimate_v"],
+        innovation_v=last["innovation_v"],
+        tracking_error_v=last["tracking_error_v"],
+        delta_1=last["delta_1"],
+        delta_2=last["delta_2"],
+        stability_margin=last["stability_margin"],
+        adaptive_gain_k=last["k"],
+        nussbaum_gain=last["nussbaum_gain"],
         converged=bool(last["converged"]),
         lock=bool(last["lock"]),
         frames_received=counters.get("frames_received", 0),
