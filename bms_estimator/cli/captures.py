@@ -8,7 +8,7 @@ import typer
 
 from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.model.sample import CurrentSign
 
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
 CELL_HELP = "lfp, nmc, nca, lco, lmo, lto: generic; else a shipped cell's name or a cell file"

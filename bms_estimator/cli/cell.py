@@ -17,7 +17,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.live import new_estimator
 from bms_estimator.service.resume import resume
-from bms_estimator.service.serve import state_folder
+from bms_estimator.service.state_folder import state_folder
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="What a pack's service has learned of its cells.")
 

@@ -14,7 +14,7 @@ from bms_estimator.model.settings import MqttSettings, Settings, load_settings
 from bms_estimator.page.dashboard import dashboard as serving
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.logs import configure_logs, drained
-from bms_estimator.service.serve import state_folder
+from bms_estimator.service.state_folder import state_folder
 
 
 def dashboard(

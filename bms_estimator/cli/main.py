@@ -15,6 +15,9 @@ from bms_estimator.model.errors import UserError
 COMMANDS = {
     "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
     "top": Entry("bms_estimator.cli.top:top", "All packs of a broker at a glance."),
+    "edge": Entry(
+        "bms_estimator.cli.edge:edge", "Send a pack's raw samples to a fleet's server, and estimate nothing."
+    ),
     "replay": Entry("bms_estimator.cli.replay:replay", "Estimate from a recorded capture or a table."),
     "alarms": Entry("bms_estimator.cli.alarms:alarms", "Which alarms a recorded capture would have raised."),
     "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),

@@ -20,8 +20,9 @@ from bms_estimator.model.settings import Settings, load_settings
 from bms_estimator.service.interrupt import starting
 from bms_estimator.service.logs import configure_logs, drained
 from bms_estimator.service.reload import Reload, ask_all, reload_on_hangup
-from bms_estimator.service.serve import serve, state_folder
+from bms_estimator.service.serve import serve
 from bms_estimator.service.several import serve_several
+from bms_estimator.service.state_folder import state_folder
 from bms_estimator.service.warm_up import load_kernels
 from bms_estimator.sinks.console_sink import ConsoleSink
 from bms_estimator.sinks.console_view import LOG_LINES

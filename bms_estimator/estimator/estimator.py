@@ -1,6 +1,8 @@
 """The estimator: kernel settings and state behind ``step`` and ``run``."""
 
 import math
+from copy import copy
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from bms_estimator.model.columns import Columns
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.resolution import BOARD, Sampling
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings, Settings
 
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
@@ -75,6 +77,13 @@ class Estimator:
         self.record: NDArray[np.void] = np.zeros(1, dtype=ESTIMATOR_STATE)
         self.state: NDArray[np.void] = self.record["observer"]
         self._trace: TraceBlock = np.zeros(0, dtype=TRACE)
+
+    def on(self, record: NDArray[np.void]) -> Self:
+        """Another of the same settings, which it shares, that works on ``record``, shape (1,), dtype ``ESTIMATOR_STATE``."""
+        other = copy(self)
+        other.record, other.state = record, record["observer"]
+        other._trace = np.zeros(0, dtype=TRACE)  # noqa: SLF001 - of this class
+        return other
 
     def step(
         self, time_s: float, current_a: float, voltage_v: float, status: int = 0, temperature_c: float = math.nan
@@ -141,6 +150,24 @@ class Estimator:
             self.record["filter"]["soc"] = self.state["soc"]
         if math.isfinite(unseen_s):
             self.record["unlearned_s"] += unseen_s
+
+
+def estimator_of(settings: Settings, cell: PackModel) -> Estimator:
+    """The estimator of a pack.
+
+    Args:
+        settings: The pack's.
+        cell: The pack as one object (``CellModel.pack``).
+    """
+    return Estimator(
+        cell,
+        settings.observer,
+        identifier=settings.identifier,
+        voltage_resolution_v=settings.sensor.voltage_resolution_v,
+        voltage_noise_v=settings.sensor.voltage_noise_v,
+        initial_soc=settings.pack.initial_soc,
+        sampling=settings.sampling,
+    )
 
 
 def estimate(

@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 _HEADER = struct.Struct("<4sBxHQQQd")
+_OLDEST = 24
+"""Where it stands in the header."""
 _MAGIC, _VERSION = b"BMSB", 1
 MOST_SAMPLES = 65_535
 """Of a block."""
@@ -75,6 +77,11 @@ def encode(block: Block) -> bytes:
     return header + zlib.compress(b"".join(column.tobytes() for column in columns))
 
 
+def with_oldest(data: bytes, oldest: int) -> bytes:
+    """The bytes of a block with another ``oldest``."""
+    return data[:_OLDEST] + oldest.to_bytes(8, "little") + data[_OLDEST + 8 :]
+
+
 def decode(data: bytes) -> Block:
     """The block in ``data``.
 
@@ -89,6 +96,14 @@ def decode(data: bytes) -> Block:
     if not (1 <= oldest <= number < MOST_NUMBER and 0 < store < MOST_NUMBER and math.isfinite(arrival_s)):
         raise BlockError(f"store {store}, number {number}, oldest {oldest}, arrival {arrival_s}: cannot be")
     return Block(store, number, oldest, arrival_s, _samples(data[_HEADER.size :], count))
+
+
+def glance(data: bytes) -> tuple[int, float]:
+    """How many samples a block says it holds, and when it arrived [s since 1970]; none, and for ever, of what is no block."""
+    if len(data) < _HEADER.size or data[:4] != _MAGIC:
+        return 0, math.inf
+    _, _, count, *_, arrival_s = _HEADER.unpack_from(data)
+    return count, arrival_s if math.isfinite(arrival_s) else math.inf
 
 
 def _samples(body: bytes, count: int) -> SampleBlock:

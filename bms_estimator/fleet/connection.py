@@ -4,7 +4,6 @@ import ssl
 import time
 from pathlib import Path
 
-import nats
 import structlog
 from nats.aio.client import Client
 
@@ -32,9 +31,10 @@ async def connect(servers: str, name: str, *, creds: Path | None = None, ca: Pat
     Raises:
         UserError: ``ca`` cannot be read, or an address is none.
     """
-    said = _Said(servers)
+    nc = Client()
+    said = _Said(nc, servers)
     try:
-        return await nats.connect(
+        await nc.connect(
             servers=[each.strip() for each in servers.split(",")],
             name=name,
             user_credentials=str(creds) if creds else None,
@@ -47,6 +47,7 @@ async def connect(servers: str, name: str, *, creds: Path | None = None, ca: Pat
         )
     except ValueError as error:
         raise UserError(f"--server {servers}: {error}") from error
+    return nc
 
 
 def _context(ca: Path) -> ssl.SSLContext:
@@ -59,8 +60,8 @@ def _context(ca: Path) -> ssl.SSLContext:
 class _Said:
     """Logs what becomes of a connection."""
 
-    def __init__(self, servers: str) -> None:
-        self._servers = servers
+    def __init__(self, nc: Client, servers: str) -> None:
+        self._nc, self._servers = nc, servers
         self._last: tuple[str, float] = ("", 0.0)
 
     async def trouble(self, error: Exception) -> None:
@@ -70,6 +71,8 @@ class _Said:
             log.warning("trouble with the server", server=self._servers, reason=text)
 
     async def gone(self) -> None:
+        if self._nc.is_closed:  # by us
+            return
         log.warning("the connection to the server is gone; trying again", server=self._servers)
 
     async def back(self) -> None:

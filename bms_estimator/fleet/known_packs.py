@@ -4,9 +4,10 @@ Packs with the same bytes share one settings object and one model; those that no
 wrong with a row makes its packs unknown, with the reason.
 """
 
+from collections.abc import Iterator
 from functools import lru_cache
 
-from bms_estimator.fleet.pack_row import PackKind, kind_of, model_of, settings_of
+from bms_estimator.fleet.pack_row import PackKind, kind_of, known_cells, model_of, settings_of
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
@@ -29,6 +30,12 @@ class KnownPacks:
     def __len__(self) -> int:
         return len(self._rows)
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __contains__(self, pack: object) -> bool:
+        return pack in self._rows
+
     def __call__(self, pack: str) -> tuple[Settings, PackModel] | None:
         """The settings of its kind, the same object for all of them and without the pack's name, and its model; None: ``reason``."""
         found = self._found(pack)
@@ -43,6 +50,10 @@ class KnownPacks:
         """Its row, or what is wrong with it; None where there is none."""
         data = self._rows.get(pack)
         return None if data is None else self._kind(data)
+
+    def cell_file(self, name: str) -> str | None:
+        """The text of a cell file; None where there is none, or the package's cell of that name goes before."""
+        return None if name in known_cells() else self._cells.get(name)
 
     def set_row(self, pack: str, data: bytes | None) -> bool:
         """A pack has another row; None: none any more. Whether this is news."""

@@ -36,6 +36,10 @@ class Members:
         self._heard[worker] = now_s
         return new and worker != self.me
 
+    def forgive(self, now_s: float) -> None:
+        """None could be heard until now: their silence says nothing."""
+        self._heard = dict.fromkeys(self._heard, now_s)
+
     def alive(self, now_s: float) -> list[str]:
         """All of them."""
         self._heard = {worker: heard_s for worker, heard_s in self._heard.items() if now_s - heard_s < DEAD_S}

@@ -27,6 +27,8 @@ class Written:
     changed: int
     same: int
     removed: int
+    left: int
+    """In the bucket, and not among the values."""
 
 
 class PackBucket:
@@ -115,11 +117,12 @@ async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, 
     """
     held = await read_bucket(nc, bucket)
     differing = {key: data for key, data in values.items() if held.get(key) != data}
-    gone = held.keys() - values.keys() if remove else set()
+    others = held.keys() - values.keys()
     await _publish(nc, bucket, differing, {})
-    await remove_keys(nc, bucket, gone)
-    new = len(differing.keys() - held.keys())
-    return Written(new, len(differing) - new, len(values) - len(differing), len(gone))
+    if remove:
+        await remove_keys(nc, bucket, others)
+    new, removed = len(differing.keys() - held.keys()), len(others) if remove else 0
+    return Written(new, len(differing) - new, len(values) - len(differing), removed, len(others) - removed)
 
 
 async def remove_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:

@@ -221,7 +221,6 @@ def table_lines(packs: Mapping[str, PackKind]) -> Iterator[str]:
     """The same as CSV, lines with their ends: only the columns of which at least one pack has something."""
     told = {name: kind.model_dump(exclude_defaults=True) for name, kind in sorted(packs.items())}
     columns = [column for column in COLUMNS if column == "pack" or any(column in row for row in told.values())]
-    for row in ({"pack": name} | values for name, values in told.items()):
-        if row["pack"] == next(iter(told)):
-            yield ",".join(columns) + "\n"
-        yield ",".join(str(row.get(column, "")) for column in columns) + "\n"
+    yield ",".join(columns) + "\n"
+    for name, row in told.items():
+        yield ",".join(str(({"pack": name} | row).get(column, "")) for column in columns) + "\n"

@@ -16,10 +16,10 @@ from nats.errors import TimeoutError as NatsTimeoutError
 from bms_estimator.fleet import subjects
 from bms_estimator.model.errors import UserError
 
-RAW_BYTES, RAW_AGE_S = 64 << 30, 7 * 86_400.0
-"""What ``RAW`` keeps at most: 100,000 packs bring 100 GB a day, see docs/fleet-server.md."""
-HOURS_BYTES, HOURS_AGE_S = 8 << 30, 30 * 86_400.0
-"""Summaries wait so long for who collects them."""
+RAW_BYTES, RAW_AGE_S = 8 << 30, 7 * 86_400.0
+"""What ``RAW`` keeps at most."""
+HOURS_PART, HOURS_AGE_S = 1 / 16, 30 * 86_400.0
+"""What ``HOURS`` may take, of what ``RAW`` may; and so long summaries wait for who collects them."""
 DUPLICATES_S = 3600.0
 """A summary that comes again within it, under its number, is dropped."""
 GROUP = "w"
@@ -62,7 +62,7 @@ async def make_streams(
             f"the stream {subjects.RAW_STREAM} has {found} partitions, and {partitions} are asked for: "
             "their number stays as it was made"
         )
-    for stream in (_raw(partitions, raw_bytes, raw_age_s), _hours(), *_buckets()):
+    for stream in (_raw(partitions, raw_bytes, raw_age_s), _hours(raw_bytes), *_buckets()):
         await _keep(nc, stream | {"num_replicas": replicas})
     numbers = range(partitions)
     for first in range(0, partitions, AT_ONCE):
@@ -90,8 +90,13 @@ def _raw(partitions: int, most_bytes: int, age_s: float) -> dict[str, Any]:
     return _stream(subjects.RAW_STREAM, subject, metadata={PARTITIONS_KEY: str(partitions)}, **limits)
 
 
-def _hours() -> dict[str, Any]:
-    limits = {"max_bytes": HOURS_BYTES, "max_age": _ns(HOURS_AGE_S), "discard": "old", "allow_direct": True}
+def _hours(raw_bytes: int) -> dict[str, Any]:
+    limits = {
+        "max_bytes": round(HOURS_PART * raw_bytes),
+        "max_age": _ns(HOURS_AGE_S),
+        "discard": "old",
+        "allow_direct": True,
+    }
     return _stream(subjects.HOURS_STREAM, subjects.hours(), duplicate_window=_ns(DUPLICATES_S), **limits)
 
 

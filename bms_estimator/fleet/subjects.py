@@ -7,7 +7,7 @@
 ``bms.<pack>.<topic>``       estimates, as ``run`` publishes them
 ``hours.<pack>``             what a worker sums up each hour, kept by the stream ``HOURS``
 ``fleet.worker.<id>``        each second, from each worker: that it lives, what it holds, how far it lags
-``fleet.unknown.<pack>``     from a worker: blocks of a pack come that no table knows
+``fleet.unknown.<pack>``     once, from a worker: it holds blocks of a pack that the table does not know, and why
 ===========================  ================================================================================
 """
 
@@ -58,8 +58,16 @@ def worker(name: str = "*") -> str:
 
 
 def unknown(pack: str = "*") -> str:
-    """Where a worker says that it does not know a pack."""
+    """Where a worker says that a pack is unknown."""
     return f"fleet.unknown.{pack}"
+
+
+def partition_of(pack: str, partitions: int) -> int:
+    """Where ``mapping`` puts a pack: FNV-1a of its name, as the server's ``partition`` has it."""
+    digest = 0x811C9DC5
+    for byte in pack.encode():
+        digest = (digest ^ byte) * 0x01000193 & 0xFFFFFFFF
+    return digest % partitions
 
 
 class Awaits(BaseModel):

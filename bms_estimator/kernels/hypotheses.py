@@ -138,6 +138,8 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
         s.covariance[q, B_SLOW, B_SLOW] = s.covariance[q, B_FAST, B_FAST] = half_v2
         s.minute_u[q] = s.ten_minutes_u[q] = 0.0
         s.fast_inflation[q] = s.slow_inflation[q] = 1.0
+    for q in range(s.count, HYPOTHESES):
+        vacate(s, q)
     s.best = (s.count - 1) // 2
     combine(s)
 
@@ -160,6 +162,16 @@ def copy(s: Record, source: int, to: int) -> None:
     s.ln_weight[to] = s.ln_weight[source]
     s.minute_u[to], s.ten_minutes_u[to] = s.minute_u[source], s.ten_minutes_u[source]
     s.fast_inflation[to], s.slow_inflation[to] = s.fast_inflation[source], s.slow_inflation[source]
+
+
+@njit(cache=True)
+def vacate(s: Record, q: int) -> None:
+    """Row ``q`` holds no hypothesis: all 0, so that a state that is kept without its zeros costs what it knows."""
+    for j in range(STATES):
+        s.mean[q, j] = 0.0
+        for k in range(STATES):
+            s.covariance[q, j, k] = 0.0
+    s.ln_weight[q] = s.minute_u[q] = s.ten_minutes_u[q] = s.fast_inflation[q] = s.slow_inflation[q] = 0.0
 
 
 @njit(cache=True)
@@ -322,6 +334,7 @@ def remove(s: Record, q: int) -> None:
     for j in range(q, s.count - 1):
         copy(s, j + 1, j)
     s.count -= 1
+    vacate(s, s.count)
     if s.best > q:
         s.best -= 1
 

@@ -5,6 +5,7 @@ descriptor brought, or some thousand rows of a file. A block of one is a sample.
 """
 
 from enum import IntFlag
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ SAMPLE = np.dtype(
     ],
     align=True,
 )
+
+CurrentSign = Literal["discharge_positive", "charge_positive"]
+"""What a device calls positive."""
 
 SampleBlock = NDArray[np.void]
 """Shape (n,), dtype ``SAMPLE``."""

@@ -7,6 +7,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ModelWrapValidatorHandle
 
 from bms_estimator.model.alarm_settings import AlarmSettings
 from bms_estimator.model.broker_url import of_brokers
+from bms_estimator.model.edge_settings import EdgeSettings
 from bms_estimator.model.export_settings import InfluxSettings, PrometheusSettings
 from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
 from bms_estimator.model.page_settings import PageSettings
@@ -287,6 +288,7 @@ class Settings(Strict):
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
     mqtt: MqttSettings | None = Field(default=None, description="leave out to publish nowhere")
+    edge: EdgeSettings | None = Field(default=None, description="leave out to send no samples to a fleet")
     home_assistant: HomeAssistantSettings = HomeAssistantSettings()
     influx: InfluxSettings | None = Field(default=None, description="leave out to write to none")
     prometheus: PrometheusSettings | None = Field(default=None, description="leave out to listen nowhere")

@@ -66,7 +66,7 @@ def pack_identity(settings: Settings, cell: PackModel) -> str:
     return hashlib.sha256(repr(meaning).encode()).hexdigest()
 
 
-def _observer_identity(settings: Settings, cell: PackModel) -> str:
+def observer_identity(settings: Settings, cell: PackModel) -> str:
     """Hash of what the observer's parameters and gain rest on; under other settings it begins anew, within seconds."""
     parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
     return hashlib.sha256(repr(parts).encode()).hexdigest()
@@ -79,6 +79,12 @@ def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDAr
             yield from fields(record[name], f"{part}{name}.")
         else:
             yield f"{part}{name}", record[name]
+
+
+def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Of a state's fields by their names those that hold under other settings of the observer: all but its own."""
+    kept, dropped = ("observer.soc", "observer.soc_coulomb", "observer.started"), ("observer.", "learning.")
+    return {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}
 
 
 @dataclass(frozen=True)
@@ -124,7 +130,7 @@ class CheckpointFile:
 
     def __init__(self, folder: Path, settings: Settings, cell: PackModel, now: Callable[[], Moment] = moment) -> None:
         self._name, self._now = settings.pack.name, now
-        self._identity, self._observer = pack_identity(settings, cell), _observer_identity(settings, cell)
+        self._identity, self._observer = pack_identity(settings, cell), observer_identity(settings, cell)
         self._range_v = cell.cell.voltage_min_v, cell.cell.voltage_max_v
         self._longest_days = settings.state.longest_days
         self._content: dict[str, Any] = {}  # of the file, as far as it is no ledger
@@ -241,8 +247,7 @@ class CheckpointFile:
         self._content = {name: v for name, v in file.items() if name not in ("format", *_OF_LEDGER)}
         self._content |= {"identity": self._identity}
         if str(file["observer"]) != self._observer:
-            kept, dropped = ("observer.soc", "observer.soc_coulomb", "observer.started"), ("observer.", "learning.")
-            state = {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}
+            state = without_observer(state)
         return Restored(state, unseen_s, ledger, "")
 
     def _remove_oldest(self) -> None:

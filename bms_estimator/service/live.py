@@ -12,11 +12,12 @@ import numpy as np
 import structlog
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.service.alarm_hooks import Hooks
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
@@ -57,6 +58,7 @@ async def run_live(
     pulse: Callable[[], Pulse] | None = None,
     recording: Callable[[], RecordingHealth | None] = lambda: None,
     hooks: Hooks | None = None,
+    raw: Callable[[SampleBlock], None] | None = None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
 
@@ -76,6 +78,7 @@ async def run_live(
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
         hooks: What is done of alarms; opened and closed here.
+        raw: Gets all samples, too, as they come; returns at once. None: nobody does.
 
     Returns:
         The estimator as the last sample left it.
@@ -121,7 +124,7 @@ async def run_live(
         await stack.enter_async_context(hooks)
         notifier.ready(name)
         tasks = [
-            _estimate(source, tally, publisher, lambda: since_boot() - restored_s),
+            _estimate(source, tally, publisher, raw, lambda: since_boot() - restored_s),
             _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -143,29 +146,25 @@ async def run_live(
 
 def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
     """The estimator of a pack, its kernels loaded: nothing compiles once samples come."""
-
-    def make() -> Estimator:
-        return Estimator(
-            cell,
-            settings.observer,
-            identifier=settings.identifier,
-            voltage_resolution_v=settings.sensor.voltage_resolution_v,
-            voltage_noise_v=settings.sensor.voltage_noise_v,
-            initial_soc=settings.pack.initial_soc,
-            sampling=settings.sampling,
-        )
-
-    make().run(np.zeros(1, dtype=SAMPLE))
-    return make()
+    estimator_of(settings, cell).run(np.zeros(1, dtype=SAMPLE))
+    return estimator_of(settings, cell)
 
 
-async def _estimate(source: Source, tally: Tally, publisher: Publisher, waited_s: Callable[[], float]) -> None:
+async def _estimate(
+    source: Source,
+    tally: Tally,
+    publisher: Publisher,
+    raw: Callable[[SampleBlock], None] | None,
+    waited_s: Callable[[], float],
+) -> None:
     """Take what the source gives; ``waited_s`` is how long it has given nothing since the state was restored [s]."""
     estimator = tally.estimator
     unseen_s = estimator.record["unseen_s"].copy()
     async for block in source:
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
             estimator.record["unseen_s"] = unseen_s + waited_s()
+        if raw is not None:
+            raw(block)
         publisher.add(block, tally.run(block))
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 

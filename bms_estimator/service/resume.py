@@ -43,7 +43,7 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     estimator.step(0.0, 0.0, estimator.cell.cell.nominal_voltage_v)
     begun = estimator.record.copy()
     was_on = bool(saved.get("filter.started", np.zeros(1))[0])
-    _fill(
+    fill(
         estimator.record,
         {name: v for name, v in saved.items() if was_on or name.startswith(("observer.", "learning."))},
     )
@@ -67,7 +67,8 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     return ""
 
 
-def _fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
+def fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
+    """Take from ``saved``, fields by their names, what ``record`` has in the same shape, or in one that has grown."""
     for name, field in fields(record):
         known = saved.get(name)
         if known is None or known.ndim != field.ndim:
@@ -86,7 +87,8 @@ def _is_shorter(known: tuple[int, ...], field: tuple[int, ...], axes: int) -> bo
 def _open_curve(estimator: Estimator) -> None:
     """Of the error of the OCV nothing is known where it was no state of the filter before."""
     f, c = estimator.record[0]["filter"], estimator.record[0]["checks"]
-    for mean, covariance in zip(f["mean"], f["covariance"], strict=True):
+    count = int(f["count"])
+    for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
         forget_curve(mean, covariance)
     keep(c, f)
 

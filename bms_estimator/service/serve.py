@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -11,8 +10,8 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
+from bms_estimator.fleet.edge import Edge
 from bms_estimator.model.alarm_limits import out_of_range, watched
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
@@ -85,6 +84,7 @@ async def serve(
     if database and settings.store.history_days:
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
+    edge = Edge(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     if reload:
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
@@ -113,6 +113,8 @@ async def serve(
         if database:
             await stack.enter_async_context(database)
         await stack.enter_async_context(outbox)
+        if edge:
+            await stack.enter_async_context(edge)
         return await run_live(
             settings,
             cell,
@@ -128,6 +130,7 @@ async def serve(
             pulse=source.pulse,
             recording=partial(recording_health, tap),
             hooks=hooks,
+            raw=edge.take if edge else None,
         )
 
 
@@ -151,25 +154,3 @@ def recording_health(tap: Tap | None) -> RecordingHealth | None:
     if not isinstance(tap, Recording):
         return None
     return RecordingHealth(on=not tap.ended.done(), bytes=tap.bytes, missed_reads=tap.missed_reads)
-
-
-def state_folder(settings: Settings) -> Path:
-    """Where checkpoints go: the folder of the settings, else systemd's StateDirectory, else the user's XDG state folder.
-
-    Made where it is not there; where it cannot be made, what is saved there later says so.
-
-    Raises:
-        UserError: The folder of the settings cannot be made.
-    """
-    systemd = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-    home = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
-    folder = settings.state.folder or Path(systemd or f"{home}/bms-estimator")
-    try:
-        folder = folder.expanduser()
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except (OSError, RuntimeError) as error:  # the latter of a user without a home
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        if settings.state.folder:
-            raise UserError(f"state.folder = {folder}: {reason}") from error
-        log.warning("the state cannot outlive a restart", folder=str(folder), reason=reason)
-    return folder

@@ -12,7 +12,8 @@ from bms_estimator.page.sink import Pages
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
-from bms_estimator.service.serve import serve, state_folder
+from bms_estimator.service.serve import serve
+from bms_estimator.service.state_folder import state_folder
 
 
 async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[Reload]) -> None:

@@ -1,7 +1,8 @@
 """What must reach the broker, sent oldest first, several messages on their way at a time."""
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.connection import Connection
@@ -15,27 +16,48 @@ WINDOW = 16
 topics find room beside them."""
 
 
-class Backlog:
-    """Fills and empties an outbox.
+class Numbered(Protocol):
+    """Messages in order, each with a number, as ``Outbox`` keeps them.
+
+    Attributes:
+        connected: Whether there is a broker; whoever sends says so.
+    """
+
+    connected: bool
+
+    @property
+    def waiting(self) -> int:
+        """Messages that the broker has not acknowledged."""
+
+    @property
+    def dropped(self) -> int:
+        """Messages that found no room, since start."""
+
+    async def take(self, most: int) -> Sequence[Waiting]:
+        """Wait until there is a message, and hand out up to ``most`` of the oldest that were not since ``rewind``."""
+
+    def sent(self, number: int) -> None:
+        """The broker has acknowledged a message."""
+
+    def rewind(self) -> None:
+        """A connection is lost: hand out again, in order, what was not acknowledged."""
+
+
+class Sending:
+    """Empties what keeps messages in order.
 
     Args:
-        outbox: The outbox.
+        outbox: What keeps them.
         delivery: It is counted there what waits and what never arrives.
         refusals: Hears how the broker answers.
         first_delay_s: Before what is refused for now is tried again; doubles with each time [s].
     """
 
-    def __init__(self, outbox: Outbox, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
+    def __init__(self, outbox: Numbered, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
         self._outbox, self._delivery, self._refusals = outbox, delivery, refusals
         self._pauses = Pauses(first_delay_s)
         self._refused = 0
         self._moved = asyncio.Event()
-
-    def put(self, messages: Iterable[Message]) -> None:
-        """Keep messages until the broker has them; returns at once."""
-        for message in messages:
-            self._outbox.put(message)
-        self._count()
 
     async def send(self, connection: Connection) -> None:
         """Send what is there and what comes, until the connection is lost.
@@ -106,3 +128,24 @@ class Backlog:
     def _count(self) -> None:
         self._delivery.drops = self._outbox.dropped + self._refused
         self._delivery.waiting = self._outbox.waiting
+
+
+class Backlog(Sending):
+    """Fills and empties an outbox.
+
+    Args:
+        outbox: The outbox.
+        delivery: As ``Sending`` has it.
+        refusals: As ``Sending`` has it.
+        first_delay_s: As ``Sending`` has it [s].
+    """
+
+    def __init__(self, outbox: Outbox, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
+        super().__init__(outbox, delivery, refusals, first_delay_s)
+        self._filled = outbox
+
+    def put(self, messages: Iterable[Message]) -> None:
+        """Keep messages until the broker has them; returns at once."""
+        for message in messages:
+            self._filled.put(message)
+        self._count()

@@ -1,5 +1,6 @@
 """Charge and energy through the pack's terminals, counted in each direction."""
 
+import math
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -40,6 +41,17 @@ class Flow(NamedTuple):
         return Flow(*map(max, self, other))
 
 
+class Last(NamedTuple):
+    """The last sample that a meter has counted."""
+
+    time_s: float = math.nan
+    """NaN: none was."""
+    current_a: float = 0.0
+    power_w: float = 0.0
+    step_s: float = 0.0
+    """To it from the one before."""
+
+
 class Meter:
     """Counts what flows: straight between samples, nothing over a gap.
 
@@ -52,11 +64,14 @@ class Meter:
     """
 
     def __init__(self, before: Flow, gap_s: float) -> None:
-        self._flow, self._gap_s = before, gap_s
+        self._gap_s = gap_s
         self._rows = np.zeros((3, 1 + WAITING_ROWS))  # time [s], current [A], power [W]; first the last of those before
-        self._rows[0, 0] = np.nan  # there is none yet
-        self._count = 1
-        self._step_s = 0.0  # to the first row from the one before
+        self.go_on(before, Last())
+
+    def go_on(self, flow: Flow, last: Last) -> None:
+        """Count on from ``flow`` and the last sample that it holds; what was taken before is forgotten."""
+        self._flow, self._count = flow, 1
+        *self._rows[:, 0], self._step_s = last
 
     def add(self, trace: TraceBlock) -> None:
         """Take accepted samples; ``trace`` has shape (n,), dtype TRACE."""
@@ -75,6 +90,12 @@ class Meter:
         if self._count > 1:
             self._integrate()
         return self._flow
+
+    @property
+    def last(self) -> Last:
+        """The last sample that ``flow`` holds."""
+        time_s, current_a, power_w = self._rows[:, 0].tolist()
+        return Last(time_s, current_a, power_w, self._step_s)
 
     def _integrate(self) -> None:
         """Count the waiting rows; the last of them stays, for the step to the next."""

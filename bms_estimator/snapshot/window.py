@@ -42,12 +42,16 @@ class WindowSummary:
 
 
 class Window:
-    """Gathers trace blocks until they are taken."""
+    """Gathers trace blocks until they are taken.
+
+    Attributes:
+        before_s: Stream clock at the end of the window before; NaN before the first.
+    """
 
     def __init__(self) -> None:
         self._rows: TraceBlock = np.zeros(WAITING_ROWS, dtype=TRACE)
         self._waiting = 0
-        self._before_s = math.nan  # stream clock at the end of the window before
+        self.before_s = math.nan
         self._clear()
 
     def _clear(self) -> None:
@@ -98,7 +102,7 @@ class Window:
         if self._last is None:
             return None
         n, last_s = self._samples, float(self._last["time_s"])
-        steps, begin_s = (n, self._before_s) if math.isfinite(self._before_s) else (n - 1, self._first_s)
+        steps, begin_s = (n, self.before_s) if math.isfinite(self.before_s) else (n - 1, self._first_s)
         span_s = last_s - begin_s
         summary = WindowSummary(
             arrival_s=self._arrival_s,
@@ -111,6 +115,6 @@ class Window:
             last=self._last,
             cells_v=self._cells.ravel(),
         )
-        self._before_s = last_s
+        self.before_s = last_s
         self._clear()
         return summary

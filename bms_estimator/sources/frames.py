@@ -4,23 +4,19 @@ import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import SAMPLE, CurrentSign, SampleBlock
 from bms_estimator.sources.protocol import DELIMITER, Ack, AckResult, Hello, MessageType, ProtocolError, unseal
+from bms_estimator.sources.text_line import PRINTABLE
 from bms_estimator.sources.wire.board_clock import clock_ppm
 from bms_estimator.sources.wire.framing import DECODER, HELLO_BYTES, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
 from bms_estimator.sources.wire.scaling import SCALING, reference
 
-CurrentSign = Literal["discharge_positive", "charge_positive"]
-
 DEAF_BYTES = 512
 """So many bytes without one whole frame, and the line itself is at fault: eight of the longest frames."""
-PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
-"""What printed lines are made of."""
 MOST_CLOCK_PPM = 20_000.0
 """No resonator is so far off: the host slept meanwhile, or the board is a simulated one in a hurry [1e-6]."""
 HELLO_FRAME_BYTES = HELLO_BYTES + 1

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import LEAST_C, MOST_C, SAMPLE, SampleBlock, forget_beyond
-from bms_estimator.sources.frames import CurrentSign
+from bms_estimator.model.sample import LEAST_C, MOST_C, SAMPLE, CurrentSign, SampleBlock, forget_beyond
 from bms_estimator.sources.number import measured
 
 BLOCK_ROWS = 65_536

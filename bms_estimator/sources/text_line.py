@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 from bms_estimator.sources.number import NUMBER, measured, number
 
+PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
+"""What printed lines are made of."""
+
 
 class Reading(NamedTuple):
     """What one line says."""

@@ -14,7 +14,7 @@ from typing import Any, Self, TypeVar
 import structlog
 
 from bms_estimator.store.disk_thread import DiskThread
-from bms_estimator.store.tables import NewerVersionError, OtherTablesError, migrate
+from bms_estimator.store.tables import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
 
 HANG_S = 10.0
 """A disk that has not answered by then is taken to hang [s]."""
@@ -54,6 +54,8 @@ class Database:
 
     Args:
         path: The file, made where it is not there.
+        tables: What makes its tables, as ``MIGRATIONS``.
+        sync_s: The first transaction after so long waits for the platter [s].
         hang_s: How long a transaction may take [s].
         retry_s: After a failure, before the disk is tried again [s].
 
@@ -61,7 +63,15 @@ class Database:
         reason: Why it cannot be used now; empty when it can.
     """
 
-    def __init__(self, path: Path, *, hang_s: float = HANG_S, retry_s: float = RETRY_S) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        tables: tuple[str, ...] = MIGRATIONS,
+        sync_s: float = SYNC_S,
+        hang_s: float = HANG_S,
+        retry_s: float = RETRY_S,
+    ) -> None:
         self.path, self.reason = path, ""
         self._hang_s, self._retry_s = hang_s, retry_s
         self._thread = DiskThread("database")
@@ -69,7 +79,7 @@ class Database:
         self._failed_s = -retry_s
         self._end_s = math.inf
         self._waits: set[asyncio.Timeout] = set()
-        self._file = _File(path)
+        self._file = _File(path, tables, sync_s)
 
     async def __aenter__(self) -> Self:
         """Nothing to open yet: the first transaction does."""
@@ -143,8 +153,8 @@ class Database:
 class _File:
     """The connection; all of it runs in the thread."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, tables: tuple[str, ...], sync_s: float) -> None:
+        self._path, self._tables, self._sync_s = path, tables, sync_s
         self._connection: sqlite3.Connection | None = None
         self._inode = (0, 0)
         self._ready = False  # tables are as they must be
@@ -174,7 +184,7 @@ class _File:
         """Open what is not open, close what has failed."""
         try:
             connection = self._opened()
-            due = time.monotonic() - self._synced_s >= SYNC_S
+            due = time.monotonic() - self._synced_s >= self._sync_s
             connection.execute(f"PRAGMA synchronous = {'FULL' if due else 'NORMAL'}")
             connection.execute("BEGIN IMMEDIATE")
             result = work(connection)
@@ -219,7 +229,7 @@ class _File:
         connection.execute("PRAGMA auto_vacuum = INCREMENTAL")  # of a new file
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute(f"PRAGMA journal_size_limit = {LOG_BYTES}")
-        migrate(connection)
+        migrate(connection, self._tables)
 
     def _refuse_planted(self, path: Path) -> None:
         """Put a link, or what is no file, out of the way: SQLite would write where it leads."""

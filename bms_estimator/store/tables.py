@@ -44,8 +44,12 @@ class OtherTablesError(Exception):
     """The tables are not those that were made."""
 
 
-def migrate(connection: sqlite3.Connection) -> None:
+def migrate(connection: sqlite3.Connection, migrations: tuple[str, ...] = MIGRATIONS) -> None:
     """Bring a database to this version; a new one is empty.
+
+    Args:
+        connection: To the database.
+        migrations: What makes its tables, as ``MIGRATIONS``.
 
     Raises:
         NewerVersionError: It is beyond this version.
@@ -53,11 +57,11 @@ def migrate(connection: sqlite3.Connection) -> None:
         sqlite3.Error: It cannot be read or written.
     """
     (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if version > len(MIGRATIONS):
-        raise NewerVersionError(f"version {version}, this program knows {len(MIGRATIONS)}")
-    for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
+    if version > len(migrations):
+        raise NewerVersionError(f"version {version}, this program knows {len(migrations)}")
+    for number, script in enumerate(migrations[version:], start=version + 1):
         connection.executescript(f"BEGIN IMMEDIATE; {script} PRAGMA user_version = {number}; COMMIT;")
-    if not _wanted() <= _tables(connection):
+    if not _wanted(migrations) <= _tables(connection):
         raise OtherTablesError("its tables are not those that were made")
 
 
@@ -66,7 +70,7 @@ def _tables(connection: sqlite3.Connection) -> frozenset[tuple[str, str]]:
 
 
 @functools.cache
-def _wanted() -> frozenset[tuple[str, str]]:
+def _wanted(migrations: tuple[str, ...]) -> frozenset[tuple[str, str]]:
     with contextlib.closing(sqlite3.connect(":memory:")) as connection:
-        connection.executescript("".join(MIGRATIONS))
+        connection.executescript("".join(migrations))
         return _tables(connection)

@@ -81,9 +81,9 @@ class Engine:
 
     def start(self, i: int, *, wait: bool = True) -> None:
         """Start node ``i`` as it was; return when it has what the others have."""
-        file = self._folder / f"n{i}.conf"
-        file.write_text(configuration(self.nodes[i]))
-        self._processes[i] = subprocess.Popen([BINARY, "-c", file, "-l", self.log(i)], stderr=subprocess.DEVNULL)
+        self.conf(i).write_text(configuration(self.nodes[i]))
+        with self.log(i).open("ab") as log:
+            self._processes[i] = subprocess.Popen([BINARY, "-c", self.conf(i)], stderr=log)
         if wait:
             self.wait_ready(i)
 
@@ -94,8 +94,11 @@ class Engine:
             process.wait(LONG_S)
 
     def accounts_changed(self, accounts: Accounts) -> None:
-        """Other claims, from the next start on."""
+        """Other claims, from the next start on, or the next reload of ``conf``."""
         self.nodes = [replace(node, accounts=accounts) for node in self.nodes]
+
+    def conf(self, i: int) -> Path:
+        return self._folder / f"n{i}.conf"
 
     def log(self, i: int) -> Path:
         return self._folder / f"n{i}.log"

@@ -35,11 +35,13 @@ async def nc(engine):
 
 async def test_only_what_differs_is_written_and_rows_go_only_when_asked(nc):
     values = {f"p{i}": LFP for i in range(2 * BATCH + 5)}
-    assert await write_bucket(nc, PACKS_BUCKET, values) == Written(new=len(values), changed=0, same=0, removed=0)
+    assert await write_bucket(nc, PACKS_BUCKET, values) == Written(len(values), 0, 0, 0, 0)
     assert await read_bucket(nc, PACKS_BUCKET) == values
     other = {"p0": LFP, "p1": b"{}", "more": LFP}
-    assert await write_bucket(nc, PACKS_BUCKET, other) == Written(new=1, changed=1, same=1, removed=0)
-    assert await write_bucket(nc, PACKS_BUCKET, other, remove=True) == Written(0, 0, 3, len(values) - 2)
+    assert await write_bucket(nc, PACKS_BUCKET, other) == Written(
+        new=1, changed=1, same=1, removed=0, left=len(values) - 2
+    )
+    assert await write_bucket(nc, PACKS_BUCKET, other, remove=True) == Written(0, 0, 3, len(values) - 2, 0)
     assert await read_bucket(nc, PACKS_BUCKET) == other
     await remove_keys(nc, PACKS_BUCKET, ["more"])
     assert (await read_bucket(nc, PACKS_BUCKET)).keys() == {"p0", "p1"}

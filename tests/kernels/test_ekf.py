@@ -325,6 +325,24 @@ def test_from_several_socs_to_one(drive) -> None:
     assert counts[-1] == 1
 
 
+def test_of_a_hypothesis_that_went_nothing_is_left(drive) -> None:
+    """Neither of those that others made superfluous nor, once the SOC is told, of all but one."""
+    estimator = start(drive)
+    f = estimator.record[0]["filter"]
+    rows = "mean", "covariance", "ln_weight", "minute_u", "ten_minutes_u", "fast_inflation", "slow_inflation"
+    counts = set()
+    for part in np.array_split(drive.samples[:600], 20):
+        estimator.run(part)
+        counts.add(int(f["count"]))
+        assert not any(f[name][f["count"] :].any() for name in rows)
+    assert len(counts) > 1
+    hypotheses.seed(f, estimator.settings_record[0]["filter"], 0.5, 0.2)
+    assert f["count"] == len(f["mean"])
+    estimator.set_soc(0.5)
+    assert f["count"] == 1
+    assert not any(f[name][1:].any() for name in rows)
+
+
 def test_an_soc_that_was_told_with_confidence_and_is_wrong_by_far_is_given_up(drive) -> None:
     """0.3 too low, known to 0.01: within ten minutes the truth is inside the band, and after twenty nearby."""
     estimator = start(drive)

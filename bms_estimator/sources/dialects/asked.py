@@ -6,9 +6,8 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from enum import Enum
 
-from bms_estimator.model.sample import LEAST_C, MOST_C
+from bms_estimator.model.sample import LEAST_C, MOST_C, CurrentSign
 from bms_estimator.sources.dialects.meter import MeterDialect
-from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
 PACE_S = 1.0

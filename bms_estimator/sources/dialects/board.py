@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import CurrentSign, SampleBlock
 from bms_estimator.sources.dialects import Command, Dialect
-from bms_estimator.sources.frames import CurrentSign, FrameDecoder
+from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.protocol import (
     AckResult,
     Hello,

@@ -12,8 +12,8 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.dialects.asked import FRESH_S, AskedDialect, Look
-from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
 PACK, STATUS, CELLS, PROBES = 0x90, 0x94, 0x95, 0x96

@@ -9,9 +9,9 @@ import re
 import struct
 from collections.abc import Sequence
 
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.dialects.asked import FRESH_S, AskedDialect, Look
 from bms_estimator.sources.dialects.meter import Beside
-from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
 BASIC, CELLS, NAME = 0x03, 0x04, 0x05

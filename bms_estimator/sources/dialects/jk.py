@@ -15,8 +15,8 @@ import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.dialects.asked import AskedDialect, Look
-from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
 OLD_START, START = b"\x4e\x57", b"\x55\xaa\xeb\x90"

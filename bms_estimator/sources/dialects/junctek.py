@@ -9,9 +9,9 @@ same line: its answers are as good.
 import math
 from collections.abc import Iterator
 
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.dialects.meter import MeterDialect
-from bms_estimator.sources.frames import PRINTABLE, CurrentSign
-from bms_estimator.sources.text_line import Reading
+from bms_estimator.sources.text_line import PRINTABLE, Reading
 
 ADDRESS = 1
 """As it is delivered."""

@@ -7,9 +7,17 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.sample import LEAST_C, LEAST_CELL_V, MOST_C, MOST_CELL_V, SAMPLE, SampleBlock, forget_beyond
+from bms_estimator.model.sample import (
+    LEAST_C,
+    LEAST_CELL_V,
+    MOST_C,
+    MOST_CELL_V,
+    SAMPLE,
+    CurrentSign,
+    SampleBlock,
+    forget_beyond,
+)
 from bms_estimator.sources.dialects import Dialect, cell_block
-from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
 

@@ -10,8 +10,8 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.dialects.meter import Beside, MeterDialect
-from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.text_line import Reading
 
 ROUND_S = 2.0

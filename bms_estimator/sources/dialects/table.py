@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 
 from bms_estimator.model.settings import SensorSettings
 from bms_estimator.sources.dialects import Dialect
-from bms_estimator.sources.dialects.board import BoardDialect
 from bms_estimator.sources.dialects.daly import DalyDialect
 from bms_estimator.sources.dialects.jbd import JbdDialect
 from bms_estimator.sources.dialects.jk import JkDialect
@@ -13,8 +12,16 @@ from bms_estimator.sources.dialects.pylontech import PylontechDialect
 from bms_estimator.sources.dialects.text import TextDialect
 from bms_estimator.sources.dialects.vedirect import VeDirectDialect
 
+
+def _board(sensor: SensorSettings) -> Dialect:
+    """Of the firmware, whose frames a kernel decodes: who has another device need not load any."""
+    from bms_estimator.sources.dialects.board import BoardDialect  # noqa: PLC0415 - as said above
+
+    return BoardDialect(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz)
+
+
 DIALECTS: Mapping[str, Callable[[SensorSettings], Dialect]] = {
-    "binary": lambda sensor: BoardDialect(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz),
+    "binary": _board,
     "text": lambda sensor: TextDialect(current_sign=sensor.current_sign),
     "vedirect": lambda sensor: VeDirectDialect(current_sign=sensor.current_sign),
     "junctek": lambda sensor: JunctekDialect(current_sign=sensor.current_sign),

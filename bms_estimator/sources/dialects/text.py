@@ -5,10 +5,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bms_estimator.model.sample import LEAST_C, LEAST_CELL_V, MOST_C, MOST_CELL_V, SAMPLE, SampleBlock, forget_beyond
+from bms_estimator.model.sample import (
+    LEAST_C,
+    LEAST_CELL_V,
+    MOST_C,
+    MOST_CELL_V,
+    SAMPLE,
+    CurrentSign,
+    SampleBlock,
+    forget_beyond,
+)
 from bms_estimator.sources.dialects import Dialect, cell_block
-from bms_estimator.sources.frames import PRINTABLE, CurrentSign
-from bms_estimator.sources.text_line import Reading, read_line
+from bms_estimator.sources.text_line import PRINTABLE, Reading, read_line
 from bms_estimator.sources.told_clock import ToldClock
 
 LINE_BYTES = 4096

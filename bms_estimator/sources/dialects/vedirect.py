@@ -10,8 +10,8 @@ import re
 from collections.abc import Iterator, Mapping
 from math import nan
 
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.dialects.meter import MeterDialect
-from bms_estimator.sources.frames import CurrentSign
 from bms_estimator.sources.number import number
 from bms_estimator.sources.text_line import Reading
 

@@ -1,0 +1,78 @@
+"""In which order a pack's blocks are taken, and what its edge is told: it follows from what came alone.
+
+An edge keeps each block until it is told that all before another one are safe, and sends again from the one that is
+awaited. So of what comes late, twice or too early nothing is needed.
+"""
+
+from enum import Enum
+
+import numpy as np
+
+from bms_estimator.fleet.block import Block
+from bms_estimator.fleet.pack_state import MOST_LOST
+from bms_estimator.fleet.subjects import Awaits
+
+TOLD_EACH = 10
+"""Blocks: so often an edge hears that those before are safe."""
+ASKED_EACH = 5
+"""Blocks that came too early: so often it hears again from where to send."""
+
+
+class Order(Enum):
+    """What a block is to the order of its pack."""
+
+    NEXT = "next"
+    RESENT = "resends"
+    """It was taken."""
+    AHEAD = "gaps"
+    """One before it is missing."""
+    FORMER_STORE = "former_store"
+    """Its store is earlier than the present one."""
+
+
+def judge(d: np.void, block: Block) -> Order:
+    """Where a block stands, with what its header tells.
+
+    Args:
+        d: The pack's record of DELIVERY; updated but for ``NEXT`` itself, which ``taken`` notes.
+        block: What came.
+    """
+    store, number = int(d["store"]), int(d["awaited"])
+    if block.store < store:
+        return Order.FORMER_STORE
+    if block.store > store:
+        d["store"], d["awaited"], d["ahead"], number = block.store, 1, 0, 1
+    if block.oldest > number:
+        d["lost_blocks"] = min(int(d["lost_blocks"]) + block.oldest - number, MOST_LOST)
+        d["awaited"], d["ahead"], number = block.oldest, 0, block.oldest
+    if block.number < number:
+        return Order.RESENT
+    if block.number > number:
+        d["ahead"] += 1
+        return Order.AHEAD
+    return Order.NEXT
+
+
+def taken(d: np.void) -> None:
+    """The block that was awaited is taken; ``d`` as in ``judge``."""
+    d["awaited"] += 1
+    d["blocks"] += 1
+    d["ahead"] = 0
+
+
+def answer(order: Order, d: np.void, block: Block, *, first: bool) -> Awaits | None:
+    """What the edge is told of a block.
+
+    Args:
+        order: What it was.
+        d: As in ``judge``, after the block.
+        block: What came.
+        first: Of this pack, since these partitions were taken over.
+    """
+    store, number = int(d["store"]), int(d["awaited"])
+    if order is Order.AHEAD:
+        due = first or int(d["ahead"]) % ASKED_EACH == 1
+        return Awaits(store=store, number=number, resend=True) if due else None
+    if first or block.number % TOLD_EACH == 0:
+        return Awaits(store=store, number=number, resend=False)
+    return None

@@ -1,0 +1,59 @@
+"""Samples gathered into blocks. Pure."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bms_estimator.model.sample import SampleBlock
+
+MOST_SAMPLES = 20_000
+"""Of a block: however little they can be packed, it is below the 1 MiB that a NATS server takes."""
+
+
+class Gathered(NamedTuple):
+    """Samples of a block, and when the last of them came."""
+
+    arrival_s: float
+    """Wall clock [s since 1970]."""
+    samples: SampleBlock
+
+
+class Gathering:
+    """Cuts what comes into blocks of a length.
+
+    Args:
+        block_s: A block's first sample and that of the next one are at least so far apart [s].
+        most: Samples of a block.
+    """
+
+    def __init__(self, block_s: float, most: int = MOST_SAMPLES) -> None:
+        self._block_s, self._most = block_s, most
+        self._parts: list[SampleBlock] = []
+        self._count, self._arrival_s, self._end_s = 0, 0.0, 0.0
+
+    def __len__(self) -> int:
+        """Samples of the block that is open."""
+        return self._count
+
+    def add(self, samples: SampleBlock, arrival_s: float) -> list[Gathered]:
+        """Take samples, in order of their times. Returns the blocks that they have ended."""
+        ended = []
+        while samples.size:
+            if not self._count:
+                self._end_s = float(samples["time_s"][0]) + self._block_s
+            fits = int(np.searchsorted(samples["time_s"], self._end_s))
+            part, samples = np.split(samples, [min(fits, self._most - self._count)])
+            self._parts.append(part)
+            self._count += part.size
+            self._arrival_s = arrival_s if part.size else self._arrival_s
+            if samples.size or self._count == self._most:
+                ended += self.cut()
+        return ended
+
+    def cut(self) -> list[Gathered]:
+        """End the block that is open; none where it has no samples."""
+        if not self._count:
+            return []
+        block = Gathered(self._arrival_s, np.concatenate(self._parts))
+        self._parts, self._count = [], 0
+        return [block]

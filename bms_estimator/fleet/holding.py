@@ -1,0 +1,300 @@
+"""One partition in the hands of a worker: taken over, stepped message by message, kept, given back.
+
+What its state becomes follows from the order of the stream alone. So it is enough to know up to which message a state
+goes: wherever messages may have gone to somebody else, or were lost on the way, they are read from the stream once more.
+"""
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from contextlib import aclosing
+from itertools import islice
+
+import structlog
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.errors import Error as NatsError
+
+from bms_estimator.fleet import subjects
+from bms_estimator.fleet.block import glance
+from bms_estimator.fleet.consumer import Given, PinnedConsumer
+from bms_estimator.fleet.keeping import Claim, FencedError, Keeping, Kept
+from bms_estimator.fleet.partition import Partition, Table, Taken
+from bms_estimator.fleet.reasons import reason
+from bms_estimator.fleet.stored import stored
+from bms_estimator.fleet.stream_reader import StreamError
+
+RETRY_S = 0.5
+"""Between two attempts at what the server does not do now [s]."""
+HOURS_AT_ONCE = 128
+"""Summaries that wait for the server's answer at a time."""
+TROUBLES = (NatsError, TimeoutError, StreamError)
+"""What may go wrong between us and the server: tried again."""
+
+log = structlog.get_logger(__name__)
+
+
+class Holding:
+    """A partition that this worker tries for, and has while the server gives its messages to nobody else.
+
+    Args:
+        nc: Connected.
+        number: Of the partition.
+        table: What each pack is.
+        keeping: Where checkpoints are.
+        inbox: As ``PinnedConsumer`` has it.
+
+    Attributes:
+        consumer: What asks for messages.
+        partition: The state; None: not taken over.
+        claim: That it is ours; None: it is not.
+        hours: Summaries that the server has not acknowledged yet: (id, pack, row).
+        lag_s: The longest since somebody last set it to None [s].
+        blocks: Taken here, as are ``samples``.
+        due_s: When a checkpoint is to be written, of a monotonic clock [s].
+        trouble: What does not work now; empty: nothing.
+    """
+
+    def __init__(self, nc: Client, number: int, table: Table, keeping: Keeping, inbox: str) -> None:
+        self._nc, self.number, self._table, self._keeping = nc, number, table, keeping
+        self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
+        self.partition: Partition | None = None
+        self.claim: Claim | None = None
+        self.hours: deque[tuple[str, str, bytes]] = deque()
+        self.lag_s: float | None = None
+        self.blocks = self.samples = 0
+        self.trouble, self.due_s = "", 0.0
+        self._pin = 0  # with which the state was made sure to be ours
+        self._whole = False  # nothing is missing between the state and the last message given
+        self._lost = False
+        self._news = asyncio.Event()
+        self._changing = asyncio.Lock()  # of state and claim
+        self._sending = asyncio.Lock()
+
+    @property
+    def kept(self) -> Kept | None:
+        """The last checkpoint."""
+        return self.claim.pointer.kept[0] if self.claim and self.claim.pointer.kept else None
+
+    def receive(self, message: Msg) -> None:
+        """Take what the server sends for this partition."""
+        if self.consumer.receive(message):
+            self._lost = True
+        self._news.set()
+
+    async def run(self) -> None:
+        """Take messages for ever."""
+        while True:
+            self._news.clear()
+            if self._lost:
+                await self._try(self._look)
+            given = await self.consumer.take()
+            if given is None:
+                await self._news.wait()
+            else:
+                await self._take(given)
+                await asyncio.sleep(0)  # each block takes its time, and heartbeats and requests must go out
+
+    async def save(self) -> None:
+        """Write a checkpoint, unless the last one is as new.
+
+        Raises:
+            nats.errors.Error: The server does not take it, or not in time: then the last one stands.
+        """
+        async with self._changing:
+            partition, claim = self.partition, self.claim
+            if partition is None or claim is None:
+                return
+            if self.kept and self.kept.sequence == partition.sequence:
+                return
+            snapshot = partition.snapshot()
+            await self.send_hours()  # those of what is in the checkpoint: nobody would make them again
+            try:
+                self.claim = await self._keeping.write(claim, snapshot.sequence, snapshot.chunks())
+            except FencedError as error:
+                self._fenced(error)
+
+    async def send_hours(self) -> None:
+        """Have the stream of summaries keep those that wait.
+
+        Raises:
+            nats.errors.Error: It does not, or not all of them: they still wait.
+        """
+        js = self._nc.jetstream()
+
+        async def send(message_id: str, pack: str, row: bytes) -> None:
+            await js.publish(subjects.hours(pack), row, headers={"Nats-Msg-Id": message_id})
+
+        async with self._sending:
+            while self.hours:
+                rows = list(islice(self.hours, HOURS_AT_ONCE))
+                await asyncio.gather(*(send(*row) for row in rows))
+                for row in rows:
+                    if self.hours and self.hours[0] is row:
+                        self.hours.popleft()
+
+    async def give_back(self) -> None:
+        """Write a checkpoint and let somebody else have the partition; ``run`` has ended."""
+        try:
+            await self.save()
+        except TROUBLES as error:
+            log.warning(
+                "given back without a checkpoint: who has it next reads the stream from the last one",
+                partition=self.number,
+                reason=reason(error),
+            )
+        try:
+            await self.consumer.unpin()
+        except TROUBLES as error:
+            log.warning("not given back: that takes its time", partition=self.number, reason=reason(error))
+
+    async def settings_changed(self, pack: str) -> None:
+        """A pack has other settings, or is known now."""
+        for taken in self.partition.settings_changed(pack) if self.partition else ():
+            self._add_hours(taken)
+            await self._publish(taken)
+
+    async def _take(self, given: Given) -> None:
+        """Take a message, after those before it; until that is done, or the partition somebody else's."""
+        while not await self._try(lambda: self._go_on_to(given)):
+            await asyncio.sleep(RETRY_S)
+            if not self.consumer.pinned:
+                self._whole = False
+                return
+        partition = self.partition
+        if partition is None or given.sequence <= partition.sequence:
+            return
+        self.lag_s = max(self.lag_s or 0.0, time.time() - glance(given.data)[1])
+        await self._publish(self._step(partition, given.pack, given.data, given.sequence))
+
+    async def _go_on_to(self, given: Given) -> None:
+        """Have the state of all messages before one that was given."""
+        partition = self.partition
+        if given.pin != self._pin or partition is None:
+            self._whole = False
+            async with self._changing:
+                partition = await self._take_over()
+            self._pin = given.pin
+        if not (self._whole and given.follows):
+            self._whole = False
+            await self._catch_up(partition, given.sequence)
+            self._whole = True
+
+    async def _take_over(self) -> Partition:
+        """Have a state that is ours, maybe an old one."""
+        partition = self.partition
+        if partition is None or self.claim is None or not await self._keeping.holds(self.claim):
+            claim = await self._keeping.claim(self.number)
+            kept = claim.pointer.kept
+            if partition is None or (kept and kept[0].sequence > partition.sequence):
+                partition = await self._restored(claim)
+            self.partition, self.claim = partition, claim
+        last = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
+        if partition.sequence > last:
+            log.warning(
+                "the stream ends before the checkpoint: it was made anew or has lost its end; it is read from its beginning",
+                partition=self.number,
+                stream=last,
+                checkpoint=partition.sequence,
+            )
+            partition.sequence = 0
+        return partition
+
+    async def _restored(self, claim: Claim) -> Partition:
+        async with aclosing(self._keeping.load(claim)) as checkpoints:
+            async for kept, data in checkpoints:
+                try:
+                    partition = Partition.restore(self.number, self._table, data)
+                except ValueError as error:
+                    log.warning(
+                        "a checkpoint cannot be used: going on from what was before",
+                        partition=self.number,
+                        object=kept.object,
+                        reason=str(error),
+                    )
+                else:
+                    log.info("taken over", partition=self.number, sequence=kept.sequence, bytes=len(data))
+                    return partition
+        log.info("taken over without a checkpoint: the stream is read from its beginning", partition=self.number)
+        return Partition(self.number, self._table)
+
+    async def _catch_up(self, partition: Partition, sequence: int) -> None:
+        """Take what the stream has before a message. Only the last that each pack's messages bring goes out."""
+        if partition.sequence + 1 >= sequence:
+            return
+        latest: dict[str, Taken] = {}
+        subject = subjects.kept(self.number)
+        messages = stored(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
+        async with aclosing(messages):
+            async for message in messages:
+                if message.sequence < sequence:
+                    pack = message.subject.rpartition(".")[2]
+                    taken = self._step(partition, pack, message.data, message.sequence)
+                    latest[pack] = _later(latest.get(pack), taken)
+                    await asyncio.sleep(0)
+        for taken in latest.values():
+            await self._publish(taken)
+
+    def _step(self, partition: Partition, pack: str, data: bytes, sequence: int) -> Taken:
+        try:
+            taken = partition.take(pack, data, sequence)
+        except Exception:  # a fault of ours with one pack, which would end one worker after the other
+            log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
+            taken = Taken(pack)
+        self.blocks += 1
+        self.samples += glance(data)[0]
+        self._add_hours(taken)
+        return taken
+
+    def _add_hours(self, taken: Taken) -> None:
+        self.hours.extend((message_id, taken.pack, row) for message_id, row in taken.hours)
+
+    async def _publish(self, taken: Taken) -> None:
+        """Publish what a message brought for edges and pages, unless the server is away: the next brings the like."""
+        if not self._nc.is_connected:
+            return
+        if taken.awaits is not None:
+            await self._nc.publish(subjects.awaits(taken.pack), taken.awaits.model_dump_json().encode())
+        for topic, payload in (("state", taken.state), ("parameters", taken.parameters)):
+            if payload is not None:
+                await self._nc.publish(subjects.published(taken.pack, topic), payload)
+
+    async def _look(self) -> None:
+        """The server has let our pin lapse: does the partition belong to somebody else now?"""
+        async with self._changing:
+            if self.claim and not await self._keeping.holds(self.claim):
+                self._fenced(FencedError(await self._keeping.owner(self.number)))
+        self._lost = False
+
+    def _fenced(self, error: FencedError) -> None:
+        log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
+        self.partition = self.claim = None
+        self._pin, self._whole = 0, False
+        self.hours.clear()  # who has the partition makes them from the last checkpoint on
+
+    async def _try(self, what: Callable[[], Awaitable[None]]) -> bool:
+        """Whether the server did it; says why not."""
+        try:
+            await what()
+        except FencedError as error:
+            self._fenced(error)
+            return False
+        except TROUBLES as error:
+            if (text := reason(error)) != self.trouble:
+                log.warning("waiting for the server", partition=self.number, reason=text)
+            self.trouble = text
+            return False
+        self.trouble = ""
+        return True
+
+
+def _later(before: Taken | None, taken: Taken) -> Taken:
+    """What is to go out of two messages of one pack."""
+    if before is None:
+        return taken
+    return taken._replace(
+        awaits=taken.awaits or before.awaits,
+        state=taken.state or before.state,
+        parameters=taken.parameters or before.parameters,
+    )

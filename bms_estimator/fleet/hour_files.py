@@ -1,0 +1,154 @@
+"""Hours of packs in Parquet files: ``date=YYYY-MM-DD/*.parquet``, written whole or not at all, and few.
+
+A file is written under a name that no question reads, brought to the disk, and renamed. The same row may stand in two of
+them: questions drop it. Needs pyarrow and duckdb.
+"""
+
+import os
+import uuid
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from datetime import UTC, date, datetime
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bms_estimator.fleet.hour_row import HOUR_S, Hour
+
+FOLDER = "date="
+BATCH, DAY, UNFINISHED = "batch-", "day-", ".part"
+"""What the names of files begin with that came as they are, and of those made of many; how one ends that is not whole."""
+MANY = 48
+"""A day of so many files becomes one though it is not over, or was one already."""
+ROW_GROUP = 100_000
+"""Rows that a question reads at least [rows]."""
+CLOSED_S = 2 * HOUR_S
+"""A day is closed so long after its end: most of what comes late has come [s]."""
+MEMORY = "500MB"
+"""A day of 100,000 packs has more bytes; DuckDB sorts it in parts."""
+_MAGIC = b"PAR1"
+
+
+def _column(annotation: object) -> pa.DataType:
+    """Seven digits are more than any of the values has; files are half as large."""
+    return pa.string() if annotation is str else pa.int32() if annotation is int else pa.float32()
+
+
+SCHEMA = pa.schema([(name, _column(field.annotation)) for name, field in Hour.model_fields.items()])
+
+
+def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
+    """Rows into a new file for each of their days; they are on the disk when this returns.
+
+    Args:
+        folder: Of the days; made where it is missing.
+        rows: In any order.
+
+    Returns:
+        The files.
+
+    Raises:
+        OSError: The disk takes them not; what is there is whole.
+    """
+    by_day: dict[date, list[Hour]] = defaultdict(list)
+    for row in rows:
+        by_day[datetime.fromtimestamp(row.hour * HOUR_S, UTC).date()].append(row)
+    return [_write_day(day_folder(folder, day), rows) for day, rows in by_day.items()]
+
+
+def day_folder(folder: Path, day: date) -> Path:
+    """Where the hours of a day are."""
+    return folder / f"{FOLDER}{day.isoformat()}"
+
+
+def _write_day(folder: Path, rows: Sequence[Hour]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{BATCH}{uuid.uuid4().hex}.parquet"
+    unfinished = path.with_name(f".{path.name}{UNFINISHED}")
+    table = pa.Table.from_pylist([row.model_dump() for row in rows], schema=SCHEMA)
+    pq.write_table(table, unfinished, compression="zstd")
+    _finish(unfinished, path)
+    return path
+
+
+def _finish(unfinished: Path, path: Path) -> None:
+    """Bring a file to the disk, then give it its name, which is there, too, after a power cut."""
+    _sync(unfinished)
+    unfinished.rename(path)
+    _sync(path.parent)
+    _sync(path.parent.parent)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def to_compact(folder: Path, now_s: float) -> list[Path]:
+    """Folders of days whose files should become one: closed for the first time, or of ``MANY`` files.
+
+    Args:
+        folder: Of the days.
+        now_s: Wall clock [s since 1970].
+    """
+    closed = datetime.fromtimestamp(now_s - CLOSED_S, UTC).date().isoformat()
+    found = []
+    for day in sorted(folder.glob(f"{FOLDER}*")):
+        files = sound_files(day)
+        first_time = day.name.removeprefix(FOLDER) < closed and not any(f.name.startswith(DAY) for f in files)
+        if len(files) >= MANY or (first_time and files):
+            found.append(day)
+    return found
+
+
+def compact(day: Path) -> Path:
+    """One file, sorted by pack and hour, each once, in the place of all that are whole; what was left unfinished goes.
+
+    Killed at any time it loses nothing: the old files go when the new one is on the disk.
+
+    Args:
+        day: Folder of a day.
+
+    Raises:
+        OSError: The disk takes it not.
+    """
+    files = sound_files(day)
+    path = day / f"{DAY}{uuid.uuid4().hex}.parquet"
+    unfinished = path.with_name(f".{path.name}{UNFINISHED}")
+    names = [str(file) for file in files]
+    with duckdb.connect(config={"memory_limit": MEMORY, "temp_directory": str(day / ".sorting")}) as base:
+        base.read_parquet(names, union_by_name=True, hive_partitioning=False).create_view("rows")
+        each_once = base.sql("SELECT DISTINCT ON (pack, hour) * FROM rows ORDER BY pack, hour")
+        each_once.write_parquet(str(unfinished), compression="zstd", row_group_size=ROW_GROUP)
+    _finish(unfinished, path)
+    for file in files:
+        file.unlink(missing_ok=True)
+    return path
+
+
+def remove_unfinished(folder: Path) -> None:
+    """What one that was killed has left; nobody else may write to ``folder`` now."""
+    for file in folder.glob(f"{FOLDER}*/.*{UNFINISHED}"):
+        file.unlink(missing_ok=True)
+
+
+def sound_files(day: Path) -> list[Path]:
+    """The files of a day that are whole, by name."""
+    return [file for file in sorted(day.glob("*.parquet")) if is_whole(file)]
+
+
+def is_whole(file: Path) -> bool:
+    """Whether a file has begin and end of Parquet; one that vanishes has not."""
+    try:
+        with file.open("rb") as opened:
+            if opened.read(4) != _MAGIC:
+                return False
+            opened.seek(-4, os.SEEK_END)
+            return opened.read(4) == _MAGIC
+    except OSError:
+        return False

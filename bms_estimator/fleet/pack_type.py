@@ -1,0 +1,86 @@
+"""Packs of one type: they share an estimator's settings, which take longer to make than a day's samples to estimate."""
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.checkpoint import pack_identity
+from bms_estimator.snapshot.flow import Flow, Meter
+
+MOST_TYPES = 256
+"""Of so many the settings are kept, 40 kB each; those of more are made again and again, 50 ms each."""
+Digest = tuple[int, int]
+"""The first 128 bits, as two words."""
+
+
+@dataclass(frozen=True)
+class PackType:
+    """What packs with the same settings have in common.
+
+    Attributes:
+        made_of: Digest of all that the estimator is made of; types with the same are the same.
+        meaning: Digest of what gives a state its meaning; under another it begins anew.
+        estimator: Works on the record of the partition.
+        meter: Counts for one pack after the other.
+        capacity_ah: Of the pack, rated; None of a fuel cell.
+    """
+
+    made_of: Digest
+    meaning: Digest = field(compare=False)
+    estimator: Estimator = field(compare=False)
+    meter: Meter = field(compare=False)
+    capacity_ah: float | None = field(compare=False)
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    made_of: Digest
+    settings: Settings = field(compare=False)
+    cell: PackModel = field(compare=False)
+
+
+def made_of(settings: Settings, cell: PackModel) -> Digest:
+    """Digest of all that a pack's estimator is made of."""
+    sensor = settings.sensor
+    parts = (
+        *(settings.observer, settings.identifier, settings.sampling, settings.pack.initial_soc, cell),
+        *(sensor.voltage_resolution_v, sensor.voltage_noise_v, sensor.current_sign),
+    )
+    return _digest(hashlib.sha256(repr(parts).encode()).digest())
+
+
+def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> PackType:
+    """The type of a pack with these settings.
+
+    Args:
+        settings: The pack's.
+        cell: The pack as one object (``CellModel.pack``).
+        record: What its estimator works on, shape (1,), dtype ESTIMATOR_STATE.
+    """
+    made = made_of(settings, cell)
+    estimator = _estimator(_Recipe(made, settings, cell)).on(record)
+    return PackType(
+        made_of=made,
+        meaning=_digest(bytes.fromhex(pack_identity(settings, cell))),
+        estimator=estimator,
+        meter=Meter(Flow(), float(estimator.settings["gap_s"][0])),
+        capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
+    )
+
+
+@lru_cache(maxsize=MOST_TYPES)
+def _estimator(recipe: _Recipe) -> Estimator:
+    """Of all partitions of a process."""
+    return estimator_of(recipe.settings, recipe.cell)
+
+
+def _digest(sha256: bytes) -> Digest:
+    return int.from_bytes(sha256[:8]), int.from_bytes(sha256[8:16])

@@ -1,0 +1,207 @@
+"""A partition: its packs' states, stepped block by block by the same kernel as everywhere.
+
+What a worker does follows from the stream's order and the table of packs alone: from any checkpoint on, the same blocks
+leave the same states to the last bit. No connection, no file; the only clock is for what is published.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.fleet.block import Block, BlockError, decode
+from bms_estimator.fleet.checkpoint import CheckpointError, Former, Snapshot, dtype_of, read_checkpoint
+from bms_estimator.fleet.delivery import Order, answer, judge, taken
+from bms_estimator.fleet.held import Held
+from bms_estimator.fleet.pack_state import Bench, Fields
+from bms_estimator.fleet.pack_type import PackType, pack_type
+from bms_estimator.fleet.stepping import Stepping
+from bms_estimator.fleet.subjects import Awaits
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.settings import PackSettings, Settings
+
+Table = Callable[[str], tuple[Settings, PackModel] | None]
+"""The settings of a pack, and the pack as one object; None: it is not known."""
+
+
+class Taken(NamedTuple):
+    """What came of a block.
+
+    Attributes:
+        pack: Whose.
+        awaits: For its edge.
+        state: Topic ``state``.
+        parameters: Topic ``parameters``.
+        hours: Finished hours: an id that is the same whoever makes the row, and the row.
+    """
+
+    pack: str
+    awaits: Awaits | None = None
+    state: bytes | None = None
+    parameters: bytes | None = None
+    hours: tuple[tuple[str, bytes], ...] = ()
+
+
+class Partition:
+    """The packs of one partition.
+
+    Args:
+        number: Of the partition.
+        table: The packs' settings.
+        wall: Wall clock, for what is published [s since 1970].
+
+    Attributes:
+        number: The same.
+        sequence: Of the last message that was taken; 0: none was.
+    """
+
+    def __init__(self, number: int, table: Table, *, wall: Callable[[], float] = time.time) -> None:
+        self.number, self.sequence = number, 0
+        self._table = table
+        self._counters: Counter[str] = Counter()
+        self._packs: dict[str, bytes] = {}
+        self._former: dict[str, Former] = {}
+        self._held = Held()
+        self._known: dict[str, tuple[PackType, PackSettings]] = {}
+        self._types: dict[PackType, PackType] = {}
+        self._greeted: set[str] = set()
+        self._bench = Bench()
+        self._stepping = Stepping(self._bench.record, self._counters, wall)
+
+    @classmethod
+    def restore(cls, number: int, table: Table, data: bytes, *, wall: Callable[[], float] = time.time) -> Self:
+        """Go on from a snapshot's bytes.
+
+        Raises:
+            CheckpointError: They are damaged, of another partition, or of a version that is not known.
+        """
+        found = read_checkpoint(data)
+        if found.number != number:
+            raise CheckpointError(f"the checkpoint is of partition {found.number}, not of {number}")
+        made = cls(number, table, wall=wall)
+        made.sequence = found.sequence
+        made._counters.update(found.counters)
+        made._packs.update(found.packs)
+        made._former.update(found.former)
+        for pack, blocks in found.held.items():
+            for held in blocks:
+                made._held.add(pack, held)
+        return made
+
+    def snapshot(self) -> Snapshot:
+        """The partition as it is now, whatever comes later; costs no more than a list of its packs."""
+        held = self._held.blocks()
+        return Snapshot(self.number, self.sequence, self.counters, dict(self._packs), dict(self._former), held)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """What came, and what became of it, since the partition began."""
+        return {**self._counters, "packs": len(self._packs) + len(self._former), "unknown": len(self._held)}
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Packs that sent something and that the table does not know."""
+        return tuple(self._held.blocks())
+
+    def state(self, pack: str) -> NDArray[np.void] | None:
+        """A copy of the record of a pack, shape (1,), dtype PACK_STATE; None where there is none of this version."""
+        packed = self._packs.get(pack)
+        if packed is None:
+            return None
+        self._bench.put(packed)
+        return self._bench.record.copy()
+
+    def take(self, pack: str, data: bytes, sequence: int) -> Taken:
+        """Take a message of the stream.
+
+        Args:
+            pack: From which.
+            data: A block, or what an edge sends for one: faults are counted by kind.
+            sequence: In the stream; one that was taken is not taken again.
+        """
+        if sequence <= self.sequence:
+            self._counters["repeated"] += 1
+            return Taken(pack)
+        self.sequence = sequence
+        try:
+            block = decode(data)
+        except BlockError:
+            self._counters["damaged"] += 1
+            return Taken(pack)
+        known = self._look_up(pack)
+        if known is None:
+            self._counters["held" if self._held.add(pack, data) else "not_held"] += 1
+            return Taken(pack)
+        if pack in self._held:
+            return _together(pack, [*self._release(pack, known), self._take(pack, block, *known)])
+        return self._take(pack, block, *known)
+
+    def settings_changed(self, pack: str) -> list[Taken]:
+        """Take the settings of a pack from the table anew, and what was held of it if it is known now."""
+        self._known.pop(pack, None)
+        known = self._look_up(pack)
+        return [] if known is None else self._release(pack, known)
+
+    def _look_up(self, pack: str) -> tuple[PackType, PackSettings] | None:
+        known = self._known.get(pack)
+        if known is None:
+            found = self._table(pack)
+            if found is None:
+                return None
+            settings, cell = found
+            made = pack_type(settings, cell, self._bench.record["estimator"])
+            known = self._known[pack] = self._types.setdefault(made, made), settings.pack
+        return known
+
+    def _release(self, pack: str, known: tuple[PackType, PackSettings]) -> list[Taken]:
+        return [self._take(pack, decode(data), *known) for data in self._held.release(pack)]
+
+    def _take(self, pack: str, block: Block, of_type: PackType, settings: PackSettings) -> Taken:
+        former = self._open(pack)
+        d = self._bench.delivery
+        lost = int(d["lost_blocks"])
+        order = judge(d, block)
+        lost = int(d["lost_blocks"]) - lost
+        made = Taken(pack)
+        if order is Order.NEXT:
+            self._bench.count_lost(lost)
+            self._stepping.settle(of_type, former, block)
+            made = Taken(pack, None, *self._stepping.step(block, of_type, settings))
+            taken(d)
+            self._former.pop(pack, None)
+        else:
+            self._counters[order.value] += 1
+        if order is Order.NEXT or former is None:  # what another version left stays as it is until a block is taken
+            self._counters["lost_blocks"] += lost
+            self._packs[pack] = self._bench.take()
+        first = pack not in self._greeted
+        self._greeted.add(pack)
+        return made._replace(awaits=answer(order, d, block, first=first))
+
+    def _open(self, pack: str) -> Fields | None:
+        """Lay a pack on the bench. Of one that another version left come its estimator's fields, which are not there yet."""
+        packed, former = self._packs.get(pack), self._former.get(pack)
+        try:
+            if packed is not None:
+                self._bench.put(packed)
+                return None
+            if former is not None:
+                return self._bench.put_former(dtype_of(former.layout), former.packed)
+        except ValueError:  # no checkpoint that was read can be so
+            self._counters["damaged_states"] += 1
+        self._bench.clear()
+        return None
+
+
+def _together(pack: str, made: list[Taken]) -> Taken:
+    """What came of several blocks, as of one."""
+    return Taken(
+        pack,
+        awaits=next((each.awaits for each in reversed(made) if each.awaits), None),
+        state=next((each.state for each in reversed(made) if each.state), None),
+        parameters=next((each.parameters for each in reversed(made) if each.parameters), None),
+        hours=tuple(row for each in made for row in each.hours),
+    )

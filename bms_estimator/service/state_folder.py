@@ -1,0 +1,33 @@
+"""Where a service keeps what outlives a restart."""
+
+import os
+from pathlib import Path
+
+import structlog
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.settings import Settings
+
+log = structlog.get_logger(__name__)
+
+
+def state_folder(settings: Settings) -> Path:
+    """Where checkpoints go: the folder of the settings, else systemd's StateDirectory, else the user's XDG state folder.
+
+    Made where it is not there; where it cannot be made, what is saved there later says so.
+
+    Raises:
+        UserError: The folder of the settings cannot be made.
+    """
+    systemd = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    home = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    folder = settings.state.folder or Path(systemd or f"{home}/bms-estimator")
+    try:
+        folder = folder.expanduser()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except (OSError, RuntimeError) as error:  # the latter of a user without a home
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        if settings.state.folder:
+            raise UserError(f"state.folder = {folder}: {reason}") from error
+        log.warning("the state cannot outlive a restart", folder=str(folder), reason=reason)
+    return folder

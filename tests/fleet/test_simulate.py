@@ -1,0 +1,76 @@
+"""Simulated edges against the real server: their blocks come into the stream, and again when a worker asks."""
+
+import asyncio
+from collections import Counter
+from pathlib import Path
+
+import nats
+import pytest
+
+from bms_estimator.fleet.block import decode
+from bms_estimator.fleet.simulate import Report, run_edges
+from bms_estimator.fleet.simulated_edges import SimulatedEdges
+from bms_estimator.fleet.simulated_fleet import SimulatedFleet
+from bms_estimator.fleet.streams import make_streams
+from bms_estimator.fleet.subjects import RAW_STREAM, Awaits, awaits
+from bms_estimator.model.settings import MqttSettings
+from tests.command_line import run
+from tests.fleet.engine import running
+from tests.patience import LONG_S
+
+PACKS, BLOCKS, AGAIN = 20, 4, 3
+
+
+async def sent(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]]]:
+    """Let the edges send; a worker asks one of them for its third block again as soon as it has seen the fourth."""
+    fleet = SimulatedFleet(PACKS, seed=3, begin_ns=1_700_000_000 * 10**9)
+    edges = SimulatedEdges(fleet, start_s=1.7e9, speed=1.0, last=BLOCKS)  # long ago: all of them are due
+    seen: Counter[tuple[str, int]] = Counter()
+    nc = await nats.connect(url)
+    await make_streams(nc, partitions=4)
+    coming = await nc.subscribe("p.*.raw.*")
+    stop = asyncio.Event()
+    sending = asyncio.create_task(
+        run_edges(fleet, edges, MqttSettings(url=mqtt), connections=2, stop=stop, said=str, quiet_s=LONG_S)
+    )
+    asks = Awaits(store=int(fleet.store[0]), number=AGAIN, resend=True).model_dump_json().encode()
+    while seen[fleet.names[0], AGAIN] < 2:
+        message = await coming.next_msg(timeout=LONG_S)
+        seen[message.subject.split(".")[3], decode(message.data).number] += 1
+        if seen.total() == PACKS * BLOCKS:
+            await nc.publish(awaits(fleet.names[0]), b"no answer")
+            await nc.publish(awaits(fleet.names[0]), asks)
+    stop.set()
+    report = await sending
+    assert (await nc.jetstream().stream_info(RAW_STREAM)).state.messages >= PACKS * BLOCKS + 1
+    await nc.close()
+    return report, seen
+
+
+def test_every_block_comes_into_the_stream_and_one_that_is_asked_for_comes_again(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=4) as engine:
+        report, seen = asyncio.run(sent(engine.url, f"mqtt://127.0.0.1:{engine.mqtt_port}"))
+    assert set(seen) == {(f"sim-{i:06d}", n) for i in range(PACKS) for n in range(1, BLOCKS + 1)}
+    assert seen["sim-000000", AGAIN] >= 2
+    assert (report.resends, report.unacknowledged) == (1, 0)
+    assert report.again >= 1
+
+
+def test_the_command_writes_table_and_truth_and_refuses_what_cannot_be(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    simulate = ("fleet", "simulate", "--packs", 4)
+    table, truth = tmp_path / "packs.csv", tmp_path / "truth.csv"
+    assert run(capsys, *simulate, "--table", table, "--truth", truth)[0] == 0
+    rows = table.read_text().splitlines()
+    assert rows[0].startswith("pack,cell,capacity_ah,series,parallel")
+    assert rows[1:3] == ["sim-000000,lfp,100.0,16,1,0.01,0.1,1", "sim-000001,nmc,10.0,14,2,0.01,0.05,1"]
+    assert len(truth.read_text().splitlines()) == 5
+    for arguments, said in (
+        ((), "--server mqtt://host:port"),
+        (("--server", "http://nowhere"), "--server http://nowhere"),
+        (("--table", tmp_path / "no" / "packs.csv"), "cannot be written"),
+        (("--prefix", "a b", "--table", table), "--prefix a b: only letters"),
+    ):
+        code, _, err = run(capsys, *simulate, *arguments)
+        assert (code, said in err) == (2, True), err
