@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.captures import Force, check_out
-from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server, connected
+from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.sinks.table import table_sink
@@ -73,6 +73,7 @@ async def fetched(pack: str, since_s: float, until_s: float, where: tuple[str, P
         UserError: It cannot be asked.
     """
     from bms_estimator.fleet.capture import fetch  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.one_question import connected  # noqa: PLC0415
 
     async with connected(*where) as nc:
         return await fetch(nc, pack, since_s=since_s, until_s=until_s)

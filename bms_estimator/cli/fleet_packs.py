@@ -9,9 +9,9 @@ from typing import Annotated
 import tomlkit
 import typer
 
-from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server, connected
+from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server, Where
 from bms_estimator.fleet.known_packs import KnownPacks
-from bms_estimator.fleet.pack_row import PackKind, settings_of
+from bms_estimator.fleet.pack_row import PackKind, model_key, settings_of
 from bms_estimator.fleet.pack_table import CELL_FILE, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.model.errors import UserError
@@ -40,10 +40,13 @@ def load(
 def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> None:
     """Print the table that the server has, as CSV that `load` reads; what is wrong with a row goes to stderr."""
     known = asyncio.run(known_packs((server, creds, ca)))
-    for pack in sorted(known):
+    kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackKind)}
+    of_each = {
+        model_key(kind): pack for pack, kind in reversed(kinds.items())
+    }  # one, whose cell stands for the others'
+    for pack in (*(pack for pack in sorted(known) if pack not in kinds), *of_each.values()):
         if reason := known.reason(pack):
             typer.echo(f"warning: {pack}: {reason}", err=True)
-    kinds = {pack: kind for pack in known if isinstance(kind := known.kind(pack), PackKind)}
     sys.stdout.writelines(table_lines(kinds))
 
 
@@ -107,13 +110,10 @@ def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:
         raise UserError(f"{', '.join(unknown)}: not in the table of packs; `fleet packs list` prints it")
 
 
-Where = tuple[str, Path | None, Path | None]
-"""Server, credentials, authority."""
-
-
 async def known_packs(where: Where) -> KnownPacks:
     """All that the server has of packs."""
-    from bms_estimator.fleet.pack_bucket import PackBucket  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.one_question import connected  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.pack_bucket import PackBucket  # noqa: PLC0415
 
     async with connected(*where) as nc:
         bucket = PackBucket(nc)
@@ -122,6 +122,7 @@ async def known_packs(where: Where) -> KnownPacks:
 
 
 async def _load(path: Path, read: PackTable, files: dict[str, str], where: Where, *, remove: bool) -> str:
+    from bms_estimator.fleet.one_question import connected  # noqa: PLC0415
     from bms_estimator.fleet.pack_bucket import read_bucket, write_bucket  # noqa: PLC0415
 
     async with connected(*where) as nc:
@@ -144,6 +145,7 @@ async def _load(path: Path, read: PackTable, files: dict[str, str], where: Where
 
 
 async def _remove(packs: set[str], where: Where) -> None:
+    from bms_estimator.fleet.one_question import connected  # noqa: PLC0415
     from bms_estimator.fleet.pack_bucket import read_bucket, remove_keys  # noqa: PLC0415
 
     async with connected(*where) as nc:

@@ -1,17 +1,9 @@
-"""What the commands have in common that ask the server of a fleet something and end."""
+"""Options that the commands have in common that ask the server of a fleet something and end."""
 
-import ssl
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-from bms_estimator.model.errors import UserError
-
-if TYPE_CHECKING:
-    from nats.aio.client import Client
 
 Server = Annotated[str, typer.Option(help="of the fleet, nats://host:port or tls://host:port; several with commas")]
 Creds = Annotated[
@@ -22,66 +14,5 @@ Ca = Annotated[
     typer.Option(help="certificate of who signed the server's; else those of the system", show_default=False),
 ]
 SERVER = "nats://127.0.0.1:4222"
-CONNECT_S, RETRY_S = 5, 0.1
-"""So long an answer of the server is waited for; between two attempts [s]."""
-
-
-@asynccontextmanager
-async def connected(server: str, creds: Path | None, ca: Path | None) -> AsyncIterator["Client"]:
-    """A connection that is not made again: what breaks it ends the command.
-
-    Raises:
-        UserError: Nobody answers there, or refuses; a file cannot be read; later, as a stream cannot be read.
-    """
-    import nats  # noqa: PLC0415 - optional
-    import nats.errors  # noqa: PLC0415
-
-    from bms_estimator.fleet.stream_reader import StreamError  # noqa: PLC0415
-
-    troubles = list[Exception]()
-
-    async def trouble(error: Exception) -> None:
-        troubles.append(error)
-
-    try:
-        nc = await nats.connect(
-            [url.strip() for url in server.split(",")],
-            user_credentials=_readable(creds) if creds is not None else None,
-            tls=_context(ca) if ca is not None else None,
-            allow_reconnect=False,
-            max_reconnect_attempts=1,  # of each server that cannot be reached
-            reconnect_time_wait=RETRY_S,
-            connect_timeout=CONNECT_S,
-            error_cb=trouble,
-        )
-    except (nats.errors.Error, OSError, ValueError) as error:
-        raise UserError(f"--server {server}: {_why(troubles[-1] if troubles else error)}") from None
-    try:
-        async with nc:
-            yield nc
-    except (StreamError, nats.errors.Error) as error:
-        raise UserError(f"--server {server}: {_why(error)}") from None
-
-
-def _readable(creds: Path) -> Path:
-    try:
-        creds.read_bytes()
-    except OSError as error:
-        raise UserError(f"--creds {creds}: cannot be read: {error.strerror}") from None
-    return creds
-
-
-def _context(ca: Path) -> ssl.SSLContext:
-    try:
-        return ssl.create_default_context(cafile=ca)
-    except OSError as error:  # that of TLS is one
-        raise UserError(f"--ca {ca}: {error.strerror or error}") from None
-
-
-def _why(error: Exception) -> str:
-    if isinstance(error, ConnectionRefusedError):
-        return "nobody listens there; start it with `bms-estimator fleet serve`"
-    if isinstance(error, TimeoutError):
-        return f"no answer within {CONNECT_S} s"
-    said = str(error).removeprefix("nats: ") or type(error).__name__
-    return f"{said}: give --creds" if "uthorization" in said else said
+Where = tuple[str, Path | None, Path | None]
+"""Server, credentials, authority."""

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bms_estimator.fleet.pack_state import PACK_STATE
+from bms_estimator.kernels.sparse import mirror_of
 
 FORMAT = 1
 CHUNK_BYTES = 1 << 20
@@ -60,6 +61,7 @@ def dtype_of(layout: str) -> np.dtype[Any]:
         raise ValueError(f"no layout of a record: {error}") from None
     if dtype.itemsize > _LONGEST_RECORD:
         raise ValueError(f"{dtype.itemsize} bytes: no layout of a pack's record")
+    mirror_of(dtype)  # refuses what is not made of whole words
     return dtype
 
 

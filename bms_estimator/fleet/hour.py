@@ -162,6 +162,7 @@ def _identified(estimator: Estimator) -> dict[str, object]:
         "soc_mean_std": float(f["soc_std"]),
         "capacity_ratio": capacity.value,
         "capacity_ratio_std": capacity.std,
+        "capacity_first_std": float(settings["filter"]["capacity_std"]),
         "current_offset_a": offset.value,
         "current_offset_std_a": offset.std,
         "r_s_ratio": r_s.value,

@@ -6,13 +6,13 @@ them: questions drop it. Needs pyarrow and duckdb.
 
 import os
 import uuid
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from datetime import UTC, date, datetime
 from pathlib import Path
 
 import duckdb
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
@@ -52,10 +52,13 @@ def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
     Raises:
         OSError: The disk takes them not; what is there is whole.
     """
-    by_day: dict[date, list[Hour]] = defaultdict(list)
-    for row in rows:
-        by_day[datetime.fromtimestamp(row.hour * HOUR_S, UTC).date()].append(row)
-    return [_write_day(day_folder(folder, day), rows) for day, rows in by_day.items()]
+    return write_table(folder, pa.Table.from_pylist([row.model_dump() for row in rows], schema=SCHEMA))
+
+
+def write_table(folder: Path, table: pa.Table) -> list[Path]:
+    """As ``write``, of columns as ``SCHEMA`` has them."""
+    days = pc.divide(table["hour"], 24)
+    return [_write_day(folder, int(day.as_py()), table.filter(pc.equal(days, day))) for day in pc.unique(days)]
 
 
 def day_folder(folder: Path, day: date) -> Path:
@@ -63,12 +66,13 @@ def day_folder(folder: Path, day: date) -> Path:
     return folder / f"{FOLDER}{day.isoformat()}"
 
 
-def _write_day(folder: Path, rows: Sequence[Hour]) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{BATCH}{uuid.uuid4().hex}.parquet"
+def _write_day(folder: Path, day: int, rows: pa.Table) -> Path:
+    """``day`` is in days since 1970."""
+    of_day = day_folder(folder, datetime.fromtimestamp(day * 24 * HOUR_S, UTC).date())
+    of_day.mkdir(parents=True, exist_ok=True)
+    path = of_day / f"{BATCH}{uuid.uuid4().hex}.parquet"
     unfinished = path.with_name(f".{path.name}{UNFINISHED}")
-    table = pa.Table.from_pylist([row.model_dump() for row in rows], schema=SCHEMA)
-    pq.write_table(table, unfinished, compression="zstd")
+    pq.write_table(rows, unfinished, compression="zstd")
     _finish(unfinished, path)
     return path
 

@@ -49,6 +49,7 @@ class Hour(Report):
     soc_mean_std: float | None = Field(description="of the mean of the cells in series alone, as the filter has it")
     capacity_ratio: float | None = Field(description="true over declared capacity")
     capacity_ratio_std: float | None
+    capacity_first_std: float | None = Field(description="of capacity_ratio, before any sample")
     current_offset_a: float | None = Field(description="what the current sensor shows at no current [A]")
     current_offset_std_a: float | None
     soc_capacity_correlation: Correlation | None = Field(description="of the errors of soc and ln(capacity_ratio)")

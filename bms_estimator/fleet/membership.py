@@ -1,19 +1,34 @@
 """Which worker tries for which partition: each computes the same from who has been heard of. Pure: the clock is a value.
 
-Rendezvous hashing (Thaler and Ravishankar, "A name-based mapping scheme for rendezvous", 1996): a partition belongs to the
-worker with the highest hash of the pair, so that one who joins or leaves moves no partition between two others. The
-workers need not agree at each moment: a partition is with whom the server has pinned it to.
+Rendezvous hashing (Thaler and Ravishankar, "A name-based mapping scheme for rendezvous", 1996) with bounded loads (Mirrokni,
+Thorup and Zadimoghaddam, "Consistent hashing with bounded loads", 2016): a partition belongs to the worker with the highest
+hash of the pair, unless that one has its fair number already; so few partitions move when somebody joins or leaves, and
+nobody has more than his part. The workers need not agree at each moment: a partition is with whom the server has pinned it
+to.
 """
 
-from collections.abc import Iterable
+import math
+from collections import Counter
+from collections.abc import Collection
 from hashlib import blake2b
 
 from bms_estimator.fleet.heartbeat import DEAD_S
 
 
-def owner(partition: int, workers: Iterable[str]) -> str:
-    """Which of some workers, one at least, is to have a partition."""
-    return max(workers, key=lambda worker: (blake2b(f"{partition} {worker}".encode(), digest_size=8).digest(), worker))
+def owners(partitions: int, workers: Collection[str]) -> list[str]:
+    """Which of some workers, one at least, is to have each of so many partitions."""
+    most = math.ceil(partitions / len(workers))
+    has = Counter[str]()
+    found = []
+    for number in range(partitions):
+        owner = max((each for each in workers if has[each] < most), key=lambda worker: _weight(number, worker))
+        has[owner] += 1
+        found.append(owner)
+    return found
+
+
+def _weight(partition: int, worker: str) -> tuple[bytes, str]:
+    return blake2b(f"{partition} {worker}".encode(), digest_size=8).digest(), worker
 
 
 class Members:
@@ -26,6 +41,8 @@ class Members:
     def __init__(self, me: str) -> None:
         self.me = me
         self._heard: dict[str, float] = {}
+        self._alive: list[str] = []
+        self._share: set[int] = set()
 
     def hear(self, worker: str, now_s: float, *, leaving: bool = False) -> bool:
         """Take a heartbeat, at ``now_s`` of a monotonic clock. Whether the worker is new."""
@@ -48,4 +65,7 @@ class Members:
     def share(self, partitions: int, now_s: float) -> set[int]:
         """Those of so many partitions that are ours to try for."""
         alive = self.alive(now_s)
-        return {number for number in range(partitions) if owner(number, alive) == self.me}
+        if alive != self._alive:
+            self._alive = alive
+            self._share = {number for number, owner in enumerate(owners(partitions, alive)) if owner == self.me}
+        return self._share

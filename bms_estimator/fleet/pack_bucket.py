@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import nats.errors
 import nats.js.errors
@@ -118,7 +119,7 @@ async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, 
     held = await read_bucket(nc, bucket)
     differing = {key: data for key, data in values.items() if held.get(key) != data}
     others = held.keys() - values.keys()
-    await _publish(nc, bucket, differing, {})
+    await put(nc, bucket, differing)
     if remove:
         await remove_keys(nc, bucket, others)
     new, removed = len(differing.keys() - held.keys()), len(others) if remove else 0
@@ -131,11 +132,17 @@ async def remove_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
     Raises:
         StreamError: The server does not answer, or refuses.
     """
-    await _publish(nc, bucket, dict.fromkeys(keys, b""), {"KV-Operation": "DEL"})
+    await put(nc, bucket, dict.fromkeys(keys, b""), {"KV-Operation": "DEL"})
 
 
-async def _publish(nc: Client, bucket: str, values: Mapping[str, bytes], headers: dict[str, str]) -> None:
-    """Write many at a time."""
+async def put(
+    nc: Client, bucket: str, values: Mapping[str, bytes], headers: Mapping[str, str] = MappingProxyType({})
+) -> None:
+    """Write values by key, many at a time.
+
+    Raises:
+        StreamError: The server does not answer, or refuses.
+    """
     js, entries = nc.jetstream(), list(values.items())
     try:
         for first in range(0, len(entries), AT_ONCE):

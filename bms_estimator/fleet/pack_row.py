@@ -18,7 +18,6 @@ from bms_estimator.model.cell import (
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
 from bms_estimator.model.settings import (
-    DEVICE_NAME,
     DeviceName,
     Fraction,
     NotNegative,
@@ -30,13 +29,15 @@ from bms_estimator.model.settings import (
 from bms_estimator.model.toml_file import Strict, parse_toml
 
 Protocol = Literal["text", "jbd", "daly", "jk", "vedirect", "junctek", "pylontech"]
+CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
+"""Of a cell; one of a pack has more in it than the pack's."""
 _COUNT = Field(ge=1, le=10_000)
 
 
 class PackKind(Strict):
     """What packs have in common that differ by their names alone; as ``[pack]`` and ``[sensor]`` of a pack's file."""
 
-    cell: Annotated[str, Field(pattern=DEVICE_NAME)] = Field(
+    cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
         description="lfp, nmc, nca, lco, lmo, lto: generic, give capacity_ah; else a shipped cell's name, or a cell "
         "file's beside the table, which must end in .toml"
     )
@@ -121,6 +122,11 @@ def model_of(kind: PackKind, cell_file: str | None) -> PackModel:
         UserError: There is no such cell, or a value in it that is not allowed; a capacity that is missing or cannot be.
     """
     return cell_of(kind, cell_file).pack(kind.series, kind.parallel)
+
+
+def model_key(kind: PackKind) -> tuple[object, ...]:
+    """Kinds with the same one have a model all of them, or none of them has."""
+    return kind.cell, kind.capacity_ah is None, kind.series, kind.parallel
 
 
 def cell_of(kind: PackKind, cell_file: str | None) -> PackModel:

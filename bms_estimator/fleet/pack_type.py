@@ -11,7 +11,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.settings import PackSettings, Settings
 from bms_estimator.service.checkpoint import pack_identity
 from bms_estimator.snapshot.flow import Flow, Meter
 
@@ -21,23 +21,25 @@ Digest = tuple[int, int]
 """The first 128 bits, as two words."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PackType:
     """What packs with the same settings have in common.
 
     Attributes:
-        made_of: Digest of all that the estimator is made of; types with the same are the same.
+        settings: Of the packs, but for the name.
+        made_of: Digest of all that the estimator is made of.
         meaning: Digest of what gives a state its meaning; under another it begins anew.
         estimator: Works on the record of the partition.
         meter: Counts for one pack after the other.
         capacity_ah: Of the pack, rated; None of a fuel cell.
     """
 
+    settings: PackSettings
     made_of: Digest
-    meaning: Digest = field(compare=False)
-    estimator: Estimator = field(compare=False)
-    meter: Meter = field(compare=False)
-    capacity_ah: float | None = field(compare=False)
+    meaning: Digest
+    estimator: Estimator
+    meter: Meter
+    capacity_ah: float | None
 
 
 @dataclass(frozen=True)
@@ -57,21 +59,48 @@ def made_of(settings: Settings, cell: PackModel) -> Digest:
     return _digest(hashlib.sha256(repr(parts).encode()).digest())
 
 
+class PackTypes:
+    """The types of a partition's packs.
+
+    Args:
+        record: What their estimators work on, shape (1,), dtype PACK_STATE.
+    """
+
+    def __init__(self, record: NDArray[np.void]) -> None:
+        self._record = record
+        self._known: dict[tuple[int, int], tuple[Settings, PackModel, PackType]] = {}
+
+    def of(self, settings: Settings, cell: PackModel) -> PackType:
+        """The type of packs with these settings: that of the same two objects is made once.
+
+        Args:
+            settings: Of the packs.
+            cell: A pack as one object (``CellModel.pack``).
+        """
+        key = id(settings), id(cell)
+        if key not in self._known:
+            if len(self._known) >= MOST_TYPES:
+                self._known.clear()
+            self._known[key] = settings, cell, pack_type(settings, cell, self._record)
+        return self._known[key][2]
+
+
 def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> PackType:
     """The type of a pack with these settings.
 
     Args:
         settings: The pack's.
         cell: The pack as one object (``CellModel.pack``).
-        record: What its estimator works on, shape (1,), dtype ESTIMATOR_STATE.
+        record: What its estimator and meter work on, shape (1,), dtype PACK_STATE.
     """
     made = made_of(settings, cell)
-    estimator = _estimator(_Recipe(made, settings, cell)).on(record)
+    estimator = _estimator(_Recipe(made, settings, cell)).on(record["estimator"])
     return PackType(
+        settings=settings.pack,
         made_of=made,
         meaning=_digest(bytes.fromhex(pack_identity(settings, cell))),
         estimator=estimator,
-        meter=Meter(Flow(), float(estimator.settings["gap_s"][0])),
+        meter=Meter(Flow(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
     )
 

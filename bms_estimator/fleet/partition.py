@@ -17,11 +17,11 @@ from bms_estimator.fleet.checkpoint import CheckpointError, Former, Snapshot, dt
 from bms_estimator.fleet.delivery import Order, answer, judge, taken
 from bms_estimator.fleet.held import Held
 from bms_estimator.fleet.pack_state import Bench, Fields
-from bms_estimator.fleet.pack_type import PackType, pack_type
+from bms_estimator.fleet.pack_type import PackType, PackTypes
 from bms_estimator.fleet.stepping import Stepping
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import PackSettings, Settings
+from bms_estimator.model.settings import Settings
 
 Table = Callable[[str], tuple[Settings, PackModel] | None]
 """The settings of a pack, and the pack as one object; None: it is not known."""
@@ -65,10 +65,10 @@ class Partition:
         self._packs: dict[str, bytes] = {}
         self._former: dict[str, Former] = {}
         self._held = Held()
-        self._known: dict[str, tuple[PackType, PackSettings]] = {}
-        self._types: dict[PackType, PackType] = {}
+        self._known: dict[str, PackType] = {}
         self._greeted: set[str] = set()
         self._bench = Bench()
+        self._types = PackTypes(self._bench.record)
         self._stepping = Stepping(self._bench.record, self._counters, wall)
 
     @classmethod
@@ -94,7 +94,7 @@ class Partition:
     def snapshot(self) -> Snapshot:
         """The partition as it is now, whatever comes later; costs no more than a list of its packs."""
         held = self._held.blocks()
-        return Snapshot(self.number, self.sequence, self.counters, dict(self._packs), dict(self._former), held)
+        return Snapshot(self.number, self.sequence, dict(self._counters), dict(self._packs), dict(self._former), held)
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -136,8 +136,8 @@ class Partition:
             self._counters["held" if self._held.add(pack, data) else "not_held"] += 1
             return Taken(pack)
         if pack in self._held:
-            return _together(pack, [*self._release(pack, known), self._take(pack, block, *known)])
-        return self._take(pack, block, *known)
+            return _together(pack, [*self._release(pack, known), self._take(pack, block, known)])
+        return self._take(pack, block, known)
 
     def settings_changed(self, pack: str) -> list[Taken]:
         """Take the settings of a pack from the table anew, and what was held of it if it is known now."""
@@ -145,31 +145,28 @@ class Partition:
         known = self._look_up(pack)
         return [] if known is None else self._release(pack, known)
 
-    def _look_up(self, pack: str) -> tuple[PackType, PackSettings] | None:
+    def _look_up(self, pack: str) -> PackType | None:
         known = self._known.get(pack)
         if known is None:
             found = self._table(pack)
             if found is None:
                 return None
-            settings, cell = found
-            made = pack_type(settings, cell, self._bench.record["estimator"])
-            known = self._known[pack] = self._types.setdefault(made, made), settings.pack
+            known = self._known[pack] = self._types.of(*found)
         return known
 
-    def _release(self, pack: str, known: tuple[PackType, PackSettings]) -> list[Taken]:
-        return [self._take(pack, decode(data), *known) for data in self._held.release(pack)]
+    def _release(self, pack: str, known: PackType) -> list[Taken]:
+        return [self._take(pack, decode(data), known) for data in self._held.release(pack)]
 
-    def _take(self, pack: str, block: Block, of_type: PackType, settings: PackSettings) -> Taken:
+    def _take(self, pack: str, block: Block, of_type: PackType) -> Taken:
         former = self._open(pack)
         d = self._bench.delivery
         lost = int(d["lost_blocks"])
         order = judge(d, block)
         lost = int(d["lost_blocks"]) - lost
+        self._bench.count_lost(lost)
         made = Taken(pack)
         if order is Order.NEXT:
-            self._bench.count_lost(lost)
-            self._stepping.settle(of_type, former, block)
-            made = Taken(pack, None, *self._stepping.step(block, of_type, settings))
+            made = Taken(pack, None, *self._stepping.step(pack, block, of_type, former))
             taken(d)
             self._former.pop(pack, None)
         else:

@@ -1,6 +1,6 @@
-"""A nats-server as a child: started, waited for, given its streams, told what we are told, outlived by nobody.
+"""A nats-server as a child: started, waited for, given its streams, told what signals tell us.
 
-It is not started again: systemd does that, or who has started us.
+It is not started again, and only systemd ends it where we are killed: that is the work of who has started us.
 """
 
 import asyncio
@@ -27,7 +27,8 @@ from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.fleet.streams import make_streams
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fleet_settings import FleetSettings, TenantSettings, reachable
+from bms_estimator.model.fleet_settings import FleetSettings, TenantSettings, TlsSettings, reachable
+from bms_estimator.sinks.credential import credential
 from bms_estimator.store.private_file import write_private
 
 log = structlog.get_logger(__name__)
@@ -110,12 +111,38 @@ def node_of(place: Place, told: Told) -> Node:
         mqtt=server.mqtt,
         monitor=server.monitor,
         cluster=Cluster(_heard(own), place.nodes) if place.nodes else None,
-        tls=Tls(tls.cert_file, tls.key_file, tls.ca_file) if tls else None,
+        tls=_tls(tls) if tls else None,
         accounts=told.accounts,
         partitions=server.partitions,
         disk_bytes=None if server.disk_gb is None else round(credentials.GB * server.disk_gb),
         sync_s=server.sync_s or None,
     )
+
+
+def _tls(settings: TlsSettings) -> Tls:
+    return Tls(
+        credential(settings.cert_file).absolute(),
+        credential(settings.key_file).absolute(),
+        credential(settings.ca_file).absolute() if settings.ca_file else None,
+    )
+
+
+def _check(tls: Tls) -> None:
+    """Say what the server would say in its own words, and end with a code that stands for a fault.
+
+    Raises:
+        UserError: A file cannot be read, or key and certificate are not of each other.
+    """
+    for name, path in (("cert_file", tls.cert), ("key_file", tls.key), ("ca_file", tls.ca)):
+        try:
+            if path:
+                path.open("rb").close()
+        except OSError as error:
+            raise UserError(f"tls.{name} = {path}: cannot be read: {error.strerror}") from None
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(tls.cert, tls.key)
+    except ssl.SSLError as error:
+        raise UserError(f"tls.cert_file = {tls.cert}, tls.key_file = {tls.key}: {error.reason or error}") from None
 
 
 async def serve(place: Place, read: Callable[[], Told], say: Callable[[str], None]) -> int:
@@ -133,10 +160,13 @@ async def serve(place: Place, read: Callable[[], Told], say: Callable[[str], Non
         UserError: There is no server that will do, settings cannot be, or it refuses the streams.
     """
     binary, told = find_server(), read()
-    _write(place.folder / CONFIGURATION, configuration(node_of(place, told)))
+    node = node_of(place, told)
+    if node.tls:
+        _check(node.tls)
+    _write(place.folder / CONFIGURATION, configuration(node))
     async with _running(binary, place.folder / CONFIGURATION) as (process, asked_to_end):
         ended = asyncio.create_task(process.wait())
-        made = asyncio.create_task(_make_ready(place, told, say))
+        made = asyncio.create_task(_make_ready(place, told, process.pid, say))
         reloading = asyncio.create_task(_reload_on_signal(place, read, process, made, say))
         try:
             await asyncio.wait((ended, made), return_when=asyncio.FIRST_COMPLETED)
@@ -184,7 +214,9 @@ async def _reload_on_signal(
 @contextlib.asynccontextmanager
 async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subprocess.Process, asyncio.Event]]:
     """The server as a child, which ends with us, and whether a signal has asked it to."""
-    process = await asyncio.create_subprocess_exec(binary, "-c", file)
+    for left in file.parent.glob("*.ports"):  # of one that was killed
+        left.unlink()
+    process = await asyncio.create_subprocess_exec(binary, "-c", file, "--ports_file_dir", file.parent)
     asked, loop = asyncio.Event(), asyncio.get_running_loop()
 
     def pass_on(number: signal.Signals) -> None:
@@ -204,10 +236,14 @@ async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subp
             loop.remove_signal_handler(number)
 
 
-async def _make_ready(place: Place, told: Told, say: Callable[[str], None]) -> None:
-    """Wait for the server, say where it is, then for a quorum, and make the streams of all tenants."""
+async def _make_ready(place: Place, told: Told, pid: int, say: Callable[[str], None]) -> None:
+    """Wait for the server, say where it is, then for a quorum, and make the streams of all tenants.
+
+    Not any server that answers is ours: it writes a file with its number once it listens, and then has its ports.
+    """
     node = node_of(place, told)
-    await _wait(node, "healthz", _listens)
+    while not list(place.folder.glob(f"*_{pid}.ports")):  # noqa: ASYNC110 - it has no other way to tell
+        await asyncio.sleep(ASK_AGAIN_S)
     secure = "s" if node.tls else ""
     say(f"edges: mqtt{secure}://{node.mqtt}  workers: {_scheme(node)}://{node.nats}  monitor: http://{node.monitor}")
     if node.cluster:
@@ -268,11 +304,6 @@ def _own_certificate(tls: Tls) -> ssl.SSLContext:
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
     context.check_hostname = False
     return context
-
-
-def _listens(health: Mapping[str, object]) -> bool:
-    """Whether clients are heard; in a cluster there may be no leader yet."""
-    return "status" in health
 
 
 def _has_streams(health: Mapping[str, object]) -> bool:

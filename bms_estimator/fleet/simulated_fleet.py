@@ -228,8 +228,8 @@ class SimulatedFleet:
     def _dice(self, packs: Whole, what: int, index: Whole | int = 0) -> Floats:
         """Numbers in [0, 1) that follow from seed, pack, ``what`` and ``index`` alone."""
         key = _mixed(np.asarray(packs, dtype=np.uint64) + (self._salt << np.uint64(32)) + np.uint64(what << 56))
-        dice: Floats = (_mixed(key + np.asarray(index).astype(np.uint64)) >> np.uint64(11)) * 2.0**-53
-        return dice
+        bits = _mixed(key + np.asarray(index).astype(np.uint64)) >> np.uint64(11)
+        return bits.astype(np.float64) * 2.0**-53
 
 
 def _mixed(bits: Bits) -> Bits:

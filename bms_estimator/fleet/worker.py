@@ -132,6 +132,7 @@ class Worker:
         self._renewed_s = time.monotonic()
         self._blocks = self._samples = 0  # of partitions that were given back
         self._leaving = False
+        self._turn = asyncio.Lock()
         self._few = asyncio.Semaphore(AT_ONCE)
         self._told: set[str] = set()
 
@@ -237,7 +238,7 @@ class Worker:
                 await holding.consumer.renew()
 
     def _try_for(self, number: int, now_s: float) -> None:
-        holding = Holding(self._nc, number, self._bucket.packs, self._keeping, self._inbox)
+        holding = Holding(self._nc, number, self._bucket.packs, self._keeping, self._inbox, self._turn)
         holding.due_s = now_s + self._options.checkpoint_s * (number + 1) / self._partitions
         self._held[number] = holding, asyncio.create_task(holding.run())
 

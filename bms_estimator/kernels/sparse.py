@@ -18,6 +18,8 @@ Words = NDArray[np.uint64]
 Mirror = NDArray[np.int32]
 """Shape (words of a record,): which word each is likely to equal, an earlier one; -1: 0."""
 WORD_BYTES, WORD_BITS = 8, 64
+_WORDS = "f8", "i8", "u8"
+"""What a word may be."""
 
 
 @lru_cache(maxsize=64)
@@ -56,7 +58,7 @@ def _fields(dtype: np.dtype[Any], offset: int) -> Iterator[tuple[int, tuple[int,
         field, at = dtype.fields[name][:2]  # type: ignore[index]
         if field.names:
             yield from _fields(field, offset + at)
-        elif field.base.names or field.base.itemsize != WORD_BYTES or (offset + at) % WORD_BYTES:
+        elif field.base.str[1:] not in _WORDS or (offset + at) % WORD_BYTES:
             raise ValueError(f"{name}: {field} at {offset + at} cannot be taken word by word")
         else:
             yield (offset + at) // WORD_BYTES, field.shape

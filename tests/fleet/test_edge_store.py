@@ -40,9 +40,10 @@ def gathered(at_s: float, count: int = 5) -> Gathered:
 
 @contextlib.asynccontextmanager
 async def opened(path: Path, most_bytes: int = FAR, wall_s: float = WALL_S) -> AsyncIterator[EdgeStore]:
-    async with Database(path, tables=EDGE_TABLES, sync_s=0.0, retry_s=0.0) as database:
-        async with EdgeStore(database, "raw/pack", most_bytes, wall=lambda: wall_s, resend_s=0.0) as store:
-            yield store
+    database = Database(path, tables=EDGE_TABLES, sync_s=0.0, retry_s=0.0)
+    store = EdgeStore(database, "raw/pack", most_bytes, wall=lambda: wall_s, resend_s=0.0)
+    async with database, store:
+        yield store
 
 
 async def until(condition) -> None:
@@ -244,7 +245,7 @@ async def test_a_full_disk_has_blocks_wait_in_memory_without_a_number(full_disk:
         await until(lambda: store._database.reason)
         assert (store.kept, store.waiting) == (3, 3)
         (full_disk / "file").unlink()
-        subprocess.run(["mount", "-o", "remount,size=10m", full_disk], check=True)
+        await asyncio.to_thread(subprocess.run, ["mount", "-o", "remount,size=10m", full_disk], check=True)
         blocks = await handed_out(store, 3)
         assert numbers(blocks) == [1, 2, 3]
 

@@ -1,0 +1,72 @@
+"""A connection for one question to the server: what is wrong with it is said at once."""
+
+import ssl
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import nats
+import nats.errors
+from nats.aio.client import Client
+
+from bms_estimator.fleet.stream_reader import StreamError
+from bms_estimator.model.errors import UserError
+
+CONNECT_S, RETRY_S = 5, 0.1
+"""So long an answer of the server is waited for; between two attempts [s]."""
+
+
+@asynccontextmanager
+async def connected(server: str, creds: Path | None = None, ca: Path | None = None) -> AsyncIterator[Client]:
+    """A connection that is not made again: what breaks it ends the command.
+
+    Raises:
+        UserError: Nobody answers there, or refuses; a file cannot be read; later, as a stream cannot be read.
+    """
+    troubles = list[Exception]()
+
+    async def trouble(error: Exception) -> None:
+        troubles.append(error)
+
+    try:
+        nc = await nats.connect(
+            [url.strip() for url in server.split(",")],
+            user_credentials=_readable(creds) if creds is not None else None,
+            tls=_context(ca) if ca is not None else None,
+            allow_reconnect=False,
+            max_reconnect_attempts=1,  # of each server that cannot be reached
+            reconnect_time_wait=RETRY_S,
+            connect_timeout=CONNECT_S,
+            error_cb=trouble,
+        )
+    except (nats.errors.Error, OSError, ValueError) as error:
+        raise UserError(f"--server {server}: {_why(troubles[-1] if troubles else error)}") from None
+    try:
+        async with nc:
+            yield nc
+    except (StreamError, nats.errors.Error) as error:
+        raise UserError(f"--server {server}: {_why(error)}") from None
+
+
+def _readable(creds: Path) -> Path:
+    try:
+        creds.read_bytes()
+    except OSError as error:
+        raise UserError(f"--creds {creds}: cannot be read: {error.strerror}") from None
+    return creds
+
+
+def _context(ca: Path) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=ca)
+    except OSError as error:  # that of TLS is one
+        raise UserError(f"--ca {ca}: {error.strerror or error}") from None
+
+
+def _why(error: Exception) -> str:
+    if isinstance(error, ConnectionRefusedError):
+        return "nobody listens there; start it with `bms-estimator fleet serve`"
+    if isinstance(error, TimeoutError):
+        return f"no answer within {CONNECT_S} s"
+    said = str(error).removeprefix("nats: ") or type(error).__name__
+    return f"{said}: give --creds" if "uthorization" in said else said

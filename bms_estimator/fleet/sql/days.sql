@@ -1,0 +1,26 @@
+-- A day of a pack in one row: what was known at its end, what was measured in it. std as variances of logarithms.
+CREATE TEMP TABLE days AS
+SELECT
+    pack,
+    hour // 24 AS day,
+    any_value(cell) AS cell,
+    any_value(series) AS series,
+    any_value(parallel) AS parallel,
+    any_value(capacity_ah) AS capacity_ah,
+    max(hour) AS last_hour,
+    ln(arg_max(capacity_ratio, hour)) AS ln_capacity,
+    arg_max((capacity_ratio_std / capacity_ratio) ^ 2, hour)::DOUBLE AS capacity_variance,
+    arg_max(capacity_first_std ^ 2, hour)::DOUBLE AS capacity_first_variance,
+    sum((charge_out_ah + charge_in_ah) / capacity_ah) AS through,
+    -- R_s where data have told of it; hours of a day are not independent: their mean is no surer than the surest
+    sum(ln(r_s_ratio) / (r_s_ratio_std / r_s_ratio) ^ 2) FILTER (r_s_unlearned_s < $r_s_fresh_s)
+        / sum(1 / (r_s_ratio_std / r_s_ratio) ^ 2) FILTER (r_s_unlearned_s < $r_s_fresh_s) AS ln_r_s,
+    min((r_s_ratio_std / r_s_ratio) ^ 2) FILTER (r_s_unlearned_s < $r_s_fresh_s)::DOUBLE AS r_s_variance,
+    min(stability_margin_min)::DOUBLE AS margin,
+    avg(temperature_c) AS temperature_c,
+    sum(samples) AS samples,
+    arg_max(suspects, hour) AS suspects,
+    arg_max(soc, hour) AS soc,
+    arg_max(soc_std, hour) AS soc_std
+FROM hours
+GROUP BY pack, day

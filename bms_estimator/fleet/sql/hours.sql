@@ -1,0 +1,8 @@
+-- Each hour of each pack once, with the time of its begin. Needs: once, maybe_twice, all_columns.
+CREATE TEMP VIEW hours AS
+SELECT *, make_timestamp(hour * 3600000000::BIGINT) AS time
+FROM (
+    SELECT * FROM all_columns
+    UNION ALL BY NAME SELECT * FROM once
+    UNION ALL BY NAME SELECT DISTINCT ON (pack, hour) * FROM maybe_twice
+)

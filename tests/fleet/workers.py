@@ -1,0 +1,174 @@
+"""Workers of a fleet as processes, what edges send them, and what is left of it in the end."""
+
+import asyncio
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from contextlib import aclosing, suppress
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from nats.aio.client import Client
+from nats.errors import Error as NatsError
+
+from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.fleet import subjects
+from bms_estimator.fleet.block import Block, encode
+from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.keeping import Keeping
+from bms_estimator.fleet.known_packs import KnownPacks
+from bms_estimator.fleet.pack_bucket import write_bucket
+from bms_estimator.fleet.pack_row import PackKind, stored
+from bms_estimator.fleet.partition import Partition
+from bms_estimator.model.sample import SAMPLE
+from tests.command_line import PROGRAM
+from tests.patience import LONG_S
+
+PERIOD_S = 10.0
+"""Between two samples."""
+KIND = stored(PackKind(cell="ncr18650", period_s=PERIOD_S))
+STORE = 1_790_000_000 * 10**9
+"""When the edges' stores were made [ns since 1970]."""
+SAMPLES = 60
+"""Of a block, which is ten minutes."""
+
+
+def samples(pack: str, number: int) -> np.ndarray:
+    """Of a pack's block, from its number alone: a load with steps, differently fast in each pack."""
+    time_s = PERIOD_S * (SAMPLES * (number - 1.0) + np.arange(SAMPLES))
+    made = np.zeros(SAMPLES, SAMPLE)
+    made["time_s"] = time_s
+    made["current_a"] = np.where(np.sin(time_s / (200.0 + int(pack[1:]))) > 0.0, 1.5, 0.25)
+    made["voltage_v"] = 3.9 - 0.06 * made["current_a"] - 5e-6 * time_s
+    made["temperature_c"] = 25.0
+    return made
+
+
+def block(pack: str, number: int, arrival_s: float = 1.79e9) -> bytes:
+    return encode(Block(STORE, number, 1, arrival_s, samples(pack, number)))
+
+
+async def know(nc: Client, packs: list[str]) -> KnownPacks:
+    """Load the table, and have it here, too."""
+    await write_bucket(nc, subjects.PACKS_BUCKET, dict.fromkeys(packs, KIND))
+    known = KnownPacks()
+    for pack in packs:
+        known.set_row(pack, KIND)
+    return known
+
+
+async def send(nc: Client, pack: str, data: bytes) -> None:
+    """Until the stream has it, maybe twice."""
+    deadline = time.monotonic() + LONG_S
+    while time.monotonic() < deadline:
+        with suppress(NatsError, TimeoutError):
+            await nc.jetstream().publish(subjects.raw(pack), data, timeout=1.0)
+            return
+        await asyncio.sleep(0.05)
+    raise AssertionError("the stream takes nothing")
+
+
+class Process:
+    """One worker."""
+
+    def __init__(self, folder: Path, url: str, name: str, *options: object) -> None:
+        self.name, self._log = name, folder / f"{name}.log"
+        command = [PROGRAM, "fleet", "worker", "--server", url, "--name", name, *map(str, options)]
+        with self._log.open("a") as log:
+            self._process = subprocess.Popen(command, stderr=log)
+
+    @property
+    def lines(self) -> list[dict[str, Any]]:
+        """Of its log."""
+        return [json.loads(line) for line in self._log.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+    async def logged(self, text: str) -> dict[str, Any]:
+        """The first line that says so."""
+
+        def found() -> dict[str, Any] | None:
+            assert self._process.poll() is None, f"it has ended: {self._log.read_text()}"
+            return next((line for line in self.lines if text in line["event"]), None)
+
+        return await until(found, self._log.read_text)
+
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
+
+    async def end(self) -> int:
+        """Its exit code after SIGTERM."""
+        self.signal(signal.SIGTERM)
+        return await asyncio.to_thread(self._process.wait, LONG_S)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(LONG_S)
+
+
+class Heartbeats:
+    """What workers say of themselves, the last of each."""
+
+    def __init__(self, nc: Client) -> None:
+        self._nc, self._last = nc, dict[str, Heartbeat]()
+
+    async def __aenter__(self) -> Self:
+        await self._nc.subscribe(subjects.worker(), cb=self._hear)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+    async def _hear(self, message: Any) -> None:
+        heard = Heartbeat.model_validate_json(message.data)
+        self._last[heard.id] = heard
+
+    def forget(self) -> None:
+        self._last.clear()
+
+    async def until(self, wanted: Callable[[Mapping[str, Heartbeat]], object]) -> None:
+        await until(lambda: wanted(self._last), lambda: self._last)
+
+    async def until_held(self, partitions: int, *workers: str) -> None:
+        """Until these workers, and no others, have all partitions, each some."""
+
+        def held(last: Mapping[str, Heartbeat]) -> bool:
+            parts = [last[worker].partitions if worker in last else () for worker in workers]
+            return all(parts) and sorted(number for part in parts for number in part) == list(range(partitions))
+
+        self.forget()
+        await self.until(held)
+
+
+async def until(found: Callable[[], Any], or_else: Callable[[], object]) -> Any:
+    deadline = time.monotonic() + LONG_S
+    while time.monotonic() < deadline:
+        if result := found():
+            return result
+        await asyncio.sleep(0.02)
+    raise AssertionError(str(or_else()))
+
+
+async def end_states(nc: Client, known: KnownPacks, partitions: int) -> dict[int, Partition]:
+    """What is in the last checkpoints."""
+    js = nc.jetstream()
+    checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
+    keeping = Keeping(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))
+    found = {}
+    for number in range(partitions):
+        async with aclosing(keeping.load(await keeping.claim(number))) as kept:
+            async for _, data in kept:
+                found[number] = Partition.restore(number, known, data)
+                break
+    return found
+
+
+def estimated(known: KnownPacks, pack: str, blocks: int) -> bytes:
+    """The record that the estimator leaves of a pack's blocks, all in one run."""
+    settings, cell = known(pack) or (None, None)
+    assert settings
+    assert cell
+    estimator = estimator_of(settings, cell)
+    estimator.run(np.concatenate([samples(pack, number) for number in range(1, blocks + 1)]))
+    return estimator.record.tobytes()
