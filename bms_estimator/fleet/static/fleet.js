@@ -158,12 +158,12 @@ const KINDS = [
 	["uncertain", "Uncertain", (v) => `SOC known to ± ${f.percent(2 * v)} %`],
 	["soc", "Low SOC", (v) => `SOC ${f.percent(v)} %`],
 	["silent", "Silent", (v) => (number(v) ? `not heard for ${ago(v)}` : "never heard")],
-	["unknown", "Unknown", (v) => `not in the table, its blocks are held${number(v) ? `; last ${ago(v)} ago` : ""}`],
+	["unknown", "Unknown", (v) => `its blocks are held${v ? `: ${v}` : ""}`],
 ];
 const NOTES = {
 	all: "The worst of each kind in turn.", margin: "Of packs alive, the smallest first; counted below 5 %: there the model is about to lose its meaning, stop discharging.",
 	suspects: "What the identifier suspects of the input, by the summary of the last hour.", uncertain: "Of packs alive, the widest band first; counted above ± 10 %.",
-	soc: "Of packs alive, the lowest first; counted below 10 %.", silent: "Not heard for three minutes or more.", unknown: "Load them with fleet packs load.",
+	soc: "Of packs alive, the lowest first; counted below 10 %.", silent: "Not heard for three minutes or more.", unknown: "Packs that send, and that the table does not know.",
 };
 const beyond = (kind, c, v) => !("limit" in c) || (kind === "uncertain" ? v > c.limit : v < c.limit);
 
