@@ -21,7 +21,7 @@ STORE = 1_700_000_000 * 10**9
 
 
 async def fill(url):
-    samples = pack_samples(8)
+    samples = pack_samples(8, rests=False)  # as a drive
     async with await nats.connect(url) as nc:
         await make_streams(nc, partitions=1)
         await put(nc, CELLS_BUCKET, {"own": WRONG.encode()})

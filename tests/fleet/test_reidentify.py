@@ -62,12 +62,6 @@ def test_a_pack_that_has_aged_gets_a_better_cell(samples):
     assert found.r_s_ohm == pytest.approx(TRUTH.a[13] * np.exp(-0.5 * TRUTH.a[14]) + TRUTH.a[15], rel=0.05)
 
 
-def test_a_drive_without_rests_is_learned_from_too():
-    found = reidentify("car", pack_samples(8, rests=False), KIND, WRONG)
-    assert found.cell_file
-    assert found.rms_v < 0.5 * found.rms_before_v
-
-
 def test_what_is_no_better_is_not_taken(samples):
     right = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": FADED * 3.0})})
     found = reidentify("house", samples, KIND, cell_text(right))
