@@ -23,6 +23,10 @@ def page(
         str, typer.Option(help="of the fleet, nats://host:port or tls://; several with commas between")
     ] = SERVER,
     listen: Annotated[str, typer.Option(help="host:port of the page")] = DEFAULT_LISTEN,
+    hours: Annotated[
+        Path | None,
+        typer.Option(help="folder that `fleet collect` writes, for what is seen over time", show_default=False),
+    ] = None,
     creds: Annotated[
         Path | None, typer.Option(help="file with what opens the server's door", show_default=False)
     ] = None,
@@ -41,12 +45,12 @@ def page(
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
     configure_logs()
     with drained():
-        asyncio.run(_serve(Server(server, creds, ca), settings, browser=browser))
+        asyncio.run(_serve(Server(server, creds, ca), settings, hours, browser=browser))
 
 
-async def _serve(server: Server, settings: PageSettings, *, browser: bool) -> None:
+async def _serve(server: Server, settings: PageSettings, hours: Path | None, *, browser: bool) -> None:
     stop = stop_on_signal()
-    async with fleet_page(server, settings) as url:
+    async with fleet_page(server, settings, hours) as url:
         typer.echo(f"page of the fleet: {url}")
         if browser:
             open_browser(url)

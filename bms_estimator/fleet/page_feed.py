@@ -77,9 +77,9 @@ class FleetFeed:
 
     async def __aexit__(self, *_: object) -> None:
         """Part from the server."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+        while self._task is not None and not self._task.done():
+            self._task.cancel()  # once more: wait_for of Python 3.11, in the library, may swallow it
+            await asyncio.wait({self._task}, timeout=0.1)
         if self._nc is not None:
             with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
                 async with asyncio.timeout(CLOSING_S):
