@@ -79,7 +79,9 @@ def identify(
     if as_json:
         typer.echo(json.dumps([_row(one) for one in found]))
     else:
-        Console().print(_table(out, found))
+        better = sum(bool(one.cell_file) for one in found)
+        typer.echo(f"{out}: {better} of {len(found)} packs have a better cell")
+        Console().print(_table(found))
     for pack in unput:
         typer.echo(f"warning: {pack}: its row was changed meanwhile; its new cell was not put", err=True)
 
@@ -177,12 +179,9 @@ def _write(path: Path, text: str) -> None:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def _table(out: Path, found: Sequence["Reidentified"]) -> Table:
+def _table(found: Sequence["Reidentified"]) -> Table:
     """Before and after, for people."""
-    better = sum(bool(one.cell_file) for one in found)
-    table = Table(
-        title=f"{out}: {better} of {len(found)} packs have a better cell", title_justify="left", box=box.SIMPLE_HEAD
-    )
+    table = Table(box=box.SIMPLE_HEAD)
     for column in ("pack", "hours", "Ah", "R_s [mohm]", "RMS [mV]", "", "why not"):
         table.add_column(column, justify="left" if column in ("pack", "", "why not") else "right")
     for one in found:

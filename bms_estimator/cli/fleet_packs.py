@@ -11,7 +11,7 @@ import typer
 
 from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server, Where
 from bms_estimator.fleet.known_packs import KnownPacks
-from bms_estimator.fleet.pack_row import PackKind, settings_of
+from bms_estimator.fleet.pack_row import PackKind, model_key, settings_of
 from bms_estimator.fleet.pack_table import CELL_FILE, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.model.errors import UserError
@@ -40,10 +40,13 @@ def load(
 def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> None:
     """Print the table that the server has, as CSV that `load` reads; what is wrong with a row goes to stderr."""
     known = asyncio.run(known_packs((server, creds, ca)))
-    for pack in sorted(known):
+    kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackKind)}
+    of_each = {
+        model_key(kind): pack for pack, kind in reversed(kinds.items())
+    }  # one, whose cell stands for the others'
+    for pack in (*(pack for pack in sorted(known) if pack not in kinds), *of_each.values()):
         if reason := known.reason(pack):
             typer.echo(f"warning: {pack}: {reason}", err=True)
-    kinds = {pack: kind for pack in known if isinstance(kind := known.kind(pack), PackKind)}
     sys.stdout.writelines(table_lines(kinds))
 
 

@@ -51,6 +51,12 @@ def present_elements(record: np.void) -> dict[str, Learned]:
     return {name: Learned(*map(float, one)) for name, *one in zip(ELEMENT_NAMES, values, stds, ages, strict=True)}
 
 
+def present_resistance(record: np.void) -> float:
+    """All of it at the present SOC, settled [ohm]; ``record`` as in ``present_elements``."""
+    ohm = record["elements"]["value"]
+    return float(ohm[R_S] + ohm[R_TS] + ohm[R_TL])
+
+
 def fitted_parameter(record: np.void, index: int) -> Learned | None:
     """a_index, 1..15, of the fit over SOC; None where its element was seen in fewer than ``LEAST_BINS`` bins.
 
@@ -92,6 +98,8 @@ def _bias(record: np.void, j: int) -> tuple[float, float]:
     """Mean and standard deviation of state ``j`` of the hypotheses together, as that of the SOC is."""
     f = record["filter"]
     n = f["count"]
+    if n == 1:  # as nearly always
+        return float(f["mean"][0, j]), math.sqrt(f["covariance"][0, j, j])
     weight = np.exp(f["ln_weight"][:n] - f["ln_weight"][f["best"]])
     weight /= weight.sum()
     values, variances = f["mean"][:n, j], f["covariance"][:n, j, j]

@@ -20,7 +20,7 @@ RENEW_S = PIN_S / 4.0
 """Between two requests [s]: the loop may be three times as late without losing a pin."""
 EXPIRES_S = 2.5 * RENEW_S
 """Of a request [s]."""
-BATCH = 128
+BATCH = 32
 """Messages that a request asks for, unless as many wait here already."""
 PIN_HEADER, STATUS_HEADER = "Nats-Pin-Id", "Status"
 WRONG_PIN = "423"

@@ -44,6 +44,8 @@ class Holding:
         table: What each pack is.
         keeping: Where checkpoints are.
         inbox: As ``PinnedConsumer`` has it.
+        turn: Held while a block is stepped: of all partitions one at a time, so that the loop sees to requests and heartbeats
+            between any two.
 
     Attributes:
         consumer: What asks for messages.
@@ -56,8 +58,9 @@ class Holding:
         trouble: What does not work now; empty: nothing.
     """
 
-    def __init__(self, nc: Client, number: int, table: Table, keeping: Keeping, inbox: str) -> None:
+    def __init__(self, nc: Client, number: int, table: Table, keeping: Keeping, inbox: str, turn: asyncio.Lock) -> None:
         self._nc, self.number, self._table, self._keeping = nc, number, table, keeping
+        self._turn = turn
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
         self.claim: Claim | None = None
@@ -94,7 +97,6 @@ class Holding:
                 await self._news.wait()
             else:
                 await self._take(given)
-                await asyncio.sleep(0)  # each block takes its time, and heartbeats and requests must go out
 
     async def save(self) -> None:
         """Write a checkpoint, unless the last one is as new.
@@ -166,7 +168,7 @@ class Holding:
         if partition is None or given.sequence <= partition.sequence:
             return
         self.lag_s = max(self.lag_s or 0.0, time.time() - glance(given.data)[1])
-        await self._publish(self._step(partition, given.pack, given.data, given.sequence))
+        await self._publish(await self._step(partition, given.pack, given.data, given.sequence))
 
     async def _go_on_to(self, given: Given) -> None:
         """Have the state of all messages before one that was given."""
@@ -230,18 +232,19 @@ class Holding:
             async for message in messages:
                 if message.sequence < sequence:
                     pack = message.subject.rpartition(".")[2]
-                    taken = self._step(partition, pack, message.data, message.sequence)
+                    taken = await self._step(partition, pack, message.data, message.sequence)
                     latest[pack] = _later(latest.get(pack), taken)
-                    await asyncio.sleep(0)
         for taken in latest.values():
             await self._publish(taken)
 
-    def _step(self, partition: Partition, pack: str, data: bytes, sequence: int) -> Taken:
-        try:
-            taken = partition.take(pack, data, sequence)
-        except Exception:  # a fault of ours with one pack, which would end one worker after the other
-            log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
-            taken = Taken(pack)
+    async def _step(self, partition: Partition, pack: str, data: bytes, sequence: int) -> Taken:
+        async with self._turn:
+            await asyncio.sleep(0)
+            try:
+                taken = partition.take(pack, data, sequence)
+            except Exception:  # a fault of ours with one pack, which would end one worker after the other
+                log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
+                taken = Taken(pack)
         self.blocks += 1
         self.samples += glance(data)[0]
         self._add_hours(taken)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 
 from bms_estimator.fleet.pack_row import PackKind, kind_of, known_cells, model_of, settings_of
+from bms_estimator.fleet.pack_type import type_estimator
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
@@ -97,6 +98,10 @@ def _kind(data: bytes) -> PackKind | str:
 
 def _made(kind: PackKind, cell_file: str | None) -> tuple[Settings, PackModel] | str:
     try:
-        return settings_of(kind), model_of(kind, cell_file)
-    except (UserError, ValueError, ArithmeticError) as error:
+        settings, model = settings_of(kind), model_of(kind, cell_file)
+        type_estimator(settings, model)  # kept: a partition asks for the same next
+    except UserError as error:
         return str(error)
+    except (ValueError, ArithmeticError) as error:
+        return f"no estimator can be made of its values: {error}"
+    return settings, model

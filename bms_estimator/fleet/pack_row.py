@@ -124,6 +124,11 @@ def model_of(kind: PackKind, cell_file: str | None) -> PackModel:
     return cell_of(kind, cell_file).pack(kind.series, kind.parallel)
 
 
+def model_key(kind: PackKind) -> tuple[object, ...]:
+    """Kinds with the same one have a model all of them, or none of them has."""
+    return kind.cell, kind.capacity_ah is None, kind.series, kind.parallel
+
+
 def cell_of(kind: PackKind, cell_file: str | None) -> PackModel:
     """One of the objects that the pack is made of; as ``model_of``."""
     name = kind.cell

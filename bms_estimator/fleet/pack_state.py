@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
+from bms_estimator.kernels.flow import FLOW_SUMS
 from bms_estimator.kernels.hour import HOUR_SUMS
 from bms_estimator.kernels.sparse import WORD_BYTES, mirror_of, pack, room, unpack
 from bms_estimator.service.checkpoint import fields
@@ -42,15 +43,11 @@ FLOW = np.dtype(
         ("charge_in_ah", "f8"),
         ("energy_out_kwh", "f8"),
         ("energy_in_kwh", "f8"),
-        ("counted", "i8"),  # 1: a sample was; of the last one
-        ("last_s", "f8"),  # the time stamp [s],
-        ("last_a", "f8"),
-        ("last_w", "f8"),
-        ("step_s", "f8"),  # and the time from the one before [s]
+        ("sums", FLOW_SUMS),
     ],
     align=True,
 )
-"""``snapshot.flow``: what has flowed, and the last sample that it holds."""
+"""All that has flowed (``snapshot.flow.Flow``), and what ``Meter`` counts in."""
 PACK_STATE = np.dtype(
     [("delivery", DELIVERY), ("flow", FLOW), ("hour", HOUR_SUMS), ("estimator", ESTIMATOR_STATE)], align=True
 )

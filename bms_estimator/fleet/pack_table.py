@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from bms_estimator.fleet.pack_row import COLUMNS, PackKind, known_cells, model_of, stored
+from bms_estimator.fleet.pack_row import COLUMNS, PackKind, known_cells, model_key, model_of, stored
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import DEVICE_NAME
 
@@ -70,18 +70,19 @@ def check_models(path: Path, table: PackTable, cell_files: Mapping[str, str]) ->
         cell_files: Texts by the names of their cells.
 
     Raises:
-        UserError: One line for each kind that has none, with the first line of the table that is of it.
+        UserError: One line for each kind that has none, with its first line in the table.
     """
-    lines, errors = dict[bytes, list[int]](), []
-    kinds = {line.data: line.kind for line in table.packs.values()}
+    alike = dict[tuple[object, ...], list[Line]]()
     for line in table.packs.values():
-        lines.setdefault(line.data, []).append(line.number)
-    for data, kind in kinds.items():
+        alike.setdefault(model_key(line.kind), []).append(line)
+    errors = []
+    for lines in alike.values():
+        first = lines[0]
         try:
-            model_of(kind, cell_files.get(kind.cell))
+            model_of(first.kind, cell_files.get(first.kind.cell))
         except UserError as error:
-            others = f", and {len(lines[data]) - 1} more of its kind" if len(lines[data]) > 1 else ""
-            errors.append(f"{path}: line {lines[data][0]}{others}: {error}")
+            others = f", and {len(lines) - 1} more of its kind" if len(lines) > 1 else ""
+            errors.append(f"{path}: line {first.number}{others}: {error}")
     _refuse(path, errors)
 
 

@@ -63,7 +63,7 @@ class PackTypes:
     """The types of a partition's packs.
 
     Args:
-        record: What their estimators work on, shape (1,), dtype ESTIMATOR_STATE.
+        record: What their estimators work on, shape (1,), dtype PACK_STATE.
     """
 
     def __init__(self, record: NDArray[np.void]) -> None:
@@ -91,23 +91,32 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
     Args:
         settings: The pack's.
         cell: The pack as one object (``CellModel.pack``).
-        record: What its estimator works on, shape (1,), dtype ESTIMATOR_STATE.
+        record: What its estimator and meter work on, shape (1,), dtype PACK_STATE.
     """
     made = made_of(settings, cell)
-    estimator = _estimator(_Recipe(made, settings, cell)).on(record)
+    estimator = type_estimator(settings, cell).on(record["estimator"])
     return PackType(
         settings=settings.pack,
         made_of=made,
         meaning=_digest(bytes.fromhex(pack_identity(settings, cell))),
         estimator=estimator,
-        meter=Meter(Flow(), float(estimator.settings["gap_s"][0])),
+        meter=Meter(Flow(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
     )
 
 
+def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
+    """An estimator of packs with these settings: of all partitions of a process the same.
+
+    Args:
+        settings: Of the packs.
+        cell: A pack as one object (``CellModel.pack``).
+    """
+    return _estimator(_Recipe(made_of(settings, cell), settings, cell))
+
+
 @lru_cache(maxsize=MOST_TYPES)
 def _estimator(recipe: _Recipe) -> Estimator:
-    """Of all partitions of a process."""
     return estimator_of(recipe.settings, recipe.cell)
 
 

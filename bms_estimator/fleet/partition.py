@@ -68,7 +68,7 @@ class Partition:
         self._known: dict[str, PackType] = {}
         self._greeted: set[str] = set()
         self._bench = Bench()
-        self._types = PackTypes(self._bench.record["estimator"])
+        self._types = PackTypes(self._bench.record)
         self._stepping = Stepping(self._bench.record, self._counters, wall)
 
     @classmethod
@@ -166,8 +166,7 @@ class Partition:
         self._bench.count_lost(lost)
         made = Taken(pack)
         if order is Order.NEXT:
-            self._stepping.settle(of_type, former, block)
-            made = Taken(pack, None, *self._stepping.step(pack, block, of_type))
+            made = Taken(pack, None, *self._stepping.step(pack, block, of_type, former))
             taken(d)
             self._former.pop(pack, None)
         else:

@@ -113,7 +113,8 @@ def reidentify(pack: str, samples: SampleBlock, kind: PackKind, cell_file: str |
         kind: What the fleet is told of it.
         cell_file: The text of the cell file that it names, if it does.
     """
-    outcome = Reidentified(pack)
+    seconds = float(np.ptp(samples["time_s"])) if samples.size else 0.0
+    outcome = Reidentified(pack, hours=seconds / 3600.0)
     try:
         cell = _battery(kind, cell_file)
         outcome = replace(outcome, capacity_before_ah=cell.cell.capacity_ah, r_s_before_ohm=_r_s(cell))
@@ -126,9 +127,8 @@ class _Pack:
     """One pack's samples, as those of one object of its cell file."""
 
     def __init__(self, outcome: Reidentified, samples: SampleBlock, kind: PackKind, cell: CellModel) -> None:
-        seconds = float(np.ptp(samples["time_s"])) if samples.size else 0.0
-        self._outcome = replace(outcome, hours=seconds / 3600.0)
-        self._kind, self._cell = kind, cell
+        self._outcome, self._kind, self._cell = outcome, kind, cell
+        seconds = 3600.0 * outcome.hours
         if seconds < LEAST_S:
             raise _NotEnoughError(f"{seconds / 3600.0:.1f} h of samples: at least {LEAST_S / 3600.0:g} h are needed")
         pieces = [piece for piece in _pieces(samples) if np.ptp(piece["time_s"]) >= LEAST_PIECE_S]

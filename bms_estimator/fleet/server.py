@@ -27,7 +27,8 @@ from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.fleet.streams import make_streams
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fleet_settings import FleetSettings, TenantSettings, reachable
+from bms_estimator.model.fleet_settings import FleetSettings, TenantSettings, TlsSettings, reachable
+from bms_estimator.sinks.credential import credential
 from bms_estimator.store.private_file import write_private
 
 log = structlog.get_logger(__name__)
@@ -110,12 +111,38 @@ def node_of(place: Place, told: Told) -> Node:
         mqtt=server.mqtt,
         monitor=server.monitor,
         cluster=Cluster(_heard(own), place.nodes) if place.nodes else None,
-        tls=Tls(tls.cert_file, tls.key_file, tls.ca_file) if tls else None,
+        tls=_tls(tls) if tls else None,
         accounts=told.accounts,
         partitions=server.partitions,
         disk_bytes=None if server.disk_gb is None else round(credentials.GB * server.disk_gb),
         sync_s=server.sync_s or None,
     )
+
+
+def _tls(settings: TlsSettings) -> Tls:
+    return Tls(
+        credential(settings.cert_file).absolute(),
+        credential(settings.key_file).absolute(),
+        credential(settings.ca_file).absolute() if settings.ca_file else None,
+    )
+
+
+def _check(tls: Tls) -> None:
+    """Say what the server would say in its own words, and end with a code that stands for a fault.
+
+    Raises:
+        UserError: A file cannot be read, or key and certificate are not of each other.
+    """
+    for name, path in (("cert_file", tls.cert), ("key_file", tls.key), ("ca_file", tls.ca)):
+        try:
+            if path:
+                path.open("rb").close()
+        except OSError as error:
+            raise UserError(f"tls.{name} = {path}: cannot be read: {error.strerror}") from None
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(tls.cert, tls.key)
+    except ssl.SSLError as error:
+        raise UserError(f"tls.cert_file = {tls.cert}, tls.key_file = {tls.key}: {error.reason or error}") from None
 
 
 async def serve(place: Place, read: Callable[[], Told], say: Callable[[str], None]) -> int:
@@ -133,7 +160,10 @@ async def serve(place: Place, read: Callable[[], Told], say: Callable[[str], Non
         UserError: There is no server that will do, settings cannot be, or it refuses the streams.
     """
     binary, told = find_server(), read()
-    _write(place.folder / CONFIGURATION, configuration(node_of(place, told)))
+    node = node_of(place, told)
+    if node.tls:
+        _check(node.tls)
+    _write(place.folder / CONFIGURATION, configuration(node))
     async with _running(binary, place.folder / CONFIGURATION) as (process, asked_to_end):
         ended = asyncio.create_task(process.wait())
         made = asyncio.create_task(_make_ready(place, told, process.pid, say))

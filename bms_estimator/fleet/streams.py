@@ -6,8 +6,10 @@ buckets are streams of the shape that all clients give them (ADR-8, ADR-20).
 """
 
 import asyncio
+import contextlib
 import json
-from typing import Any
+from collections.abc import Awaitable, Callable
+from typing import Any, ParamSpec, TypeVar
 
 from nats.aio.client import Client
 from nats.errors import NoRespondersError
@@ -15,6 +17,9 @@ from nats.errors import TimeoutError as NatsTimeoutError
 
 from bms_estimator.fleet import subjects
 from bms_estimator.model.errors import UserError
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 RAW_BYTES, RAW_AGE_S = 8 << 30, 7 * 86_400.0
 """What ``RAW`` keeps at most."""
@@ -28,8 +33,8 @@ PIN_S = 2.0
 """A worker that has asked for nothing for so long has lost a partition."""
 PARTITIONS_KEY = "bms.partitions"
 """In the metadata of ``RAW``."""
-ANSWER_S = 30.0
-"""Of a server that has just chosen a leader."""
+ANSWER_S, ATTEMPTS = 5.0, 12
+"""A cluster drops what is asked while it chooses a leader: so long an answer is waited for, and so often it is asked."""
 NO_SUCH_STREAM = 10059
 """The server's number for it."""
 AT_ONCE = 16
@@ -63,15 +68,15 @@ async def make_streams(
             "their number stays as it was made"
         )
     for stream in (_raw(partitions, raw_bytes, raw_age_s), _hours(raw_bytes), *_buckets()):
-        await _keep(nc, stream | {"num_replicas": replicas})
+        await _repeated(_keep, nc, stream | {"num_replicas": replicas})
     numbers = range(partitions)
     for first in range(0, partitions, AT_ONCE):
-        await asyncio.gather(*(_keep_consumer(nc, n, replicas) for n in numbers[first : first + AT_ONCE]))
+        await asyncio.gather(*(_repeated(_keep_consumer, nc, n, replicas) for n in numbers[first : first + AT_ONCE]))
 
 
 async def partitions_of(nc: Client) -> int | None:
     """How many partitions the stream ``RAW`` has; None: it has not been made."""
-    answer = await _ask(nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
+    answer = await _repeated(_ask, nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
     if "error" in answer:
         if answer["error"].get("err_code") == NO_SUCH_STREAM:
             return None
@@ -141,18 +146,29 @@ async def _keep_consumer(nc: Client, partition: int, replicas: int) -> None:
         raise _refused(f"{subjects.RAW_STREAM}, consumer {name}", answer)
 
 
+async def _repeated(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Ask until there is an answer; whatever is asked here may be asked twice.
+
+    Raises:
+        UserError: There is none, or as ``ask``.
+    """
+    for _ in range(ATTEMPTS):
+        with contextlib.suppress(NatsTimeoutError):
+            return await ask(*args, **kwargs)
+    raise UserError(f"the server has answered nothing for {ATTEMPTS * ANSWER_S:g} s: are most nodes up?")
+
+
 async def _ask(nc: Client, what: str, request: dict[str, Any]) -> dict[str, Any]:
     """One request to the server's JetStream, whose library knows neither metadata nor priority groups.
 
     Raises:
-        UserError: It has no JetStream, or none for this account; or it does not answer.
+        UserError: It has no JetStream, or none for this account.
+        NatsTimeoutError: It does not answer.
     """
     try:
         answer = await nc.request(f"$JS.API.{what}", json.dumps(request).encode(), timeout=ANSWER_S)
     except NoRespondersError:
         raise UserError("the server keeps no streams for this account: was it started by `fleet serve`?") from None
-    except NatsTimeoutError:
-        raise UserError(f"the server has not answered {what} within {ANSWER_S:g} s: are most nodes up?") from None
     decoded = json.loads(answer.data)
     return decoded if isinstance(decoded, dict) else {}
 

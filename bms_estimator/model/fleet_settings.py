@@ -59,10 +59,12 @@ class ServerSettings(Strict):
 class TlsSettings(Strict):
     """Certificates of all ports but the monitor's, PEM."""
 
-    cert_file: Path = Field(description="the server's certificate, with what leads to its authority")
-    key_file: Path = Field(description="its private key, not encrypted")
+    cert_file: Path = Field(
+        description="the server's certificate, with what leads to its authority; a name alone: systemd's credential"
+    )
+    key_file: Path = Field(description="its private key, not encrypted; as cert_file")
     ca_file: Path | None = Field(
-        default=None, description="authority of the nodes' certificates, among several nodes; else the system's"
+        default=None, description="authority of the nodes' certificates, among several nodes; as cert_file"
     )
 
 

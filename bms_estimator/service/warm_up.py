@@ -8,8 +8,10 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.live import new_estimator
+from bms_estimator.snapshot.flow import Flow, Meter
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
+from bms_estimator.snapshot.window import Window
 from bms_estimator.sources.frames import FrameDecoder
 
 CELL = "chen_mora"
@@ -23,7 +25,9 @@ def load_kernels() -> None:
     estimator = new_estimator(Settings(), cell)
     sample = np.zeros(1, dtype=SAMPLE)
     sample["voltage_v"] = cell.cell.nominal_voltage_v
-    estimator.run(sample)
+    trace = estimator.run(sample)
+    Meter(Flow(), 1.0).add(trace)
+    Window().add(trace, 0.0)
     estimator.set_soc(0.5)
     estimator.resume(0.0)
     parameter_report(estimator, 0.0)

@@ -1,16 +1,13 @@
 """Charge and energy through the pack's terminals, counted in each direction."""
 
-import math
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.sample_step import GAP_RATIO
+from bms_estimator.kernels.flow import FLOW_SUMS, add_flow
 from bms_estimator.model.estimate import Totals
-
-WAITING_ROWS = 1024
-"""Rows are integrated so many at a time: at 1,000 blocks a second, one by one would take as long as the estimate."""
 
 
 class Flow(NamedTuple):
@@ -41,17 +38,6 @@ class Flow(NamedTuple):
         return Flow(*map(max, self, other))
 
 
-class Last(NamedTuple):
-    """The last sample that a meter has counted."""
-
-    time_s: float = math.nan
-    """NaN: none was."""
-    current_a: float = 0.0
-    power_w: float = 0.0
-    step_s: float = 0.0
-    """To it from the one before."""
-
-
 class Meter:
     """Counts what flows: straight between samples, nothing over a gap.
 
@@ -61,52 +47,26 @@ class Meter:
     Args:
         before: Counted by the runs before.
         gap_s: A step longer than this is a gap, unless the one before was about as long [s]; as ``kernels.sample_step.is_gap``.
+        sums: Shape (1,), dtype ``FLOW_SUMS``: what it counts in, where that outlives it.
     """
 
-    def __init__(self, before: Flow, gap_s: float) -> None:
+    def __init__(self, before: Flow, gap_s: float, sums: NDArray[np.void] | None = None) -> None:
         self._gap_s = gap_s
-        self._rows = np.zeros((3, 1 + WAITING_ROWS))  # time [s], current [A], power [W]; first the last of those before
-        self.go_on(before, Last())
+        self._sums: NDArray[np.void] = np.zeros(1, dtype=FLOW_SUMS) if sums is None else sums
+        self.go_on(before)
 
-    def go_on(self, flow: Flow, last: Last) -> None:
-        """Count on from ``flow`` and the last sample that it holds; what was taken before is forgotten."""
-        self._flow, self._count = flow, 1
-        *self._rows[:, 0], self._step_s = last
+    def go_on(self, flow: Flow) -> None:
+        """Count on from ``flow`` and what the sums hold."""
+        self._flow = flow
 
     def add(self, trace: TraceBlock) -> None:
         """Take accepted samples; ``trace`` has shape (n,), dtype TRACE."""
-        for first in range(0, trace.size, WAITING_ROWS):
-            part = trace[first : first + WAITING_ROWS]
-            if self._count + part.size > self._rows.shape[1]:
-                self._integrate()
-            time_s, current_a, power_w = self._rows[:, self._count : self._count + part.size]
-            time_s[:], current_a[:] = part["time_s"], part["current_a"]
-            np.multiply(part["voltage_v"], part["current_a"], out=power_w)
-            self._count += part.size
+        add_flow(self._sums, trace, self._gap_s)
 
     @property
     def flow(self) -> Flow:
         """All that has flowed."""
-        if self._count > 1:
-            self._integrate()
+        s = self._sums[0]
+        self._flow = self._flow.and_net(float(s["charge_as"]), float(s["energy_ws"]))
+        s["charge_as"] = s["energy_ws"] = 0.0
         return self._flow
-
-    @property
-    def last(self) -> Last:
-        """The last sample that ``flow`` holds."""
-        time_s, current_a, power_w = self._rows[:, 0].tolist()
-        return Last(time_s, current_a, power_w, self._step_s)
-
-    def _integrate(self) -> None:
-        """Count the waiting rows; the last of them stays, for the step to the next."""
-        time_s, current_a, power_w = self._rows[:, : self._count]
-        step_s = np.diff(time_s)
-        before_s = np.concatenate(([self._step_s], step_s[:-1]))
-        # NaN to the first sample of all, below 0 where the clock was set back: neither is counted
-        counted_s = np.where((step_s > 0.0) & (step_s <= np.fmax(self._gap_s, GAP_RATIO * before_s)), step_s, 0.0)
-        charge_as = 0.5 * float(counted_s @ (current_a[:-1] + current_a[1:]))
-        energy_ws = 0.5 * float(counted_s @ (power_w[:-1] + power_w[1:]))
-        self._flow = self._flow.and_net(charge_as, energy_ws)
-        self._step_s = float(step_s[-1])
-        self._rows[:, 0] = self._rows[:, self._count - 1]
-        self._count = 1

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.learned import present_elements, relative_capacity
+from bms_estimator.estimator.learned import present_resistance, relative_capacity
 from bms_estimator.kernels import cell as chen_mora
 
 LONGEST_H = 1000.0
@@ -62,7 +62,6 @@ def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:
 def _resistance(estimator: Estimator, soc: float) -> float:
     """All of it, settled [ohm]."""
     if estimator.identifying:
-        elements = present_elements(estimator.record[0])
-        return sum(elements[name].value for name in ("r_s_ohm", "r_ts_ohm", "r_tl_ohm"))
+        return present_resistance(estimator.record[0])
     a = estimator.state[0]["a"]
     return float(chen_mora.r_s(soc, a) + chen_mora.r_ts(soc, a) + chen_mora.r_tl(soc, a))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator import __version__
+from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import PAYLOAD_VERSION, Estimate, Info
@@ -42,12 +43,15 @@ def estimate_report(
         flow: What has gone through the terminals.
         capacity_ah: Of the pack, rated; None of a fuel cell.
     """
-    last = window.last
-    soc = finite(last["soc"])
+    values = zip(
+        TRACE.names or (), window.last.item(), strict=True
+    )  # plain numbers: a field of a record costs as much as a sum
+    last = {name: value if math.isfinite(value) else None for name, value in values}
+    soc = last["soc"]
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
-        board_time_s=float(last["time_s"]),
+        board_time_s=last["time_s"],
         voltage_v=window.voltage_v,
         current_a=window.current_a,
         power_w=window.power_w,
@@ -55,9 +59,9 @@ def estimate_report(
         **_cells(window.cells_v),
         soc=soc,
         soc_percent=None if soc is None else 100.0 * soc,
-        soc_std=finite(last["soc_std"]),
-        soc_coulomb=finite(last["soc_coulomb"]),
-        soc_ocv=finite(last["soc_ocv"]),
+        soc_std=last["soc_std"],
+        soc_coulomb=last["soc_coulomb"],
+        soc_ocv=last["soc_ocv"],
         remaining_capacity_ah=finite(remaining.capacity_ah),
         usable_capacity_ah=finite(remaining.usable_ah),
         remaining_energy_wh=finite(remaining.energy_wh),
@@ -65,14 +69,14 @@ def estimate_report(
         time_to_full_s=finite(remaining.time_to_full_s),
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
-        voltage_estimate_v=finite(last["voltage_estimate_v"]),
-        innovation_v=finite(last["innovation_v"]),
-        tracking_error_v=finite(last["tracking_error_v"]),
-        delta_1=finite(last["delta_1"]),
-        delta_2=finite(last["delta_2"]),
-        stability_margin=finite(last["stability_margin"]),
-        adaptive_gain_k=finite(last["k"]),
-        nussbaum_gain=finite(last["nussbaum_gain"]),
+        voltage_estimate_v=last["voltage_estimate_v"],
+        innovation_v=last["innovation_v"],
+        tracking_error_v=last["tracking_error_v"],
+        delta_1=last["delta_1"],
+        delta_2=last["delta_2"],
+        stability_margin=last["stability_margin"],
+        adaptive_gain_k=last["k"],
+        nussbaum_gain=last["nussbaum_gain"],
         converged=bool(last["converged"]),
         lock=bool(last["lock"]),
         frames_received=counters.get("frames_received", 0),
@@ -84,7 +88,7 @@ def estimate_report(
 
 def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
     """What is told of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
-    if not np.isfinite(cells_v).any():
+    if not (cells_v.size and np.isfinite(cells_v).any()):
         return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))
     lowest, highest = int(np.nanargmin(cells_v)), int(np.nanargmax(cells_v))
     return {

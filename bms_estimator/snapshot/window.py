@@ -7,11 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.state import TRACE
+from bms_estimator.kernels.window import WINDOW_SUMS, add_window
 from bms_estimator.model.sample import NO_CELLS, CellBlock
-
-WAITING_ROWS = 1024
-"""Rows are summed so many at a time: at 1,000 blocks a second, one by one would take as long as the estimate."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +46,12 @@ class Window:
     """
 
     def __init__(self) -> None:
-        self._rows: TraceBlock = np.zeros(WAITING_ROWS, dtype=TRACE)
-        self._waiting = 0
         self.before_s = math.nan
+        self._sums: NDArray[np.void] = np.zeros(1, dtype=WINDOW_SUMS)
         self._clear()
 
     def _clear(self) -> None:
-        self._samples = self._temperatures = 0
-        self._voltage = self._current = self._power = self._temperature = 0.0
-        self._first_s = math.nan
+        self._sums.fill(0)
         self._last: np.void | None = None
         self._arrival_s = math.nan
         self._cells = NO_CELLS
@@ -72,45 +66,26 @@ class Window:
         """
         if cells.size:
             self._cells = cells[-1:]
-        for first in range(0, trace.size, WAITING_ROWS):
-            part = trace[first : first + WAITING_ROWS]
-            if self._waiting + part.size > WAITING_ROWS:
-                self._sum()
-            self._rows[self._waiting : self._waiting + part.size] = part
-            self._waiting += part.size
+        if trace.size:
+            add_window(self._sums, trace)
+            self._last = trace[-1].copy()
         self._arrival_s = arrival_s
-
-    def _sum(self) -> None:
-        """Add the waiting rows to the sums."""
-        rows, self._waiting = self._rows[: self._waiting], 0
-        if self._last is None:
-            self._first_s = float(rows["time_s"][0])
-        voltage, current, temperature = rows["voltage_v"], rows["current_a"], rows["temperature_c"]
-        self._samples += rows.size
-        self._voltage += float(voltage.sum())
-        self._current += float(current.sum())
-        self._power += float(voltage @ current)
-        known = temperature[np.isfinite(temperature)]
-        self._temperatures += known.size
-        self._temperature += float(known.sum())
-        self._last = rows[-1].copy()
 
     def take(self) -> WindowSummary | None:
         """Summary of all since the last call, None when nothing came."""
-        if self._waiting:
-            self._sum()
         if self._last is None:
             return None
-        n, last_s = self._samples, float(self._last["time_s"])
-        steps, begin_s = (n, self.before_s) if math.isfinite(self.before_s) else (n - 1, self._first_s)
+        n, first_s, voltage, current, power, temperatures, temperature = self._sums[0].item()
+        last_s = float(self._last["time_s"])
+        steps, begin_s = (n, self.before_s) if math.isfinite(self.before_s) else (n - 1, first_s)
         span_s = last_s - begin_s
         summary = WindowSummary(
             arrival_s=self._arrival_s,
             samples=n,
-            voltage_v=self._voltage / n,
-            current_a=self._current / n,
-            power_w=self._power / n,
-            temperature_c=self._temperature / self._temperatures if self._temperatures else math.nan,
+            voltage_v=voltage / n,
+            current_a=current / n,
+            power_w=power / n,
+            temperature_c=temperature / temperatures if temperatures else math.nan,
             sample_rate_hz=steps / span_s if span_s > 0.0 else math.nan,
             last=self._last,
             cells_v=self._cells.ravel(),

@@ -8,6 +8,7 @@ import capture
 import kernel
 import live
 import packs
+import partition
 from table import show
 
 GROUPS = {
@@ -15,6 +16,7 @@ GROUPS = {
     "capture": capture.rows,
     "live": live.rows,
     "packs": packs.rows,
+    "partition": partition.rows,
     "callbacks": callbacks.rows,
 }
 

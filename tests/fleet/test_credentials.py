@@ -12,16 +12,21 @@ from pathlib import Path
 
 import aiomqtt
 import nats
+import numpy as np
 import pytest
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
 from bms_estimator.fleet import credentials, subjects
+from bms_estimator.fleet.block import Block, encode
 from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.server_config import Accounts, configuration
 from bms_estimator.fleet.streams import consumer, make_streams
+from bms_estimator.fleet.worker import Options, work
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fleet_settings import TenantSettings
+from bms_estimator.model.sample import SAMPLE
+from tests.command_line import run
 from tests.fleet.engine import Engine, running
 from tests.patience import LONG_S
 
@@ -221,6 +226,42 @@ async def test_a_worker_may_do_its_work_and_no_more(fleet: Fleet) -> None:
         assert refused == []
         streams = ("$JS.API.STREAM.DELETE.RAW", "$JS.API.STREAM.PURGE.RAW")
         await are_refused(nc, refused, "raw.p1", "p.1.raw.p1", "$KV.packs.p1", *streams)
+
+
+def test_the_worker_that_there_is_works_with_its_credentials(
+    fleet: Fleet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "packs.csv").write_text("pack,cell\nreal,ncr18650\n")
+    server = ("--server", fleet.engine.url, "--creds", credentials.credentials_file(fleet.keys, "acme", Role.ADMIN))
+    assert run(capsys, "fleet", "packs", "load", tmp_path / "packs.csv", *server)[::2] == (0, "")
+    before = fleet.engine.log(0).read_text().count("Violation")
+    asyncio.run(_work(fleet))
+    assert fleet.engine.log(0).read_text().count("Violation") == before
+
+
+async def _work(fleet: Fleet) -> None:
+    samples = np.zeros(60, dtype=SAMPLE)
+    samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(60), 3.9, 25.0
+    block = encode(Block(store=1, number=1, oldest=1, arrival_s=60.0, samples=samples))
+    stop = asyncio.Event()
+    file = credentials.credentials_file(fleet.keys, "acme", Role.WORKER)
+    working = asyncio.create_task(work(Options(fleet.engine.url, "one", file), stop))
+    async with (
+        asyncio.timeout(LONG_S),
+        fleet.program(Role.READER) as (reader, _),
+        fleet.edge(fleet.token("real")) as edge,
+    ):
+        states = await reader.subscribe(subjects.published("real", "state"))
+        await reader.flush()
+        await edge.subscribe("edge/real/awaits")
+        await edge.publish("raw/real", block, qos=1)
+        assert b"soc" in (await states.next_msg(LONG_S)).data
+        awaited = subjects.Awaits.model_validate_json(str((await anext(edge.messages)).payload, "utf-8"))
+        assert (awaited.store, awaited.number) == (1, 2)
+        stop.set()
+        await working
+        checkpoints = await reader.jetstream().key_value(subjects.CHECKPOINTS_BUCKET)
+        assert [key for key in await checkpoints.keys() if key != "p1"]
 
 
 async def test_who_reads_changes_nothing(fleet: Fleet) -> None:

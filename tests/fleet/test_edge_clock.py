@@ -16,9 +16,8 @@ WALL_S = 1.7e9
 def run(clock: EdgeClock, told_s: np.ndarray, late_s: float | np.ndarray = 0.0, host_s: np.ndarray | None = None):
     """Samples that come one by one, at ``host_s`` (as told when left out); wall and steady clock agree."""
     host_s = (told_s if host_s is None else host_s) + late_s
-    return np.concatenate(
-        [clock.place(np.array([t]), WALL_S + h, h) for t, h in zip(told_s, np.broadcast_to(host_s, told_s.shape))]
-    )
+    host_s = np.broadcast_to(host_s, told_s.shape)
+    return np.concatenate([clock.place(np.array([t]), WALL_S + h, h) for t, h in zip(told_s, host_s, strict=True)])
 
 
 def test_an_even_pace_stays_even_to_the_last_bit() -> None:

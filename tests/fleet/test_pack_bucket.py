@@ -26,7 +26,7 @@ def engine(tmp_path_factory):
 
 @pytest.fixture
 async def nc(engine):
-    async with await nats.connect(engine.url) as nc:
+    async with await nats.connect(engine.url, reconnect_time_wait=0.1) as nc:
         await make_streams(nc, partitions=1)
         for bucket in (PACKS_BUCKET, CELLS_BUCKET):
             await write_bucket(nc, bucket, {}, remove=True)

@@ -159,6 +159,7 @@ def test_packs_of_one_kind_share_settings_and_model():
         (b'{"cell":"pem_30w","capacity_ah":1}', "pem_30w is a fuel cell, which has no capacity"),
         (b'{"cell":"lfp","capacity_ah":1,"initial_soc":2}', "its row is wrong: initial_soc: "),
         (b"\xff\xfe", "its row is wrong: "),
+        (b'{"cell":"ncr18650","voltage_noise_v":1e300}', "no estimator can be made of its values: "),
     ],
 )
 def test_whatever_is_wrong_makes_a_pack_unknown_with_the_reason(data, reason):

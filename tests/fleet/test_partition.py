@@ -14,6 +14,7 @@ from bms_estimator.fleet.delivery import ASKED_EACH, TOLD_EACH
 from bms_estimator.fleet.held import MOST_BLOCKS, MOST_BYTES, Held
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.partition import Partition
+from bms_estimator.fleet.stepping import AT_ONCE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.estimate import Estimate, ParameterReport
 from bms_estimator.model.fuel_cell import load_any
@@ -409,6 +410,18 @@ class TestFaultsOfAnEdge:
             for pack in ("a", "unknown"):
                 stream.send(pack, encode(replace(block, samples=rows)))
             stream.take_over()
+
+
+def test_a_block_of_hours_is_as_many_small_ones(stream, samples) -> None:
+    long, short = stream.send("a", one_block(samples, 1)), Stream(Partition(5, table))
+    last = [short.send("a", data) for data in blocks_of(samples, size=AT_ONCE // 2)][-1]
+    assert_same(stream, "a", estimated(samples))
+    assert_same(short, "a", estimated(samples))
+    of_long, of_short = (json.loads(taken.state) for taken in (long, last))
+    assert of_long["sample_rate_hz"] == of_short["sample_rate_hz"] == 1.0
+    assert of_long["voltage_v"] == pytest.approx(samples["voltage_v"].mean())
+    net = [told["charge_out_ah"] - told["charge_in_ah"] for told in (of_long, of_short)]
+    assert net[0] == pytest.approx(net[1])
 
 
 def test_packs_of_many_types_do_not_disturb_each_other(samples) -> None:

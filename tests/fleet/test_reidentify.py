@@ -12,9 +12,11 @@ from tests.calibration.simulated_load import TRUTH, capture, wrong_start
 
 SERIES, PARALLEL = 14, 4
 KIND = PackKind(
-    cell="own", series=SERIES, parallel=PARALLEL, voltage_resolution_v=0.01, current_resolution_a=0.01, period_s=1.0
+    cell="own", series=SERIES, parallel=PARALLEL, voltage_resolution_v=0.01, current_resolution_a=0.01, period_s=5.0
 )
 WRONG = cell_text(wrong_start(1.3, 0.8))
+EVERY = 5
+"""Seconds between two samples: so a fifth of the work."""
 FADED = 0.88
 """Of the capacity that the cell file has."""
 
@@ -40,7 +42,7 @@ def pack_samples(hours, *, rests=True):
     samples = capture(cycles(hours, rests=rests), cell=faded, soc=0.95)
     samples["voltage_v"] *= SERIES
     samples["current_a"] *= PARALLEL
-    return samples
+    return samples[::EVERY]
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +78,9 @@ def test_what_is_no_better_is_not_taken(samples):
 @pytest.mark.parametrize(
     ("change", "kind", "reason"),
     [
-        (lambda s: s[: 3600 * 3], KIND, "3.0 h of samples: at least 6 h are needed"),
+        (lambda s: s[: 720 * 3], KIND, "3.0 h of samples: at least 6 h are needed"),
         (lambda s: s[:0], KIND, "0.0 h of samples"),
-        (lambda s: s[::100], KIND, "0.00 capacities were moved"),
+        (lambda s: s[::20], KIND, "0.00 capacities were moved"),
         (lambda s: s[:60], PackKind(cell="pem_30w"), "pem_30w is a fuel cell"),
         (lambda s: s, KIND.model_copy(update={"series": 7}), "no sample is one that this cell can have"),
         (lambda s: s, PackKind(cell="nowhere"), "nowhere: no cell file of this name was loaded"),
@@ -97,5 +99,5 @@ def test_resting_for_days_tells_nothing(samples):
 
 
 def test_gaps_and_steps_back_in_time_do_no_harm(samples):
-    holes = np.concatenate([samples[:9000], samples[9300:15000], samples[14000:20000], samples[21000:]])
+    holes = np.concatenate([samples[:1800], samples[1860:3000], samples[2900:4000], samples[4200:]])
     assert reidentify("house", holes, KIND, WRONG).cell_file

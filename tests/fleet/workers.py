@@ -27,20 +27,22 @@ from bms_estimator.model.sample import SAMPLE
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
-KIND = stored(PackKind(cell="ncr18650"))
+PERIOD_S = 10.0
+"""Between two samples."""
+KIND = stored(PackKind(cell="ncr18650", period_s=PERIOD_S))
 STORE = 1_790_000_000 * 10**9
 """When the edges' stores were made [ns since 1970]."""
 SAMPLES = 60
-"""Of a block, one a second."""
+"""Of a block, which is ten minutes."""
 
 
 def samples(pack: str, number: int) -> np.ndarray:
     """Of a pack's block, from its number alone: a load with steps, differently fast in each pack."""
-    time_s = SAMPLES * (number - 1.0) + np.arange(SAMPLES)
+    time_s = PERIOD_S * (SAMPLES * (number - 1.0) + np.arange(SAMPLES))
     made = np.zeros(SAMPLES, SAMPLE)
     made["time_s"] = time_s
-    made["current_a"] = np.where(np.sin(time_s / (20.0 + int(pack[1:]))) > 0.0, 1.5, 0.25)
-    made["voltage_v"] = 3.9 - 0.06 * made["current_a"] - 2e-5 * time_s
+    made["current_a"] = np.where(np.sin(time_s / (200.0 + int(pack[1:]))) > 0.0, 1.5, 0.25)
+    made["voltage_v"] = 3.9 - 0.06 * made["current_a"] - 5e-6 * time_s
     made["temperature_c"] = 25.0
     return made
 

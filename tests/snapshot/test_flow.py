@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.kernels.state import TRACE
-from bms_estimator.snapshot.flow import WAITING_ROWS, Flow, Meter
+from bms_estimator.snapshot.flow import Flow, Meter
 
 GAP_S = 5.0
 
@@ -35,7 +35,7 @@ def test_an_hour_out_and_half_an_hour_in_count_each_on_its_own_and_upon_what_was
 
 def test_it_is_the_same_in_blocks_of_any_size() -> None:
     rng = np.random.default_rng(1)
-    time_s = np.cumsum(rng.uniform(0.001, 4.0, 3 * WAITING_ROWS))
+    time_s = np.cumsum(rng.uniform(0.001, 4.0, 3000))
     whole = trace(time_s, rng.normal(3.0, 1.0, time_s.size), rng.uniform(3.0, 4.2, time_s.size))
     current_a, power_w = whole["current_a"], whole["current_a"] * whole["voltage_v"]
     wanted = Flow().and_net(np.trapezoid(current_a, time_s), np.trapezoid(power_w, time_s))

@@ -1,0 +1,121 @@
+"""A whole fleet as processes on the loopback: server, workers, simulated edges. What both benches of the fleet begin with."""
+
+import contextlib
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import nats
+import psutil
+from nats.aio.client import Client
+
+from bms_estimator.fleet.simulated_fleet import SimulatedFleet
+from bms_estimator.fleet.streams import make_streams
+from tests.command_line import PROGRAM
+from tests.fleet.engine import Engine, running
+from tests.patience import LONG_S
+
+
+class Rig:
+    """Processes of one fleet; what they say is in files of ``folder``.
+
+    Args:
+        folder: For all files.
+        engine: The server, whose nodes run.
+    """
+
+    def __init__(self, folder: Path, engine: Engine) -> None:
+        self.folder, self.engine = folder, engine
+        self.server = ",".join(engine.urls)
+        self._mqtt = ",".join(f"mqtt://127.0.0.1:{port}" for port in engine.mqtt_ports)
+        self.workers: dict[str, subprocess.Popen[bytes]] = {}
+        self._names = 0
+
+    def start_worker(self, *, checkpoint_s: float) -> str:
+        """Start one, under a name that none had. Returns it."""
+        self._names += 1
+        name = f"w{self._names}"
+        arguments = ["--server", self.server, "--name", name, "--checkpoint-s", str(checkpoint_s)]
+        self.workers[name] = self.run("worker", *arguments, log=name)
+        return name
+
+    def kill_worker(self, name: str) -> None:
+        """By SIGKILL."""
+        process = self.workers.pop(name)
+        process.kill()
+        process.wait(LONG_S)
+
+    def stop_workers(self) -> None:
+        """As an operator does: each writes its checkpoints."""
+        for process in self.workers.values():
+            process.send_signal(signal.SIGTERM)
+        for process in self.workers.values():
+            process.wait(LONG_S)
+        self.workers.clear()
+
+    def load(self, fleet: SimulatedFleet) -> None:
+        """Let the server know the packs."""
+        table = self.folder / "packs.csv"
+        table.write_text(fleet.table())
+        process = self.run("packs", "load", str(table), "--server", self.server, log="load")
+        if process.wait(10 * LONG_S):
+            raise RuntimeError((self.folder / "load.log").read_text())
+
+    def simulate(
+        self, packs: int, *, seed: int, begin: str, speed: float, blocks: int | None = None
+    ) -> subprocess.Popen[bytes]:
+        """Be their edges, for so many blocks each, or until it is stopped."""
+        arguments = ["--packs", packs, "--seed", seed, "--begin", begin, "--speed", speed]
+        arguments += ["--blocks", blocks] if blocks else []
+        return self.run("simulate", "--server", self._mqtt, *map(str, arguments), log="edges")
+
+    def run(self, *arguments: str, log: str) -> subprocess.Popen[bytes]:
+        """Start a command of ``fleet``."""
+        with (self.folder / f"{log}.log").open("ab") as file:
+            return subprocess.Popen([PROGRAM, "fleet", *arguments], stdout=file, stderr=file)
+
+    def end(self) -> None:
+        """Leave none behind."""
+        for process in self.workers.values():
+            process.kill()
+            process.wait(LONG_S)
+
+    async def connected(self) -> Client:
+        """To any node that lives; again and again where the one it has goes."""
+        return await nats.connect(
+            self.engine.urls, max_reconnect_attempts=-1, reconnect_time_wait=0.1, error_cb=_nobody
+        )
+
+
+async def _nobody(_error: Exception) -> None:
+    """Nodes are killed on purpose."""
+
+
+@contextlib.contextmanager
+def rig(folder: Path, nodes: int, *, partitions: int) -> Iterator[Rig]:
+    """A server that is ready, and no worker yet."""
+    with running(folder, nodes, partitions=partitions) as engine:
+        made = Rig(folder, engine)
+        try:
+            yield made
+        finally:
+            made.end()
+
+
+async def make(rig: Rig, *, partitions: int) -> None:
+    """The streams, with as many replicas as there are nodes."""
+    nc = await rig.connected()
+    await make_streams(nc, partitions=partitions, replicas=len(rig.engine.nodes))
+    await nc.close()
+
+
+def cpu_s(pid: int) -> float:
+    """What a process has used of the processors [s]."""
+    times = psutil.Process(pid).cpu_times()
+    return times.user + times.system
+
+
+def rss_mib(pid: int) -> float:
+    """Memory of a process [MiB]."""
+    return float(psutil.Process(pid).memory_info().rss / 2**20)

@@ -1,0 +1,112 @@
+"""What a block of a fleet's pack costs a worker, all in and part by part, and what a pack takes in memory and on disk."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from load import CELL, pulses
+from table import Row
+
+from bms_estimator.fleet import hour
+from bms_estimator.fleet.block import Block, decode, encode
+from bms_estimator.fleet.partition import Partition
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import Settings
+from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.snapshot.remaining import remaining_charge
+from bms_estimator.snapshot.topics import estimate_report
+from bms_estimator.snapshot.window import Window
+
+PACKS, MINUTES, SAMPLES = 100, 90, 60
+STORE = 480_000 * 3600 * 10**9
+ROUNDS, CALLS = 5, 400
+MOST_US = 250.0
+SETTINGS, PACK = Settings(), load_cell(CELL)
+
+
+def rows() -> Iterator[Row]:
+    """Processor time; of parts the least of some rounds."""
+    samples = pulses(MINUTES * SAMPLES, rate_hz=1)
+    blocks = [_block(samples, minute) for minute in range(MINUTES)]
+    partition = Partition(0, lambda _: (SETTINGS, PACK))
+    each_us = _whole(partition, blocks)
+    yield Row(
+        f"a block of {SAMPLES} samples, all in", f"below {MOST_US:.0f} us", f"{each_us:.0f} us", each_us < MOST_US
+    )
+    for what, us in _parts(partition, samples, blocks):
+        yield Row(f"  {what}", "-", f"{us:.1f} us", None)
+    packs = partition.snapshot().packs
+    kept = sum(map(sys.getsizeof, packs.values())) / PACKS
+    begin_s = time.process_time()
+    data = b"".join(partition.snapshot().chunks())
+    written_s = time.process_time() - begin_s
+    begin_s = time.process_time()
+    Partition.restore(0, lambda _: None, data)
+    read_s = time.process_time() - begin_s
+    yield Row("a pack in memory", "-", f"{kept / 1e3:.1f} kB", None)
+    yield Row("a pack in the checkpoint", "-", f"{len(data) / PACKS / 1e3:.1f} kB", None)
+    yield Row("  to write it", "-", f"{1e6 * written_s / PACKS:.0f} us", None)
+    yield Row("  to read it", "-", f"{1e6 * read_s / PACKS:.0f} us", None)
+
+
+def _block(samples: SampleBlock, minute: int) -> bytes:
+    part = samples[minute * SAMPLES : (minute + 1) * SAMPLES]
+    return encode(Block(STORE, minute + 1, 1, STORE / 1e9 + float(part["time_s"][-1]), part))
+
+
+def _whole(partition: Partition, blocks: list[bytes]) -> float:
+    """Of one block, among those of all packs in turn [us]: the median of all minutes, and a share of the full hour."""
+    minutes_s, sequence = [], 0
+    for data in blocks:
+        begin_s = time.process_time()
+        for pack in range(PACKS):
+            sequence += 1
+            partition.take(f"pack{pack}", data, sequence)
+        minutes_s.append(time.process_time() - begin_s)
+    usual_s = np.median(minutes_s[1:])
+    hourly_s = max(minutes_s[60] - usual_s, 0.0) / 60
+    return float(1e6 * (usual_s + hourly_s) / PACKS)
+
+
+def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
+    """Each part on the state that the last block found."""
+    bench, of_type = partition._bench, partition._known["pack0"]
+    estimator, wall_s = of_type.estimator, STORE / 1e9 + samples.size
+    packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
+    bench.put(packed)
+    before, trace = estimator.record.copy(), estimator.run(block.samples).copy()
+
+    def state() -> bytes:
+        window.add(trace, wall_s)
+        summary = window.take()
+        assert summary is not None
+        remaining = remaining_charge(estimator, summary.current_a)
+        return estimate_report(summary, remaining, {}, wall_s, of_type.meter.flow, 3.0).model_dump_json().encode()
+
+    def step() -> None:
+        estimator.record[...] = before
+        estimator.run(block.samples)
+
+    put_back_us = _us(lambda: estimator.record.__setitem__(..., before))
+    yield "its bytes", _us(lambda: decode(blocks[-1]))
+    yield "the state unpacked", _us(lambda: bench.put(packed))
+    yield "the estimator", _us(step) - put_back_us
+    yield "the hour's sums", _us(lambda: hour.add(bench.record["hour"], trace, block, estimator))
+    yield "what has flowed", _us(lambda: (of_type.meter.add(trace), of_type.meter.flow))
+    yield "topic state", _us(state)
+    yield "the state packed", _us(bench.take)
+    parameters_us = _us(lambda: parameter_report(estimator, wall_s).model_dump_json())
+    row_us = _us(lambda: hour.row(of_type.settings, 480_000, bench.record["hour"], estimator).model_dump_json())
+    yield "topic parameters and the row of an hour, a 60th of it", (parameters_us + row_us) / 60
+
+
+def _us(call: Callable[[], object]) -> float:
+    least_s = float("inf")
+    for _ in range(ROUNDS):
+        begin_s = time.process_time()
+        for _ in range(CALLS):
+            call()
+        least_s = min(least_s, time.process_time() - begin_s)
+    return 1e6 * least_s / CALLS

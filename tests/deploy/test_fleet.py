@@ -1,0 +1,56 @@
+"""The fleet's units, judged by systemd, and the three nodes' configuration, which is what the code makes."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.cli.fleet_serve import _nodes
+from bms_estimator.fleet.server import Place, Told, node_of
+from bms_estimator.fleet.server_config import Accounts, configuration
+from bms_estimator.model.fleet_settings import FleetSettings
+from bms_estimator.model.toml_file import read_toml
+from tests.deploy.test_unit import HIGHEST_EXPOSURE, verify
+
+Program = Callable[[str, str], str]
+NODES = "a.example,b.example,c.example"
+
+
+@pytest.fixture(params=["bms-estimator-fleet.service", "bms-estimator-worker@1.service"])
+def unit(request: pytest.FixtureRequest, deploy: Path, tmp_path: Path) -> Path:
+    """A unit with a program that exists here."""
+    text = (deploy / "fleet" / request.param.replace("@1", "@")).read_text()
+    path = tmp_path / request.param
+    path.write_text(re.sub(r"(?m)^ExecStart=/\S+", f"ExecStart={sys.executable}", text))
+    return path
+
+
+def test_systemd_finds_nothing_wrong_in_the_units(program: Program, unit: Path) -> None:
+    assert verify(program("systemd-analyze", "systemd"), unit) == ""
+
+
+def test_exposure_is_at_most_1_5(program: Program, unit: Path) -> None:
+    command = [program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", text)
+    assert found, text
+    assert float(found[1]) <= HIGHEST_EXPOSURE
+
+
+def example(deploy: Path, number: int) -> str:
+    """The configuration of a node of three; the claims, which are of the operator's own keys, only named."""
+    settings = read_toml(deploy / "fleet" / "fleet.toml", FleetSettings)
+    place = Place(Path("/var/lib/bms-estimator-fleet"), number, _nodes(settings, number, NODES))
+    accounts = Accounts(
+        "OPERATOR", "SYSTEM", {"SYSTEM": "CLAIMS", **dict.fromkeys(map(str.upper, settings.tenants), "CLAIMS")}
+    )
+    text = configuration(node_of(place, Told(settings, accounts)))
+    return re.sub(r'"[^"]*/(fleet[a-z-]*\.(crt|key))"', r'"/run/credentials/bms-estimator-fleet.service/\1"', text)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_the_three_nodes_are_as_the_code_makes_them(deploy: Path, number: int) -> None:
+    assert (deploy / f"fleet/three-nodes/n{number}.conf").read_text() == example(deploy, number)

@@ -1,0 +1,109 @@
+"""Who takes an edge's blocks from the stream as a worker does, and keeps the samples."""
+
+import asyncio
+import contextlib
+from typing import Self
+
+import nats
+import numpy as np
+from nats.js.errors import NotFoundError
+
+from bms_estimator.fleet import subjects
+from bms_estimator.fleet.block import Block, decode
+from bms_estimator.fleet.streams import make_streams
+from bms_estimator.fleet.subjects import Awaits
+from bms_estimator.model.sample import SampleBlock
+from tests.patience import LONG_S, end
+
+POLL_S = 0.01
+
+
+class Receiver:
+    """Reads the stream in order; takes blocks in the order of their numbers and asks for those that are missing.
+
+    Args:
+        url: Of the server.
+        pack: Whose blocks.
+
+    Attributes:
+        lose: Numbers of blocks of which the first that comes is lost.
+        blocks: Those that were taken.
+        resends, gaps: Blocks that were not, for they had come, or one before them had not.
+        lost: Blocks that will never come.
+    """
+
+    def __init__(self, url: str, pack: str) -> None:
+        self._url, self.pack = url, pack
+        self._store, self._next = 0, 1
+        self._asked = 0
+        self.blocks: list[Block] = []
+        self.lose: set[int] = set()
+        self.resends = self.gaps = self.lost = 0
+
+    async def __aenter__(self) -> Self:
+        self.nc = await nats.connect(self._url, reconnect_time_wait=0.05, max_reconnect_attempts=-1)
+        await make_streams(self.nc, partitions=4)
+        self._task = asyncio.create_task(self._read())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await end(self._task)
+        await self.nc.close()
+
+    @property
+    def samples(self) -> SampleBlock:
+        """With their times since 1970."""
+        parts = []
+        for block in self.blocks:
+            part = block.samples.copy()
+            part["time_s"] += block.store / 1e9
+            parts.append(part)
+        return np.concatenate(parts)
+
+    async def until(self, count: int) -> None:
+        """So many samples were taken."""
+        async with asyncio.timeout(LONG_S):
+            while sum(block.samples.size for block in self.blocks) < count:
+                if self._task.done():
+                    self._task.result()
+                await asyncio.sleep(POLL_S)
+
+    async def say(self, awaits: Awaits | bytes) -> None:
+        payload = awaits if isinstance(awaits, bytes) else awaits.model_dump_json().encode()
+        await self.nc.publish(subjects.awaits(self.pack), payload)
+        await self.nc.flush()
+
+    async def _read(self) -> None:
+        js, sequence = self.nc.jetstream(timeout=1.0), 1
+        while True:
+            with contextlib.suppress(nats.errors.Error, asyncio.TimeoutError):
+                state = (await js.stream_info(subjects.RAW_STREAM)).state
+                while sequence <= state.last_seq:
+                    with contextlib.suppress(NotFoundError):
+                        message = await js.get_msg(subjects.RAW_STREAM, sequence)
+                        if str(message.subject).endswith(f".raw.{self.pack}"):
+                            await self._take(decode(message.data or b""))
+                    sequence += 1
+            await asyncio.sleep(POLL_S)
+
+    async def _take(self, block: Block) -> None:
+        if block.store < self._store or block.number in self.lose:
+            self.lose.discard(block.number)
+            return
+        if block.store > self._store:
+            self._store, self._next = block.store, block.oldest
+        if block.oldest > self._next:
+            self.lost += block.oldest - self._next
+            self._next = block.oldest
+        if block.number < self._next:
+            self.resends += 1
+        elif block.number > self._next:
+            self.gaps += 1
+            if self._asked != self._next or self.gaps % 5 == 0:
+                self._asked = self._next
+                await self.say(Awaits(store=self._store, number=self._next, resend=True))
+        else:
+            self._next += 1
+            self.blocks.append(block)
+            if self._next % 10 == 2:
+                await self.say(Awaits(store=self._store, number=self._next, resend=False))
