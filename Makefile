@@ -16,7 +16,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare home-assistant real-home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check test demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -42,6 +42,15 @@ test: apt venv ## all there is to check: packages, style, types, firmware, pytes
 demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory --silent firmware || echo "the firmware does not build here: the Python board serves"; fi
 	@$(BIN)/bms-estimator demo $(ARGS)
+
+demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of which one is killed, the page: a minute
+	@$(BIN)/bms-estimator fleet demo $(ARGS)
+
+fleet: venv ## what a fleet costs, in processes on this machine, e.g. make fleet ARGS="--packs 10000 --minutes 5"
+	@$(BIN)/python -m tests.benchmarks.fleet $(ARGS)
+
+fleet-kills: venv ## workers and servers of a fleet killed 100 times, one node and three, states compared bit by bit: 15 minutes
+	@$(BIN)/python -m tests.benchmarks.fleet_kills $(ARGS)
 
 nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)
@@ -105,8 +114,12 @@ audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 
 page: apt venv ## what the live page costs a real Chromium at 10 Hz, e.g. make page ARGS=60: minutes
 	@$(BIN)/python -m tests.benchmarks.page $(ARGS)
 
-screenshots: apt venv ## the pictures of the live page in docs
+fleet-page: venv ## what the page of a fleet of 100,000 packs costs its process, e.g. make fleet-page ARGS="--packs 10000": four minutes
+	@$(BIN)/python -m tests.benchmarks.fleet_page $(ARGS)
+
+screenshots: apt venv ## the pictures of the live page and of the page of a fleet in docs
 	@$(BIN)/python -m tests.page.screenshots
+	@$(BIN)/python -m tests.fleet.page_screenshots
 
 simulate: venv ## the whole service simulated: make simulate SEED=5, or many, e.g. make simulate ARGS="--seeds 1000": minutes
 	@$(BIN)/python -m tests.world $(if $(SEED),--seed $(SEED)) $(ARGS)

@@ -8,6 +8,7 @@ import typer
 
 from bms_estimator.cli.browser import open_browser
 from bms_estimator.cli.page_options import page_settings
+from bms_estimator.fleet.connection import SERVER
 from bms_estimator.fleet.page import fleet_page
 from bms_estimator.fleet.page_feed import Server
 from bms_estimator.model.page_settings import PageSettings
@@ -20,10 +21,17 @@ DEFAULT_LISTEN = "127.0.0.1:8080"
 def page(
     server: Annotated[
         str, typer.Option(help="of the fleet, nats://host:port or tls://; several with commas between")
-    ] = "nats://127.0.0.1:4222",
+    ] = SERVER,
     listen: Annotated[str, typer.Option(help="host:port of the page")] = DEFAULT_LISTEN,
+    hours: Annotated[
+        Path | None,
+        typer.Option(help="folder that `fleet collect` writes, for what is seen over time", show_default=False),
+    ] = None,
     creds: Annotated[
         Path | None, typer.Option(help="file with what opens the server's door", show_default=False)
+    ] = None,
+    ca: Annotated[
+        Path | None, typer.Option(help="certificate of who has signed the server's", show_default=False)
     ] = None,
     token_file: Annotated[
         Path | None, typer.Option(help="file with the token that a browser must show", show_default=False)
@@ -37,12 +45,12 @@ def page(
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
     configure_logs()
     with drained():
-        asyncio.run(_serve(Server(server, creds), settings, browser=browser))
+        asyncio.run(_serve(Server(server, creds, ca), settings, hours, browser=browser))
 
 
-async def _serve(server: Server, settings: PageSettings, *, browser: bool) -> None:
+async def _serve(server: Server, settings: PageSettings, hours: Path | None, *, browser: bool) -> None:
     stop = stop_on_signal()
-    async with fleet_page(server, settings) as url:
+    async with fleet_page(server, settings, hours) as url:
         typer.echo(f"page of the fleet: {url}")
         if browser:
             open_browser(url)

@@ -2,6 +2,7 @@
 
 import ssl
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import structlog
@@ -19,7 +20,14 @@ SAID_S = 30.0
 log = structlog.get_logger(__name__)
 
 
-async def connect(servers: str, name: str, *, creds: Path | None = None, ca: Path | None = None) -> Client:
+async def connect(
+    servers: str,
+    name: str,
+    *,
+    creds: Path | None = None,
+    ca: Path | None = None,
+    linked: Callable[[str | None], None] = lambda _: None,
+) -> Client:
     """Connect, however long that takes; later on, connect again whenever the connection breaks.
 
     Args:
@@ -27,18 +35,19 @@ async def connect(servers: str, name: str, *, creds: Path | None = None, ca: Pat
         name: Of this connection, in the server's lists.
         creds: File of the tenant's credentials, as ``fleet serve`` made it; None: the server asks for none.
         ca: Certificate of the authority that has signed the server's; None: those of the system.
+        linked: Called with why there is no connection, and with None when there is one again.
 
     Raises:
         UserError: ``ca`` cannot be read, or an address is none.
     """
     nc = Client()
-    said = _Said(nc, servers)
+    said = _Said(nc, servers, linked)
     try:
         await nc.connect(
             servers=[each.strip() for each in servers.split(",")],
             name=name,
             user_credentials=str(creds) if creds else None,
-            tls=_context(ca) if ca else None,
+            tls=context(ca) if ca else None,
             max_reconnect_attempts=-1,
             reconnect_time_wait=RETRY_S,
             error_cb=said.trouble,
@@ -50,7 +59,12 @@ async def connect(servers: str, name: str, *, creds: Path | None = None, ca: Pat
     return nc
 
 
-def _context(ca: Path) -> ssl.SSLContext:
+def context(ca: Path) -> ssl.SSLContext:
+    """Trust in the authority of a certificate.
+
+    Raises:
+        UserError: It cannot be read.
+    """
     try:
         return ssl.create_default_context(cafile=ca)
     except (OSError, ssl.SSLError) as error:
@@ -60,12 +74,14 @@ def _context(ca: Path) -> ssl.SSLContext:
 class _Said:
     """Logs what becomes of a connection."""
 
-    def __init__(self, nc: Client, servers: str) -> None:
-        self._nc, self._servers = nc, servers
+    def __init__(self, nc: Client, servers: str, linked: Callable[[str | None], None]) -> None:
+        self._nc, self._servers, self._linked = nc, servers, linked
         self._last: tuple[str, float] = ("", 0.0)
 
     async def trouble(self, error: Exception) -> None:
         text, now_s = reason(error), time.monotonic()
+        if not self._nc.is_connected:
+            self._linked(text)
         if (text, True) != (self._last[0], now_s < self._last[1] + SAID_S):
             self._last = text, now_s
             log.warning("trouble with the server", server=self._servers, reason=text)
@@ -73,8 +89,10 @@ class _Said:
     async def gone(self) -> None:
         if self._nc.is_closed:  # by us
             return
+        self._linked("the server is lost")
         log.warning("the connection to the server is gone; trying again", server=self._servers)
 
     async def back(self) -> None:
         self._last = ("", 0.0)
+        self._linked(None)
         log.info("the server is back", server=self._servers)

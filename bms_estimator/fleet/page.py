@@ -17,11 +17,14 @@ from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.page.newest import Newest
 from bms_estimator.page.server import STATIC as SHARED
 from bms_estimator.page.web import File, WebServer
+from bms_estimator.store.disk_thread import DiskThread
 
 STEP_S = 2.0
 """Between two pictures of the fleet [s]."""
-FLEET = "fleet"
-"""Key of what is streamed."""
+ASK_S = 600.0
+"""Between two times that the hours are asked [s]."""
+FLEET, ANSWERS = "fleet", "answers"
+"""Keys of what is streamed."""
 STATIC = Path(__file__).with_name("static")
 FILES = {
     "/": File(STATIC / "fleet.html", "text/html"),
@@ -36,12 +39,15 @@ FILES = {
 
 
 @contextlib.asynccontextmanager
-async def fleet_page(server: Server, settings: PageSettings, *, step_s: float = STEP_S) -> AsyncIterator[str]:
+async def fleet_page(
+    server: Server, settings: PageSettings, hours: Path | None = None, *, step_s: float = STEP_S
+) -> AsyncIterator[str]:
     """Serve while the context lasts.
 
     Args:
         server: Of the fleet.
         settings: Where the page is served.
+        hours: Folder of the hours' Parquet files, of which questions are asked; None: none are.
         step_s: Between two pictures of the fleet [s].
 
     Yields:
@@ -66,12 +72,15 @@ async def fleet_page(server: Server, settings: PageSettings, *, step_s: float = 
         WebServer(settings, FILES, newest, {"/packs": packs, "/pack": pack}, patient=False) as page,
         FleetFeed(server, view, newest.say_link),
     ):
-        drawing = asyncio.create_task(_draw(view, newest, step_s), name="fleet page")
+        tasks = [asyncio.create_task(_draw(view, newest, step_s), name="fleet page")]
+        if hours is not None:
+            tasks.append(asyncio.create_task(_ask(hours, newest), name="fleet questions"))
         try:
             yield page.url
         finally:
-            drawing.cancel()
-            await asyncio.gather(drawing, return_exceptions=True)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def _draw(view: FleetView, newest: Newest, step_s: float) -> None:
@@ -80,6 +89,16 @@ async def _draw(view: FleetView, newest: Newest, step_s: float) -> None:
         if view.listening:
             newest.say(FLEET, view.text(time.monotonic(), time.time()))
         await asyncio.sleep(step_s)
+
+
+async def _ask(hours: Path, newest: Newest) -> None:
+    """Questions to the hours, now and then: seconds of work for a large fleet."""
+    from bms_estimator.fleet.page_answers import answers  # noqa: PLC0415 - duckdb is needed for nothing else
+
+    thread, loop = DiskThread("questions"), asyncio.get_running_loop()
+    while True:
+        newest.say(ANSWERS, await loop.run_in_executor(thread, answers, hours))
+        await asyncio.sleep(ASK_S)
 
 
 def _json(value: Any) -> web.Response:

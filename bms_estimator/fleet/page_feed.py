@@ -14,6 +14,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.fleet import subjects
+from bms_estimator.fleet.connection import connect
 from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.pack_row import PackKind
 from bms_estimator.fleet.page_view import FleetView
@@ -21,14 +22,14 @@ from bms_estimator.fleet.stream_reader import StreamError, read_stream
 from bms_estimator.fleet.streams import partitions_of
 from bms_estimator.model.errors import UserError
 
-AGAIN_S = 2.0
-"""Before a server that is lost, or a table that cannot be read, is tried again [s]."""
-TABLE_S = 5.0
-"""Between two looks for what has changed in the table of packs [s]."""
+TABLE_S = 2.0
+"""Between two looks for what has changed in the table of packs, or before it is tried again [s]."""
 HOURS_S = 3900.0
 """Summaries of an hour come once in that, and somewhat late [s]."""
 MOST_BYTES = 1 << 16
 """Nothing of ours is longer."""
+MOST_REASON = 200
+"""Bytes of why a pack is unknown."""
 CLOSING_S = 3.0
 
 log = structlog.get_logger(__name__)
@@ -39,12 +40,14 @@ class Server:
     """Where the fleet's server is.
 
     Attributes:
-        url: nats://host:port, or tls://; several with commas between.
+        urls: nats://host:port, or tls://; several with commas between.
         creds: File with what opens its door; None: none is needed.
+        ca: Certificate of the authority that has signed its own; None: those of the system.
     """
 
-    url: str
+    urls: str
     creds: Path | None = None
+    ca: Path | None = None
 
 
 class FleetFeed:
@@ -63,43 +66,37 @@ class FleetFeed:
         if server.creds is not None and not server.creds.is_file():
             raise UserError(f"--creds {server.creds}: no such file")
         self._server, self._view, self._linked = server, view, linked
-        self._nc = Client()
-        self._why = "not reached yet"
-        self._tasks: list[asyncio.Task[None]] = []
+        self._nc: Client | None = None
+        self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
         """Start reaching for the server."""
-        self._say_lost()
-        self._tasks.append(asyncio.create_task(self._run(), name="fleet feed"))
+        self._on_link("not reached yet")
+        self._task = asyncio.create_task(self._run(), name="fleet feed")
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """Part from the server."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
-            async with asyncio.timeout(CLOSING_S):
-                await self._nc.close()
+        while self._task is not None and not self._task.done():
+            self._task.cancel()  # once more: wait_for of Python 3.11, in the library, may swallow it
+            await asyncio.wait({self._task}, timeout=0.1)
+        if self._nc is not None:
+            with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
+                async with asyncio.timeout(CLOSING_S):
+                    await self._nc.close()
 
     async def _run(self) -> None:
         """Connect, which lasts until there is a server; then the library stays connected, and subscribed."""
-        await self._nc.connect(
-            self._server.url.split(","),
-            name="bms-estimator fleet page",
-            max_reconnect_attempts=-1,
-            reconnect_time_wait=AGAIN_S,  # type: ignore[arg-type]  # it sleeps so long
-            user_credentials=str(self._server.creds) if self._server.creds else None,
-            error_cb=self._on_error,
-            disconnected_cb=self._on_lost,
-            reconnected_cb=self._on_back,
+        server = self._server
+        self._nc = await connect(
+            server.urls, "bms-estimator fleet page", creds=server.creds, ca=server.ca, linked=self._on_link
         )
         for subject, heard in self._heard().items():
             await self._nc.subscribe(subject, cb=heard)
-        await self._on_back()
+        self._on_link(None)
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._follow_table())
-            tasks.create_task(self._patiently(self._read_hours))
+            tasks.create_task(self._follow_table(self._nc))
+            tasks.create_task(self._read_hours(self._nc))
 
     def _heard(self) -> dict[str, Callable[[Msg], Coroutine[Any, Any, None]]]:
         view, clock = self._view, time.monotonic
@@ -119,7 +116,7 @@ class FleetFeed:
             view.hear_worker(message.data, clock())
 
         async def unknown(message: Msg) -> None:
-            view.hear_unknown(message.subject.rpartition(".")[2], clock())
+            view.hear_unknown(message.subject.rpartition(".")[2], message.data[:MOST_REASON].decode(errors="replace"))
 
         return {
             subjects.published("*", "state"): state,
@@ -129,26 +126,30 @@ class FleetFeed:
             subjects.unknown(): unknown,
         }
 
-    async def _follow_table(self) -> None:
+    async def _follow_table(self, nc: Client) -> None:
         """Know the packs that are in the table."""
-        bucket = PackBucket(self._nc)
+        bucket, view = PackBucket(nc), self._view
 
         async def refresh() -> None:
-            self._view.workers.partitions = await partitions_of(self._nc) or self._view.workers.partitions
+            view.workers.partitions = await partitions_of(nc) or view.workers.partitions
             for pack in await bucket.refresh():
                 kind = bucket.packs.kind(pack)
-                self._view.know(pack, None if kind is None else type_name(kind))
+                view.know(pack, None if kind is None else type_name(kind))
 
         while True:
             await self._patiently(refresh)
             await asyncio.sleep(TABLE_S)
 
-    async def _read_hours(self) -> None:
+    async def _read_hours(self, nc: Client) -> None:
         """What the last hour's summaries said, before this page was there."""
         since_s = time.time() - HOURS_S
-        async for batch in read_stream(self._nc, subjects.HOURS_STREAM, subjects.hours(), since_s=since_s):
-            for message in batch:
-                self._view.packs.hear_hour(message.subject.split(".")[1], message.data)
+
+        async def read() -> None:
+            async for batch in read_stream(nc, subjects.HOURS_STREAM, subjects.hours(), since_s=since_s):
+                for message in batch:
+                    self._view.packs.hear_hour(message.subject.split(".")[1], message.data)
+
+        await self._patiently(read)
 
     async def _patiently(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Do what a server is needed for; where it does not answer, or has no such stream, again later."""
@@ -159,24 +160,12 @@ class FleetFeed:
                 log.warning("the fleet's server does not tell", reason=str(error))
             await asyncio.sleep(TABLE_S)
 
-    def _say_lost(self) -> None:
-        self._linked(f"{self._server.url}: {self._why}")
-
-    async def _on_lost(self) -> None:
-        self._view.end()
-        self._why = "the server is lost"
-        self._say_lost()
-
-    async def _on_back(self) -> None:
-        self._view.begin(time.monotonic())
-        self._linked(None)
-
-    async def _on_error(self, error: Exception) -> None:
-        if self._nc.is_connected:
-            log.warning("the fleet's server", reason=str(error) or type(error).__name__)
-            return
-        self._why = str(error) or type(error).__name__
-        self._say_lost()
+    def _on_link(self, trouble: str | None) -> None:
+        if trouble is None:
+            self._view.begin(time.monotonic())
+        else:
+            self._view.end()
+        self._linked(trouble and f"{self._server.urls}: {trouble}")
 
 
 def type_name(kind: PackKind | str) -> str:

@@ -11,8 +11,6 @@ from bms_estimator.fleet.page_packs import LISTED, FleetPacks
 from bms_estimator.fleet.page_workers import OVER_S, FleetWorkers
 from bms_estimator.model.clock import iso_utc
 
-UNKNOWN_S = 600.0
-"""A pack that no table knows is named for so long after its last block [s]."""
 MOST_UNKNOWN = 1000
 
 
@@ -26,7 +24,7 @@ class FleetView:
 
     def __init__(self, partitions: int, now_s: float) -> None:
         self.packs, self.workers = FleetPacks(), FleetWorkers(partitions)
-        self._unknown: dict[str, float] = {}
+        self._unknown: dict[str, str] = {}
         self._since_s = now_s
         self._counted = deque([(now_s, 0)])
         self.listening = False
@@ -50,10 +48,10 @@ class FleetView:
         except ValidationError:
             self.damaged += 1
 
-    def hear_unknown(self, name: str, now_s: float) -> None:
-        """A block came of a pack that no table knows."""
+    def hear_unknown(self, name: str, why: str) -> None:
+        """A worker holds blocks of a pack that it does not know."""
         self._unknown.pop(name, None)
-        self._unknown[name] = now_s
+        self._unknown[name] = why
         if len(self._unknown) > MOST_UNKNOWN:
             del self._unknown[next(iter(self._unknown))]
 
@@ -88,9 +86,9 @@ class FleetView:
         return (self.packs.states - states) / (now_s - before_s) if now_s > before_s else None
 
     def _named_unknown(self, now_s: float) -> dict[str, Any]:
-        for name in [name for name, at_s in self._unknown.items() if at_s < now_s - UNKNOWN_S]:
-            del self._unknown[name]
+        """Those that the workers count; who was named once is named as long as there are any."""
         count, named = self.workers.unknown(now_s)
+        if not count:
+            self._unknown.clear()
         newest = dict.fromkeys([*reversed(self._unknown), *named])
-        listed = [[name, now_s - self._unknown[name] if name in self._unknown else None] for name in newest]
-        return {"count": max(count, len(newest)), "packs": listed[:LISTED]}
+        return {"count": count, "packs": [[name, self._unknown.get(name, "")] for name in newest][:LISTED]}

@@ -17,6 +17,29 @@ HOME, VAN, PLANT = (
     PackKind(cell="nmc", capacity_ah=50.0, series=96),
 )
 SHARES = {"home": (HOME, 0.7), "van": (VAN, 0.25), "plant": (PLANT, 0.05)}
+MEASURED = {
+    "home": {
+        "voltage_v": 52.81,
+        "voltage_estimate_v": 52.814,
+        "current_a": -31.2,
+        "power_w": -1647.7,
+        "temperature_c": 21.5,
+    },
+    "van": {
+        "voltage_v": 51.93,
+        "voltage_estimate_v": 51.928,
+        "current_a": 4.6,
+        "power_w": 238.9,
+        "temperature_c": 12.1,
+    },
+    "plant": {
+        "voltage_v": 354.2,
+        "voltage_estimate_v": 354.19,
+        "current_a": 12.4,
+        "power_w": 4392.1,
+        "temperature_c": 24.8,
+    },
+}
 _MARK = 0.123456789012345
 
 
@@ -42,9 +65,10 @@ def many(count: int, seed: int = 1) -> list[Pack]:
     std = rng.lognormal(np.where(names == "home", -4.1, -4.6), 0.45)
     lowest = rng.uniform(0.01, 0.09, count)
     marks = {"soc": _MARK, "soc_std": _MARK + 1.0, "stability_margin": _MARK + 2.0}
-    begin, of_soc, of_std, end = _parts(state(**marks), *marks.values())
+    parts = {name: _parts(state(**marks, **MEASURED[name]), *marks.values()) for name in SHARES}
     packs = []
     for i, name in enumerate(names):
+        begin, of_soc, of_std, end = parts[name]
         values = (f"{soc[i]:.6f}", f"{std[i]:.6f}", f"{soc[i] - lowest[i]:.6f}")
         data = begin + values[0].encode() + of_soc + values[1].encode() + of_std + values[2].encode() + end
         packs.append(Pack(f"{name}-{i:06d}", SHARES[name][0], data))

@@ -10,16 +10,21 @@ import numpy as np
 import pytest
 
 from bms_estimator.fleet import subjects
+from bms_estimator.fleet.block import decode
 from bms_estimator.fleet.edge import Edge
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.edge_settings import EdgeSettings
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.estimate import EdgeHealth
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.fleet.engine import Engine, running
 from tests.fleet.receiver import Receiver
+from tests.mosquitto import Broker, Listener, broker
 from tests.patience import LONG_S
 from tests.sinks.proxy import Proxy
+
+__all__ = ["broker"]
 
 WALL_S = 1.7e9
 SETTINGS = {"block_s": 60.0, "store_mib": 1.0}
@@ -43,7 +48,7 @@ class Feed:
 
     def __init__(self, receiver: Receiver, folder: Path, url: str, **settings: float) -> None:
         self.now_s, self._count, self._reads = 0.0, 0, list[SampleBlock]()
-        self.receiver = receiver
+        self.receiver, self._random = receiver, np.random.default_rng(1)
         self.edge = Edge(
             EdgeSettings(url=url, **SETTINGS | settings),
             receiver.pack,
@@ -52,13 +57,14 @@ class Feed:
             steady=lambda: self.now_s,
             first_delay_s=0.05,
             retry_s=0.05,
+            handover_s=LONG_S,
         )
 
     def give(self, minutes: float) -> None:
         for _ in range(round(60 * minutes)):
             sample = np.zeros(1, dtype=SAMPLE)
             sample["time_s"], sample["voltage_v"] = self.now_s, 3.0 + 1e-6 * self._count
-            sample["current_a"], sample["temperature_c"] = np.sin(self.now_s), np.nan
+            sample["current_a"], sample["temperature_c"] = self._random.normal(), np.nan
             self.edge.take(sample)
             sample["time_s"] += WALL_S
             self._reads.append(sample)
@@ -170,12 +176,12 @@ async def test_an_edge_without_room_says_from_where_on_it_has_blocks(
         network.away = True
         feed = Feed(receiver, tmp_path, network.url, store_mib=0.1)
         async with feed.edge:
-            for _ in range(6):
+            for _ in range(3):
                 feed.give(60)
                 await until(lambda: not feed.edge.store._waiting)
             dropped = feed.edge.store.dropped
             network.away = False
-            await receiver.until(360 * 60 - 60 - 60 * dropped)
+            await receiver.until(180 * 60 - 60 - 60 * dropped)
     await receiver.until(feed.count - 60 * dropped)
     assert dropped > 0
     assert receiver.gaps == 0
@@ -200,6 +206,23 @@ async def test_garbage_from_who_is_no_worker_changes_nothing(
         await until(lambda: feed.edge.unread == len(garbage))
         feed.give(3)
         await feed.all_came()
+
+
+async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
+    """What hears there says which blocks are safe, and from where to send again."""
+    edge = Edge(EdgeSettings(url=broker.url), "pack", tmp_path, handover_s=LONG_S)
+    async with Listener(broker, "raw/#") as heard, edge:
+        samples = np.zeros(600, dtype=SAMPLE)
+        samples["time_s"] = np.arange(600.0)
+        edge.take(samples)
+        await heard.wait("raw/pack", lambda data: decode(data).number == 9)
+        store = decode(heard.all("raw/pack")[0]).store
+        before = len(heard.messages)
+        await heard.publish("edge/pack/awaits", Awaits(store=store, number=7, resend=True).model_dump_json(), qos=1)
+        again = decode(await heard.wait("raw/pack", skip=before))
+        await heard.wait("raw/pack", lambda data: decode(data).number == 9, skip=before)
+        assert (again.number, again.oldest) == (7, 7)
+        assert edge.health() == EdgeHealth(blocks_kept=3, blocks_unsent=0, blocks_dropped=0, trouble=None)
 
 
 async def test_a_source_that_is_silent_holds_no_samples_back(

@@ -7,7 +7,7 @@ import pytest
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.page_feed import type_name
 from bms_estimator.fleet.page_packs import ALIVE_S, LISTED, OTHER, UNLISTED, FleetPacks
-from bms_estimator.fleet.page_view import UNKNOWN_S, FleetView
+from bms_estimator.fleet.page_view import FleetView
 from bms_estimator.fleet.page_workers import FleetWorkers
 from bms_estimator.model.suspect import Suspect
 from tests.fleet.many_packs import HOME, many, state
@@ -186,16 +186,18 @@ def test_rates_are_of_late_and_begin_anew_with_a_worker():
     assert line["blocks_per_s"] is None
 
 
-def test_unknown_packs_are_named_until_the_table_knows_them_or_they_end():
+def test_unknown_packs_are_named_until_the_table_knows_them_or_no_worker_has_any():
     view = FleetView(1, 0.0)
     view.hear_worker(beat("w", 0, unknown=("x", "held"), unknown_count=7).model_dump_json().encode(), 0.0)
-    view.hear_unknown("x", 1.0)
-    view.hear_unknown("y", 2.0)
+    view.hear_unknown("x", "no row")
+    view.hear_unknown("y", "")
     shown = view.picture(3.0, 0.0)
-    assert shown["concerns"]["unknown"] == {"count": 7, "packs": [["y", 1.0], ["x", 2.0], ["held", None]]}
+    assert shown["concerns"]["unknown"] == {"count": 7, "packs": [["y", ""], ["x", "no row"], ["held", ""]]}
     assert shown["attention"] == 7
     view.know("y", "lfp 1s1p")
-    assert view.picture(1.5 + UNKNOWN_S, 0.0)["concerns"]["unknown"]["packs"] == []
+    assert len(view.picture(3.0, 0.0)["concerns"]["unknown"]["packs"]) == 2
+    view.hear_worker(beat("w", 0).model_dump_json().encode(), 4.0)
+    assert view.picture(4.0, 0.0)["concerns"]["unknown"] == {"count": 0, "packs": []}
 
 
 def test_states_are_counted_by_the_second():

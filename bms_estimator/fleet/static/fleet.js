@@ -12,13 +12,14 @@ const ago = (s) => (number(s) ? f.duration(s) : "");
 const short = (s) => (number(s) ? (s < 9.95 ? `${f.fixed(s, 1)} s` : f.duration(s)) : "–");
 const rate = (x) => (number(x) ? count(x < 9.95 ? Math.round(10 * x) / 10 : Math.round(x)) : "");
 
-const ui = { fleet: null, link: null, at: 0, upAt: 0, since: null, type: null, kind: "all", pack: null };
+const ui = { fleet: null, link: null, at: 0, upAt: 0, since: null, type: null, kind: "all", pack: null, answers: null };
 
 function take(message) {
 	if (message.link) {
 		if (message.link.up && !ui.link?.up) ui.upAt = Date.now();
 		ui.link = message.link;
 	}
+	if (message.answers) ui.answers = message.answers;
 	if (message.fleet) [ui.fleet, ui.at] = [message.fleet, Date.now()];
 }
 
@@ -47,6 +48,7 @@ function draw() {
 	drawSpread(types, soc_std_edges);
 	drawConcerns(concerns);
 	drawWorkers(ui.fleet);
+	drawAnswers(ui.answers);
 }
 
 function drawStatus() {
@@ -158,12 +160,12 @@ const KINDS = [
 	["uncertain", "Uncertain", (v) => `SOC known to ± ${f.percent(2 * v)} %`],
 	["soc", "Low SOC", (v) => `SOC ${f.percent(v)} %`],
 	["silent", "Silent", (v) => (number(v) ? `not heard for ${ago(v)}` : "never heard")],
-	["unknown", "Unknown", (v) => `not in the table, its blocks are held${number(v) ? `; last ${ago(v)} ago` : ""}`],
+	["unknown", "Unknown", (v) => `its blocks are held${v ? `: ${v}` : ""}`],
 ];
 const NOTES = {
 	all: "The worst of each kind in turn.", margin: "Of packs alive, the smallest first; counted below 5 %: there the model is about to lose its meaning, stop discharging.",
 	suspects: "What the identifier suspects of the input, by the summary of the last hour.", uncertain: "Of packs alive, the widest band first; counted above ± 10 %.",
-	soc: "Of packs alive, the lowest first; counted below 10 %.", silent: "Not heard for three minutes or more.", unknown: "Load them with fleet packs load.",
+	soc: "Of packs alive, the lowest first; counted below 10 %.", silent: "Not heard for three minutes or more.", unknown: "Packs that send, and that the table does not know.",
 };
 const beyond = (kind, c, v) => !("limit" in c) || (kind === "uncertain" ? v > c.limit : v < c.limit);
 
@@ -229,6 +231,38 @@ function drawWorkers({ workers, holders, unheld }) {
 		const name = node("td", {}, node("i", { class: `swatch c${i % COLOURS}` }), w.id, w.leaving ? " (leaving)" : "");
 		if (w.trouble) name.append(node("p", { class: "bad" }, w.trouble));
 		return node("tr", w.alive ? {} : { class: "gone" }, name, ...said.map((s) => node("td", {}, s)));
+	}));
+}
+
+// over time
+
+const percents = (x) => (number(x) ? `${f.percent(x)} %` : "");
+const between = (low, high, say) => (number(low) && number(high) ? `${say(low)} to ${say(high)}` : "");
+const QUESTIONS = {
+	soh: ["Capacity by the year", "By type, with the 95 % band of its trend.", "No trend can be told yet: seven days are needed.", [
+		["Type", (r) => r.type], ["Packs", (r) => count(r.packs)], ["Capacity", (r) => percents(r.capacity_ratio)],
+		["A year", (r) => `${f.fixed(r.percent_per_year, 1)} %`], ["Band", (r) => between(r.percent_per_year_low, r.percent_per_year_high, (x) => `${f.fixed(x, 1)} %`)]]],
+	failing: ["About to fail", "A limit is reached within 90 days, or the input is suspected of late.", "No pack is.", [
+		["Pack", (r) => chooser(r.pack)], ["What", (r) => r.quantity.replaceAll("_", " ")], ["Value", (r) => f.digits(r.value, 3)], ["Limit", (r) => f.digits(r.limit, 3)],
+		["Days left", (r) => (number(r.days_left) ? f.fixed(r.days_left, 0) : "")]]],
+	outliers: ["Not as their type", "Capacity or Rₛ far from those of the same type.", "No pack is.", [
+		["Pack", (r) => chooser(r.pack)], ["What", (r) => r.quantity.replaceAll("_", " ")], ["Value", (r) => f.digits(r.value, 3)], ["Type's median", (r) => f.digits(r.median_of_type, 3)],
+		["Deviations", (r) => f.fixed(r.score, 1)]]],
+	honest: ["Is the band honest?", "How often the SOC was within ± two standard deviations, in hindsight; 95 % is right.", "Nothing can be judged yet.", [
+		["Of", (r) => [r.of, r.which].filter(Boolean).join(" ")], ["Packs", (r) => count(r.packs)], ["Within", (r) => percents(r.within_2_std)], ["Surely", (r) => between(r.low, r.high, percents)],
+		["Std should be", (r) => (number(r.std_should_be_times) ? `× ${f.fixed(r.std_should_be_times, 2)}` : "")]]],
+};
+
+function drawAnswers(answers) {
+	hide($("timecard"), !answers);
+	if (!answers || !changed($("answers"), JSON.stringify(answers))) return;
+	$("answers").replaceChildren(...Object.entries(QUESTIONS).filter(([name]) => answers[name]).map(([name, [title, note, none, columns]]) => {
+		const { reason, columns: names = [], rows = [], count: all } = answers[name];
+		const records = rows.map((row) => Object.fromEntries(row.map((value, i) => [names[i], value])));
+		const table = node("table", {}, node("thead", {}, node("tr", {}, ...columns.map(([head]) => node("th", { scope: "col" }, head)))),
+			node("tbody", {}, ...records.map((r) => node("tr", {}, ...columns.map(([, say]) => node("td", {}, say(r) ?? ""))))));
+		const said = reason ?? (rows.length ? note + (all > rows.length ? ` The first ${rows.length} of ${count(all)}.` : "") : none);
+		return node("div", { "data-answer": name }, node("h3", {}, title), node("p", { class: "note" }, said), ...(rows.length ? [node("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": title }, table)] : []));
 	}));
 }
 

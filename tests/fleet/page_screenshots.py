@@ -1,0 +1,121 @@
+"""The pictures of docs/fleet-page.md: a made-up fleet on the real nats-server, in a real Chromium; ``make screenshots``."""
+
+import asyncio
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import nats
+import numpy as np
+from nats.aio.client import Client
+
+from bms_estimator.fleet import subjects
+from bms_estimator.fleet.page import fleet_page
+from bms_estimator.fleet.page_feed import Server
+from bms_estimator.fleet.streams import make_streams
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.model.suspect import Suspect
+from tests.fleet.engine import running
+from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
+from tests.fleet.many_packs import Pack, beat, load, many, publish
+from tests.page.chromium import PHONE, Tab, chromium, tab
+from tests.sinks.snapshots import ONE
+
+DOCS = Path(__file__).parents[2] / "docs"
+PACKS, AWAY, DAYS = 5000, 12, 90
+SUSPECTED = {7: Suspect.CAPACITY, 40: Suspect.OFFSET, 93: Suspect.SIGN_OF_CURRENT, 161: Suspect.OUTLIERS | Suspect.OCV}
+STEP_S = 0.2
+TOP = 420
+"""Of the page: so much shows how it looks in the dark, or stale [px]."""
+
+
+def write_hours(folder: Path, names: list[str]) -> None:
+    """Packs that lose some of their capacity; a few of them much."""
+    rng = np.random.default_rng(3)
+    begin = rng.normal(-0.03, 0.015, (len(names), 1))
+    begin[:2] -= 0.4
+    truth = begin - rng.normal(0.03, 0.01, (len(names), 1)) * np.arange(DAYS) / 365.25
+    logs, variance = capacities(rng, truth, 0.01, through=1.0)
+    ratio = np.exp(logs)
+    write_fleet(
+        folder, BEGIN + 24 * np.arange(DAYS) + 23, names, cell="lfp", series=16, capacity_ah=280.0,
+        capacity_ratio=ratio, capacity_ratio_std=ratio * np.sqrt(variance), capacity_first_std=FIRST_STD, charge_out_ah=280.0,
+    )  # fmt: skip
+
+
+async def work(nc: Client, packs: list[Pack]) -> None:
+    """Two workers, for ever; some packs are silent, one is not known."""
+    rounds = 0
+    while True:
+        rounds += 1
+        more = {"packs": PACKS // 2, "blocks": rounds * PACKS // 120, "samples": rounds * PACKS // 2}
+        await beat(nc, "cellar", range(32), lag_s=0.6, unknown_count=1, **more)
+        await beat(nc, "loft", range(32, 64), lag_s=0.9, **more)
+        for pack in packs[:-AWAY] if rounds % 5 == 1 else ():
+            await publish(nc, pack.name, pack.state)
+        for place, suspects in SUSPECTED.items():
+            await nc.publish(subjects.hours(packs[place].name), json.dumps({"suspects": int(suspects)}).encode())
+        await nc.publish(subjects.unknown("home-900001"), b"not in the table of packs")
+        for pack in packs[:100] if rounds % 5 == 1 else ():
+            await nc.publish(f"bms.{pack.name}.parameters", ONE.parameters.model_dump_json().encode())
+        await asyncio.sleep(1.0)
+
+
+async def shoot(opened: Tab, name: str, part: str = "", height: int = 0) -> None:
+    """A part of the page, or its top."""
+    path, page = DOCS / f"fleet-page-{name}.png", opened.page
+    if part:
+        await page.locator(part).screenshot(path=path)
+    else:
+        size = page.viewport_size
+        assert size
+        await page.screenshot(path=path, clip={"x": 0, "y": 0, "width": size["width"], "height": height})
+    sys.stdout.write(f"{path.relative_to(DOCS.parent)}: {path.stat().st_size / 1e3:.0f} kB\n")
+
+
+async def shoot_all(url: str, kill: asyncio.Event) -> None:
+    async with chromium() as browser:
+        async with tab(browser, url, size={"width": 1280, "height": 990}) as opened:
+            await ready(opened)
+            await shoot(opened, "desktop", height=990)
+            await shoot(opened, "time", ".time")
+            await opened.page.locator("#concerns button", has_text="home-000007").click()
+            await opened.page.locator("#parameters tr").nth(5).wait_for()
+            await shoot(opened, "pack", "dialog")
+        async with tab(browser, url, size={**PHONE, "height": 1220}) as opened:
+            await ready(opened)
+            await shoot(opened, "phone", height=1220)
+        async with tab(browser, url, color_scheme="dark") as opened:
+            await ready(opened)
+            await shoot(opened, "dark", height=TOP)
+            kill.set()
+            await opened.until_status("stale since")
+            await shoot(opened, "stale", height=TOP)
+
+
+async def ready(opened: Tab) -> None:
+    await opened.until_text("known", f"of {PACKS:,}")
+    await opened.until_text("alive", f"{PACKS - AWAY:,}")
+    await opened.until("() => document.querySelectorAll('#answers tbody tr').length > 2")
+
+
+async def main() -> None:
+    with tempfile.TemporaryDirectory() as temporary, running(Path(temporary)) as engine:
+        nc, kill, packs = await nats.connect(engine.url), asyncio.Event(), many(PACKS)
+        await make_streams(nc)
+        await load(nc, packs)
+        hours = Path(temporary) / "hours"
+        write_hours(hours, [pack.name for pack in packs if pack.name.startswith("home")][:300])
+        async with fleet_page(Server(engine.url), PageSettings(listen="127.0.0.1:0"), hours, step_s=STEP_S) as url:
+            working = asyncio.create_task(work(nc, packs))
+            shooting = asyncio.create_task(shoot_all(url, kill))
+            await asyncio.wait({shooting, asyncio.create_task(kill.wait())}, return_when=asyncio.FIRST_COMPLETED)
+            working.cancel()
+            engine.kill(0)
+            await shooting
+        await nc.close()
+
+
+if __name__ == "__main__":
+    asyncio.run(main())
