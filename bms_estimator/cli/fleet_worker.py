@@ -12,11 +12,11 @@ import typer
 
 from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.fleet.connection import SERVER
+from bms_estimator.fleet.warm_up import load_fleet_kernels
 from bms_estimator.fleet.worker import CHECKPOINT_S, Options, work
 from bms_estimator.model.errors import UserError
 from bms_estimator.service.interrupt import starting, stop_on_signal
 from bms_estimator.service.logs import configure_logs, drained
-from bms_estimator.service.warm_up import load_kernels
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -43,7 +43,7 @@ def worker(
     configure_logs()
     with starting(None), drained():
         with compiling_shown(structlog.get_logger(__name__).info):
-            load_kernels()
+            load_fleet_kernels()
         asyncio.run(_work(options))
 
 
