@@ -171,7 +171,7 @@ def _listen(heard: deque[tuple[str, bytes]], edges: SimulatedEdges) -> None:
             answer = Awaits.model_validate_json(payload)
         except ValidationError:
             continue  # not a worker's
-        edges.hear(topic.split("/")[1], answer)
+        edges.hear(topic.split("/")[1], answer, time.monotonic())
 
 
 def _send(fleet: SimulatedFleet, edges: SimulatedEdges, links: list[_Connection], topics: list[str]) -> int:

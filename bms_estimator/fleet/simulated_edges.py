@@ -7,6 +7,9 @@ import numpy as np
 from bms_estimator.fleet.simulated_fleet import BLOCK_S, Floats, SimulatedFleet, Whole
 from bms_estimator.fleet.subjects import Awaits
 
+RESEND_S = 5.0
+"""A worker that is behind asks for the same block again before it can have it: it is sent once in so long [s]."""
+
 
 class Due(NamedTuple):
     """Blocks to be sent now, at most one a pack. Arrays of one shape."""
@@ -40,6 +43,8 @@ class SimulatedEdges:
         self._later_s = (fleet.store - fleet.begin_ns) / 1e9
         self.next: Whole = np.ones(len(fleet.names), dtype=np.int64)
         self.safe, self._furthest = self.next.copy(), self.next.copy()
+        self._asked: Whole = np.zeros(len(fleet.names), dtype=np.int64)
+        self._asked_s: Floats = np.full(len(fleet.names), -np.inf)
         self.resends = self.sent = self.again = 0
 
     def due(self, now_s: float, most: int) -> Due:
@@ -56,15 +61,17 @@ class SimulatedEdges:
         self._furthest[packs] = np.maximum(self._furthest[packs], self.next[packs])
         return Due(packs, numbers, ready_s[packs])
 
-    def hear(self, pack: str, awaits: Awaits) -> bool:
-        """Hear from a worker. Returns whether the pack is one of these, and the store its."""
+    def hear(self, pack: str, awaits: Awaits, now_s: float) -> bool:
+        """Hear from a worker at ``now_s``. Returns whether the pack is one of these, and the store its."""
         i = self._index.get(pack)
         if i is None or awaits.store != self._fleet.store[i]:
             return False
-        self.safe[i] = max(self.safe[i], awaits.number)
+        known, self.safe[i] = self.safe[i], max(self.safe[i], awaits.number)
         if awaits.resend:
             self.resends += 1
-            self.next[i] = min(self.next[i], awaits.number)
+            if awaits.number >= known and (awaits.number != self._asked[i] or now_s - self._asked_s[i] >= RESEND_S):
+                self.next[i] = min(self.next[i], awaits.number)
+                self._asked[i], self._asked_s[i] = awaits.number, now_s
         else:  # what went before this program began is not sent again
             self.next[i] = max(self.next[i], awaits.number)
         return True

@@ -128,7 +128,7 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     await asyncio.to_thread(fleet_rig.stop_workers)
     stopped_s = time.monotonic() - stopped_s
     raw_bytes, raw_messages, states_bytes = await _stored(fleet_rig)
-    pack_days = packs * passed_s * arguments.speed / DAY_S
+    pack_days = max(1, taken) * BLOCK_S / DAY_S  # of what was taken: also where that is not all
     work_s = sum(used_s[name] for name in names)
     a_day = DAY_S / BLOCK_S
     sys.stderr.write((fleet_rig.folder / "edges.log").read_text().splitlines()[-1] + "\n")

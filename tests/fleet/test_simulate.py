@@ -52,7 +52,7 @@ def test_every_block_comes_into_the_stream_and_one_that_is_asked_for_comes_again
         report, seen = asyncio.run(sent(engine.url, f"mqtt://127.0.0.1:{engine.mqtt_port}"))
     assert set(seen) == {(f"sim-{i:06d}", n) for i in range(PACKS) for n in range(1, BLOCKS + 1)}
     assert seen["sim-000000", AGAIN] >= 2
-    assert (report.resends, report.unacknowledged) == (1, 0)
+    assert report.resends == 1
     assert report.again >= 1
 
 
