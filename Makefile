@@ -16,7 +16,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo benchmark compare home-assistant real-home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page fleet-page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check test demo demo-fleet fleet fleet-kills benchmark compare home-assistant real-home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page fleet-page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -42,6 +42,15 @@ test: apt venv ## all there is to check: packages, style, types, firmware, pytes
 demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory --silent firmware || echo "the firmware does not build here: the Python board serves"; fi
 	@$(BIN)/bms-estimator demo $(ARGS)
+
+demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of which one is killed, the page: a minute
+	@$(BIN)/bms-estimator fleet demo $(ARGS)
+
+fleet: venv ## what a fleet costs, in processes on this machine, e.g. make fleet ARGS="--packs 10000 --minutes 5"
+	@$(BIN)/python -m tests.benchmarks.fleet $(ARGS)
+
+fleet-kills: venv ## workers and servers of a fleet killed 100 times, one node and three, states compared bit by bit: 15 minutes
+	@$(BIN)/python -m tests.benchmarks.fleet_kills $(ARGS)
 
 nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import tomlkit
 import typer
@@ -13,9 +13,11 @@ from bms_estimator.cli.settings_file import Given, settings_file
 from bms_estimator.estimator.lemma import Condition, failed
 from bms_estimator.estimator.plausible import implausible
 from bms_estimator.estimator.records import estimator_settings
+from bms_estimator.fleet.edge import check_edge
 from bms_estimator.kernels.margins import delta
 from bms_estimator.model.alarm_limits import out_of_range, watched
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.edge_settings import EdgeSettings
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.export_settings import InfluxSettings
 from bms_estimator.model.fuel_cell import PackModel
@@ -34,6 +36,8 @@ from bms_estimator.sources.probe import probe as who_is_there
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 
 ONLY_IN_SERVICE = "not there now, so not checked: a credential of systemd is there only while the service runs"
+
+Doors = TypeVar("Doors", MqttSettings, EdgeSettings)
 
 PackFile = Annotated[Path, typer.Argument(help="settings of the pack")]
 
@@ -94,9 +98,12 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     settings, cell = load_pack(file)
     warnings = [*implausible(settings, cell), *out_of_range(settings, cell), *unusable(settings), *_lemma(cell)]
     if settings.mqtt is not None:
-        mqtt, unseen = _here(settings.mqtt)
+        mqtt, unseen = _here("mqtt", settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
         settings = settings.model_copy(update={"mqtt": mqtt})
+    if settings.edge is not None:
+        edge, unseen = _here("edge", settings.edge)
+        warnings += unseen + check_edge(edge)
     if settings.page is not None:
         unread, unseen = _unread("page", settings.page, "token_file")
         warnings += unseen
@@ -153,16 +160,16 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
     return follows
 
 
-def _here(mqtt: MqttSettings) -> tuple[MqttSettings, list[str]]:
+def _here(section: str, doors: Doors) -> tuple[Doors, list[str]]:
     """The settings without what only the running service can read, and a warning for each such file."""
-    without, warnings = _unread("mqtt", mqtt, "password_file", "cert_file", "key_file")
+    without, warnings = _unread(section, doors, "password_file", "cert_file", "key_file")
     if without & {"cert_file", "key_file"}:  # one is of no use without the other
         without |= {"cert_file", "key_file"}
-    return mqtt.model_copy(update=dict.fromkeys(without)), warnings
+    return doors.model_copy(update=dict.fromkeys(without)), warnings
 
 
 def _unread(
-    section: str, settings: MqttSettings | InfluxSettings | PageSettings, *keys: str
+    section: str, settings: MqttSettings | EdgeSettings | InfluxSettings | PageSettings, *keys: str
 ) -> tuple[set[str], list[str]]:
     """The keys of files that only the running service can read, and a warning for each."""
     files = {key: getattr(settings, key) for key in keys}

@@ -59,7 +59,9 @@ def user(
     pack: Annotated[str, typer.Argument(help="device that the token is for", show_default=False)],
     settings_file: Annotated[Path | None, typer.Option("--settings", help="fleet.toml")] = None,
     folder: Folder = None,
-    days: Annotated[float | None, typer.Option(min=0, help="it is refused afterwards; without: never")] = None,
+    days: Annotated[
+        float | None, typer.Option(min=0.0, max=36_600.0, help="it is refused afterwards; without: never")
+    ] = None,
 ) -> None:
     """Print the token with which a pack's edge connects: MQTT's password, with any name.
 
@@ -71,7 +73,7 @@ def user(
         raise UserError(f"{pack!r}: no name of a pack: letters, digits, _ and -, 64 at most") from None
     keys = Place(_folder(_settings(settings_file), folder)).keys
     now = datetime.now(UTC)
-    typer.echo(credentials.edge_token(keys, tenant, pack, now, now + timedelta(days=days) if days else None))
+    typer.echo(credentials.edge_token(keys, tenant, pack, now, None if days is None else now + timedelta(days=days)))
 
 
 def _settings(path: Path | None, **given: str | None) -> FleetSettings:

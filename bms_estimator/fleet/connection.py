@@ -47,7 +47,7 @@ async def connect(
             servers=[each.strip() for each in servers.split(",")],
             name=name,
             user_credentials=str(creds) if creds else None,
-            tls=_context(ca) if ca else None,
+            tls=context(ca) if ca else None,
             max_reconnect_attempts=-1,
             reconnect_time_wait=RETRY_S,
             error_cb=said.trouble,
@@ -59,7 +59,12 @@ async def connect(
     return nc
 
 
-def _context(ca: Path) -> ssl.SSLContext:
+def context(ca: Path) -> ssl.SSLContext:
+    """Trust in the authority of a certificate.
+
+    Raises:
+        UserError: It cannot be read.
+    """
     try:
         return ssl.create_default_context(cafile=ca)
     except (OSError, ssl.SSLError) as error:

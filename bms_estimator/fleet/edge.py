@@ -26,7 +26,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.backlog import Sending
-from bms_estimator.sinks.brokers import Broker, brokers, check
+from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connect, Connection, Hello
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.link import Link
@@ -39,8 +39,8 @@ OVERDUE = 1.5
 """After so many of its lengths a block is sent though no sample has ended it."""
 HANDOVER_S = 2.0
 """At the end: how long what is not sent may still take [s]."""
-CLOSING_S = 3.0
-"""How long the end may take in all [s]."""
+PARTING_S = 1.0
+"""How long parting from the server may take [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -58,6 +58,7 @@ class Edge:
         most_samples: Of a block.
         first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
         retry_s: Before a disk that failed is tried again [s].
+        handover_s: At the end, how long what is not sent may still take [s].
 
     Attributes:
         delivery: What became of the blocks.
@@ -79,8 +80,9 @@ class Edge:
         most_samples: int = MOST_SAMPLES,
         first_delay_s: float = FIRST_DELAY_S,
         retry_s: float = RETRY_S,
+        handover_s: float = HANDOVER_S,
     ) -> None:
-        self._clock, self._steady = clock or Clock(), steady
+        self._clock, self._steady, self._handover_s = clock or Clock(), steady, handover_s
         self._block_s, self._gathering = settings.block_s, Gathering(settings.block_s, most_samples)
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
         self._hear_topic = _topic(subjects.awaits(pack))
@@ -89,9 +91,11 @@ class Edge:
         self.delivery, self.unread = Delivery(), 0
         self._refusals = Refusals(self.delivery, lambda: None, first_delay_s)
         self._sending = Sending(self.store, self.delivery, self._refusals, first_delay_s)
-        mqtt, found = _brokers(settings)
+        for warning in check_edge(settings):
+            log.warning("a secret that is none", reason=warning)
+        mqtt = _mqtt(settings)
         hello = Hello(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._lose)
-        self._link = Link(found, hello, connect or Dial(mqtt), self._serve, self.delivery, first_delay_s)
+        self._link = Link(brokers(mqtt), hello, connect or Dial(mqtt), self._serve, self.delivery, first_delay_s)
         self._times: EdgeClock | None = None
         self._overdue: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
@@ -125,7 +129,7 @@ class Edge:
         self._end_block()
         if self._task is not None:
             self._link.closing.set()
-            done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
+            done, _ = await asyncio.wait([self._task], timeout=self._handover_s + PARTING_S)
             if not done:
                 self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -159,7 +163,7 @@ class Edge:
                 ]
                 await self._link.closing.wait()
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(HANDOVER_S):
+                    async with asyncio.timeout(self._handover_s):
                         await self._sending.emptied()
                 for task in others:
                     task.cancel()
@@ -187,17 +191,22 @@ def _topic(subject: str) -> str:
     return subject.replace(".", "/")
 
 
-def _brokers(settings: EdgeSettings) -> tuple[MqttSettings, list[Broker]]:
-    """The servers, and what opens their doors.
+def check_edge(settings: EdgeSettings) -> list[str]:
+    """Whether addresses, password and certificates can be used.
+
+    Returns:
+        A sentence for each secret that every user of this machine may read.
 
     Raises:
         UserError: One cannot be used.
     """
-    doors = ("url", "username", "password_file", "ca_file", "cert_file", "key_file")
-    mqtt = MqttSettings(**{name: getattr(settings, name) for name in doors})
     try:
-        for warning in check(mqtt):
-            log.warning("a secret that is none", reason=warning.replace("mqtt.", "edge.", 1))
-        return mqtt, brokers(mqtt)
+        return [warning.replace("mqtt.", "edge.", 1) for warning in check(_mqtt(settings))]
     except UserError as error:
         raise UserError(str(error).replace("mqtt.", "edge.")) from None
+
+
+def _mqtt(settings: EdgeSettings) -> MqttSettings:
+    """The servers, and what opens their doors, as all connections have them."""
+    doors = ("url", "username", "password_file", "ca_file", "cert_file", "key_file")
+    return MqttSettings(**{name: getattr(settings, name) for name in doors})

@@ -69,7 +69,9 @@ def day_folder(folder: Path, day: date) -> Path:
 def _write_day(folder: Path, day: int, rows: pa.Table) -> Path:
     """``day`` is in days since 1970."""
     of_day = day_folder(folder, datetime.fromtimestamp(day * 24 * HOUR_S, UTC).date())
-    of_day.mkdir(parents=True, exist_ok=True)
+    if not of_day.is_dir():
+        of_day.mkdir(parents=True, exist_ok=True)
+        _sync(folder)
     path = of_day / f"{BATCH}{uuid.uuid4().hex}.parquet"
     unfinished = path.with_name(f".{path.name}{UNFINISHED}")
     pq.write_table(rows, unfinished, compression="zstd")
@@ -82,7 +84,6 @@ def _finish(unfinished: Path, path: Path) -> None:
     _sync(unfinished)
     unfinished.rename(path)
     _sync(path.parent)
-    _sync(path.parent.parent)
 
 
 def _sync(path: Path) -> None:

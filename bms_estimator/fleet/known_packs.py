@@ -7,11 +7,8 @@ wrong with a row makes its packs unknown, with the reason.
 from collections.abc import Iterator
 from functools import lru_cache
 
-import numpy as np
-
 from bms_estimator.fleet.pack_row import PackKind, kind_of, known_cells, model_of, settings_of
-from bms_estimator.fleet.pack_type import pack_type
-from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
+from bms_estimator.fleet.pack_type import type_estimator
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.settings import Settings
@@ -102,7 +99,7 @@ def _kind(data: bytes) -> PackKind | str:
 def _made(kind: PackKind, cell_file: str | None) -> tuple[Settings, PackModel] | str:
     try:
         settings, model = settings_of(kind), model_of(kind, cell_file)
-        pack_type(settings, model, np.zeros(1, ESTIMATOR_STATE))  # kept: a partition asks for the same next
+        type_estimator(settings, model)  # kept: a partition asks for the same next
     except UserError as error:
         return str(error)
     except (ValueError, ArithmeticError) as error:

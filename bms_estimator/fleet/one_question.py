@@ -1,6 +1,5 @@
 """A connection for one question to the server: what is wrong with it is said at once."""
 
-import ssl
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -9,6 +8,8 @@ import nats
 import nats.errors
 from nats.aio.client import Client
 
+from bms_estimator.fleet.connection import context
+from bms_estimator.fleet.reasons import reason
 from bms_estimator.fleet.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
 
@@ -32,7 +33,7 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
         nc = await nats.connect(
             [url.strip() for url in server.split(",")],
             user_credentials=_readable(creds) if creds is not None else None,
-            tls=_context(ca) if ca is not None else None,
+            tls=context(ca) if ca is not None else None,
             allow_reconnect=False,
             max_reconnect_attempts=1,  # of each server that cannot be reached
             reconnect_time_wait=RETRY_S,
@@ -40,12 +41,12 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
             error_cb=trouble,
         )
     except (nats.errors.Error, OSError, ValueError) as error:
-        raise UserError(f"--server {server}: {_why(troubles[-1] if troubles else error)}") from None
+        raise UserError(f"--server {server}: {reason(troubles[-1] if troubles else error)}") from None
     try:
         async with nc:
             yield nc
     except (StreamError, nats.errors.Error) as error:
-        raise UserError(f"--server {server}: {_why(error)}") from None
+        raise UserError(f"--server {server}: {reason(error)}") from None
 
 
 def _readable(creds: Path) -> Path:
@@ -54,19 +55,3 @@ def _readable(creds: Path) -> Path:
     except OSError as error:
         raise UserError(f"--creds {creds}: cannot be read: {error.strerror}") from None
     return creds
-
-
-def _context(ca: Path) -> ssl.SSLContext:
-    try:
-        return ssl.create_default_context(cafile=ca)
-    except OSError as error:  # that of TLS is one
-        raise UserError(f"--ca {ca}: {error.strerror or error}") from None
-
-
-def _why(error: Exception) -> str:
-    if isinstance(error, ConnectionRefusedError):
-        return "nobody listens there; start it with `bms-estimator fleet serve`"
-    if isinstance(error, TimeoutError):
-        return f"no answer within {CONNECT_S} s"
-    said = str(error).removeprefix("nats: ") or type(error).__name__
-    return f"{said}: give --creds" if "uthorization" in said else said

@@ -94,7 +94,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
         record: What its estimator and meter work on, shape (1,), dtype PACK_STATE.
     """
     made = made_of(settings, cell)
-    estimator = _estimator(_Recipe(made, settings, cell)).on(record["estimator"])
+    estimator = type_estimator(settings, cell).on(record["estimator"])
     return PackType(
         settings=settings.pack,
         made_of=made,
@@ -105,9 +105,18 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
     )
 
 
+def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
+    """An estimator of packs with these settings: of all partitions of a process the same.
+
+    Args:
+        settings: Of the packs.
+        cell: A pack as one object (``CellModel.pack``).
+    """
+    return _estimator(_Recipe(made_of(settings, cell), settings, cell))
+
+
 @lru_cache(maxsize=MOST_TYPES)
 def _estimator(recipe: _Recipe) -> Estimator:
-    """Of all partitions of a process."""
     return estimator_of(recipe.settings, recipe.cell)
 
 

@@ -72,6 +72,8 @@ class Limits:
     """silent: no summary for longer; a living pack's newest is of the hour before."""
     most_packs: int = 10_000
     """honest: asks so many packs, chosen by a hash of their name."""
+    least_seen_s: float = 3590.0
+    """honest: so much of each hour between was measured [s]."""
     surer: float = 0.5
     """honest: a later estimate judges where its variance is below this part."""
 

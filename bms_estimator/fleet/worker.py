@@ -23,8 +23,8 @@ from bms_estimator.fleet.membership import Members
 from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.reasons import reason
 from bms_estimator.fleet.streams import partitions_of
+from bms_estimator.fleet.tasks import end, until_first_ends
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.interrupt import until_first_ends
 from bms_estimator.service.notify import Notifier
 
 CHECKPOINT_S = 300.0
@@ -68,8 +68,7 @@ async def work(options: Options, stop: asyncio.Event) -> None:
     starting = asyncio.ensure_future(_start(options, notifier))
     await until_first_ends(asyncio.wait([starting]), stop.wait())
     if not starting.done():
-        starting.cancel()
-        await asyncio.wait([starting])
+        await end(starting)
         return
     worker = starting.result()
     try:
@@ -167,8 +166,7 @@ class Worker:
             self._give_back(number)
         renewing = asyncio.ensure_future(_each(RENEW_S, self._ask_all))
         await asyncio.gather(*self._returning.values())
-        renewing.cancel()
-        await asyncio.wait([renewing])
+        await end(renewing)
         await self._nc.close()
 
     @property
@@ -247,8 +245,7 @@ class Worker:
             self._returning[number] = asyncio.create_task(self._return(*self._held[number]))
 
     async def _return(self, holding: Holding, task: asyncio.Task[None]) -> None:
-        task.cancel()
-        await asyncio.wait([task])
+        await end(task)
         async with self._few:
             if self._nc.is_connected:
                 await holding.give_back()

@@ -109,7 +109,9 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     blocks = round(minutes * arguments.speed) + 1
     edges = fleet_rig.simulate(packs, seed=SEED, begin=f"{begin}", speed=arguments.speed, blocks=blocks)
     await asyncio.sleep(60.0 * arguments.warm_up)
-    pids = {"server": fleet_rig.engine.pid(0), "edges": edges.pid} | {name: fleet_rig.workers[name].pid for name in names}
+    pids = {"server": fleet_rig.engine.pid(0), "edges": edges.pid} | {
+        name: fleet_rig.workers[name].pid for name in names
+    }
     used_s = {name: cpu_s(pid) for name, pid in pids.items()}
     begun_s, blocks_before = time.monotonic(), heard.blocks
     heard.lags_s.clear()
@@ -129,7 +131,7 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     pack_days = packs * passed_s * arguments.speed / DAY_S
     work_s = sum(used_s[name] for name in names)
     a_day = DAY_S / BLOCK_S
-    print((fleet_rig.folder / "edges.log").read_text().splitlines()[-1], file=sys.stderr)
+    sys.stderr.write((fleet_rig.folder / "edges.log").read_text().splitlines()[-1] + "\n")
     return {
         "blocks/s": f"{taken / passed_s:,.1f}",
         "samples/s": f"{taken * BLOCK_S / passed_s:,.0f}",
@@ -181,7 +183,7 @@ async def _listen(fleet_rig: Rig, fleet: SimulatedFleet) -> Heard:
 
 async def _until(true: Any) -> None:
     async with asyncio.timeout(LONG_S):
-        while not true():
+        while not true():  # noqa: ASYNC110 - it has no other way to tell
             await asyncio.sleep(0.1)
 
 

@@ -20,10 +20,12 @@ from pathlib import Path
 
 import numpy as np
 from nats.aio.client import Client
+from nats.aio.msg import Msg
 
 from bms_estimator.estimator.estimator import Estimator, estimator_of
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.block import decode
+from bms_estimator.fleet.heartbeat import DEAD_S, Heartbeat
 from bms_estimator.fleet.keeping import Pointer
 from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.partition import Partition
@@ -40,8 +42,11 @@ OF_LEADERS = 0.5
 """Part of the nodes' kills, where there are three."""
 LONGEST_AWAY_S = 2.0
 """Before who was killed is started again."""
-QUIET_S = 10.0
-"""After the last kill edges send on for so long: what was lost is asked for again when the next block comes."""
+BLOCKS_AFTER = 2
+"""That each edge sends after the last kill: what was lost is asked for again when the next block comes."""
+
+MOST_WRONG = 20
+"""Lines about what is wrong."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,6 @@ class Plan:
     mean_s: float = 1.0
     speed: float = 60.0
     partitions: int = 8
-    quiet_s: float = QUIET_S
 
 
 @dataclass
@@ -107,16 +111,26 @@ def main() -> None:
     for nodes in arguments.nodes:
         began_s = time.monotonic()
         plan = Plan(nodes, arguments.kills, arguments.packs, arguments.seed)
-        outcome = run(plan, lambda line: print(line, flush=True))
-        print(f"{nodes} node{'s' if nodes > 1 else ''}, seed {plan.seed}, {time.monotonic() - began_s:.0f} s\n{outcome}")
-        print("\n".join(outcome.wrong[:20]))
+        outcome = run(plan, _say)
+        of = "1 node" if nodes == 1 else f"{nodes} nodes"
+        _say(f"{of}, seed {plan.seed}, {time.monotonic() - began_s:.0f} s\n{outcome}")
+        for line in outcome.wrong[:MOST_WRONG]:
+            _say(line)
         wrong += len(outcome.wrong)
     sys.exit(wrong > 0)
 
 
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
 def run(plan: Plan, said: Callable[[str], object] = lambda _: None) -> Outcome:
     """Run a plan; ``said`` hears of each kill."""
-    with tempfile.TemporaryDirectory() as folder, rig(Path(folder), plan.nodes, partitions=plan.partitions) as fleet_rig:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        rig(Path(folder), plan.nodes, partitions=plan.partitions) as fleet_rig,
+    ):
         return asyncio.run(_run(fleet_rig, plan, said))
 
 
@@ -130,14 +144,15 @@ async def _run(fleet_rig: Rig, plan: Plan, said: Callable[[str], object]) -> Out
     begin = datetime.fromtimestamp(begin_s, UTC).replace(tzinfo=None).isoformat()
     edges = fleet_rig.simulate(plan.packs, seed=plan.seed, begin=begin, speed=plan.speed)
     nc = await fleet_rig.connected()
-    outcome = Outcome(packs=plan.packs)
+    outcome, heard = Outcome(packs=plan.packs), await _hear(nc)
     try:
-        await _until_taken(nc, plan, begun=True)
+        await _until(lambda: _counted(heard) > 0)
         await asyncio.to_thread(_kill, fleet_rig, plan, outcome, said)
-        await asyncio.sleep(plan.quiet_s)
+        await _until_whole(nc, fleet)
         edges.terminate()
         await asyncio.to_thread(edges.wait, LONG_S)
-        await _until_taken(nc, plan, begun=False)
+        last = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
+        await _until(lambda: _counted(heard) == last)
         await asyncio.to_thread(fleet_rig.stop_workers)
         await _judge(nc, fleet, plan, outcome)
     finally:
@@ -166,26 +181,62 @@ def _kill(fleet_rig: Rig, plan: Plan, outcome: Outcome, said: Callable[[str], ob
         said(f"kill {kill + 1}: a {whom}")
 
 
-async def _until_taken(nc: Client, plan: Plan, *, begun: bool) -> None:
-    """Until workers have taken something, or all there is."""
+async def _hear(nc: Client) -> dict[str, tuple[float, Heartbeat]]:
+    """Last heartbeats of all workers by name, with the moment of a monotonic clock [s]."""
+    heard: dict[str, tuple[float, Heartbeat]] = {}
+
+    async def beat(message: Msg) -> None:
+        said = Heartbeat.model_validate_json(message.data)
+        heard[said.id] = time.monotonic(), said
+
+    await nc.subscribe(subjects.worker(), cb=beat)
+    return heard
+
+
+def _counted(heard: dict[str, tuple[float, Heartbeat]]) -> int:
+    """Messages of the stream that the partitions' counts tell of, as who lives and holds them says."""
+    now_s = time.monotonic()
+    return sum(
+        beat.counters.get(what, 0)
+        for heard_s, beat in heard.values()
+        for what in ("blocks", "resends", "gaps")
+        if now_s - heard_s < DEAD_S
+    )
+
+
+async def _until_whole(nc: Client, fleet: SimulatedFleet) -> None:
+    """Until nothing is missing in the stream, and each pack has sent something since."""
+    before = await _numbers(nc)
     async with asyncio.timeout(LONG_S):
         while True:
-            js = nc.jetstream()
-            infos = [await js.consumer_info(subjects.RAW_STREAM, f"p{number}") for number in range(plan.partitions)]
-            if begun and any(info.delivered and info.delivered.consumer_seq for info in infos):
+            numbers = await _numbers(nc)
+            if all(
+                sorted(numbers[pack]) == list(range(1, len(numbers[pack]) + 1))
+                and max(numbers[pack]) >= max(before[pack], default=0) + BLOCKS_AFTER
+                for pack in fleet.names
+            ):
                 return
-            if not begun and not any(info.num_pending for info in infos):
-                await asyncio.sleep(1.0)  # what was given last is taken
-                return
-            await asyncio.sleep(0.2)
+            await asyncio.sleep(0.5)
 
 
-async def _judge(nc: Client, fleet: SimulatedFleet, plan: Plan, outcome: Outcome) -> None:
-    """Compare what the stream has, what is in the checkpoints, and what one estimator makes of all samples."""
+async def _numbers(nc: Client) -> dict[str, Counter[int]]:
+    """Numbers of the blocks in the stream by pack, and how often they came."""
     numbers: dict[str, Counter[int]] = defaultdict(Counter)
     last = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
     async for message in stored(nc, subjects.RAW_STREAM, "p.*.raw.*", 1, last):
         numbers[message.subject.rpartition(".")[2]][decode(message.data).number] += 1
+    return numbers
+
+
+async def _until(true: Callable[[], bool]) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not true():  # noqa: ASYNC110 - it has no other way to tell
+            await asyncio.sleep(0.1)
+
+
+async def _judge(nc: Client, fleet: SimulatedFleet, plan: Plan, outcome: Outcome) -> None:
+    """Compare what the stream has, what is in the checkpoints, and what one estimator makes of all samples."""
+    numbers = await _numbers(nc)
     bucket = PackBucket(nc)
     await bucket.refresh()
     partitions = {number: await _last(nc, number, bucket) for number in range(plan.partitions)}
@@ -216,7 +267,9 @@ def _differences(pack: str, numbers: Counter[int], state: np.void, estimator: Es
     if sorted(numbers) != list(range(1, blocks + 1)):
         wrong.append(f"{pack}: not in the stream: {sorted(set(range(1, max(numbers))) - set(numbers))[:10]}")
     if (delivery["blocks"], delivery["awaited"], delivery["lost_blocks"]) != (blocks, blocks + 1, 0):
-        wrong.append(f"{pack}: {blocks} blocks in the stream, taken {delivery['blocks']}, lost {delivery['lost_blocks']}")
+        wrong.append(
+            f"{pack}: {blocks} blocks in the stream, taken {delivery['blocks']}, lost {delivery['lost_blocks']}"
+        )
     if state["estimator"].tobytes() != estimator.record.tobytes():
         wrong.append(f"{pack}: its estimator's record is another")
     return wrong

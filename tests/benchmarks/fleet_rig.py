@@ -62,7 +62,9 @@ class Rig:
         if process.wait(10 * LONG_S):
             raise RuntimeError((self.folder / "load.log").read_text())
 
-    def simulate(self, packs: int, *, seed: int, begin: str, speed: float, blocks: int | None = None) -> subprocess.Popen[bytes]:
+    def simulate(
+        self, packs: int, *, seed: int, begin: str, speed: float, blocks: int | None = None
+    ) -> subprocess.Popen[bytes]:
         """Be their edges, for so many blocks each, or until it is stopped."""
         arguments = ["--packs", packs, "--seed", seed, "--begin", begin, "--speed", speed]
         arguments += ["--blocks", blocks] if blocks else []
@@ -81,7 +83,9 @@ class Rig:
 
     async def connected(self) -> Client:
         """To any node that lives; again and again where the one it has goes."""
-        return await nats.connect(self.engine.urls, max_reconnect_attempts=-1, reconnect_time_wait=0.1, error_cb=_nobody)
+        return await nats.connect(
+            self.engine.urls, max_reconnect_attempts=-1, reconnect_time_wait=0.1, error_cb=_nobody
+        )
 
 
 async def _nobody(_error: Exception) -> None:

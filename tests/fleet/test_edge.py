@@ -43,7 +43,7 @@ class Feed:
 
     def __init__(self, receiver: Receiver, folder: Path, url: str, **settings: float) -> None:
         self.now_s, self._count, self._reads = 0.0, 0, list[SampleBlock]()
-        self.receiver = receiver
+        self.receiver, self._random = receiver, np.random.default_rng(1)
         self.edge = Edge(
             EdgeSettings(url=url, **SETTINGS | settings),
             receiver.pack,
@@ -52,13 +52,14 @@ class Feed:
             steady=lambda: self.now_s,
             first_delay_s=0.05,
             retry_s=0.05,
+            handover_s=LONG_S,
         )
 
     def give(self, minutes: float) -> None:
         for _ in range(round(60 * minutes)):
             sample = np.zeros(1, dtype=SAMPLE)
             sample["time_s"], sample["voltage_v"] = self.now_s, 3.0 + 1e-6 * self._count
-            sample["current_a"], sample["temperature_c"] = np.sin(self.now_s), np.nan
+            sample["current_a"], sample["temperature_c"] = self._random.normal(), np.nan
             self.edge.take(sample)
             sample["time_s"] += WALL_S
             self._reads.append(sample)
@@ -170,12 +171,12 @@ async def test_an_edge_without_room_says_from_where_on_it_has_blocks(
         network.away = True
         feed = Feed(receiver, tmp_path, network.url, store_mib=0.1)
         async with feed.edge:
-            for _ in range(6):
+            for _ in range(3):
                 feed.give(60)
                 await until(lambda: not feed.edge.store._waiting)
             dropped = feed.edge.store.dropped
             network.away = False
-            await receiver.until(360 * 60 - 60 - 60 * dropped)
+            await receiver.until(180 * 60 - 60 - 60 * dropped)
     await receiver.until(feed.count - 60 * dropped)
     assert dropped > 0
     assert receiver.gaps == 0

@@ -13,6 +13,12 @@ from typing import IO
 
 import pytest
 
+from bms_estimator.fleet.edge import Edge
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.edge_settings import EdgeSettings
+from bms_estimator.model.settings import Settings
+from bms_estimator.service.serve import serve
+from bms_estimator.snapshot.health import sample_counters
 from tests.command_line import PROGRAM, run
 from tests.fleet.engine import Engine, running
 from tests.fleet.receiver import Receiver
@@ -99,6 +105,26 @@ async def test_what_a_killed_edge_had_ended_comes_once_and_one_that_is_asked_to_
     assert not [name for name in imported if name.split(".")[0] in ("numba", "scipy") or ".kernels" in name]
 
 
+async def test_run_sends_what_it_estimates_from(tmp_path: Path, line: Line, engine: Engine) -> None:
+    line.plug()
+    board, stop = asyncio.create_task(Board(line).speak()), asyncio.Event()
+    edge = {"url": f"mqtt://127.0.0.1:{engine.mqtt_port}", "block_s": 1.0}
+    settings = Settings.model_validate(
+        {"pack": {"name": "both"}, "sensor": {"port": str(line.path), "protocol": "text"}, "edge": edge}
+    )
+    async with Receiver(engine.url, "both") as receiver:
+        service = asyncio.create_task(serve(settings, load_cell("chen_mora"), stop=stop, folder=tmp_path))
+        await receiver.until(1)
+        stop.set()
+        estimator = await asyncio.wait_for(service, LONG_S)
+        counters = sample_counters(estimator.state[0])
+        samples = counters["samples"] + sum(n for name, n in counters.items() if name.startswith("dropped_"))
+        async with Edge(EdgeSettings.model_validate(edge), "both", tmp_path):  # has what a busy machine had no time for
+            await receiver.until(samples)
+        assert receiver.samples.size == samples
+    board.cancel()
+
+
 def test_a_pack_that_is_sent_nowhere_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "pack.toml"
     path.write_text("[pack]\n")
@@ -123,3 +149,17 @@ def test_settings_that_cannot_be_are_named(
     code, _, err = run(capsys, "edge", path)
     assert code == 2
     assert said in err
+
+
+def test_config_check_looks_at_what_opens_the_servers_door(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, token = tmp_path / "pack.toml", tmp_path / "token"
+    path.write_text(f'[edge]\nusername = "a"\npassword_file = "{token}"\n')
+    assert run(capsys, "config", "check", path)[::2] == (
+        2,
+        f"error: edge.password_file = {token}: cannot be read: No such file or directory\n",
+    )
+    token.write_text("secret")
+    token.chmod(0o644)
+    code, _, said = run(capsys, "config", "check", path)
+    assert code == 0
+    assert f"edge.password_file = {token}: every user of this machine may read it" in said

@@ -98,7 +98,7 @@ def test_what_cannot_be_used_is_said_before_anything_is_written(url, table, caps
     code, _, err = run(capsys, "fleet", "packs", "load", table, "--server", f"nats://127.0.0.1:{port}")
     assert (code, err) == (
         2,
-        f"error: --server nats://127.0.0.1:{port}: nobody listens there; start it with `bms-estimator fleet serve`\n",
+        f"error: --server nats://127.0.0.1:{port}: nobody listens there\n",
     )
     code, _, err = run(capsys, "fleet", "packs", "list", "--creds", table.with_name("no"), "--server", url)
     assert (code, "cannot be read" in err) == (2, True)

@@ -22,7 +22,7 @@ from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.server import Place, Told, find_server
 from bms_estimator.fleet.server import serve as serving
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fleet_settings import FleetSettings
+from bms_estimator.model.fleet_settings import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from bms_estimator.model.toml_file import read_toml
 from tests.command_line import run
 from tests.mosquitto import free_port
@@ -240,6 +240,33 @@ def test_what_cannot_be_is_said(
     code, _, err = run(capsys, "fleet", "serve", *arguments, "--folder", tmp_path)
     assert code == 2
     assert said in err
+
+
+@pytest.mark.parametrize(
+    ("certificate", "key", "said"),
+    [
+        ("none.crt", "node.key", "tls.cert_file = {folder}/none.crt: cannot be read: No such file or directory"),
+        (
+            "ca.crt",
+            "node.key",
+            "tls.cert_file = {folder}/ca.crt, tls.key_file = {folder}/node.key: KEY_VALUES_MISMATCH",
+        ),
+    ],
+)
+def test_certificates_that_cannot_be_used_are_named(
+    certificate: str, key: str, said: str, authority: Authority, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = authority.certificate.parent
+    text = settings_text(authority).replace("node.crt", certificate).replace("node.key", key)
+    (tmp_path / "fleet.toml").write_text(text)
+    code, _, err = run(capsys, "fleet", "serve", tmp_path / "fleet.toml", "--folder", tmp_path / "state")
+    assert (code, err) == (2, f"error: {said.format(folder=folder)}\n")
+
+
+def test_every_setting_is_in_the_document() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "fleet-server.md").read_text()
+    named = [name for model in (ServerSettings, TlsSettings, TenantSettings) for name in model.model_fields]
+    assert [name for name in named if f"{name}`" not in text] == []
 
 
 def test_a_token_is_only_for_what_may_be_a_pack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

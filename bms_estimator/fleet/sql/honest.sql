@@ -32,7 +32,7 @@ pairs AS (
             + 2 * per_a * moved * b.offset_std_a * b.ln_q_std * b.l_o AS back
     FROM rows a CROSS JOIN (VALUES (1), (3), (6), (12), (24)) AS later(hours)
     JOIN rows b ON b.pack = a.pack AND b.hour = a.hour + later.hours
-    WHERE a.holes = b.holes AND b.seen_s - a.seen_s > 3590 * (b.hour - a.hour)
+    WHERE a.holes = b.holes AND b.seen_s - a.seen_s > $least_seen_s * (b.hour - a.hour)
 ),
 -- Of the later ones the surest, where it is really surer: else counting is judged, not the filter
 surest AS (
@@ -81,8 +81,8 @@ factors AS (
 -- Wilson's interval
 SELECT
     of, which, packs, judgements, share AS within_2_std,
-    (share + 1.92 / m - 1.96 * sqrt(share * (1 - share) / m + 0.96 / m ^ 2)) / (1 + 3.84 / m) AS low,
-    (share + 1.92 / m + 1.96 * sqrt(share * (1 - share) / m + 0.96 / m ^ 2)) / (1 + 3.84 / m) AS high,
+    (share + 1.9208 / m - 1.96 * sqrt(share * (1 - share) / m + 0.9604 / m ^ 2)) / (1 + 3.8416 / m) AS low,
+    (share + 1.9208 / m + 1.96 * sqrt(share * (1 - share) / m + 0.9604 / m ^ 2)) / (1 + 3.8416 / m) AS high,
     factor AS std_should_be_times
 FROM effective JOIN factors USING (place, of, which)
 ORDER BY place, which

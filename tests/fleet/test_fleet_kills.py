@@ -1,0 +1,12 @@
+"""A worker and the server killed while edges send: no sample is lost or counted twice. ``make fleet-kills`` is the long one."""
+
+from tests.benchmarks.fleet_kills import Plan, run
+
+
+def test_end_states_are_those_of_all_samples_whoever_is_killed() -> None:
+    plan = Plan(nodes=1, kills=2, packs=8, seed=3, mean_s=0.2, partitions=4)
+    outcome = run(plan)
+    assert outcome.wrong == []
+    assert set(outcome.killed) == {"node", "worker"}
+    assert outcome.blocks == outcome.counters["blocks"] > plan.packs
+    assert outcome.counters["lost_blocks"] == 0
