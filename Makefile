@@ -16,7 +16,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients nats-server systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check test demo demo-fleet fleet fleet-kills benchmark compare home-assistant real-home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page fleet-page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check test demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere resolution unseen soak nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)

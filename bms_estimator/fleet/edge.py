@@ -22,6 +22,7 @@ from bms_estimator.fleet.gathering import MOST_SAMPLES, Gathering
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.edge_settings import EdgeSettings
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.estimate import EdgeHealth
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
@@ -115,6 +116,16 @@ class Edge:
             self.store.put(block)
         if ended or self._overdue is None:
             self._watch_open_block()
+
+    def health(self) -> EdgeHealth:
+        """What became of the blocks."""
+        store = self.store
+        return EdgeHealth(
+            blocks_kept=store.kept,
+            blocks_unsent=store.waiting,
+            blocks_dropped=store.dropped,
+            trouble=self.delivery.trouble,
+        )
 
     async def __aenter__(self) -> Self:
         """Start reaching for the server."""

@@ -128,6 +128,15 @@ class RecordingHealth(Report):
     missed_reads: int = Field(description="reads that are not in the file")
 
 
+class EdgeHealth(Report):
+    """Blocks of raw samples on their way to a fleet's server."""
+
+    blocks_kept: int = Field(description="on disk or in memory, for no worker has said yet that they are safe")
+    blocks_unsent: int = Field(description="of these, those that the server has not acknowledged")
+    blocks_dropped: int = Field(description="that found no room or could not be read, since start")
+    trouble: str | None = Field(description="why the server was lost or could not be reached last; null: never")
+
+
 class Totals(Report):
     """What is counted over restarts; what came after the last checkpoint before a kill is missing."""
 
@@ -178,6 +187,7 @@ class Health(Report):
     checkpoint: str = Field(description="what became of the last checkpoint")
     loop: LoopHealth
     recording: RecordingHealth | None = Field(description="null: nothing is recorded")
+    edge: EdgeHealth | None = Field(default=None, description="null: no raw samples are sent")
     unseen_s: float | None = Field(
         description="how long nobody measured in the last gap of the samples or before the start [s]; "
         "null: never since the start, or nobody knows"

@@ -1,7 +1,6 @@
 """The service of a pack whose samples are only sent, as ``bms-estimator edge`` starts it."""
 
 import asyncio
-import contextlib
 from pathlib import Path
 
 import structlog
@@ -46,7 +45,7 @@ async def serve_edge(
     if settings.edge is None:
         raise UserError('edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"')
     stop, name = stop_on_signal(stop), settings.pack.name
-    notifier = notifier or Notifier([name])
+    notifier = notifier or Notifier([name], doing="sending samples of")
     set_level(name, settings.log.level)
     source = open_reports(settings) or SerialBoard(settings.sensor, memory=BoardMemory(folder, name))
     with alone(folder, name):
@@ -81,15 +80,6 @@ async def _keep_alive(source: SerialBoard | Reports, edge: Edge, notifier: Notif
 
 async def _report(edge: Edge) -> None:
     """Say in the log, at times, what has become of the blocks."""
-    with contextlib.suppress(asyncio.CancelledError):
-        while True:
-            await asyncio.sleep(REPORT_S)
-            store, delivery = edge.store, edge.delivery
-            log.info(
-                "blocks of samples",
-                kept=store.kept,
-                unsent=store.waiting,
-                dropped=store.dropped,
-                losses=delivery.losses,
-                trouble=delivery.trouble,
-            )
+    while True:
+        await asyncio.sleep(REPORT_S)
+        log.info("blocks of samples", **edge.health().model_dump())

@@ -13,11 +13,12 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.fleet.edge import Edge
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import SAMPLE
 from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.service.alarm_hooks import Hooks
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
@@ -58,7 +59,7 @@ async def run_live(
     pulse: Callable[[], Pulse] | None = None,
     recording: Callable[[], RecordingHealth | None] = lambda: None,
     hooks: Hooks | None = None,
-    raw: Callable[[SampleBlock], None] | None = None,
+    edge: Edge | None = None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
 
@@ -78,7 +79,7 @@ async def run_live(
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
         hooks: What is done of alarms; opened and closed here.
-        raw: Gets all samples, too, as they come; returns at once. None: nobody does.
+        edge: Gets all samples, too, as they come; None: they are sent nowhere. Opened and closed by who made it.
 
     Returns:
         The estimator as the last sample left it.
@@ -103,6 +104,7 @@ async def run_live(
         delivery=delivery,
         pulse=pulse,
         recording=recording,
+        edge=edge.health if edge else lambda: None,
         on_alarm=hooks.tell,
     )
     _restore_alarms(publisher, ledger.alarms)
@@ -124,7 +126,7 @@ async def run_live(
         await stack.enter_async_context(hooks)
         notifier.ready(name)
         tasks = [
-            _estimate(source, tally, publisher, raw, lambda: since_boot() - restored_s),
+            _estimate(source, tally, publisher, edge, lambda: since_boot() - restored_s),
             _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -154,7 +156,7 @@ async def _estimate(
     source: Source,
     tally: Tally,
     publisher: Publisher,
-    raw: Callable[[SampleBlock], None] | None,
+    edge: Edge | None,
     waited_s: Callable[[], float],
 ) -> None:
     """Take what the source gives; ``waited_s`` is how long it has given nothing since the state was restored [s]."""
@@ -163,8 +165,8 @@ async def _estimate(
     async for block in source:
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
             estimator.record["unseen_s"] = unseen_s + waited_s()
-        if raw is not None:
-            raw(block)
+        if edge:
+            edge.take(block)
         publisher.add(block, tally.run(block))
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 

@@ -15,10 +15,13 @@ class Notifier:
     Args:
         packs: Names of the packs.
         environment: Where ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC`` are looked up.
+        doing: What is done with them, for people.
     """
 
-    def __init__(self, packs: Collection[str], environment: Mapping[str, str] = os.environ) -> None:
-        self._packs = frozenset(packs)
+    def __init__(
+        self, packs: Collection[str], environment: Mapping[str, str] = os.environ, *, doing: str = "estimating"
+    ) -> None:
+        self._packs, self._doing = frozenset(packs), doing
         self._awaited: dict[str, set[str]] = {}
         self._texts = dict.fromkeys(packs, "")
         address = environment.get("NOTIFY_SOCKET", "")
@@ -52,7 +55,7 @@ class Notifier:
     @property
     def _status(self) -> str:
         packs = (f"{pack}: {text}" if text else pack for pack, text in sorted(self._texts.items()))
-        return f"STATUS=estimating {', '.join(packs)}"
+        return f"STATUS={self._doing} {', '.join(packs)}"
 
     def _send_with_last(self, pack: str, state: str, more: str = "") -> None:
         awaited = self._awaited.setdefault(state, set(self._packs))

@@ -130,7 +130,7 @@ async def serve(
             pulse=source.pulse,
             recording=partial(recording_health, tap),
             hooks=hooks,
-            raw=edge.take if edge else None,
+            edge=edge,
         )
 
 

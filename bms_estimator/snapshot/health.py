@@ -9,7 +9,7 @@ import numpy as np
 from bms_estimator.kernels.input_checks import COUNTERS
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Health, LoopHealth, RecordingHealth, Totals
+from bms_estimator.model.estimate import EdgeHealth, Health, LoopHealth, RecordingHealth, Totals
 from bms_estimator.model.suspect import Suspect
 from bms_estimator.sinks import Delivery
 
@@ -80,6 +80,7 @@ def health_report(
     unseen_s: float | None,
     loop: LoopHealth,
     recording: RecordingHealth | None,
+    edge: EdgeHealth | None = None,
 ) -> Health:
     """Topic ``health``.
 
@@ -99,6 +100,7 @@ def health_report(
         unseen_s: How long nobody measured last [s]; None: never, or nobody knows.
         loop: How long what comes in waits.
         recording: The state of one; None: nothing is recorded.
+        edge: Of raw samples on their way; None: none are sent.
     """
     state = record["observer"]
     return Health(
@@ -128,6 +130,7 @@ def health_report(
         checkpoint=checkpoint,
         loop=loop,
         recording=recording,
+        edge=edge,
         unseen_s=unseen_s,
         total=total,
     )

@@ -9,7 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.estimate import Estimate, Health, Info, LoopHealth, RecordingHealth, Snapshot
+from bms_estimator.model.estimate import EdgeHealth, Estimate, Health, Info, LoopHealth, RecordingHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
@@ -52,6 +52,7 @@ class Publisher:
         delivery: What became of what was sent and asked.
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
+        edge: Of raw samples on their way to a fleet; None where none are sent.
         on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
 
     Attributes:
@@ -79,6 +80,7 @@ class Publisher:
         delivery: Delivery | None = None,
         pulse: Callable[[], Pulse] | None = None,
         recording: Callable[[], RecordingHealth | None] = lambda: None,
+        edge: Callable[[], EdgeHealth | None] = lambda: None,
         on_alarm: Callable[[Change], object] = lambda _: None,
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
@@ -87,7 +89,7 @@ class Publisher:
         self._restarts, self._delivery = restarts, delivery or Delivery()
         self._rest = Rest(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
-        self._pulse, self._recording, self._latency = pulse, recording, Latency()
+        self._pulse, self._recording, self._edge, self._latency = pulse, recording, edge, Latency()
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
         self.kept: Flow | None = None
@@ -221,6 +223,7 @@ class Publisher:
             unseen_s=self._tally.unseen_s,
             loop=self._loop(),
             recording=self._recording(),
+            edge=self._edge(),
         )
 
     def _log_suspicions(self, health: Health) -> None:

@@ -13,7 +13,7 @@ from bms_estimator.fleet.block import Block, decode
 from bms_estimator.fleet.streams import make_streams
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.sample import SampleBlock
-from tests.patience import LONG_S
+from tests.patience import LONG_S, end
 
 POLL_S = 0.01
 
@@ -47,8 +47,7 @@ class Receiver:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._task.cancel()
-        await asyncio.gather(self._task, return_exceptions=True)
+        await end(self._task)
         await self.nc.close()
 
     @property

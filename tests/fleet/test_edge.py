@@ -10,16 +10,21 @@ import numpy as np
 import pytest
 
 from bms_estimator.fleet import subjects
+from bms_estimator.fleet.block import decode
 from bms_estimator.fleet.edge import Edge
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.edge_settings import EdgeSettings
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.estimate import EdgeHealth
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.fleet.engine import Engine, running
 from tests.fleet.receiver import Receiver
+from tests.mosquitto import Broker, Listener, broker
 from tests.patience import LONG_S
 from tests.sinks.proxy import Proxy
+
+__all__ = ["broker"]
 
 WALL_S = 1.7e9
 SETTINGS = {"block_s": 60.0, "store_mib": 1.0}
@@ -201,6 +206,23 @@ async def test_garbage_from_who_is_no_worker_changes_nothing(
         await until(lambda: feed.edge.unread == len(garbage))
         feed.give(3)
         await feed.all_came()
+
+
+async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
+    """What hears there says which blocks are safe, and from where to send again."""
+    edge = Edge(EdgeSettings(url=broker.url), "pack", tmp_path, handover_s=LONG_S)
+    async with Listener(broker, "raw/#") as heard, edge:
+        samples = np.zeros(600, dtype=SAMPLE)
+        samples["time_s"] = np.arange(600.0)
+        edge.take(samples)
+        await heard.wait("raw/pack", lambda data: decode(data).number == 9)
+        store = decode(heard.all("raw/pack")[0]).store
+        before = len(heard.messages)
+        await heard.publish("edge/pack/awaits", Awaits(store=store, number=7, resend=True).model_dump_json(), qos=1)
+        again = decode(await heard.wait("raw/pack", skip=before))
+        await heard.wait("raw/pack", lambda data: decode(data).number == 9, skip=before)
+        assert (again.number, again.oldest) == (7, 7)
+        assert edge.health() == EdgeHealth(blocks_kept=3, blocks_unsent=0, blocks_dropped=0, trouble=None)
 
 
 async def test_a_source_that_is_silent_holds_no_samples_back(
