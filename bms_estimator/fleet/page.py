@@ -17,7 +17,6 @@ from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.page.newest import Newest
 from bms_estimator.page.server import STATIC as SHARED
 from bms_estimator.page.web import File, WebServer
-from bms_estimator.store.disk_thread import DiskThread
 
 STEP_S = 2.0
 """Between two pictures of the fleet [s]."""
@@ -92,12 +91,12 @@ async def _draw(view: FleetView, newest: Newest, step_s: float) -> None:
 
 
 async def _ask(hours: Path, newest: Newest) -> None:
-    """Questions to the hours, now and then: seconds of work for a large fleet."""
-    from bms_estimator.fleet.page_answers import answers  # noqa: PLC0415 - duckdb is needed for nothing else
+    """Questions to the hours, now and then: seconds of work for a large fleet. The process ends after the one that is asked."""
+    from bms_estimator.fleet.page_answers import ASKED, answer  # noqa: PLC0415 - duckdb is needed for nothing else
 
-    thread, loop = DiskThread("questions"), asyncio.get_running_loop()
     while True:
-        newest.say(ANSWERS, await loop.run_in_executor(thread, answers, hours))
+        found = {name: await asyncio.to_thread(answer, hours, name) for name in ASKED}
+        newest.say(ANSWERS, json.dumps(found, allow_nan=False, separators=(",", ":")))
         await asyncio.sleep(ASK_S)
 
 

@@ -1,6 +1,5 @@
 """What the hours of a fleet answer, for its page: each question asked now and then, off the event loop."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +14,19 @@ LISTED = 20
 """Rows of an answer, at most."""
 
 
-def answers(folder: Path) -> str:
-    """The answer to each, JSON in one line.
+def answer(folder: Path, name: str) -> dict[str, Any]:
+    """The answer to one of ``ASKED``.
 
     Args:
         folder: Of the hours, as ``fleet collect`` writes it.
+        name: Of the question.
 
     Returns:
-        By question ``columns``, the first ``rows``, and how many there are (``count``); or why there is none (``reason``).
+        ``columns``, the first ``rows``, and how many there are (``count``); or why there is none (``reason``).
     """
-    found = {name: _answer(folder, name) for name in ASKED}
-    return json.dumps(found, allow_nan=False, separators=(",", ":"))
-
-
-def _answer(folder: Path, name: str) -> dict[str, Any]:
     try:
-        answer = ask(folder, name)
+        found = ask(folder, name)
     except (UserError, duckdb.Error) as error:
         return {"reason": str(error)}
-    rows = [row for row in answer.rows if name != "soh" or row[answer.columns.index("pack")] is None]
-    return {"columns": answer.columns, "rows": rows[:LISTED], "count": len(rows)}
+    rows = [row for row in found.rows if name != "soh" or row[found.columns.index("pack")] is None]
+    return {"columns": found.columns, "rows": rows[:LISTED], "count": len(rows)}

@@ -14,7 +14,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.fleet import subjects
-from bms_estimator.fleet.connection import connect
+from bms_estimator.fleet.connection import connect, context
 from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.pack_row import PackKind
 from bms_estimator.fleet.page_view import FleetView
@@ -59,12 +59,14 @@ class FleetFeed:
         linked: Called with why there is no server, and with None when there is.
 
     Raises:
-        UserError: The credentials cannot be read.
+        UserError: The credentials or the certificate cannot be read.
     """
 
     def __init__(self, server: Server, view: FleetView, linked: Callable[[str | None], None]) -> None:
         if server.creds is not None and not server.creds.is_file():
             raise UserError(f"--creds {server.creds}: no such file")
+        if server.ca is not None:
+            context(server.ca)
         self._server, self._view, self._linked = server, view, linked
         self._nc: Client | None = None
         self._task: asyncio.Task[None] | None = None
@@ -87,10 +89,13 @@ class FleetFeed:
 
     async def _run(self) -> None:
         """Connect, which lasts until there is a server; then the library stays connected, and subscribed."""
-        server = self._server
-        self._nc = await connect(
-            server.urls, "bms-estimator fleet page", creds=server.creds, ca=server.ca, linked=self._on_link
-        )
+        server, name = self._server, "bms-estimator fleet page"
+        try:
+            self._nc = await connect(server.urls, name, creds=server.creds, ca=server.ca, linked=self._on_link)
+        except UserError as error:  # of the address: the page says so
+            log.error("the fleet's server cannot be reached", reason=str(error))  # noqa: TRY400 - of a person, not ours
+            self._on_link(str(error))
+            return
         for subject, heard in self._heard().items():
             await self._nc.subscribe(subject, cb=heard)
         self._on_link(None)

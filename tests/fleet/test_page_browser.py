@@ -29,6 +29,7 @@ from tests.fleet.many_packs import HOME, VAN, Pack, beat, load, publish, state
 from tests.mosquitto import free_port
 from tests.page.chromium import Tab, chromium, tab
 from tests.page.house import starting
+from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE
 
 in_module = pytest.mark.asyncio(loop_scope="module")
@@ -288,3 +289,16 @@ async def test_a_server_that_is_not_there_is_said_and_waited_for() -> None:
     async with FleetFeed(Server(url), FleetView(1, 0.0), said.put_nowait):
         assert await said.get() == f"{url}: not reached yet"
         assert await said.get() == f"{url}: nobody listens there"
+
+
+@in_module
+async def test_what_the_last_hour_said_before_the_page_was_there_is_read(fleet: Fleet) -> None:
+    hour = json.dumps({"suspects": int(Suspect.OCV)}).encode()
+    await fleet.nc.jetstream().publish(subjects.hours("early-1"), hour)
+    view = FleetView(1, 0.0)
+    async with FleetFeed(Server(fleet.engine.url), view, lambda _: None), asyncio.timeout(LONG_S):
+        while not view.packs.find("early"):  # noqa: ASYNC110 - nobody tells
+            await asyncio.sleep(0.01)
+    shown = view.picture(0.0, 0.0)
+    assert ["early-1", "ocv"] in shown["concerns"]["suspects"]["packs"]
+    assert view.workers.partitions == PARTITIONS

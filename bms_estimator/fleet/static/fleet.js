@@ -343,8 +343,10 @@ async function find() {
 		names = answer.ok ? await answer.json() : null;
 	} catch { /* said below */ }
 	if (mine !== asked) return; // somebody types on
-	const rows = names?.map((name) => node("li", {}, chooser(name))) ?? [];
-	$("found").replaceChildren(...(rows.length ? rows : [node("li", {}, node("p", {}, names ? "No pack's name begins so." : "The page's server does not answer."))]));
+	if (changed($("found"), JSON.stringify(names))) { // else who has gone down the list stays there
+		const rows = names?.map((name) => node("li", {}, chooser(name))) ?? [];
+		$("found").replaceChildren(...(rows.length ? rows : [node("li", {}, node("p", {}, names ? "No pack's name begins so." : "The page's server does not answer."))]));
+	}
 	hide($("found"), false);
 }
 
