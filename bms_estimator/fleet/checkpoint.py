@@ -195,8 +195,8 @@ def _entries_of(data: memoryview, at: int) -> Iterator[tuple[int, str, bytes]]:
         length, crc = _CHUNK.unpack_from(data, at)
         at += _CHUNK.size
         if length == 0:
-            if at != len(data):
-                raise CheckpointError(f"the checkpoint is damaged: {len(data) - at} bytes behind its end")
+            if at != len(data) or crc:
+                raise CheckpointError(f"the checkpoint is damaged: its end is at {at} of {len(data)} bytes")
             return
         chunk = _checked(data[at : at + length], length, crc)
         at += length

@@ -76,6 +76,13 @@ def test_whatever_is_damaged_is_said_and_no_other_exception(snapshot: Snapshot, 
         read_checkpoint(bytes(bad))
 
 
+def test_no_byte_can_be_another_unseen() -> None:
+    good = whole(Snapshot(3, 7, {"blocks": 1}, {"a": b"12345678"}, held={"b": (b"x",)}))
+    for at in range(len(good)):
+        with pytest.raises(CheckpointError):
+            read_checkpoint(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
+
+
 @pytest.mark.parametrize("data", [b"", b"BMSFLEET", b"x" * 100])
 def test_bytes_that_are_no_checkpoint_are_refused(data: bytes) -> None:
     with pytest.raises(CheckpointError, match="checkpoint"):
