@@ -148,6 +148,8 @@ async def _run(fleet_rig: Rig, plan: Plan, said: Callable[[str], object]) -> Out
     try:
         await _until(lambda: _counted(heard) > 0)
         await asyncio.to_thread(_kill, fleet_rig, plan, outcome, said)
+        used = {subjects.partition_of(pack, plan.partitions) for pack in fleet.names}
+        await _until(lambda: used <= _held(heard))  # a partition is taken over with the next message that comes
         await _until_whole(nc, fleet)
         edges.terminate()
         await asyncio.to_thread(edges.wait, LONG_S)
@@ -202,6 +204,12 @@ def _counted(heard: dict[str, tuple[float, Heartbeat]]) -> int:
         for what in ("blocks", "resends", "gaps")
         if now_s - heard_s < DEAD_S
     )
+
+
+def _held(heard: dict[str, tuple[float, Heartbeat]]) -> set[int]:
+    """Partitions that somebody who lives has."""
+    now_s = time.monotonic()
+    return {number for heard_s, beat in heard.values() if now_s - heard_s < DEAD_S for number in beat.partitions}
 
 
 async def _until_whole(nc: Client, fleet: SimulatedFleet) -> None:
