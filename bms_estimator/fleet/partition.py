@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple, Self
 
 import numpy as np
+import structlog
 from numpy.typing import NDArray
 
 from bms_estimator.fleet.block import Block, BlockError, decode
@@ -25,6 +26,8 @@ from bms_estimator.model.settings import Settings
 
 Table = Callable[[str], tuple[Settings, PackModel] | None]
 """The settings of a pack, and the pack as one object; None: it is not known."""
+
+log = structlog.get_logger(__name__)
 
 
 class Taken(NamedTuple):
@@ -166,7 +169,12 @@ class Partition:
         self._bench.count_lost(lost)
         made = Taken(pack)
         if order is Order.NEXT:
-            made = Taken(pack, None, *self._stepping.step(pack, block, of_type, former))
+            stepped = self._step(pack, block, of_type, former)
+            if stepped is None:  # as if it had brought nothing
+                self._open(pack)
+                judge(d, block)
+                self._bench.count_lost(lost)
+            made = stepped or made
             taken(d)
             self._former.pop(pack, None)
         else:
@@ -177,6 +185,16 @@ class Partition:
         first = pack not in self._greeted
         self._greeted.add(pack)
         return made._replace(awaits=answer(order, d, block, first=first))
+
+    def _step(self, pack: str, block: Block, of_type: PackType, former: Fields | None) -> Taken | None:
+        """What comes of the next block; None: of this one nothing can."""
+        try:
+            return Taken(pack, None, *self._stepping.step(pack, block, of_type, former))
+        except Exception:  # a fault of ours, with one block: awaited for ever it would stop the pack
+            log.exception("a block is left out", partition=self.number, pack=pack, number=block.number)
+        self._counters["failed"] += 1
+        self._stepping.forget()
+        return None
 
     def _open(self, pack: str) -> Fields | None:
         """Lay a pack on the bench. Of one that another version left come its estimator's fields, which are not there yet."""

@@ -24,8 +24,9 @@ from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.topics import estimate_report
 from bms_estimator.snapshot.window import Window
 
-LONGEST_STORE_S = 1e9
-"""No store is in use for so long: a sample that is told to be later has no time [s]."""
+LONGEST_STORE_S = 2.0**33
+"""A store may be made before its machine knows the time, in 1970: it is no longer in use than the time since then. A sample that is
+told to be later has no time [s]."""
 LAST_WALL_S = 2.0**34
 """No wall clock shows a later time: the year 2514 [s since 1970]."""
 AT_ONCE = 4096
@@ -69,6 +70,10 @@ class Stepping:
         state = self._state(of_type, now_s)
         told = turned and state is not None
         return state, self._parameters(of_type.estimator, arrival_s, now_s) if told else None, rows
+
+    def forget(self) -> None:
+        """A block has failed: nothing of it goes into the next one's window."""
+        self._window = Window()
 
     def _settle(self, of_type: PackType, former: Fields | None, block: Block) -> None:
         """Make the pack one of its type: as it is, or taken over from other settings or from another version."""

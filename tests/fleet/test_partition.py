@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.fleet.block import Block, encode
@@ -14,7 +15,7 @@ from bms_estimator.fleet.delivery import ASKED_EACH, TOLD_EACH
 from bms_estimator.fleet.held import MOST_BLOCKS, MOST_BYTES, Held
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.partition import Partition
-from bms_estimator.fleet.stepping import AT_ONCE
+from bms_estimator.fleet.stepping import AT_ONCE, Stepping
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.estimate import Estimate, ParameterReport
 from bms_estimator.model.fuel_cell import load_any
@@ -373,6 +374,39 @@ class TestFaultsOfAnEdge:
         estimator.run(good)
         assert stream.partition.counters["no_time"] == 40
         assert stream.partition.state("a")["estimator"]["observer"]["soc"] == estimator.state["soc"]
+
+    def test_a_block_with_which_something_fails_is_left_out_and_all_go_on(self, stream, samples, monkeypatch) -> None:
+        def fail(*_args) -> None:
+            raise RuntimeError("of ours")
+
+        blocks = blocks_of(samples[:400])
+        deliver(stream, "a", blocks[:9])
+        with monkeypatch.context() as patched, capture_logs() as logs:
+            patched.setattr(Stepping, "_state", fail)  # after the estimator has taken the samples
+            taken = stream.send("a", blocks[9])
+            stream.send("new", blocks[0])
+        assert (taken.state, taken.awaits.number, taken.awaits.resend) == (None, 11, False)
+        assert [(line["event"], line["pack"], line["number"]) for line in logs] == [
+            ("a block is left out", "a", 10),
+            ("a block is left out", "new", 1),
+        ]
+        assert stream.partition.counters["failed"] == 2
+        other = json.loads(stream.send("b", one_block(samples[220:240], 1)).state)
+        assert other["voltage_v"] == pytest.approx(samples["voltage_v"][220:240].mean())  # nothing of theirs in it
+        deliver(stream, "a", blocks[10:], first=11)
+        deliver(stream, "new", blocks[1:], first=2)
+        estimator = estimator_of(SETTINGS, CELL)
+        estimator.run(samples[:180])
+        estimator.run(samples[200:400])
+        assert_same(stream, "a", estimator.record)
+        assert_same(stream, "new", estimated(samples[20:400]))
+
+    def test_an_edge_may_hear_what_time_it_is_after_it_began(self, stream, samples) -> None:
+        rows = samples[:400].copy()
+        rows["time_s"][200:] += 1.8e9  # since 1970
+        deliver(stream, "a", blocks_of(rows, store=10**9))
+        assert stream.partition.counters["dropped_samples"] == 0
+        assert_same(stream, "a", estimated(rows))
 
     def test_time_that_goes_back_is_counted_as_it_is_everywhere(self, stream, samples) -> None:
         rows = samples[:600].copy()
