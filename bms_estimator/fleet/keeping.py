@@ -6,26 +6,32 @@ An object is written before the pointer that names it; and a pointer names the o
 somebody left behind, who was killed between the two, is found and removed.
 """
 
+import asyncio
 import base64
 import hashlib
 import io
+import json
 import time
 from collections.abc import AsyncGenerator, Iterator
 from dataclasses import dataclass
 
 import structlog
 from nats.aio.client import Client
+from nats.js.api import Header, ObjectInfo
 from nats.js.errors import BadObjectMetaError, KeyNotFoundError, KeyWrongLastSequenceError, NotFoundError
-from nats.js.kv import KeyValue
+from nats.js.kv import MSG_ROLLUP_SUBJECT, KeyValue
 from nats.js.object_store import ObjectStore
 from nats.nuid import NUID
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.stored import stored
+from bms_estimator.model.clock import iso_utc
 
 KEPT = 2
 """So many checkpoints of a partition: the last, and one before, should the last be damaged."""
+PIECE_BYTES = 128 << 10
+"""Of an object, in one message."""
 _STREAM = f"OBJ_{subjects.STATES_BUCKET}"
 
 log = structlog.get_logger(__name__)
@@ -85,6 +91,7 @@ class Keeping:
         self._nc, self._js, self._worker = nc, nc.jetstream(), worker
         self._checkpoints, self._states = checkpoints, states
         self._names = NUID()
+        self._tried: dict[int, Pointer] = {}  # by partition, what was written last: maybe without an answer
 
     async def owner(self, partition: int) -> str:
         """Who has claimed a partition last; empty: nobody."""
@@ -138,9 +145,10 @@ class Keeping:
         Raises:
             FencedError: Another worker has taken the partition over; nothing was changed.
         """
+        claim = await self._present(claim)
         pointer = claim.pointer
-        info = await self._states.put(pointer.next, io.BufferedReader(_Chunks(chunks)))
-        made = Kept(sequence=sequence, object=pointer.next, bytes=info.size or 0, made_s=time.time())
+        size = await self._put(pointer.next, chunks)
+        made = Kept(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())
         kept = (made, *pointer.kept)
         try:
             claim = await self._replace(claim.partition, claim.revision, kept[:KEPT])
@@ -150,6 +158,19 @@ class Keeping:
         for old in kept[KEPT:]:
             await self._remove(old.object)
         return claim
+
+    async def _present(self, claim: Claim) -> Claim:
+        """The claim as it stands: the last write may have been done though no answer came.
+
+        Raises:
+            FencedError: Another worker has taken the partition over.
+        """
+        found = await self._look(claim.partition)
+        if found is None or found[0] <= claim.revision:  # less: of a node that is behind
+            return claim
+        if found[1] == self._tried.get(claim.partition):
+            return Claim(claim.partition, *found)
+        raise FencedError(found[1].worker)
 
     async def _look(self, partition: int) -> tuple[int, Pointer] | None:
         try:
@@ -164,6 +185,7 @@ class Keeping:
 
     async def _replace(self, partition: int, revision: int, kept: tuple[Kept, ...]) -> Claim:
         pointer = Pointer(worker=self._worker, next=f"p{partition}-{self._names.next().decode()}", kept=kept)
+        self._tried[partition] = pointer
         try:
             data = pointer.model_dump_json().encode()
             return Claim(partition, await self._checkpoints.update(_key(partition), data, revision), pointer)
@@ -173,26 +195,45 @@ class Keeping:
                 return Claim(partition, found[0], pointer)
             raise FencedError(found[1].worker if found else "") from None
 
+    async def _put(self, name: str, chunks: Iterator[bytes]) -> int:
+        """Write an object; how many bytes it has.
+
+        As ``ObjectStore.put`` does, but for where the pieces are: under the object's name, so that those of one that was never
+        finished are found.
+        """
+        subject, digest, size, count = _pieces(name), hashlib.sha256(), 0, 0
+        await self._js.purge_stream(_STREAM, subject=subject)  # of an attempt before
+        reader = io.BufferedReader(_Chunks(chunks), PIECE_BYTES)
+        while piece := await asyncio.to_thread(reader.read, PIECE_BYTES):
+            await self._js.publish(subject, piece)
+            digest.update(piece)
+            size, count = size + len(piece), count + 1
+        info = ObjectInfo(
+            name=name,
+            bucket=subjects.STATES_BUCKET,
+            nuid=name,
+            size=size,
+            chunks=count,
+            digest=_digest(digest.digest()),
+            mtime=iso_utc(time.time()),
+        )
+        described = json.dumps(info.as_dict()).encode()
+        await self._js.publish(_described(name), described, headers={Header.ROLLUP: MSG_ROLLUP_SUBJECT})
+        return size
+
     async def _read(self, name: str) -> bytes | None:
         """The bytes of an object; None: some are missing, or others than were written."""
         info = await self._states.get_info(name)
         subject = f"$O.{subjects.STATES_BUCKET}.C.{info.nuid}"
         last = (await self._js.get_last_msg(_STREAM, subject)).seq or 0
         data = b"".join([message.data async for message in stored(self._nc, _STREAM, subject, 1, last)])
-        digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).decode()
-        return data if len(data) == info.size and info.digest == f"SHA-256={digest}" else None
+        return data if len(data) == info.size and info.digest == _digest(hashlib.sha256(data).digest()) else None
 
     async def _remove(self, name: str) -> None:
-        """Remove an object and what is told of it, where it is there: a deleted one would leave its name for ever."""
-        if not name:
-            return
-        try:
-            info = await self._states.get_info(name, show_deleted=True)
-        except (NotFoundError, BadObjectMetaError):
-            return
-        encoded = base64.urlsafe_b64encode(name.encode()).decode()
-        for subject in (f"C.{info.nuid}", f"M.{encoded}"):
-            await self._js.purge_stream(_STREAM, subject=f"$O.{subjects.STATES_BUCKET}.{subject}")
+        """Remove an object and what is told of it, as far as they are there: a deleted one would leave its name for ever."""
+        if name:
+            for subject in (_described(name), _pieces(name)):
+                await self._js.purge_stream(_STREAM, subject=subject)
 
 
 class _Chunks(io.RawIOBase):
@@ -214,6 +255,20 @@ class _Chunks(io.RawIOBase):
         buffer[:count] = self._rest[:count]
         self._rest = self._rest[count:]
         return count
+
+
+def _pieces(name: str) -> str:
+    """Where the bytes of an object are."""
+    return f"$O.{subjects.STATES_BUCKET}.C.{name}"
+
+
+def _described(name: str) -> str:
+    """Where it stands what an object is."""
+    return f"$O.{subjects.STATES_BUCKET}.M.{base64.urlsafe_b64encode(name.encode()).decode()}"
+
+
+def _digest(sha256: bytes) -> str:
+    return f"SHA-256={base64.urlsafe_b64encode(sha256).decode()}"
 
 
 def _key(partition: int) -> str:

@@ -92,10 +92,26 @@ async def test_who_lost_the_partition_cannot_write_and_leaves_nothing_behind(nc)
         await slow.write(claim, 2, iter([b"2"]))
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
     assert await _load(quick, theirs) == [b"1"]
-    # killed between the object and the pointer
-    await (await nc.jetstream().object_store(subjects.STATES_BUCKET)).put(theirs.pointer.next, b"3")
+    # killed between two pieces of an object
+    await nc.jetstream().publish(f"$O.{subjects.STATES_BUCKET}.C.{theirs.pointer.next}", b"3")
     assert await _load(slow, await slow.claim(8)) == [b"1"]
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
+    left = (await nc.jetstream().stream_info(STATES, subjects_filter=">")).state.subjects
+    assert sum(".C.p8-" in subject for subject in left) == 1
+
+
+async def test_a_write_whose_answer_was_lost_is_known_to_be_ours(nc):
+    keeping, other = await _keeping(nc, "a"), await _keeping(nc, "b")
+    claim = await keeping.claim(9)
+    await keeping.write(claim, 1, iter([b"1"]))
+    written = await keeping.write(claim, 2, iter([b"2"]))  # as whoever has heard nothing of the first
+    assert await _load(keeping, written) == [b"2", b"1"]
+    assert await _objects(nc, 9) == {kept.object for kept in written.pointer.kept}
+    await keeping.write(written, 3, iter([b"3"]))
+    theirs = await other.claim(9)
+    with pytest.raises(FencedError, match="b"):
+        await keeping.write(written, 4, iter([b"4"]))
+    assert await _load(other, theirs) == [b"3", b"2"]
 
 
 async def test_a_worker_waits_for_streams_and_settings_and_goes_on_from_what_is_whole(tmp_path):
