@@ -14,7 +14,8 @@ from nats.aio.msg import Msg
 
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.sequences import sequences
-from bms_estimator.fleet.streams import GROUP, PIN_S, consumer
+from bms_estimator.fleet.stream_reader import StreamError
+from bms_estimator.fleet.streams import ANSWER_S, GROUP, PIN_S, consumer
 
 RENEW_S = PIN_S / 4.0
 """Between two requests [s]: the loop may be three times as late without losing a pin."""
@@ -57,6 +58,7 @@ class PinnedConsumer:
     def __init__(self, nc: Client, partition: int, inbox: str) -> None:
         self._nc, self._inbox = nc, inbox
         self._next = f"$JS.API.CONSUMER.MSG.NEXT.{subjects.RAW_STREAM}.{consumer(partition)}"
+        self._info = f"$JS.API.CONSUMER.INFO.{subjects.RAW_STREAM}.{consumer(partition)}"
         self._unpin = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
         self.waiting: deque[Given] = deque()
         self.trouble = ""
@@ -69,6 +71,18 @@ class PinnedConsumer:
     def pinned(self) -> bool:
         """Whether it is ours, as far as we have heard."""
         return bool(self._pin)
+
+    async def is_pinned(self) -> bool:
+        """Whether the server has pinned it to anybody.
+
+        Raises:
+            StreamError: The server does not know it.
+            nats.errors.Error: The server does not answer.
+        """
+        answer = json.loads((await self._nc.request(self._info, timeout=ANSWER_S)).data)
+        if "error" in answer:
+            raise StreamError(f"the server tells nothing of a partition: {answer['error'].get('description', '')}")
+        return any(group.get("pinned_client_id") for group in answer.get("priority_groups") or ())
 
     async def renew(self) -> None:
         """Ask again; to be called each ``RENEW_S``. With enough waiting for one more only, which keeps the pin."""

@@ -19,11 +19,13 @@ class Heartbeat(BaseModel):
     leaving: bool = False
     """It gives its partitions back and ends."""
     partitions: tuple[int, ...] = ()
-    """That the server has pinned to it."""
+    """That it has claimed."""
     packs: int = 0
     """In those partitions."""
     blocks: int = 0
     samples: int = 0
+    faults: int = 0
+    """Blocks left out for a fault of ours: the log has its traceback."""
     lag_s: float | None = None
     """From the arrival of a block's last sample at the edge to when the block was taken: the worst since the heartbeat before;
     None: no block was taken [s]."""

@@ -1,7 +1,8 @@
 """One partition in the hands of a worker: taken over, stepped message by message, kept, given back.
 
 What its state becomes follows from the order of the stream alone. So it is enough to know up to which message a state
-goes: wherever messages may have gone to somebody else, or were lost on the way, they are read from the stream once more.
+goes: wherever messages may have gone to somebody else, or were lost on the way, they are read from the stream once more;
+so, too, where nothing comes: what somebody was given who died then, comes to nobody again.
 """
 
 import asyncio
@@ -15,6 +16,7 @@ import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
+from nats.js.errors import NotFoundError
 
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.block import glance
@@ -27,6 +29,10 @@ from bms_estimator.fleet.stream_reader import StreamError
 
 RETRY_S = 0.5
 """Between two attempts at what the server does not do now [s]."""
+SILENCE_S = 3.0
+"""So long after the last message the stream is asked whether there was another: those who give back have had their time [s]."""
+LATER_S = 5.0 * SILENCE_S
+"""After it had no other [s]."""
 HOURS_AT_ONCE = 128
 """Summaries that wait for the server's answer at a time."""
 TROUBLES = (NatsError, TimeoutError, StreamError)
@@ -36,7 +42,7 @@ log = structlog.get_logger(__name__)
 
 
 class Holding:
-    """A partition that this worker tries for, and has while the server gives its messages to nobody else.
+    """A partition that this worker tries for, and has while nobody else has claimed it.
 
     Args:
         nc: Connected.
@@ -54,6 +60,7 @@ class Holding:
         hours: Summaries that the server has not acknowledged yet: (id, pack, row).
         lag_s: The longest since somebody last set it to None [s].
         blocks: Taken here, as are ``samples``.
+        faults: Of ours: blocks that were left out.
         due_s: When a checkpoint is to be written, of a monotonic clock [s].
         trouble: What does not work now; empty: nothing.
     """
@@ -66,11 +73,12 @@ class Holding:
         self.claim: Claim | None = None
         self.hours: deque[tuple[str, str, bytes]] = deque()
         self.lag_s: float | None = None
-        self.blocks = self.samples = 0
+        self.blocks = self.samples = self.faults = 0
         self.trouble, self.due_s = "", 0.0
         self._pin = 0  # with which the state was made sure to be ours
         self._whole = False  # nothing is missing between the state and the last message given
-        self._lost = False
+        self._lost = self._silent = False
+        self._ask_s = time.monotonic() + SILENCE_S  # when silence is to be looked into
         self._news = asyncio.Event()
         self._changing = asyncio.Lock()  # of state and claim
         self._sending = asyncio.Lock()
@@ -80,11 +88,22 @@ class Holding:
         """The last checkpoint."""
         return self.claim.pointer.kept[0] if self.claim and self.claim.pointer.kept else None
 
+    @property
+    def held(self) -> bool:
+        """Whether we have it, as far as we have heard."""
+        return self.partition is not None and self.claim is not None
+
     def receive(self, message: Msg) -> None:
         """Take what the server sends for this partition."""
         if self.consumer.receive(message):
-            self._lost = True
+            self._lost, self._ask_s = True, time.monotonic() + SILENCE_S
         self._news.set()
+
+    def remind(self) -> None:
+        """Look into silence, if there was enough of it; to be called now and then."""
+        if time.monotonic() >= self._ask_s:
+            self._silent = True
+            self._news.set()
 
     async def run(self) -> None:
         """Take messages for ever."""
@@ -93,10 +112,14 @@ class Holding:
             if self._lost:
                 await self._try(self._look)
             given = await self.consumer.take()
-            if given is None:
-                await self._news.wait()
-            else:
+            if given is not None:
                 await self._take(given)
+                self._ask_s = time.monotonic() + SILENCE_S
+            elif self._silent:
+                self._silent, self._ask_s = False, time.monotonic() + SILENCE_S
+                await self._try(self._break_silence)
+            else:
+                await self._news.wait()
 
     async def save(self) -> None:
         """Write a checkpoint, unless the last one is as new.
@@ -167,7 +190,6 @@ class Holding:
         partition = self.partition
         if partition is None or given.sequence <= partition.sequence:
             return
-        self.lag_s = max(self.lag_s or 0.0, time.time() - glance(given.data)[1])
         await self._publish(await self._step(partition, given.pack, given.data, given.sequence))
 
     async def _go_on_to(self, given: Given) -> None:
@@ -182,6 +204,21 @@ class Holding:
             self._whole = False
             await self._catch_up(partition, given.sequence)
             self._whole = True
+
+    async def _break_silence(self) -> None:
+        """Have the state of all messages that the stream has, without being given any."""
+        if not self.consumer.pinned and await self.consumer.is_pinned():
+            await self._look()
+            return
+        async with self._changing:
+            partition = await self._take_over()
+        js, subject = self._nc.jetstream(), subjects.kept(self.number)
+        try:
+            await js.get_msg(subjects.RAW_STREAM, partition.sequence + 1, subject, next=True)
+        except NotFoundError:
+            self._ask_s = time.monotonic() + LATER_S
+        else:
+            await self._catch_up(partition, (await js.get_last_msg(subjects.RAW_STREAM, subject)).seq or 0)
 
     async def _take_over(self) -> Partition:
         """Have a state that is ours, maybe an old one."""
@@ -222,18 +259,17 @@ class Holding:
         return Partition(self.number, self._table)
 
     async def _catch_up(self, partition: Partition, sequence: int) -> None:
-        """Take what the stream has before a message. Only the last that each pack's messages bring goes out."""
-        if partition.sequence + 1 >= sequence:
+        """Take what the stream has up to a message. Only the last that each pack's messages bring goes out."""
+        if partition.sequence >= sequence:
             return
         latest: dict[str, Taken] = {}
         subject = subjects.kept(self.number)
         messages = stored(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
         async with aclosing(messages):
             async for message in messages:
-                if message.sequence < sequence:
-                    pack = message.subject.rpartition(".")[2]
-                    taken = await self._step(partition, pack, message.data, message.sequence)
-                    latest[pack] = _later(latest.get(pack), taken)
+                pack = message.subject.rpartition(".")[2]
+                taken = await self._step(partition, pack, message.data, message.sequence)
+                latest[pack] = _later(latest.get(pack), taken)
         for taken in latest.values():
             await self._publish(taken)
 
@@ -245,10 +281,16 @@ class Holding:
             except Exception:  # a fault of ours with one pack, which would end one worker after the other
                 log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
                 taken = Taken(pack)
-        self.blocks += 1
-        self.samples += glance(data)[0]
+                self.faults += 1
+        self._count(data)
         self._add_hours(taken)
         return taken
+
+    def _count(self, data: bytes) -> None:
+        samples, arrival_s = glance(data)
+        self.blocks += 1
+        self.samples += samples
+        self.lag_s = max(self.lag_s or 0.0, time.time() - arrival_s)
 
     def _add_hours(self, taken: Taken) -> None:
         self.hours.extend((message_id, taken.pack, row) for message_id, row in taken.hours)

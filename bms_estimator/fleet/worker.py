@@ -129,7 +129,7 @@ class Worker:
         self._changed: asyncio.Queue[set[str]] = asyncio.Queue()
         self._started_s = time.time()
         self._renewed_s = time.monotonic()
-        self._blocks = self._samples = 0  # of partitions that were given back
+        self._blocks = self._samples = self._faults = 0  # of partitions that were given back
         self._leaving = False
         self._turn = asyncio.Lock()
         self._few = asyncio.Semaphore(AT_ONCE)
@@ -229,6 +229,9 @@ class Worker:
             if task.done() and not task.cancelled():
                 task.result()
         await self._ask_all()
+        if self._nc.is_connected:
+            for holding in self._holdings:
+                holding.remind()
 
     async def _ask_all(self) -> None:
         if self._nc.is_connected:
@@ -250,6 +253,7 @@ class Worker:
             if self._nc.is_connected:
                 await holding.give_back()
         self._blocks, self._samples = self._blocks + holding.blocks, self._samples + holding.samples
+        self._faults += holding.faults
         del self._held[holding.number], self._returning[holding.number]
 
     async def _save(self) -> None:
@@ -281,7 +285,7 @@ class Worker:
                     await asyncio.sleep(0)
 
     def _heartbeat(self) -> Heartbeat:
-        holdings = [holding for holding in self._holdings if holding.consumer.pinned]
+        holdings = [holding for holding in self._holdings if holding.held]
         counters, unknown = Counter[str](), list[str]()
         for holding in holdings:
             if holding.partition:
@@ -300,6 +304,7 @@ class Worker:
             packs=counters["packs"],
             blocks=self._blocks + sum(holding.blocks for holding in self._holdings),
             samples=self._samples + sum(holding.samples for holding in self._holdings),
+            faults=self._faults + sum(holding.faults for holding in self._holdings),
             lag_s=max(lags, default=None),
             counters=dict(counters),
             unknown_count=len(unknown),

@@ -26,6 +26,7 @@ from rich.table import Table
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.simulated_fleet import BLOCK_S, SimulatedFleet
+from bms_estimator.fleet.worker import CHECKPOINT_S
 from bms_estimator.service.warm_up import load_kernels
 from tests.benchmarks.fleet_rig import Rig, cpu_s, make, rig, rss_mib
 from tests.patience import LONG_S
@@ -33,8 +34,6 @@ from tests.patience import LONG_S
 SEED, DAY_S, PARTITIONS = 1, 86_400.0, 64
 LISTENED = 256
 """Packs whose estimates are heard, evenly spread."""
-NEVER_S = 1e6
-"""Between checkpoints, where only those of the end count."""
 
 
 @dataclass
@@ -101,7 +100,7 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     loaded_s = time.monotonic()
     await asyncio.to_thread(fleet_rig.load, fleet)
     loaded_s = time.monotonic() - loaded_s
-    names = [fleet_rig.start_worker(checkpoint_s=NEVER_S) for _ in range(arguments.workers)]
+    names = [fleet_rig.start_worker(checkpoint_s=CHECKPOINT_S) for _ in range(arguments.workers)]
     heard = await _listen(fleet_rig, fleet)
     await _until(lambda: len(heard.workers) == len(names))
     minutes = arguments.warm_up + arguments.minutes

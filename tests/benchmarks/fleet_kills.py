@@ -148,8 +148,7 @@ async def _run(fleet_rig: Rig, plan: Plan, said: Callable[[str], object]) -> Out
     try:
         await _until(lambda: _counted(heard) > 0)
         await asyncio.to_thread(_kill, fleet_rig, plan, outcome, said)
-        used = {subjects.partition_of(pack, plan.partitions) for pack in fleet.names}
-        await _until(lambda: used <= _held(heard))  # a partition is taken over with the next message that comes
+        await _until(lambda: _held(heard) == set(range(plan.partitions)))
         await _until_whole(nc, fleet)
         edges.terminate()
         await asyncio.to_thread(edges.wait, LONG_S)
