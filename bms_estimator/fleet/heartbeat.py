@@ -20,6 +20,8 @@ class Heartbeat(BaseModel):
     """It gives its partitions back and ends."""
     partitions: tuple[int, ...] = ()
     """That the server has pinned to it."""
+    asks: tuple[int, ...] = ()
+    """Those that it asks for, what it has among them: the server pins one with the next block."""
     packs: int = 0
     """In those partitions."""
     blocks: int = 0

@@ -297,6 +297,7 @@ class Worker:
             started_s=self._started_s,
             leaving=self._leaving,
             partitions=tuple(holding.number for holding in holdings),
+            asks=tuple(sorted(self._held.keys() - self._returning.keys())),
             packs=counters["packs"],
             blocks=self._blocks + sum(holding.blocks for holding in self._holdings),
             samples=self._samples + sum(holding.samples for holding in self._holdings),
