@@ -12,7 +12,7 @@ REMEMBERED_S = 300.0
 OVER_S = 10.0
 """Rates are means over so long [s]."""
 MOST_WORKERS = 256
-UNHELD, AWAITED = -1, -2
+UNHELD = -1
 
 
 class _Heard(NamedTuple):
@@ -57,8 +57,7 @@ class FleetWorkers:
 
         Returns:
             ``workers`` (each: id, alive, what it holds and does), ``holders`` (of each partition the place of its worker, -1
-            where nobody holds it, -2 where somebody will with its next block), ``unheld`` and ``twice`` (partitions),
-            ``lag_s`` (the longest).
+            where nobody holds it), ``unheld`` and ``twice`` (partitions), ``lag_s`` (the longest).
         """
         for name in [name for name, heard in self._heard.items() if heard[-1].at_s < now_s - REMEMBERED_S]:
             del self._heard[name]
@@ -71,9 +70,6 @@ class FleetWorkers:
                 if holders[partition] != UNHELD:
                     twice.add(partition)
                 holders[partition] = place
-        for partition in {number for heard in alive.values() for number in heard[-1].heartbeat.asks}:
-            if partition < self.partitions and holders[partition] == UNHELD:
-                holders[partition] = AWAITED
         lags = [_lag(heard) for heard in alive.values()]
         return {
             "workers": [_line(self._heard[name], now_s, name in alive) for name in sorted(self._heard)],

@@ -174,14 +174,6 @@ def test_who_holds_which_partition_and_which_nobody_holds():
     assert workers.picture(400.0)["workers"] == []
 
 
-def test_a_partition_without_a_block_so_far_is_nobody_s_trouble_where_a_worker_asks_for_it():
-    workers = FleetWorkers(4)
-    workers.hear(beat("a", 0, asks=[0, 1, 9]), 0.0)
-    workers.hear(beat("b", asks=[2]), 0.0)
-    shown = workers.picture(1.0)
-    assert (shown["holders"], shown["unheld"]) == ([0, -2, -2, -1], [3])
-
-
 def test_rates_are_of_late_and_begin_anew_with_a_worker():
     workers = FleetWorkers(1)
     for second in range(30):

@@ -3,7 +3,7 @@ import * as f from "./format.js";
 import { attribute, changed, hide, listen, node, text } from "./live.js";
 
 const REFRESH_MS = 5000; // of the pack that is shown
-const LAG_S = 60, LISTED = 20, COLOURS = 8, AWAITED = -2;
+const LAG_S = 60, LISTED = 20, COLOURS = 8;
 const $ = (id) => document.getElementById(id);
 const number = (x) => typeof x === "number";
 const count = (n) => n.toLocaleString("en");
@@ -80,10 +80,9 @@ function drawTiles({ packs, holders, unheld, twice, lag_s, workers, states_per_s
 	tile("alive", packs.silent > 0.01 * packs.known ? "wrong" : packs.silent ? "low" : unsure || !packs.known ? "" : "fine");
 
 	const alive = workers.filter((w) => w.alive).length;
-	const awaited = holders.filter(place => place === AWAITED).length;
-	put("held", count(holders.length - unheld.length - awaited));
+	put("held", count(holders.length - unheld.length));
 	put("partitions", `of ${holders.length}`);
-	put("unheld", unheld.length ? `unheld: ${ranges(unheld)}` : twice.length ? `held twice: ${ranges(twice)}` : awaited ? `${awaited} as soon as blocks come` : `by ${many(alive, "worker")}`);
+	put("unheld", unheld.length ? `unheld: ${ranges(unheld)}` : twice.length ? `held twice: ${ranges(twice)}` : `by ${many(alive, "worker")}`);
 	tile("held", unheld.length ? "wrong" : twice.length ? "low" : "fine");
 
 	put("lag", short(lag_s));
@@ -220,11 +219,10 @@ function chooser(pack) {
 function drawWorkers({ workers, holders, unheld }) {
 	const alive = workers.filter((w) => w.alive).length;
 	put("workers", `${count(alive)} alive${workers.length > alive ? `, ${count(workers.length - alive)} gone` : ""}`);
-	attribute($("holders"), "aria-label", `${holders.length} partitions: ${unheld.length ? `${ranges(unheld)} held by nobody` : "each with a worker"}`);
+	attribute($("holders"), "aria-label", `${holders.length} partitions: ${unheld.length ? `${ranges(unheld)} held by nobody` : "all held"}`);
 	if (changed($("holders"), JSON.stringify([holders, workers.map((w) => w.id)]))) {
 		$("holders").replaceChildren(...holders.map((place, n) => node("li", {
-			class: place === AWAITED ? "awaited" : place < 0 ? "unheld" : `c${place % COLOURS}`,
-			title: `partition ${n}: ${place === AWAITED ? "no block yet" : place < 0 ? "nobody" : workers[place].id}`,
+			class: place < 0 ? "unheld" : `c${place % COLOURS}`, title: `partition ${n}: ${place < 0 ? "nobody" : workers[place].id}`,
 		})));
 	}
 	if (!changed($("workers"), JSON.stringify(workers))) return;
