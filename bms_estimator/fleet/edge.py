@@ -109,6 +109,9 @@ class Edge:
         if self._task is not None and self._task.done():
             self._task.result()  # only a fault of ours ends it: let it be seen
         wall_s = self._clock.wall()
+        self._times.go_on_from(
+            self.store.last_s
+        )  # a store may be later than our clock, where workers have had a later one
         placed = samples.copy()
         placed["time_s"] = self._times.place(samples["time_s"], wall_s, self._steady())
         ended = self._gathering.add(placed, wall_s)

@@ -42,6 +42,11 @@ class EdgeClock:
         self._owed_s = 0.0  # by so much the offset is to grow, slowly
         self._least_late_s, self._window_s = math.inf, 0.0  # of the present window, and when it began
 
+    def go_on_from(self, time_s: float) -> None:
+        """Place nothing before a time that is later than all that was placed, and what comes now there [s since 1970]."""
+        if time_s > self._last_s:
+            self._last_s, self._lead_s, self._told_s = time_s, math.nan, math.nan
+
     def place(self, told_s: Times, wall_s: float, steady_s: float) -> Times:
         """Times of samples that have just come [s since 1970].
 

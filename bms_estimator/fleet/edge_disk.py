@@ -1,6 +1,5 @@
 """What an edge keeps on its disk, and what is done with it, each in one transaction."""
 
-import math
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,7 +39,7 @@ class Kept(NamedTuple):
     next: int
     """Number of the next block."""
     last_s: float
-    """Time of its last sample, since it was made [s]; minus infinity without any."""
+    """Time of its last sample, since it was made [s]; 0 without any."""
     bytes: int
     """Of its blocks."""
     run: str
@@ -106,7 +105,7 @@ class Settle:
         """A new store, made when the first sample that waits for it was taken."""
         connection.execute("DELETE FROM block")
         first_s = float(self.put[0][1].samples["time_s"][0]) if self.put else self.now_s
-        return Kept(max(int(first_s), self.known_s + 1, self.after_s + 1), 1, -math.inf, 0, "", 0)
+        return Kept(max(int(first_s), self.known_s + 1, self.after_s + 1), 1, 0.0, 0, "", 0)
 
 
 class Page(NamedTuple):

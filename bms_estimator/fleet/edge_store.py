@@ -75,7 +75,7 @@ class EdgeStore:
 
     @property
     def last_s(self) -> float:
-        """Time of the last sample on disk [s since 1970]; minus infinity without any."""
+        """Time of the last sample on disk, else when the store was made [s since 1970]; minus infinity before the disk has answered."""
         return self._settled.kept.made_s + self._settled.kept.last_s if self._settled else -math.inf
 
     @property
@@ -186,10 +186,11 @@ class EdgeStore:
             self._wanted.set()
 
     def _give_up(self, first: int) -> None:
-        """Blocks below ``first`` cannot be read."""
-        self._drop(first - self._cursor, "blocks on the disk are damaged")
-        self._safe = self._cursor = first
-        self._handed.clear()
+        """Those from the cursor on cannot be read; where one before them is not safe yet, that waits until a worker asks for them."""
+        if self.oldest >= self._cursor:
+            self._drop(first - self._cursor, "blocks on the disk are damaged")
+            self._safe = first
+        self._cursor = first
 
     def _drop(self, blocks: int, reason: str) -> None:
         if not self._full:

@@ -177,7 +177,7 @@ class Holding:
     async def settings_changed(self, pack: str) -> None:
         """A pack has other settings, or is known now."""
         for taken in self.partition.settings_changed(pack) if self.partition else ():
-            self._add_hours(taken)
+            self._note(taken)
             await self._publish(taken)
 
     async def _take(self, given: Given) -> None:
@@ -229,6 +229,9 @@ class Holding:
             if partition is None or (kept and kept[0].sequence > partition.sequence):
                 partition = await self._restored(claim)
             self.partition, self.claim = partition, claim
+            for pack in partition.unknown:  # the table may know it by now
+                await self.settings_changed(pack)
+                await asyncio.sleep(0)
         last = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
         if partition.sequence > last:
             log.warning(
@@ -280,10 +283,9 @@ class Holding:
                 taken = partition.take(pack, data, sequence)
             except Exception:  # a fault of ours with one pack, which would end one worker after the other
                 log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
-                taken = Taken(pack)
-                self.faults += 1
+                taken = Taken(pack, failed=1)
         self._count(data)
-        self._add_hours(taken)
+        self._note(taken)
         return taken
 
     def _count(self, data: bytes) -> None:
@@ -292,7 +294,8 @@ class Holding:
         self.samples += samples
         self.lag_s = max(self.lag_s or 0.0, time.time() - arrival_s)
 
-    def _add_hours(self, taken: Taken) -> None:
+    def _note(self, taken: Taken) -> None:
+        self.faults += taken.failed
         self.hours.extend((message_id, taken.pack, row) for message_id, row in taken.hours)
 
     async def _publish(self, taken: Taken) -> None:

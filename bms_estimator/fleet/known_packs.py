@@ -4,7 +4,7 @@ Packs with the same bytes share one settings object and one model; those that no
 wrong with a row makes its packs unknown, with the reason.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 
 from bms_estimator.fleet.pack_row import PackKind, kind_of, known_cells, model_of, settings_of
@@ -66,15 +66,25 @@ class KnownPacks:
             self._rows[pack] = self._same.setdefault(data, data)
         return True
 
-    def set_cell(self, name: str, text: str | None) -> set[str]:
-        """A cell file is another; None: there is none any more. Returns the packs that are made of it."""
+    def set_cell(self, name: str, file: bytes | None) -> bool:
+        """A cell file is another; None: there is none any more. Whether this is news."""
+        text = None if file is None else file.decode(errors="replace")
         if text == self._cells.get(name):
-            return set()
+            return False
         if text is None:
             del self._cells[name]
         else:
             self._cells[name] = text
-        return {pack for pack, data in self._rows.items() if _names(self._kind(data), name)}
+        return True
+
+    def made_of(self, cells: Collection[str]) -> set[str]:
+        """The packs that are made of one of some cells; looks at all packs."""
+        found = set[str]()
+        for pack, data in self._rows.items() if cells else ():
+            kind = self._kind(data)
+            if not isinstance(kind, str) and kind.cell in cells:
+                found.add(pack)
+        return found
 
     def _found(self, pack: str) -> tuple[Settings, PackModel] | str:
         kind = self.kind(pack)
@@ -83,10 +93,6 @@ class KnownPacks:
         if isinstance(kind, str):
             return f"its row is wrong: {kind}"
         return self._made(kind, self._cells.get(kind.cell))
-
-
-def _names(kind: PackKind | str, cell: str) -> bool:
-    return not isinstance(kind, str) and kind.cell == cell
 
 
 def _kind(data: bytes) -> PackKind | str:

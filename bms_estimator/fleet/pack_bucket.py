@@ -10,6 +10,7 @@ import nats.js.errors
 from nats.aio.client import Client
 
 from bms_estimator.fleet.known_packs import KnownPacks
+from bms_estimator.fleet.reasons import reason
 from bms_estimator.fleet.stream_reader import ANSWER_S, Stored, StreamError, read_stream
 from bms_estimator.fleet.subjects import CELLS_BUCKET, PACKS_BUCKET
 
@@ -49,6 +50,7 @@ class PackBucket:
         self.faults, self.fault = 0, ""
         self._nc = nc
         self._next = {PACKS_BUCKET: 1, CELLS_BUCKET: 1}
+        self._changed: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
 
     async def refresh(self) -> set[str]:
         """Read what has changed, the first time everything; returns the packs of which it tells.
@@ -56,13 +58,26 @@ class PackBucket:
         Raises:
             StreamError: The server does not answer, or has no such bucket.
         """
-        changed = set[str]()
-        for bucket in (CELLS_BUCKET, PACKS_BUCKET):  # a row finds its cell
-            async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next[bucket]):
-                for message in batch:
-                    changed |= self._take(bucket, message)
-                self._next[bucket] = batch[-1].sequence + 1
+        await self._read(CELLS_BUCKET, self.packs.set_cell)  # a row finds its cell
+        await self._read(PACKS_BUCKET, self.packs.set_row)
+        changed = self._changed[PACKS_BUCKET] | self.packs.made_of(self._changed[CELLS_BUCKET])
+        self._changed = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
         return changed
+
+    async def _read(self, bucket: str, take: Callable[[str, bytes | None], bool]) -> None:
+        """Note which keys of a bucket have another value now: for the next one, too, should this refresh not come to its end."""
+        try:
+            state = (await self._nc.jetstream().stream_info(_stream(bucket))).state
+        except nats.errors.Error as error:
+            raise StreamError(f"the server refuses to read {_stream(bucket)}: {reason(error)}") from None
+        if state.last_seq + 1 < self._next[bucket]:
+            self._next[bucket] = 1  # made anew, or its end is lost: numbers come again for other values
+        async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next[bucket]):
+            for message in batch:
+                key, data = _entry(bucket, message)
+                if take(key, data):
+                    self._changed[bucket].add(key)
+            self._next[bucket] = batch[-1].sequence + 1
 
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
         """Go on for ever: tell ``changed`` which packs have another row or cell now.
@@ -79,12 +94,6 @@ class PackBucket:
             self.fault = ""
             if news:
                 changed(news)
-
-    def _take(self, bucket: str, message: Stored) -> set[str]:
-        key, data = _entry(bucket, message)
-        if bucket == CELLS_BUCKET:
-            return self.packs.set_cell(key, None if data is None else data.decode(errors="replace"))
-        return {key} if self.packs.set_row(key, data) else set()
 
 
 async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:

@@ -39,6 +39,7 @@ class Taken(NamedTuple):
         state: Topic ``state``.
         parameters: Topic ``parameters``.
         hours: Finished hours: an id that is the same whoever makes the row, and the row.
+        failed: Blocks that were left out for a fault of ours.
     """
 
     pack: str
@@ -46,6 +47,7 @@ class Taken(NamedTuple):
     state: bytes | None = None
     parameters: bytes | None = None
     hours: tuple[tuple[str, bytes], ...] = ()
+    failed: int = 0
 
 
 class Partition:
@@ -174,7 +176,8 @@ class Partition:
                 self._open(pack)
                 judge(d, block)
                 self._bench.count_lost(lost)
-            made = stepped or made
+                self._counters["failed"] += 1
+            made = stepped or Taken(pack, failed=1)
             taken(d)
             self._former.pop(pack, None)
         else:
@@ -192,7 +195,6 @@ class Partition:
             return Taken(pack, None, *self._stepping.step(pack, block, of_type, former))
         except Exception:  # a fault of ours, with one block: awaited for ever it would stop the pack
             log.exception("a block is left out", partition=self.number, pack=pack, number=block.number)
-        self._counters["failed"] += 1
         self._stepping.forget()
         return None
 
@@ -219,4 +221,5 @@ def _together(pack: str, made: list[Taken]) -> Taken:
         state=next((each.state for each in reversed(made) if each.state), None),
         parameters=next((each.parameters for each in reversed(made) if each.parameters), None),
         hours=tuple(row for each in made for row in each.hours),
+        failed=sum(each.failed for each in made),
     )

@@ -75,7 +75,7 @@ class Awaits(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    store: Annotated[int, Field(ge=0)]
-    number: Annotated[int, Field(ge=1)]
+    store: Annotated[int, Field(ge=0, lt=2**63)]
+    number: Annotated[int, Field(ge=1, le=2**63)]
     resend: bool
     """A later one came first: send this one, and all after it, again."""

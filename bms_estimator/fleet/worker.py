@@ -225,9 +225,9 @@ class Worker:
             self._give_back(number)
         for number in sorted(share - self._held.keys()):
             self._try_for(number, now_s)
-        for _, task in self._held.values():
+        for task in [*self._returning.values(), *(task for _, task in self._held.values())]:
             if task.done() and not task.cancelled():
-                task.result()
+                task.result()  # a fault of ours: were it not seen, the partition would be nobody's
         await self._ask_all()
         if self._nc.is_connected:
             for holding in self._holdings:

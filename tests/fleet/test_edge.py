@@ -127,6 +127,25 @@ async def test_a_link_that_is_cut_costs_nothing(receiver: Receiver, engine: Engi
         assert feed.edge.delivery.losses == 3
 
 
+async def test_a_store_that_must_be_later_than_the_clock_goes_on_at_the_same_pace(
+    receiver: Receiver, engine: Engine, tmp_path: Path
+) -> None:
+    feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:9")  # nobody is there
+    async with feed.edge:
+        feed.give(2)
+        later = Awaits(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
+        await until(lambda: feed.edge.store._settled.kept.next == 2)  # on disk
+        feed.edge.store.heard(later)
+        await until(lambda: feed.edge.store.last_s > WALL_S + 1e8)
+        feed.give(4)
+        async with asyncio.timeout(LONG_S):
+            first, second, third = [decode((await feed.edge.store.take(1))[0].message.payload) for _ in range(3)]
+    assert (first.number, first.store > later.store) == (1, True)
+    assert (first.samples["time_s"] == 0.0).all()  # they had been placed by then
+    assert second.samples["time_s"].tolist() == [*np.arange(60.0)]
+    assert third.samples["time_s"].tolist() == [*np.arange(60.0, 120.0)]
+
+
 async def test_a_server_that_is_killed_in_mid_send_costs_nothing(tmp_path: Path) -> None:
     with running(tmp_path, partitions=4) as engine:
         async with Receiver(engine.url, "pack") as receiver:
@@ -198,10 +217,10 @@ async def test_garbage_from_who_is_no_worker_changes_nothing(
         await feed.all_came()
         store = receiver.blocks[0].store
         garbage = [b"", b"\xff\x00", b"{}", b'{"store": -1, "number": 1, "resend": false}', b"9" * 10_000, b"[" * 9_000]
+        garbage += [f'{{"store": {n}, "number": {n}, "resend": true}}'.encode() for n in (10**30, 10**400)]
         for payload in garbage:
             await receiver.say(payload)
         await receiver.say(Awaits(store=1, number=1, resend=True))
-        await receiver.say(Awaits(store=1 << 90, number=1 << 90, resend=True))
         await receiver.say(Awaits(store=store, number=1, resend=False))
         await until(lambda: feed.edge.unread == len(garbage))
         feed.give(3)

@@ -55,6 +55,15 @@ def test_a_source_that_begins_anew_goes_on_by_the_host() -> None:
     assert after[0] - before[-1] == pytest.approx(901.0)
 
 
+def test_it_goes_on_from_a_later_time_at_the_source_s_pace() -> None:
+    clock = EdgeClock()
+    run(clock, np.arange(10.0))
+    clock.go_on_from(WALL_S)  # it is there already
+    assert run(clock, np.arange(10.0, 20.0))[-1] == WALL_S + 19.0
+    clock.go_on_from(WALL_S + 1e8)
+    assert (run(clock, np.arange(20.0, 30.0)) == WALL_S + 1e8 + np.arange(10.0)).all()
+
+
 def test_a_step_back_within_one_read_is_seen() -> None:
     clock = EdgeClock()
     clock.place(np.array([0.0]), WALL_S, 0.0)

@@ -129,8 +129,12 @@ async def test_a_worker_waits_for_streams_and_settings_and_goes_on_from_what_is_
             states = await nc.subscribe(subjects.published("p1", "state"))
             known = await know(nc, ["p1"])
             await _until_block(states, 1)  # that was held
+            await send(nc, "p2", block("p2", 1))
+            await unknown.next_msg(LONG_S)
             stop.set()
             await working
+        late = await nc.subscribe(subjects.published("p2", "state"))
+        known = await know(nc, ["p1", "p2"])
         number = 1
         for damaged in (0, 1, 2):
             number += 1
@@ -146,6 +150,7 @@ async def test_a_worker_waits_for_streams_and_settings_and_goes_on_from_what_is_
                 await working
             assert sum("is damaged" in line["event"] for line in logs) == damaged
             assert any("from its beginning" in line["event"] for line in logs) == (damaged == 2)
+        await _until_block(late, 1)  # though none came after it became known
         state = (await end_states(nc, known, 1))[0].state("p1")
         assert state is not None
         assert state["estimator"].tobytes() == estimated(known, "p1", number)

@@ -66,6 +66,21 @@ async def test_a_worker_sees_all_rows_and_then_what_changes(nc):
     assert bucket.packs("b")
 
 
+async def test_what_changed_is_told_though_the_table_is_lost_meanwhile_and_made_anew(nc):
+    await write_bucket(nc, PACKS_BUCKET, {"a": stored(PackKind(cell="own")), "b": LFP, "c": LFP})
+    bucket = PackBucket(nc)
+    await bucket.refresh()
+    await nc.jetstream().delete_stream(f"KV_{PACKS_BUCKET}")
+    await write_bucket(nc, CELLS_BUCKET, {"own": cell_text(load_cell("ncr18650")).encode()})
+    with pytest.raises(StreamError, match="KV_packs: the server lacks"):
+        await bucket.refresh()
+    await make_streams(nc, partitions=1)
+    await write_bucket(nc, PACKS_BUCKET, {"b": b"{broken"})  # of a number that there was
+    assert await bucket.refresh() == {"a", "b"}
+    assert bucket.packs("a")
+    assert bucket.packs("b") is None
+
+
 async def test_following_goes_on_where_the_server_was_killed(engine, nc):
     news = asyncio.Queue()
     bucket = PackBucket(nc)

@@ -164,7 +164,7 @@ def test_packs_of_one_kind_share_settings_and_model():
 )
 def test_whatever_is_wrong_makes_a_pack_unknown_with_the_reason(data, reason):
     known = KnownPacks()
-    known.set_cell("broken", "= 1")
+    known.set_cell("broken", b"= 1")
     known.set_row("house", data)
     assert known("house") is None or reason == ""
     assert known.reason("house").startswith(reason)
@@ -177,10 +177,13 @@ def test_a_pack_becomes_known_with_its_row_and_its_cell():
     assert known.set_row("house", stored(PackKind(cell="own", series=2)))
     assert not known.set_row("house", stored(PackKind(cell="own", series=2)))
     assert known("house") is None
-    assert known.set_cell("own", cell_text(load_cell("ncr18650"))) == {"house"}
+    assert known.set_cell("own", cell_text(load_cell("ncr18650")).encode())
+    assert known.made_of({"own", "other"}) == {"house"}
+    assert known.made_of({"other"}) == known.made_of(()) == set()
     assert known.reason("house") == ""
     assert known("house")[1].cell.series_count == 2
-    assert known.set_cell("own", None) == {"house"}
+    assert known.set_cell("own", None)
+    assert not known.set_cell("own", None)
     assert known("house") is None
     assert known.set_row("house", None)
     assert known.reason("house") == NOT_TOLD

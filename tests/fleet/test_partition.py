@@ -385,7 +385,7 @@ class TestFaultsOfAnEdge:
             patched.setattr(Stepping, "_state", fail)  # after the estimator has taken the samples
             taken = stream.send("a", blocks[9])
             stream.send("new", blocks[0])
-        assert (taken.state, taken.awaits.number, taken.awaits.resend) == (None, 11, False)
+        assert (taken.state, taken.failed, taken.awaits.number, taken.awaits.resend) == (None, 1, 11, False)
         assert [(line["event"], line["pack"], line["number"]) for line in logs] == [
             ("a block is left out", "a", 10),
             ("a block is left out", "new", 1),
