@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.cli.fleet import COMMANDS as OF_A_FLEET
+from bms_estimator.cli.main import COMMANDS
+
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
@@ -67,6 +70,20 @@ def test_relative_links_lead_to_files(document: Path) -> None:
     links = re.findall(r"\]\(([^)\s#]+)[^)]*\)", document.read_text(encoding="utf-8"))
     relative = [link for link in links if not re.match(r"[a-z]+:", link)]
     assert [link for link in relative if not (document.parent / link).exists()] == []
+
+
+def test_every_command_has_its_section() -> None:
+    headings = re.findall(r"^## (.+)$", (ROOT / "docs" / "cli.md").read_text(encoding="utf-8"), re.MULTILINE)
+    described = {name for heading in headings for name in heading.split(", ")}
+    commands = {*COMMANDS, *(f"fleet {name}" for name in OF_A_FLEET)} - {"fleet"}
+    assert commands - described == set()
+
+
+def test_documents_of_the_fleet_lead_to_one_another() -> None:
+    documents = sorted((ROOT / "docs").glob("fleet-*.md"))
+    overview = (ROOT / "docs" / "fleet.md").read_text(encoding="utf-8")
+    assert [path.name for path in documents if f"]({path.name}" not in overview] == []
+    assert [path.name for path in documents if "](fleet.md" not in path.read_text(encoding="utf-8")] == []
 
 
 def test_thesis_document_gives_a_reason_for_every_verdict() -> None:

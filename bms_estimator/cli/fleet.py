@@ -9,7 +9,7 @@ COMMANDS = {
     "serve": Entry("bms_estimator.cli.fleet_serve:serve", "Run a node of the server, with its streams."),
     "user": Entry("bms_estimator.cli.fleet_serve:user", "Print the token with which a tenant's pack connects."),
     "worker": Entry("bms_estimator.cli.fleet_worker:worker", "Estimate the packs of some partitions."),
-    "packs": Entry("bms_estimator.cli.fleet_packs:app", "Which cells each pack has: load, list, remove."),
+    "packs": Entry("bms_estimator.cli.fleet_packs:app", "Which cells each pack has: load, list, show, remove."),
     "capture": Entry("bms_estimator.cli.fleet_capture:capture", "What a pack has sent, as a capture for replay."),
     "identify": Entry("bms_estimator.cli.fleet_identify:identify", "Identify packs anew from what they have sent."),
     "collect": Entry("bms_estimator.cli.fleet_ask:collect", "Write the summaries of hours to Parquet."),

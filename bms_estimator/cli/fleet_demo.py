@@ -11,8 +11,8 @@ from bms_estimator.cli.browser import open_browser
 from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.fleet.demo import Demo, free_port, run_demo
+from bms_estimator.fleet.warm_up import load_fleet_kernels
 from bms_estimator.service.interrupt import stop_on_signal
-from bms_estimator.service.warm_up import load_kernels
 
 
 def demo(
@@ -31,7 +31,7 @@ def demo(
     the speed. What is said comes from the workers' heartbeats and from estimates beside the simulated packs' true SOC.
     """
     with compiling_shown():
-        load_kernels()
+        load_fleet_kernels()
     with tempfile.TemporaryDirectory(prefix="fleet-demo-") as folder:
         opened = open_browser if browser else _leave
         asyncio.run(_run(Demo(packs, seconds, page_port or free_port(), Path(folder), typer.echo, opened)))

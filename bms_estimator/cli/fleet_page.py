@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.browser import open_browser
+from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server
 from bms_estimator.cli.page_options import page_settings
-from bms_estimator.fleet.connection import SERVER
+from bms_estimator.fleet import page_feed
 from bms_estimator.fleet.page import fleet_page
-from bms_estimator.fleet.page_feed import Server
 from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.logs import configure_logs, drained
@@ -19,19 +19,15 @@ DEFAULT_LISTEN = "127.0.0.1:8080"
 
 
 def page(
-    server: Annotated[
-        str, typer.Option(help="of the fleet, nats://host:port or tls://; several with commas between")
-    ] = SERVER,
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
     listen: Annotated[str, typer.Option(help="host:port of the page")] = DEFAULT_LISTEN,
-    hours: Annotated[
+    folder: Annotated[
         Path | None,
-        typer.Option(help="folder that `fleet collect` writes, for what is seen over time", show_default=False),
-    ] = None,
-    creds: Annotated[
-        Path | None, typer.Option(help="file with what opens the server's door", show_default=False)
-    ] = None,
-    ca: Annotated[
-        Path | None, typer.Option(help="certificate of who has signed the server's", show_default=False)
+        typer.Option(
+            help="of the Parquet files, as `fleet collect` writes them, for what is seen over time", show_default=False
+        ),
     ] = None,
     token_file: Annotated[
         Path | None, typer.Option(help="file with the token that a browser must show", show_default=False)
@@ -45,10 +41,10 @@ def page(
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
     configure_logs()
     with drained():
-        asyncio.run(_serve(Server(server, creds, ca), settings, hours, browser=browser))
+        asyncio.run(_serve(page_feed.Server(server, creds, ca), settings, folder, browser=browser))
 
 
-async def _serve(server: Server, settings: PageSettings, hours: Path | None, *, browser: bool) -> None:
+async def _serve(server: page_feed.Server, settings: PageSettings, hours: Path | None, *, browser: bool) -> None:
     stop = stop_on_signal()
     async with fleet_page(server, settings, hours) as url:
         typer.echo(f"page of the fleet: {url}")

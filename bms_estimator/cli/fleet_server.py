@@ -1,9 +1,11 @@
-"""Options that the commands have in common that ask the server of a fleet something and end."""
+"""Options that all commands of a fleet have in common: where its server is, and what opens its door."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+SERVER = "nats://127.0.0.1:4222"
 
 Server = Annotated[str, typer.Option(help="of the fleet, nats://host:port or tls://host:port; several with commas")]
 Creds = Annotated[
@@ -13,6 +15,5 @@ Ca = Annotated[
     Path | None,
     typer.Option(help="certificate of who signed the server's; else those of the system", show_default=False),
 ]
-SERVER = "nats://127.0.0.1:4222"
 Where = tuple[str, Path | None, Path | None]
 """Server, credentials, authority."""

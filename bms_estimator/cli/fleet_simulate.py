@@ -25,13 +25,15 @@ MOST_PACKS = 999_999
 
 def simulate(
     packs: Annotated[int, typer.Option(parser=whole(1, MOST_PACKS), help="how many")] = 1000,
-    server: Annotated[
+    mqtt: Annotated[
         str | None,
-        typer.Option(help="MQTT address of the fleet's server, mqtt://host:port; several with a comma between"),
+        typer.Option(help="of the fleet's server, mqtt://host:port or mqtts://host:port; several with commas"),
     ] = None,
     username: Annotated[str | None, typer.Option(help="of somebody who may publish for all of them")] = None,
     password_file: Annotated[Path | None, typer.Option(help="file with the password")] = None,
-    ca_file: Annotated[Path | None, typer.Option(help="certificate authority of mqtts; else the system's")] = None,
+    ca: Annotated[
+        Path | None, typer.Option(help="certificate of who signed the server's; else those of the system")
+    ] = None,
     speed: Annotated[float, typer.Option(parser=decimal(1e-3, 1e5), help="the packs' seconds per second")] = 1.0,
     blocks: Annotated[
         int | None, typer.Option(parser=whole(1), help="minutes of each pack; else until Ctrl-C", show_default=False)
@@ -49,15 +51,15 @@ def simulate(
 
     A few MQTT connections stand for all edges, so that the cost of a connection an edge is not in what is measured. Of
     the shipped cells, with capacities and resistances that differ; a block follows from seed, pack and number, so that
-    nothing is kept. With --table and without --server the table is written, and that is all.
+    nothing is kept. With --table and without --mqtt the table is written, and that is all.
     """
-    if server is None and table is None and truth is None:
-        raise UserError("give --server mqtt://host:port, or --table OUT.csv to write the table of the packs alone")
+    if mqtt is None and table is None and truth is None:
+        raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write the table of the packs alone")
     fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin), prefix=_prefix(prefix))
     _write(table, fleet.table())
     _write(truth, fleet.truth_table())
-    if server is not None:
-        settings = _broker(server, username=username, password_file=password_file, ca_file=ca_file)
+    if mqtt is not None:
+        settings = _broker(mqtt, username=username, password_file=password_file, ca_file=ca)
         typer.echo(asyncio.run(_run(fleet, settings, connections, speed, blocks)))
 
 
@@ -86,18 +88,27 @@ def _prefix(prefix: str) -> str:
         raise UserError(f"--prefix {prefix}: only letters, digits, _ and -") from None
 
 
-def _broker(server: str, **given: str | Path | None) -> MqttSettings:
+def _broker(url: str, **given: str | Path | None) -> MqttSettings:
     """Whom to connect to.
 
     Raises:
         UserError: It cannot be.
     """
     try:
-        settings = MqttSettings.model_validate({"url": tuple(server.split(",")), **given})
+        settings = MqttSettings.model_validate({"url": tuple(url.split(",")), **given})
+        check(settings)
     except ValidationError as error:
-        raise UserError(f"--server {server}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
-    check(settings)
+        raise UserError(f"--mqtt {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+    except UserError as error:
+        raise UserError(_with_options(str(error))) from None
     return settings
+
+
+def _with_options(said: str) -> str:
+    """What is said of settings, of the options that they were given by."""
+    for setting, option in (("url", "--mqtt"), ("password_file", "--password-file"), ("ca_file", "--ca")):
+        said = said.replace(f"mqtt.{setting} = ", f"{option} ")
+    return said
 
 
 def _write(path: Path | None, text: str) -> None:

@@ -4,14 +4,13 @@ import asyncio
 import os
 import re
 import socket
-from pathlib import Path
 from typing import Annotated
 
 import structlog
 import typer
 
 from bms_estimator.cli.compiling import compiling_shown
-from bms_estimator.fleet.connection import SERVER
+from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server
 from bms_estimator.fleet.warm_up import load_fleet_kernels
 from bms_estimator.fleet.worker import CHECKPOINT_S, Options, work
 from bms_estimator.model.errors import UserError
@@ -22,18 +21,15 @@ _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 def worker(
-    server: Annotated[str, typer.Option(help="nats://host:port or tls://host:port; several with commas")] = SERVER,
-    creds: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="the tenant's credentials", show_default=False)
-    ] = None,
-    ca: Annotated[
-        Path | None,
-        typer.Option(exists=True, dir_okay=False, help="of who signed the server's certificate", show_default=False),
-    ] = None,
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
     name: Annotated[
         str | None, typer.Option(help="its own among workers", show_default="host and process number")
     ] = None,
-    checkpoint_s: Annotated[float, typer.Option(min=1.0, help="between two checkpoints of a partition")] = CHECKPOINT_S,
+    checkpoint_s: Annotated[
+        float, typer.Option(min=1.0, help="between two checkpoints of a partition [s]")
+    ] = CHECKPOINT_S,
 ) -> None:
     """Estimate the packs of some partitions, until SIGINT or SIGTERM.
 

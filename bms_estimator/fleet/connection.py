@@ -1,5 +1,7 @@
 """The connection of a service of the fleet to the server: made again without end, and what is wrong with it said once."""
 
+import logging
+import re
 import ssl
 import time
 from collections.abc import Callable
@@ -11,13 +13,14 @@ from nats.aio.client import Client
 from bms_estimator.fleet.reasons import reason
 from bms_estimator.model.errors import UserError
 
-SERVER = "nats://127.0.0.1:4222"
 RETRY_S = 1
 """Between two attempts to connect [s]."""
 SAID_S = 30.0
 """The same trouble is logged no more often [s]."""
 
 log = structlog.get_logger(__name__)
+# The library's end of a TLS connection, of no use to anybody.
+logging.getLogger("asyncio").addFilter(lambda record: "eof_received() has no effect" not in str(record.msg))
 
 
 async def connect(
@@ -38,15 +41,15 @@ async def connect(
         linked: Called with why there is no connection, and with None when there is one again.
 
     Raises:
-        UserError: ``ca`` cannot be read, or an address is none.
+        UserError: ``creds`` or ``ca`` cannot be read, or an address is none.
     """
     nc = Client()
     said = _Said(nc, servers, linked)
     try:
         await nc.connect(
-            servers=[each.strip() for each in servers.split(",")],
+            servers=addresses(servers),
             name=name,
-            user_credentials=str(creds) if creds else None,
+            user_credentials=str(readable(creds)) if creds else None,
             tls=context(ca) if ca else None,
             max_reconnect_attempts=-1,
             reconnect_time_wait=RETRY_S,
@@ -57,6 +60,33 @@ async def connect(
     except ValueError as error:
         raise UserError(f"--server {servers}: {error}") from error
     return nc
+
+
+def addresses(servers: str) -> list[str]:
+    """One or several with commas between.
+
+    Raises:
+        UserError: One is of another protocol.
+    """
+    found = [each.strip() for each in servers.split(",")]
+    if not all(re.fullmatch(r"((nats|tls)://)?[^/\s]+", each) for each in found):
+        raise UserError(f"--server {servers}: must be nats://host:port or tls://host:port; several with commas")
+    return found
+
+
+def readable(creds: Path) -> Path:
+    """A file of credentials that is there.
+
+    Raises:
+        UserError: It cannot be read, or holds none.
+    """
+    try:
+        data = creds.read_bytes()
+    except OSError as error:
+        raise UserError(f"--creds {creds}: cannot be read: {error.strerror}") from None
+    if b"BEGIN NATS USER JWT" not in data or b"BEGIN USER NKEY SEED" not in data:
+        raise UserError(f"--creds {creds}: no credentials: `fleet serve` makes some, such as keys/TENANT/worker.creds")
+    return creds
 
 
 def context(ca: Path) -> ssl.SSLContext:

@@ -118,7 +118,7 @@ class PinnedConsumer:
         pin, self._pin = self._pin, ""
         self.waiting.clear()
         if pin:
-            await self._nc.request(self._unpin, json.dumps({"group": GROUP}).encode())
+            await self._nc.request(self._unpin, json.dumps({"group": GROUP}).encode(), timeout=PIN_S)
 
     async def _ask(self, batch: int) -> None:
         request: dict[str, str | int] = {"batch": batch, "expires": round(1e9 * EXPIRES_S), "group": GROUP}

@@ -22,6 +22,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.fleet import subjects
+from bms_estimator.fleet.child import ends_with_us
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.errors import UserError
@@ -49,22 +50,35 @@ class Seen:
     """What was heard.
 
     Attributes:
+        partitions: Those that have packs.
         workers: Last heartbeat by name, with its moment of a monotonic clock [s].
         errors: Estimated less true SOC, of estimates since the last line.
         within: Whether the true SOC was within two standard deviations.
+        dead: Workers that are known not to come back.
         worst_s: Longest lag since the last line [s].
     """
 
+    partitions: set[int]
     workers: dict[str, tuple[float, Heartbeat]] = field(default_factory=dict)
     errors: list[float] = field(default_factory=list)
     within: Counter[bool] = field(default_factory=Counter)
+    dead: set[str] = field(default_factory=set)
     worst_s: float = 0.0
 
     @property
     def alive(self) -> dict[str, Heartbeat]:
-        """Workers that were heard within ``DEAD_S``."""
+        """Workers that were heard within ``DEAD_S``, and not killed since."""
         now_s = time.monotonic()
-        return {name: beat for name, (heard_s, beat) in self.workers.items() if now_s - heard_s < DEAD_S}
+        return {
+            name: beat
+            for name, (heard_s, beat) in self.workers.items()
+            if now_s - heard_s < DEAD_S and name not in self.dead
+        }
+
+    @property
+    def held(self) -> set[int]:
+        """Partitions of workers that are alive."""
+        return {number for beat in self.alive.values() for number in beat.partitions}
 
     @property
     def done(self) -> int:
@@ -120,10 +134,10 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
         stack.push_async_callback(processes.end)
         await processes.start("server", "serve", config)
         nc = await stack.enter_async_context(_connected(server, processes, stop))
-        demo.say(f"server: {server} for workers, {mqtt} for edges; streams of 64 partitions")
+        demo.say(f"server: {server} for workers and the page, {mqtt} for edges")
         await processes.run("packs", "packs", "load", table, "--server", server)
         demo.say(
-            f"{demo.packs:,} packs of four kinds in its table; their true capacities and resistances nobody is told"
+            f"table: {demo.packs:,} packs of four kinds of cells; how much each has aged, and its SOC, nobody is told"
         )
         seen = await _listen(nc, fleet)
         for name in _WORKERS:
@@ -131,14 +145,19 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
         page = ("--listen", f"{LOOPBACK}:{demo.page_port}", "--no-browser")
         await processes.start("page", "page", "--server", server, *page)
         await processes.until(lambda: len(seen.alive) == len(_WORKERS), stop)
-        demo.say(f"two workers: {' and '.join(_WORKERS)}; the fleet's page: http://{LOOPBACK}:{demo.page_port}/")
+        demo.say(
+            f"two workers: {' and '.join(_WORKERS)}, who share the packs by {subjects.PARTITIONS} partitions of them"
+        )
+        demo.say(f"the fleet's page: http://{LOOPBACK}:{demo.page_port}/")
         demo.opened(f"http://{LOOPBACK}:{demo.page_port}/")
         begin = datetime.fromtimestamp(begin_s, UTC).astimezone().replace(tzinfo=None).isoformat()
-        edges = ("--packs", demo.packs, "--seed", SEED, "--speed", SPEED, "--begin", begin, "--server", mqtt)
+        edges = ("--packs", demo.packs, "--seed", SEED, "--speed", SPEED, "--begin", begin, "--mqtt", mqtt)
         await processes.start("edges", "simulate", *edges)
         demo.say(
-            f"edges send a minute of samples each {BLOCK_S / SPEED:g} s, all packs together {demo.packs * SPEED:,.0f}/s"
+            f"{demo.packs:,} edges, {SPEED:g} times as fast as real ones: each sends its block, a minute of samples, every "
+            f"{BLOCK_S / SPEED:g} s"
         )
+        await processes.until(lambda: seen.held == seen.partitions, stop)  # given to workers with the first block
         await _tell(demo, seen, processes, stop)
         if not stop.is_set():
             await processes.stop("edges")
@@ -146,19 +165,26 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
 
 
 async def _tell(demo: Demo, seen: Seen, processes: "Processes", stop: asyncio.Event) -> None:
-    """Say how it goes; in the middle of it kill a worker."""
+    """Say how it goes; in the middle of it kill a worker, and see the other one take over: with the packs' next blocks."""
     begin_s, kill_s, gone_s, spoke, done = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
-    while not stop.is_set() and (now_s := time.monotonic() - begin_s) < demo.seconds:
+    while not stop.is_set():
+        now_s = time.monotonic() - begin_s
+        if now_s >= demo.seconds + (0.0 if gone_s == math.inf else PATIENCE_S):
+            return
         processes.check()
         if now_s >= kill_s:
             held = len(seen.alive[_KILLED].partitions) if _KILLED in seen.alive else 0
             await processes.kill(_KILLED)
+            seen.dead.add(_KILLED)
             demo.say(
-                f"{now_s:4.0f} s  {_KILLED} is killed (SIGKILL), with {held} partitions and what it had not kept yet"
+                f"{now_s:4.0f} s  {_KILLED} is killed (SIGKILL), and with it all that it knew of its {held} partitions"
             )
             kill_s, gone_s = math.inf, now_s
-        if gone_s < now_s and _KILLED not in seen.alive and _partitions(seen) >= subjects.PARTITIONS:
-            demo.say(f"{now_s:4.0f} s  {_WORKERS[1]} has all partitions, {now_s - gone_s:.1f} s after the kill")
+        if gone_s < now_s and seen.held == seen.partitions:
+            demo.say(
+                f"{now_s:4.0f} s  {_WORKERS[1]} has all partitions, {now_s - gone_s:.1f} s after the kill: it goes on from "
+                f"{_KILLED}'s last checkpoints, and reads from the stream what came since"
+            )
             gone_s = math.inf
         if now_s >= spoke * SAID_S:
             demo.say(f"{now_s:4.0f} s  {_line(seen, done)}")
@@ -169,14 +195,13 @@ async def _tell(demo: Demo, seen: Seen, processes: "Processes", stop: asyncio.Ev
 
 
 def _line(seen: Seen, done: int) -> str:
-    who = ", ".join(f"{name} {len(beat.partitions)}" for name, beat in sorted(seen.alive.items()))
-    error = f", SOC {100.0 * float(np.mean(np.abs(seen.errors))):.1f} % off on average" if seen.errors else ""
-    rate = f"{(seen.done - done) / SAID_S:,.0f} blocks/s"
-    return f"{rate}, lag at most {seen.worst_s:.1f} s; partitions: {who}{error}"
+    rate = f"{(seen.done - done) / SAID_S:4,.0f} blocks/s estimated, {seen.worst_s:.1f} s after they came at most"
+    error = f"; SOC {100.0 * float(np.mean(np.abs(seen.errors))):.1f} % off on average" if seen.errors else ""
+    return f"{rate}{error}; {_who(seen)} partitions"
 
 
-def _partitions(seen: Seen) -> int:
-    return len({number for beat in seen.alive.values() for number in beat.partitions})
+def _who(seen: Seen) -> str:
+    return " and ".join(f"{name} with {len(beat.partitions)}" for name, beat in sorted(seen.alive.items()))
 
 
 async def _counted(nc: Client, seen: Seen, processes: "Processes", stop: asyncio.Event) -> str:
@@ -192,15 +217,16 @@ async def _counted(nc: Client, seen: Seen, processes: "Processes", stop: asyncio
     for beat in seen.alive.values():
         counted.update(beat.counters)
     return (
-        f"end: {kept:,} blocks came into the stream, {seen.taken:,} were taken, {counted['resends']:,} had come twice, "
-        f"{counted['lost_blocks']:,} lost; the true SOC was within two standard deviations in {100.0 * within:.0f} % of "
-        f"{seen.within.total():,} estimates"
+        f"end: {kept:,} blocks came into the stream; {seen.taken:,} were taken, each once, {counted['resends']:,} had come "
+        f"before, {counted['lost_blocks']:,} lost; the true SOC was within two standard deviations in {100.0 * within:.0f} % "
+        f"of {seen.within.total():,} estimates"
     )
 
 
 async def _listen(nc: Client, fleet: SimulatedFleet) -> Seen:
     """Hear all workers, and some packs."""
-    seen, index = Seen(), {name: i for i, name in enumerate(fleet.names)}
+    seen = Seen({subjects.partition_of(name, subjects.PARTITIONS) for name in fleet.names})
+    index = {name: i for i, name in enumerate(fleet.names)}
 
     async def beat(message: Msg) -> None:
         heard = Heartbeat.model_validate_json(message.data)
@@ -245,7 +271,12 @@ class Processes:
         command = (sys.executable, "-c", "from bms_estimator.cli.main import main; main()", "fleet")
         with (self.folder / f"{name}.log").open("ab") as log:
             process = await asyncio.create_subprocess_exec(
-                *command, *map(str, arguments), stdout=log, stderr=log, start_new_session=True
+                *command,
+                *map(str, arguments),
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                preexec_fn=ends_with_us(),
             )
         self._running[name] = process
         return process

@@ -25,7 +25,7 @@ class Heartbeat(BaseModel):
     blocks: int = 0
     samples: int = 0
     faults: int = 0
-    """Blocks left out for a fault of ours: the log has its traceback."""
+    """Blocks left out for a fault of ours, beside those that ``counters`` has as failed: the log has its traceback."""
     lag_s: float | None = None
     """From the arrival of a block's last sample at the edge to when the block was taken: the worst since the heartbeat before;
     None: no block was taken [s]."""

@@ -8,7 +8,7 @@ import nats
 import nats.errors
 from nats.aio.client import Client
 
-from bms_estimator.fleet.connection import context
+from bms_estimator.fleet.connection import addresses, context, readable
 from bms_estimator.fleet.reasons import reason
 from bms_estimator.fleet.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
@@ -31,8 +31,8 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
 
     try:
         nc = await nats.connect(
-            [url.strip() for url in server.split(",")],
-            user_credentials=_readable(creds) if creds is not None else None,
+            addresses(server),
+            user_credentials=readable(creds) if creds is not None else None,
             tls=context(ca) if ca is not None else None,
             allow_reconnect=False,
             max_reconnect_attempts=1,  # of each server that cannot be reached
@@ -45,13 +45,5 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
     try:
         async with nc:
             yield nc
-    except (StreamError, nats.errors.Error) as error:
-        raise UserError(f"--server {server}: {reason(error)}") from None
-
-
-def _readable(creds: Path) -> Path:
-    try:
-        creds.read_bytes()
-    except OSError as error:
-        raise UserError(f"--creds {creds}: cannot be read: {error.strerror}") from None
-    return creds
+    except (StreamError, nats.errors.Error) as error:  # what is not allowed is said beside the question
+        raise UserError(f"--server {server}: {reason(troubles[-1] if troubles else error)}") from None

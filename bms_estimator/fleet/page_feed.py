@@ -14,7 +14,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.fleet import subjects
-from bms_estimator.fleet.connection import connect, context
+from bms_estimator.fleet.connection import connect, context, readable
 from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.pack_row import PackKind
 from bms_estimator.fleet.page_view import FleetView
@@ -63,8 +63,8 @@ class FleetFeed:
     """
 
     def __init__(self, server: Server, view: FleetView, linked: Callable[[str | None], None]) -> None:
-        if server.creds is not None and not server.creds.is_file():
-            raise UserError(f"--creds {server.creds}: no such file")
+        if server.creds is not None:
+            readable(server.creds)
         if server.ca is not None:
             context(server.ca)
         self._server, self._view, self._linked = server, view, linked

@@ -10,10 +10,16 @@ _REASONS: dict[type[BaseException], str] = {
     nats.js.errors.ServiceUnavailableError: "the server's streams are not available now",
     nats.js.errors.APIError: "the server refuses",
     nats.errors.AuthorizationError: "the server refuses these credentials: look at --creds",
-    TimeoutError: "the server did not answer in time: are most nodes up?",  # that of NATS is one, too
+    TimeoutError: "no answer in time: are most nodes up, and is it the port for workers (4222)?",  # that of NATS is one, too
     ConnectionRefusedError: "nobody listens there",
 }
 """The first that an error is one of."""
+_WORDS = {
+    "authorization violation": "the server refuses these credentials, or asks for some: look at --creds",
+    "permissions violation": "these credentials may not do that: look at --creds",
+    "certificate_verify_failed": "its certificate is of nobody whom we trust, or names another server: look at --ca",
+}
+"""What the library says in words alone."""
 
 
 def reason(error: BaseException) -> str:
@@ -22,4 +28,7 @@ def reason(error: BaseException) -> str:
     for kind, text in _REASONS.items():
         if isinstance(error, kind):
             return f"{text} ({said})" if isinstance(error, nats.js.errors.APIError) else text
+    for words, text in _WORDS.items():
+        if words in said.lower():
+            return f"{text} ({said})"
     return said

@@ -1,6 +1,6 @@
 """A nats-server as a child: started, waited for, given its streams, told what signals tell us.
 
-It is not started again, and only systemd ends it where we are killed: that is the work of who has started us.
+It ends with us, even where we are killed. It is not started again: that is the work of who has started us.
 """
 
 import asyncio
@@ -23,6 +23,7 @@ from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
 from bms_estimator.fleet import credentials
+from bms_estimator.fleet.child import ends_with_us
 from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.fleet.streams import make_streams
@@ -216,7 +217,9 @@ async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subp
     """The server as a child, which ends with us, and whether a signal has asked it to."""
     for left in file.parent.glob("*.ports"):  # of one that was killed
         left.unlink()
-    process = await asyncio.create_subprocess_exec(binary, "-c", file, "--ports_file_dir", file.parent)
+    process = await asyncio.create_subprocess_exec(
+        binary, "-c", file, "--ports_file_dir", file.parent, preexec_fn=ends_with_us()
+    )
     asked, loop = asyncio.Event(), asyncio.get_running_loop()
 
     def pass_on(number: signal.Signals) -> None:

@@ -98,6 +98,29 @@ class Outcome:
         )
 
 
+@dataclass
+class Sent:
+    """What the stream has of a pack.
+
+    Attributes:
+        numbers: Of its blocks, and how often each came.
+        awaited: The number after those that came in their order, whatever came too early or again.
+    """
+
+    numbers: Counter[int] = field(default_factory=Counter)
+    awaited: int = 1
+
+    def add(self, number: int) -> None:
+        """One more message."""
+        self.numbers[number] += 1
+        self.awaited += number == self.awaited
+
+    @property
+    def last(self) -> int:
+        """The highest number."""
+        return max(self.numbers, default=0)
+
+
 def main() -> None:
     """Kill, compare, and end with 1 where a state is wrong."""
     parser = argparse.ArgumentParser(prog="make fleet-kills ARGS=...", description=__doc__)
@@ -212,27 +235,24 @@ def _held(heard: dict[str, tuple[float, Heartbeat]]) -> set[int]:
 
 
 async def _until_whole(nc: Client, fleet: SimulatedFleet) -> None:
-    """Until nothing is missing in the stream, and each pack has sent something since."""
-    before = await _numbers(nc)
+    """Until the stream has all blocks of each pack in their order, some sent since among them."""
+    before = await _sent(nc)
     async with asyncio.timeout(LONG_S):
         while True:
-            numbers = await _numbers(nc)
-            if all(
-                sorted(numbers[pack]) == list(range(1, len(numbers[pack]) + 1))
-                and max(numbers[pack]) >= max(before[pack], default=0) + BLOCKS_AFTER
-                for pack in fleet.names
-            ):
+            now = await _sent(nc)
+            last = {pack: max(now[pack].last, before[pack].last + BLOCKS_AFTER) for pack in fleet.names}
+            if all(now[pack].awaited > last[pack] for pack in fleet.names):
                 return
             await asyncio.sleep(0.5)
 
 
-async def _numbers(nc: Client) -> dict[str, Counter[int]]:
-    """Numbers of the blocks in the stream by pack, and how often they came."""
-    numbers: dict[str, Counter[int]] = defaultdict(Counter)
+async def _sent(nc: Client) -> dict[str, Sent]:
+    """What the stream has, by pack."""
+    sent: dict[str, Sent] = defaultdict(Sent)
     last = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
     async for message in stored(nc, subjects.RAW_STREAM, "p.*.raw.*", 1, last):
-        numbers[message.subject.rpartition(".")[2]][decode(message.data).number] += 1
-    return numbers
+        sent[message.subject.rpartition(".")[2]].add(decode(message.data).number)
+    return sent
 
 
 async def _until(true: Callable[[], bool]) -> None:
@@ -243,7 +263,7 @@ async def _until(true: Callable[[], bool]) -> None:
 
 async def _judge(nc: Client, fleet: SimulatedFleet, plan: Plan, outcome: Outcome) -> None:
     """Compare what the stream has, what is in the checkpoints, and what one estimator makes of all samples."""
-    numbers = await _numbers(nc)
+    numbers = {pack: sent.numbers for pack, sent in (await _sent(nc)).items()}
     bucket = PackBucket(nc)
     await bucket.refresh()
     partitions = {number: await _last(nc, number, bucket) for number in range(plan.partitions)}

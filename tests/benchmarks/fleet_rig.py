@@ -68,7 +68,7 @@ class Rig:
         """Be their edges, for so many blocks each, or until it is stopped."""
         arguments = ["--packs", packs, "--seed", seed, "--begin", begin, "--speed", speed]
         arguments += ["--blocks", blocks] if blocks else []
-        return self.run("simulate", "--server", self._mqtt, *map(str, arguments), log="edges")
+        return self.run("simulate", "--mqtt", self._mqtt, *map(str, arguments), log="edges")
 
     def run(self, *arguments: str, log: str) -> subprocess.Popen[bytes]:
         """Start a command of ``fleet``."""

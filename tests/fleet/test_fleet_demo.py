@@ -11,7 +11,8 @@ def test_the_demo_ends_by_itself_and_says_what_was_seen() -> None:
     command = [PROGRAM, "fleet", "demo", *arguments]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=2 * LONG_S, check=False)
     assert ended.returncode == 0, ended.stderr
-    assert "two workers: ada and bob; the fleet's page: http://127.0.0.1:" in ended.stdout
+    assert "two workers: ada and bob, who share the packs" in ended.stdout
+    assert "the fleet's page: http://127.0.0.1:" in ended.stdout
     assert "ada is killed" in ended.stdout
     assert "blocks came into the stream" in ended.stdout
     assert ", 0 lost;" in ended.stdout

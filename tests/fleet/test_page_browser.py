@@ -278,7 +278,7 @@ async def test_the_command_serves_until_it_is_told_to_end(fleet: Fleet, tmp_path
 
 @in_module
 async def test_credentials_that_are_not_there_are_said() -> None:
-    with pytest.raises(UserError, match=r"--creds no\.creds: no such file"):
+    with pytest.raises(UserError, match=r"--creds no\.creds: cannot be read: No such file"):
         FleetFeed(Server("nats://127.0.0.1:1", Path("no.creds")), FleetView(1, 0.0), lambda _: None)
 
 

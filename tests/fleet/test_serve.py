@@ -174,8 +174,23 @@ def test_a_second_one_ends_with_the_server_s_code_and_the_first_with_0(serve: tu
     finally:
         second.close()
     assert made.end() == 0
+    assert not heard(port_of(settings_of(folder).server.listen))
+
+
+async def test_the_server_does_not_outlive_a_fleet_serve_that_is_killed(tmp_path: Path) -> None:
+    listen, mqtt, monitor = free_port(), free_port(), free_port()
+    addresses = f'listen = "127.0.0.1:{listen}"\nmqtt = "127.0.0.1:{mqtt}"\nmonitor = "127.0.0.1:{monitor}"\n'
+    (tmp_path / "fleet.toml").write_text(f"[server]\npartitions = 4\nraw_gb = 0.1\n{addresses}")
+    for _ in range(2):  # the second finds ports and streams as the first was killed with them
+        made = Serving(tmp_path / "fleet.toml", tmp_path / "state")
+        await asyncio.to_thread(made.wait, "streams ready")
+        made.close()
+        await until(lambda: not heard(listen))
+
+
+def heard(port: int) -> bool:
     with socket.socket() as probe:
-        assert probe.connect_ex(("127.0.0.1", port_of(settings_of(folder).server.listen))) != 0
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 async def until(is_so: Callable[[], bool]) -> None:

@@ -67,8 +67,8 @@ def test_the_command_writes_table_and_truth_and_refuses_what_cannot_be(
     assert rows[1:3] == ["sim-000000,lfp,100.0,16,1,0.01,0.1,1", "sim-000001,nmc,10.0,14,2,0.01,0.05,1"]
     assert len(truth.read_text().splitlines()) == 5
     for arguments, said in (
-        ((), "--server mqtt://host:port"),
-        (("--server", "http://nowhere"), "--server http://nowhere"),
+        ((), "--mqtt mqtt://host:port"),
+        (("--mqtt", "http://nowhere"), "--mqtt http://nowhere"),
         (("--table", tmp_path / "no" / "packs.csv"), "cannot be written"),
         (("--prefix", "a b", "--table", table), "--prefix a b: only letters"),
     ):
