@@ -66,7 +66,7 @@ class Collector:
         """Collect until ``stop`` is set; what waits then is written.
 
         Raises:
-            UserError: The server has no such stream.
+            UserError: The server has no such stream, or has closed the connection for good.
         """
         while not stop.is_set():
             await self._take(await self._fetch(stop))
@@ -102,6 +102,8 @@ class Collector:
             return ()
         except nats.errors.Error as error:
             self._subscription = None
+            if self._nc.is_closed:
+                raise UserError("the server has closed the connection: look at --creds") from None
             await self._failed("the server gives no rows", error, stop)
             return ()
 

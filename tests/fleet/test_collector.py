@@ -67,6 +67,14 @@ async def collecting(collector):
         await task
 
 
+async def test_a_connection_that_is_closed_for_good_ends_it(engine, tmp_path):
+    nc = await nats.connect(engine.url)
+    await make_streams(nc, partitions=1)
+    await nc.close()
+    with pytest.raises(UserError, match="closed the connection"):
+        await Collector(nc, tmp_path).run(asyncio.Event())
+
+
 async def test_rows_come_into_the_folder_of_their_day_and_are_acknowledged(nc, tmp_path):
     await publish(nc, [an_hour("a", MIDNIGHT - 1), an_hour("a", MIDNIGHT), an_hour("b", MIDNIGHT)])
     collector = Collector(nc, tmp_path, period_s=0.0)

@@ -241,6 +241,7 @@ async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
         again = decode(await heard.wait("raw/pack", skip=before))
         await heard.wait("raw/pack", lambda data: decode(data).number == 9, skip=before)
         assert (again.number, again.oldest) == (7, 7)
+        await until(lambda: not edge.store.waiting)  # the broker's acknowledgement is on its way
         assert edge.health() == EdgeHealth(blocks_kept=3, blocks_unsent=0, blocks_dropped=0, trouble=None)
 
 
