@@ -192,6 +192,9 @@ def _unmet(condition: Condition) -> str:
 def _in_short(settings: Settings, cell: PackModel) -> str:
     c = cell.cell
     broker = ", ".join(settings.mqtt.urls) if settings.mqtt else "no broker"
+    if settings.edge:
+        url = settings.edge.url
+        broker += f"; samples to {url if isinstance(url, str) else ', '.join(url)}"
     holds = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
     board = f"{settings.sensor.protocol} board on {settings.sensor.port}"
     return (
