@@ -15,6 +15,8 @@ from bms_estimator.model.errors import UserError
 
 RETRY_S = 1
 """Between two attempts to connect [s]."""
+PING_S = 10
+"""After two pings without an answer a connection that broke in silence is made anew [s]."""
 SAID_S = 30.0
 """The same trouble is logged no more often [s]."""
 
@@ -53,6 +55,7 @@ async def connect(
             tls=context(ca) if ca else None,
             max_reconnect_attempts=-1,
             reconnect_time_wait=RETRY_S,
+            ping_interval=PING_S,
             error_cb=said.trouble,
             disconnected_cb=said.gone,
             reconnected_cb=said.back,
