@@ -87,6 +87,6 @@ async def _answered(answers: Subscription, stream: str) -> tuple[list[Stored], b
         elif status in (_END, _NONE):
             return batch, bool(batch) and int(headers.get("Nats-Num-Pending", 0)) > 0
         else:
-            why = headers.get("Description") or f"status {status}"
+            why = " ".join((headers.get("Description") or f"status {status}").split())
             hint = ": was `fleet serve` started, which makes its streams?" if status == "503" else ""
             raise StreamError(f"the server refuses to read {stream}: {why}{hint}")
