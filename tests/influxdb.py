@@ -10,7 +10,7 @@ import urllib.request
 from pathlib import Path
 from typing import Any, Self
 
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.patience import LONG_S
 
 INFLUXD = shutil.which("influxd", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")

@@ -15,15 +15,10 @@ from typing import Any, Self
 import aiomqtt
 import pytest
 
+from tests.free_port import free_port
 from tests.patience import LONG_S
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Broker:

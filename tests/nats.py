@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import pytest
 
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.patience import LONG_S
 
 NATS = shutil.which("nats-server", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")

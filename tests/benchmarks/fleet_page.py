@@ -20,7 +20,7 @@ from nats.aio.client import Client
 from bms_estimator.fleet.streams import make_streams
 from tests.fleet.engine import running
 from tests.fleet.many_packs import beat, load, many, publish
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.page.house import starting
 
 MINUTE_S = 60.0

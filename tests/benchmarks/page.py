@@ -11,7 +11,8 @@ from pathlib import Path
 
 import psutil
 
-from tests.mosquitto import Broker, free_port
+from tests.free_port import free_port
+from tests.mosquitto import Broker
 from tests.page.chromium import chromium, tab
 from tests.page.house import Service, simulated
 

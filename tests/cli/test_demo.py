@@ -15,7 +15,8 @@ from bms_estimator.cli.main import main
 from bms_estimator.demo.board import FIRMWARE_BUILD
 from bms_estimator.simulation.firmware_board import FirmwareBoard
 from tests.command_line import PROGRAM
-from tests.mosquitto import Listener, free_port
+from tests.free_port import free_port
+from tests.mosquitto import Listener
 from tests.patience import LONG_S
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.pseudo_terminal import ALTERNATE, BACK, CURSOR, PseudoTerminal
 
 NEVER_CUT = (r"SOC \d+\.\d\d% ± \d+\.\d\d%", r"\d\.\d{3} V", r"[+-]\d\.\d{3} A", "health good")

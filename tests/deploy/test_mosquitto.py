@@ -15,6 +15,7 @@ import aiomqtt
 import pytest
 
 from tests.deploy.boot import by_the_page
+from tests.free_port import free_port
 from tests.patience import LONG_S
 
 PACKS = ("pack", "shed")
@@ -29,15 +30,16 @@ LAST = {
 
 
 @pytest.fixture
-def broker(program, deploy, free_port, tmp_path) -> Iterator[int]:
+def broker(program, deploy, tmp_path) -> Iterator[int]:
     """Port of a Mosquitto with the example's files, in a folder of its own."""
+    port = free_port()
     mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
     write_users(tmp_path, deploy, passwd)
     text = (deploy / "mosquitto/bms.conf").read_text()
     assert "listener 1883 127.0.0.1" in text
-    text = text.replace("listener 1883", f"listener {free_port}").replace("/etc/mosquitto", str(tmp_path))
-    with running(mosquitto, tmp_path / "bms.conf", text, free_port):
-        yield free_port
+    text = text.replace("listener 1883", f"listener {port}").replace("/etc/mosquitto", str(tmp_path))
+    with running(mosquitto, tmp_path / "bms.conf", text, port):
+        yield port
 
 
 def write_users(folder: Path, deploy: Path, passwd: str) -> None:
@@ -137,8 +139,9 @@ async def test_a_pack_hears_nothing_of_another(broker):
 
 
 @pytest.fixture
-def certified(program, deploy, free_port, tmp_path) -> Iterator[int]:
+def certified(program, deploy, tmp_path) -> Iterator[int]:
     """Port of the listener for other machines, with certificates made by the commands of docs/deploy.md."""
+    port = free_port()
     mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
     program("openssl", "openssl")
     commands = by_the_page("Certificates").replace("broker.lan", "localhost").replace("house", "pack")
@@ -149,9 +152,9 @@ def certified(program, deploy, free_port, tmp_path) -> Iterator[int]:
     text = re.sub(
         r"(?m)^# (?=(listener|cafile|certfile|keyfile|require_certificate|use_identity_as_username) )", "", text
     )
-    text = text.replace("listener 1883 127.0.0.1\n", "").replace("listener 8883", f"listener {free_port}")
-    with running(mosquitto, tmp_path / "bms.conf", text.replace("/etc/mosquitto", str(tmp_path)), free_port):
-        yield free_port
+    text = text.replace("listener 1883 127.0.0.1\n", "").replace("listener 8883", f"listener {port}")
+    with running(mosquitto, tmp_path / "bms.conf", text.replace("/etc/mosquitto", str(tmp_path)), port):
+        yield port
 
 
 def with_certificate(port: int, folder: Path, name: str) -> aiomqtt.Client:

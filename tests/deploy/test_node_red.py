@@ -11,7 +11,8 @@ import pytest
 
 from bms_estimator.model.estimate import Alarm, Estimate
 from bms_estimator.sinks.messages import Messages
-from tests.mosquitto import Broker, Listener, broker, free_port
+from tests.free_port import free_port
+from tests.mosquitto import Broker, Listener, broker
 from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE, SOC_LOW
 

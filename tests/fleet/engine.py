@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.patience import LONG_S
 
 BINARY = Path(sys.executable).parent / "nats-server"

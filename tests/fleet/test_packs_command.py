@@ -13,7 +13,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from tests.command_line import run
 from tests.fleet.engine import running
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 
 TABLE = "pack,cell,capacity_ah,series,protocol\nboat,own.toml,,2,\nhouse,lfp,280.0,16,jk\n"
 

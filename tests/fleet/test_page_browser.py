@@ -26,7 +26,7 @@ from bms_estimator.model.suspect import Suspect
 from tests.fleet.engine import Engine, running
 from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
 from tests.fleet.many_packs import HOME, VAN, Pack, beat, load, publish, state
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.page.chromium import Tab, chromium, tab
 from tests.page.house import starting
 from tests.patience import LONG_S

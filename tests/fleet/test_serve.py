@@ -25,7 +25,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fleet_settings import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from bms_estimator.model.toml_file import read_toml
 from tests.command_line import run
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.patience import LONG_S
 from tests.sinks.certificates import Authority
 

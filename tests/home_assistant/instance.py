@@ -13,7 +13,7 @@ from typing import Any
 
 from websockets.sync.client import connect
 
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.patience import LONG_S
 
 VERSION = os.environ.get("HOME_ASSISTANT", "2025.2.5")

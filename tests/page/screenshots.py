@@ -18,7 +18,8 @@ from playwright.async_api import Browser
 
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Snapshot
-from tests.mosquitto import Broker, free_port
+from tests.free_port import free_port
+from tests.mosquitto import Broker
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import SERIES, Service, simulated
 from tests.sinks.snapshots import ONE

@@ -20,7 +20,8 @@ from bms_estimator.model.estimate import Alarm
 from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.page.dashboard import dashboard
-from tests.mosquitto import MOSQUITTO, Broker, Listener, free_port
+from tests.free_port import free_port
+from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, starting
 from tests.sinks.snapshots import ONE, STACK

@@ -10,8 +10,8 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.serve import serve
+from tests.free_port import free_port
 from tests.influxdb import INFLUXD, InfluxDB
-from tests.mosquitto import free_port
 from tests.patience import LONG_S
 from tests.serial_line import Line, line
 

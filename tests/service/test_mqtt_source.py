@@ -15,7 +15,8 @@ from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.replay import RawCapture
-from tests.mosquitto import Broker, Listener, free_port
+from tests.free_port import free_port
+from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S, end
 
 STATE, HEALTH, AVAILABILITY = "bms/pack/state", "bms/pack/health", "bms/pack/sensor/availability"

@@ -5,7 +5,8 @@ import signal
 from pathlib import Path
 
 from tests.cli.test_demo import listening
-from tests.mosquitto import Broker, Listener, free_port
+from tests.free_port import free_port
+from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.pseudo_terminal import PseudoTerminal
 from tests.serial_line import Line

@@ -13,7 +13,7 @@ import pytest
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Estimate, Health, Snapshot
 from bms_estimator.model.export_settings import PrometheusSettings
-from tests.mosquitto import free_port
+from tests.free_port import free_port
 from tests.patience import LONG_S
 from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW, STACK, snapshot
 

@@ -2,11 +2,10 @@
 
 import asyncio
 import os
-import socket
 import struct
 import tty
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, closing
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 from pymodbus import FramerType
@@ -54,12 +53,6 @@ class Registers:
 def float_words(value: float) -> tuple[int, int]:
     high, low = struct.unpack(">HH", struct.pack(">f", value))
     return high, low
-
-
-def free_port() -> int:
-    with closing(socket.socket()) as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
 
 
 @asynccontextmanager

@@ -16,8 +16,9 @@ from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.modbus import ModbusBringer
 from bms_estimator.sources.report_line import CONNECTED
 from bms_estimator.sources.reports import NothingComesError
+from tests.free_port import free_port
 from tests.patience import LONG_S
-from tests.sources.modbus_device import Registers, float_words, free_port, serial_device, tcp_device
+from tests.sources.modbus_device import Registers, float_words, serial_device, tcp_device
 
 UNIT = 5
 
