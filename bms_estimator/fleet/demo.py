@@ -157,7 +157,7 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
             f"{demo.packs:,} edges, {SPEED:g} times as fast as real ones: each sends its block, a minute of samples, every "
             f"{BLOCK_S / SPEED:g} s"
         )
-        await processes.until(lambda: seen.held == seen.partitions, stop)  # given to workers with the first block
+        await processes.until(lambda: seen.held >= seen.partitions, stop)  # workers hold those without a pack, too
         await _tell(demo, seen, processes, stop)
         if not stop.is_set():
             await processes.stop("edges")
@@ -180,7 +180,7 @@ async def _tell(demo: Demo, seen: Seen, processes: "Processes", stop: asyncio.Ev
                 f"{now_s:4.0f} s  {_KILLED} is killed (SIGKILL), and with it all that it knew of its {held} partitions"
             )
             kill_s, gone_s = math.inf, now_s
-        if gone_s < now_s and seen.held == seen.partitions:
+        if gone_s < now_s and seen.held >= seen.partitions:
             demo.say(
                 f"{now_s:4.0f} s  {_WORKERS[1]} has all partitions, {now_s - gone_s:.1f} s after the kill: it goes on from "
                 f"{_KILLED}'s last checkpoints, and reads from the stream what came since"
