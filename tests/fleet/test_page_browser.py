@@ -240,7 +240,9 @@ async def test_it_is_stale_while_the_server_is_away_and_comes_back_by_itself(bro
         await opened.until_text("alive", "3")
         await opened.until_text("held", "7")
         assert await opened.page.inner_text("#why") == ""
-        await load(fleet.nc, [Pack("late-1", HOME, b"")])
+        late = await nats.connect(fleet.engine.url)  # a connection that was cut may take its time
+        await load(late, [Pack("late-1", HOME, b"")])
+        await late.close()
         await opened.until_text("known", "of 5")
 
 
@@ -294,7 +296,9 @@ async def test_a_server_that_is_not_there_is_said_and_waited_for() -> None:
 @in_module
 async def test_what_the_last_hour_said_before_the_page_was_there_is_read(fleet: Fleet) -> None:
     hour = json.dumps({"suspects": int(Suspect.OCV)}).encode()
-    await fleet.nc.jetstream().publish(subjects.hours("early-1"), hour)
+    late = await nats.connect(fleet.engine.url)
+    await late.jetstream().publish(subjects.hours("early-1"), hour)
+    await late.close()
     view = FleetView(1, 0.0)
     async with FleetFeed(Server(fleet.engine.url), view, lambda _: None), asyncio.timeout(LONG_S):
         while not view.packs.find("early"):  # noqa: ASYNC110 - nobody tells
