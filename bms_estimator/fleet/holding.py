@@ -222,12 +222,11 @@ class Holding:
 
     async def _take_over(self) -> Partition:
         """Have a state that is ours, maybe an old one."""
+        await self._confirm()
         partition = self.partition
-        if partition is None or self.claim is None or not await self._keeping.holds(self.claim):
+        if partition is None:
             claim = await self._keeping.claim(self.number)
-            kept = claim.pointer.kept
-            if partition is None or (kept and kept[0].sequence > partition.sequence):
-                partition = await self._restored(claim)
+            partition = await self._restored(claim)
             self.partition, self.claim = partition, claim
             for pack in partition.unknown:  # the table may know it by now
                 await self.settings_changed(pack)
@@ -311,9 +310,16 @@ class Holding:
     async def _look(self) -> None:
         """The server has let our pin lapse: does the partition belong to somebody else now?"""
         async with self._changing:
-            if self.claim and not await self._keeping.holds(self.claim):
-                self._fenced(FencedError(await self._keeping.owner(self.number)))
+            await self._confirm()
         self._lost = False
+
+    async def _confirm(self) -> None:
+        """See whether our claim still stands; ``_changing`` is held."""
+        if self.claim:
+            try:
+                self.claim = await self._keeping.present(self.claim)
+            except FencedError as error:
+                self._fenced(error)
 
     def _fenced(self, error: FencedError) -> None:
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))

@@ -93,11 +93,6 @@ class Keeping:
         self._names = NUID()
         self._tried: dict[int, Pointer] = {}  # by partition, what was written last: maybe without an answer
 
-    async def owner(self, partition: int) -> str:
-        """Who has claimed a partition last; empty: nobody."""
-        found = await self._look(partition)
-        return found[1].worker if found else ""
-
     async def claim(self, partition: int) -> Claim:
         """Take a partition over, whoever had it.
 
@@ -112,10 +107,18 @@ class Keeping:
             await self._remove(before.next)
         return claim
 
-    async def holds(self, claim: Claim) -> bool:
-        """Whether nobody has claimed the partition since."""
+    async def present(self, claim: Claim) -> Claim:
+        """The claim as it stands: the last write may have been done though no answer came.
+
+        Raises:
+            FencedError: Another worker has taken the partition over.
+        """
         found = await self._look(claim.partition)
-        return found is not None and found[0] == claim.revision
+        if found is None or found[0] <= claim.revision:  # less: of a node that is behind
+            return claim
+        if found[1] == self._tried.get(claim.partition):
+            return Claim(claim.partition, *found)
+        raise FencedError(found[1].worker)
 
     async def load(self, claim: Claim) -> AsyncGenerator[tuple[Kept, bytes], None]:
         """The checkpoints that can be read, the newest first; of others is said what is wrong."""
@@ -145,7 +148,7 @@ class Keeping:
         Raises:
             FencedError: Another worker has taken the partition over; nothing was changed.
         """
-        claim = await self._present(claim)
+        claim = await self.present(claim)
         pointer = claim.pointer
         size = await self._put(pointer.next, chunks)
         made = Kept(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())
@@ -158,19 +161,6 @@ class Keeping:
         for old in kept[KEPT:]:
             await self._remove(old.object)
         return claim
-
-    async def _present(self, claim: Claim) -> Claim:
-        """The claim as it stands: the last write may have been done though no answer came.
-
-        Raises:
-            FencedError: Another worker has taken the partition over.
-        """
-        found = await self._look(claim.partition)
-        if found is None or found[0] <= claim.revision:  # less: of a node that is behind
-            return claim
-        if found[1] == self._tried.get(claim.partition):
-            return Claim(claim.partition, *found)
-        raise FencedError(found[1].worker)
 
     async def _look(self, partition: int) -> tuple[int, Pointer] | None:
         try:

@@ -1,4 +1,5 @@
-"""Partitions to which nothing comes: what a worker was given that died, and a block that is a fault of ours."""
+"""Partitions to which nothing comes: what a worker was given that died, a partition that was somebody else's
+meanwhile, and a block that is a fault of ours."""
 
 import asyncio
 from pathlib import Path
@@ -6,6 +7,7 @@ from pathlib import Path
 import nats
 from nats.aio.client import Client
 from nats.aio.msg import Msg
+from structlog.testing import capture_logs
 
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.consumer import PinnedConsumer
@@ -64,7 +66,7 @@ async def test_a_fault_of_ours_costs_its_block_and_is_counted(tmp_path: Path) ->
             return known(pack) if pack != "p1" else {}[pack]
 
         inbox = nc.new_inbox()
-        holding = Holding(nc, 0, table, await _keeping(nc), inbox, asyncio.Lock())
+        holding = Holding(nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock())
         await _subscribe(nc, f"{inbox}.0.*", holding.receive)
         taking = asyncio.create_task(holding.run())
         for pack in PACKS:
@@ -74,6 +76,39 @@ async def test_a_fault_of_ours_costs_its_block_and_is_counted(tmp_path: Path) ->
         assert holding.faults == 1
         assert holding.partition
         assert holding.partition.counters["blocks"] == len(PACKS) - 1
+        await end(taking)
+        await nc.close()
+
+
+async def test_who_was_fenced_out_and_is_given_the_partition_again_says_so_and_begins_from_what_is_kept(
+    tmp_path: Path,
+) -> None:
+    with running(tmp_path, partitions=1) as engine:
+        nc = await nats.connect(engine.url)
+        await make_streams(nc, partitions=1)
+        known = await know(nc, PACKS)
+        inbox = nc.new_inbox()
+        holding = Holding(nc, 0, known, await _keeping(nc, "w"), inbox, asyncio.Lock())
+        await _subscribe(nc, f"{inbox}.0.*", holding.receive)
+        taking = asyncio.create_task(holding.run())
+        for pack in PACKS:
+            await send(nc, pack, block(pack, 1))
+        await holding.consumer.renew()
+        await until(lambda: holding.blocks == len(PACKS), lambda: holding.blocks)
+        await (await _keeping(nc, "other")).claim(0)  # and dies: its pin has lapsed when we ask for more
+
+        def said() -> object:
+            holding.remind()
+            return any(line["event"].startswith("fenced out") and line["worker"] == "other" for line in logs)
+
+        with capture_logs() as logs:
+            await until(said, lambda: logs)
+            await until(lambda: holding.blocks == 2 * len(PACKS), lambda: holding.blocks)
+        assert holding.partition
+        for pack in PACKS:
+            state = holding.partition.state(pack)
+            assert state is not None
+            assert state["estimator"].tobytes() == estimated(known, pack, 1)
         await end(taking)
         await nc.close()
 
@@ -99,7 +134,7 @@ async def _subscribe(nc: Client, subject: str, receive) -> None:
     await nc.subscribe(subject, cb=received)
 
 
-async def _keeping(nc: Client) -> Keeping:
+async def _keeping(nc: Client, worker: str) -> Keeping:
     js = nc.jetstream()
     states = await js.object_store(subjects.STATES_BUCKET)
-    return Keeping(nc, "w", await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
+    return Keeping(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
