@@ -6,14 +6,13 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import nats
 import psutil
 from nats.aio.client import Client
 
 from bms_estimator.fleet.simulated_fleet import SimulatedFleet
 from bms_estimator.fleet.streams import make_streams
 from tests.command_line import PROGRAM
-from tests.fleet.engine import Engine, running
+from tests.fleet.engine import Engine, connected, running
 from tests.patience import LONG_S
 
 
@@ -83,13 +82,7 @@ class Rig:
 
     async def connected(self) -> Client:
         """To any node that lives; again and again where the one it has goes."""
-        return await nats.connect(
-            self.engine.urls, max_reconnect_attempts=-1, reconnect_time_wait=0.1, error_cb=_nobody
-        )
-
-
-async def _nobody(_error: Exception) -> None:
-    """Nodes are killed on purpose."""
+        return await connected(self.engine.urls)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import nats
+from nats.aio.client import Client
+
 from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
 from tests.free_port import free_port
 from tests.patience import LONG_S
@@ -139,6 +142,17 @@ class Engine:
                 alone or "leader" in self.ask(i, "jsz")["meta_cluster"]
             )
         return False
+
+
+async def connected(urls: str | list[str]) -> Client:
+    """A connection that goes on however often its server is killed; one that broke in silence is noticed within seconds."""
+
+    async def expected(_error: Exception) -> None:
+        pass
+
+    return await nats.connect(
+        urls, max_reconnect_attempts=-1, reconnect_time_wait=0.1, ping_interval=2, error_cb=expected
+    )
 
 
 @contextlib.contextmanager

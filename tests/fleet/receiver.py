@@ -13,6 +13,7 @@ from bms_estimator.fleet.block import Block, decode
 from bms_estimator.fleet.streams import make_streams
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.sample import SampleBlock
+from tests.fleet.engine import connected
 from tests.patience import LONG_S, end
 
 POLL_S = 0.01
@@ -41,7 +42,7 @@ class Receiver:
         self.resends = self.gaps = self.lost = 0
 
     async def __aenter__(self) -> Self:
-        self.nc = await nats.connect(self._url, reconnect_time_wait=0.05, max_reconnect_attempts=-1)
+        self.nc = await connected(self._url)
         await make_streams(self.nc, partitions=4)
         self._task = asyncio.create_task(self._read())
         return self

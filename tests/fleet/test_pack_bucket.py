@@ -12,7 +12,7 @@ from bms_estimator.fleet.streams import make_streams
 from bms_estimator.fleet.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
-from tests.fleet.engine import running
+from tests.fleet.engine import connected, running
 from tests.patience import LONG_S
 
 LFP = stored(PackKind(cell="lfp", capacity_ah=100.0, series=16))
@@ -26,7 +26,7 @@ def engine(tmp_path_factory):
 
 @pytest.fixture
 async def nc(engine):
-    async with await nats.connect(engine.url, reconnect_time_wait=0.1) as nc:
+    async with await connected(engine.url) as nc:
         await make_streams(nc, partitions=1)
         for bucket in (PACKS_BUCKET, CELLS_BUCKET):
             await write_bucket(nc, bucket, {}, remove=True)

@@ -23,7 +23,7 @@ from bms_estimator.fleet.streams import make_streams
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.model.suspect import Suspect
-from tests.fleet.engine import Engine, running
+from tests.fleet.engine import Engine, connected, running
 from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
 from tests.fleet.many_packs import HOME, VAN, Pack, beat, load, publish, state
 from tests.free_port import free_port
@@ -87,7 +87,7 @@ def hours(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @module_fixture
 async def fleet(engine: Engine, hours: Path) -> AsyncIterator[Fleet]:
-    nc = await nats.connect(engine.url, max_reconnect_attempts=-1, reconnect_time_wait=0.2)
+    nc = await connected(engine.url)
     await make_streams(nc, partitions=PARTITIONS)
     await load(nc, [*PACKS, LISTED_ONLY])
     settings = PageSettings(listen="127.0.0.1:0")

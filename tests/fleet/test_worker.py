@@ -6,13 +6,11 @@ from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 
-import nats
-
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.membership import owners
 from bms_estimator.fleet.partition import Partition
 from bms_estimator.fleet.streams import make_streams
-from tests.fleet.engine import running
+from tests.fleet.engine import connected, running
 from tests.fleet.workers import Heartbeats, Process, block, end_states, estimated, know, send
 
 PARTITIONS = 4
@@ -21,7 +19,7 @@ PACKS = [f"p{i}" for i in range(8)]
 
 async def test_whatever_is_killed_the_states_are_those_of_one_run(tmp_path: Path) -> None:
     with running(tmp_path, partitions=PARTITIONS) as engine, ExitStack() as stack:
-        nc = await nats.connect(engine.url, max_reconnect_attempts=-1, reconnect_time_wait=0.1, error_cb=_quiet)
+        nc = await connected(engine.url)
         await make_streams(nc, partitions=PARTITIONS)
         known = await know(nc, PACKS)
         assert {subjects.partition_of(pack, PARTITIONS) for pack in PACKS} == set(range(PARTITIONS))
@@ -66,10 +64,6 @@ async def test_whatever_is_killed_the_states_are_those_of_one_run(tmp_path: Path
             assert state["estimator"].tobytes() == estimated(known, pack, sent)
         assert await _hours(nc) == _expected_hours(known, sent)
         await nc.close()
-
-
-async def _quiet(_: Exception) -> None:
-    pass
 
 
 async def _hours(nc) -> dict[str, bytes]:
