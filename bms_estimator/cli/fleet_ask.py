@@ -40,6 +40,7 @@ def collect(
 async def _collect(where: Where, folder: Path, period_s: float) -> None:
     from bms_estimator.fleet.collector import Collector  # noqa: PLC0415
     from bms_estimator.fleet.connection import connect  # noqa: PLC0415
+    from bms_estimator.fleet.tasks import end  # noqa: PLC0415
     from bms_estimator.service.interrupt import stop_on_signal  # noqa: PLC0415
 
     server, creds, ca = where
@@ -50,8 +51,7 @@ async def _collect(where: Where, folder: Path, period_s: float) -> None:
     )
     await asyncio.wait((connecting, stopping), return_when=asyncio.FIRST_COMPLETED)
     if not connecting.done():  # told to stop before a server was there
-        connecting.cancel()
-        await asyncio.wait((connecting,))
+        await end(connecting)
         return
     nc = connecting.result()
     try:

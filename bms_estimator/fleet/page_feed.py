@@ -20,6 +20,7 @@ from bms_estimator.fleet.pack_row import PackKind
 from bms_estimator.fleet.page_view import FleetView
 from bms_estimator.fleet.stream_reader import StreamError, read_stream
 from bms_estimator.fleet.streams import partitions_of
+from bms_estimator.fleet.tasks import end
 from bms_estimator.model.errors import UserError
 
 TABLE_S = 2.0
@@ -79,9 +80,8 @@ class FleetFeed:
 
     async def __aexit__(self, *_: object) -> None:
         """Part from the server."""
-        while self._task is not None and not self._task.done():
-            self._task.cancel()  # once more: wait_for of Python 3.11, in the library, may swallow it
-            await asyncio.wait({self._task}, timeout=0.1)
+        if self._task is not None:
+            await end(self._task)
         if self._nc is not None:
             with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
                 async with asyncio.timeout(CLOSING_S):
@@ -99,9 +99,8 @@ class FleetFeed:
         for subject, heard in self._heard().items():
             await self._nc.subscribe(subject, cb=heard)
         self._on_link(None)
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._follow_table(self._nc))
-            tasks.create_task(self._read_hours(self._nc))
+        # no group of tasks: it cancels its own once only, and the library may swallow that
+        await asyncio.gather(self._follow_table(self._nc), self._read_hours(self._nc))
 
     def _heard(self) -> dict[str, Callable[[Msg], Coroutine[Any, Any, None]]]:
         view, clock = self._view, time.monotonic

@@ -16,6 +16,7 @@ from nats.aio.client import Client
 from playwright.async_api import Browser
 
 from bms_estimator.fleet import subjects
+from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.page import FILES, STATIC, fleet_page
 from bms_estimator.fleet.page_feed import FleetFeed, Server
 from bms_estimator.fleet.page_view import FleetView
@@ -291,6 +292,29 @@ async def test_a_server_that_is_not_there_is_said_and_waited_for() -> None:
     async with FleetFeed(Server(url), FleetView(1, 0.0), said.put_nowait):
         assert await said.get() == f"{url}: not reached yet"
         assert await said.get() == f"{url}: nobody listens there"
+
+
+@in_module
+async def test_it_ends_though_the_library_swallows_that_it_is_cancelled(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, swallowed = asyncio.Event(), asyncio.Event()
+
+    async def refresh(_: PackBucket) -> set[str]:
+        asked.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:  # as wait_for of Python 3.11 does when the answer comes at that moment
+            swallowed.set()
+        return set()
+
+    monkeypatch.setattr(PackBucket, "refresh", refresh)
+    async with (
+        asyncio.timeout(LONG_S),
+        FleetFeed(Server(fleet.engine.url), FleetView(PARTITIONS, 0.0), lambda _: None),
+    ):
+        await asked.wait()
+    assert swallowed.is_set()
 
 
 @in_module
