@@ -55,6 +55,9 @@ async def test_whatever_is_killed_the_states_are_those_of_one_run(tmp_path: Path
             await heard.until_held(PARTITIONS, "b", "c")
             done.set()
             sent = await feeder
+            await heard.until(
+                lambda last: sum(last[name].counters.get("blocks", 0) for name in ("b", "c")) == sent * len(PACKS)
+            )
         assert [await b.end(), await c.end()] == [0, 0]
         states = await end_states(nc, known, PARTITIONS)
         for pack in PACKS:
