@@ -25,8 +25,9 @@ from nats.errors import Error as NatsError
 from bms_estimator.fleet import credentials
 from bms_estimator.fleet.child import ends_with_us
 from bms_estimator.fleet.claims import Role
+from bms_estimator.fleet.connection import LET_IN_S, part
 from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
-from bms_estimator.fleet.streams import make_streams
+from bms_estimator.fleet.streams import NoAnswerError, make_streams
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fleet_settings import FleetSettings, TenantSettings, TlsSettings, reachable
 from bms_estimator.sinks.credential import credential
@@ -198,13 +199,13 @@ async def _reload_on_signal(
         try:
             told = read()
             node = node_of(place, told)
-            loaded = await _ask(node, "varz")
-            _write(place.folder / CONFIGURATION, configuration(node))
-            process.send_signal(signal.SIGHUP)
             async with asyncio.timeout(RELOAD_S):
+                loaded = await _wait(node, "varz", bool)
+                _write(place.folder / CONFIGURATION, configuration(node))
+                process.send_signal(signal.SIGHUP)
                 await _wait(node, "varz", functools.partial(_has_reloaded, loaded))
             await _make_all_streams(place, told, say)
-        except UserError as error:
+        except (UserError, NatsError) as error:
             log.error("the settings stay as they were", reason=str(error))  # noqa: TRY400 - a person can mend it
         except TimeoutError:
             log.error("the server has not taken its new settings; what it says of them stands above")  # noqa: TRY400
@@ -252,7 +253,11 @@ async def _make_ready(place: Place, told: Told, pid: int, say: Callable[[str], N
     if node.cluster:
         say(f"waiting for the other nodes: {', '.join(node.cluster.routes)}")
     await _wait(node, "healthz", _has_streams)
-    await _make_all_streams(place, told, say)
+    while True:
+        try:
+            return await _make_all_streams(place, told, say)
+        except NoAnswerError as error:  # of a node that is busy with all who come back, or again without a quorum
+            log.warning("the streams are not there yet; trying again", reason=str(error))
 
 
 async def _make_all_streams(place: Place, told: Told, say: Callable[[str], None]) -> None:
@@ -271,6 +276,8 @@ async def _make_streams(place: Place, told: Told, name: str, tenant: TenantSetti
     node, server = node_of(place, told), told.settings.server
     try:
         nc = await connect(node, credentials.credentials_file(place.keys, name, Role.ADMIN) if name else None)
+    except TimeoutError:
+        raise NoAnswerError(f"{node.nats}: the server does not let us in in time") from None
     except (NatsError, OSError) as error:
         raise UserError(f"{node.nats}: the server lets us not in: {error}") from None
     try:
@@ -281,11 +288,13 @@ async def _make_streams(place: Place, told: Told, name: str, tenant: TenantSetti
             raw_bytes=round(credentials.GB * (tenant.raw_gb or server.raw_gb)),
             raw_age_s=86_400.0 * (tenant.raw_days or server.raw_days),
         )
+    except NoAnswerError:
+        raise
     except UserError as error:
         hint = "; less raw_gb, or more disk, for this tenant or all?" if "insufficient" in str(error) else ""
         raise UserError(f"{f'tenant {name}: ' if name else ''}{error}{hint}") from None
     finally:
-        await nc.close()
+        await part(nc)
 
 
 async def connect(node: Node, credentials_file: Path | None) -> Client:
@@ -298,7 +307,7 @@ async def connect(node: Node, credentials_file: Path | None) -> Client:
     where = f"{_scheme(node)}://{f'[{host}]' if ':' in host else host}:{port}"
     more = {"tls": _own_certificate(node.tls)} if node.tls else {}
     users = {"user_credentials": credentials_file} if credentials_file else {}
-    return await nats.connect(where, allow_reconnect=False, **more, **users)
+    return await nats.connect(where, allow_reconnect=False, connect_timeout=LET_IN_S, **more, **users)
 
 
 def _own_certificate(tls: Tls) -> ssl.SSLContext:
@@ -317,10 +326,11 @@ def _has_reloaded(before: Mapping[str, object], varz: Mapping[str, object]) -> b
     return varz.get("config_load_time") not in (None, before.get("config_load_time"))
 
 
-async def _wait(node: Node, what: str, is_so: Callable[[Mapping[str, object]], bool]) -> None:
-    """Until the server's monitor says so."""
-    while not is_so(await _ask(node, what)):  # noqa: ASYNC110 - it has no other way to tell
+async def _wait(node: Node, what: str, is_so: Callable[[Mapping[str, object]], bool]) -> Mapping[str, object]:
+    """What the server's monitor says, once it says so."""
+    while not is_so(said := await _ask(node, what)):  # noqa: ASYNC110 - it has no other way to tell
         await asyncio.sleep(ASK_AGAIN_S)
+    return said
 
 
 async def _ask(node: Node, what: str) -> Mapping[str, object]:

@@ -41,6 +41,10 @@ AT_ONCE = 16
 """So many consumers are made at a time."""
 
 
+class NoAnswerError(UserError):
+    """The server says nothing; it may later."""
+
+
 async def make_streams(
     nc: Client,
     *,
@@ -59,7 +63,8 @@ async def make_streams(
         raw_age_s: Nor anything older.
 
     Raises:
-        UserError: The streams have another number of partitions, the server has no room for them, or none answers.
+        UserError: The streams have another number of partitions, or the server has no room for them.
+        NoAnswerError: None answers.
     """
     found = await partitions_of(nc)
     if found not in (None, partitions):
@@ -150,12 +155,13 @@ async def _repeated(ask: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.k
     """Ask until there is an answer; whatever is asked here may be asked twice.
 
     Raises:
-        UserError: There is none, or as ``ask``.
+        NoAnswerError: There is none.
+        UserError: As ``ask``.
     """
     for _ in range(ATTEMPTS):
         with contextlib.suppress(NatsTimeoutError):
             return await ask(*args, **kwargs)
-    raise UserError(f"the server has answered nothing for {ATTEMPTS * ANSWER_S:g} s: are most nodes up?")
+    raise NoAnswerError(f"the server has answered nothing for {ATTEMPTS * ANSWER_S:g} s: are most nodes up?")
 
 
 async def _ask(nc: Client, what: str, request: dict[str, Any]) -> dict[str, Any]:

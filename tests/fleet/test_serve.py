@@ -21,6 +21,7 @@ from bms_estimator.fleet import credentials, server, subjects
 from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.server import Place, Told, find_server
 from bms_estimator.fleet.server import serve as serving
+from bms_estimator.fleet.streams import NoAnswerError
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fleet_settings import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from bms_estimator.model.toml_file import read_toml
@@ -197,6 +198,28 @@ async def until(is_so: Callable[[], bool]) -> None:
     async with asyncio.timeout(LONG_S):
         while not is_so():  # noqa: ASYNC110 - another process does it
             await asyncio.sleep(0.02)
+
+
+async def test_a_server_that_does_not_answer_in_time_is_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, make_streams = [], server.make_streams
+
+    async def busy(nc, **more) -> None:
+        asked.append(more)
+        if len(asked) == 1:
+            raise NoAnswerError("nothing")
+        await make_streams(nc, **more)
+
+    monkeypatch.setattr(server, "make_streams", busy)
+    ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
+    told = Told(FleetSettings(server=ServerSettings(**ports, partitions=4)))
+    said: list[str] = []
+    task = asyncio.create_task(serving(Place(tmp_path), lambda: told, said.append))
+    await until(lambda: "streams ready, 4 partitions" in said or task.done())
+    assert len(asked) == 2
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authority) -> None:
