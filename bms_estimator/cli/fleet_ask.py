@@ -39,7 +39,7 @@ def collect(
 
 async def _collect(where: Where, folder: Path, period_s: float) -> None:
     from bms_estimator.fleet.collector import Collector  # noqa: PLC0415
-    from bms_estimator.fleet.connection import connect  # noqa: PLC0415
+    from bms_estimator.fleet.connection import connect, part  # noqa: PLC0415
     from bms_estimator.fleet.tasks import end  # noqa: PLC0415
     from bms_estimator.service.interrupt import stop_on_signal  # noqa: PLC0415
 
@@ -57,7 +57,7 @@ async def _collect(where: Where, folder: Path, period_s: float) -> None:
     try:
         await Collector(nc, folder, period_s=period_s).run(stop)
     finally:
-        await nc.close()
+        await part(nc)
 
 
 def ask(

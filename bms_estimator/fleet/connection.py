@@ -1,5 +1,7 @@
 """The connection of a service of the fleet to the server: made again without end, and what is wrong with it said once."""
 
+import asyncio
+import contextlib
 import logging
 import re
 import ssl
@@ -7,8 +9,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import nats.aio.client
+import nats.errors
 import structlog
 from nats.aio.client import Client
+from nats.aio.transport import TcpTransport
 
 from bms_estimator.fleet.reasons import reason
 from bms_estimator.model.errors import UserError
@@ -17,12 +22,33 @@ RETRY_S = 1
 """Between two attempts to connect [s]."""
 PING_S = 10
 """After two pings without an answer a connection that broke in silence is made anew [s]."""
+LET_IN_S = 10
+"""So long a server may take for each step of letting somebody in: one that starts, or a far line [s]."""
+FLUSH_S = 5.0
+"""So long who has much to say waits for a server that reads nothing [s]."""
+CLOSING_S = 3.0
+"""So long a connection may take to end [s]."""
 SAID_S = 30.0
 """The same trouble is logged no more often [s]."""
 
 log = structlog.get_logger(__name__)
 # The library's end of a TLS connection, of no use to anybody.
 logging.getLogger("asyncio").addFilter(lambda record: "eof_received() has no effect" not in str(record.msg))
+
+
+class _Transport(TcpTransport):
+    """Ends in time: after a TLS handshake that failed, or with bytes that a silent server does not read, its end never comes."""
+
+    async def wait_closed(self) -> None:
+        try:
+            async with asyncio.timeout(CLOSING_S):
+                await super().wait_closed()  # type: ignore[no-untyped-call]
+        except TimeoutError:
+            if self._io_writer is not None:
+                self._io_writer.transport.abort()
+
+
+nats.aio.client.TcpTransport = _Transport  # type: ignore[attr-defined] # the library asks nobody which to take
 
 
 async def connect(
@@ -56,6 +82,8 @@ async def connect(
             max_reconnect_attempts=-1,
             reconnect_time_wait=RETRY_S,
             ping_interval=PING_S,
+            connect_timeout=LET_IN_S,
+            flush_timeout=FLUSH_S,
             error_cb=said.trouble,
             disconnected_cb=said.gone,
             reconnected_cb=said.back,
@@ -63,6 +91,13 @@ async def connect(
     except ValueError as error:
         raise UserError(f"--server {servers}: {error}") from error
     return nc
+
+
+async def part(nc: Client) -> None:
+    """Close a connection, in whatever state it is."""
+    with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
+        async with asyncio.timeout(2.0 * CLOSING_S):
+            await nc.close()
 
 
 def addresses(servers: str) -> list[str]:

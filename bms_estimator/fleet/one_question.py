@@ -8,7 +8,7 @@ import nats
 import nats.errors
 from nats.aio.client import Client
 
-from bms_estimator.fleet.connection import addresses, context, readable
+from bms_estimator.fleet.connection import FLUSH_S, addresses, context, readable
 from bms_estimator.fleet.reasons import reason
 from bms_estimator.fleet.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
@@ -38,6 +38,7 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
             max_reconnect_attempts=1,  # of each server that cannot be reached
             reconnect_time_wait=RETRY_S,
             connect_timeout=CONNECT_S,
+            flush_timeout=FLUSH_S,
             error_cb=trouble,
         )
     except (nats.errors.Error, OSError, ValueError) as error:

@@ -1,7 +1,6 @@
 """What a fleet publishes, heard for its page: states, parameters, hours, workers, unknown packs, and the table of packs."""
 
 import asyncio
-import contextlib
 import time
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.fleet import subjects
-from bms_estimator.fleet.connection import connect, context, readable
+from bms_estimator.fleet.connection import connect, context, part, readable
 from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.pack_row import PackKind
 from bms_estimator.fleet.page_view import FleetView
@@ -31,7 +30,6 @@ MOST_BYTES = 1 << 16
 """Nothing of ours is longer."""
 MOST_REASON = 200
 """Bytes of why a pack is unknown."""
-CLOSING_S = 3.0
 
 log = structlog.get_logger(__name__)
 
@@ -83,19 +81,27 @@ class FleetFeed:
         if self._task is not None:
             await end(self._task)
         if self._nc is not None:
-            with contextlib.suppress(nats.errors.Error, OSError, TimeoutError):
-                async with asyncio.timeout(CLOSING_S):
-                    await self._nc.close()
+            await part(self._nc)
 
     async def _run(self) -> None:
-        """Connect, which lasts until there is a server; then the library stays connected, and subscribed."""
-        server, name = self._server, "bms-estimator fleet page"
+        """Listen for ever; why that ended stands on the page."""
         try:
-            self._nc = await connect(server.urls, name, creds=server.creds, ca=server.ca, linked=self._on_link)
-        except UserError as error:  # of the address: the page says so
-            log.error("the fleet's server cannot be reached", reason=str(error))  # noqa: TRY400 - of a person, not ours
+            await self._listen()
+        except UserError as error:
+            log.error("nothing more is heard from the fleet's server", reason=str(error))  # noqa: TRY400 - of a person
             self._on_link(str(error))
-            return
+        except Exception:
+            log.exception("nothing more is heard from the fleet's server")
+            self._on_link("a fault of the page, which its log tells: start it again")
+
+    async def _listen(self) -> None:
+        """Connect, which lasts until there is a server; then the library stays connected, and subscribed.
+
+        Raises:
+            UserError: The address cannot be used, or the server has closed the connection for good.
+        """
+        server, name = self._server, "bms-estimator fleet page"
+        self._nc = await connect(server.urls, name, creds=server.creds, ca=server.ca, linked=self._on_link)
         for subject, heard in self._heard().items():
             await self._nc.subscribe(subject, cb=heard)
         self._on_link(None)
@@ -161,6 +167,8 @@ class FleetFeed:
             try:
                 return await work()
             except (StreamError, UserError, nats.errors.Error) as error:
+                if self._nc is not None and self._nc.is_closed:
+                    raise UserError("the server has closed the connection: look at --creds") from None
                 log.warning("the fleet's server does not tell", reason=str(error))
             await asyncio.sleep(TABLE_S)
 

@@ -14,7 +14,7 @@ from nats.aio.msg import Msg
 from pydantic import ValidationError
 
 from bms_estimator.fleet import subjects
-from bms_estimator.fleet.connection import connect
+from bms_estimator.fleet.connection import connect, part
 from bms_estimator.fleet.consumer import RENEW_S
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.holding import RETRY_S, TROUBLES, Holding
@@ -86,10 +86,21 @@ async def _start(options: Options, notifier: Notifier) -> "Worker":
         try:
             return await _found(nc, options, notifier)
         except (*TROUBLES, UserError) as error:
+            _check(nc, options)
             if (text := reason(error)) != said:
                 log.warning("waiting for the server", reason=text)
             said = text
         await asyncio.sleep(RETRY_S)
+
+
+def _check(nc: Client, options: Options) -> None:
+    """Whether the connection can come back.
+
+    Raises:
+        UserError: The server has closed it for good.
+    """
+    if nc.is_closed:
+        raise UserError(f"the server {options.servers} has closed the connection: look at --creds")
 
 
 async def _found(nc: Client, options: Options, notifier: Notifier) -> "Worker":
@@ -167,7 +178,7 @@ class Worker:
         renewing = asyncio.ensure_future(_each(RENEW_S, self._ask_all))
         await asyncio.gather(*self._returning.values())
         await end(renewing)
-        await self._nc.close()
+        await part(self._nc)
 
     @property
     def _holdings(self) -> list[Holding]:
@@ -214,8 +225,7 @@ class Worker:
 
     async def _renew(self) -> None:
         """Try for what is ours by now, give back what is not, and ask for more messages."""
-        if self._nc.is_closed:
-            raise UserError(f"the server {self._options.servers} has closed the connection: look at --creds")
+        _check(self._nc, self._options)
         now_s = time.monotonic()
         if not self._nc.is_connected or now_s > self._renewed_s + DEAD_S / 2.0:
             self._members.forgive(now_s)  # nobody could be heard

@@ -318,6 +318,29 @@ async def test_it_ends_though_the_library_swallows_that_it_is_cancelled(
 
 
 @in_module
+async def test_why_nothing_more_is_heard_is_said(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = asyncio.Queue[str | None]()
+
+    async def until(wanted: str) -> None:
+        async with asyncio.timeout(LONG_S):
+            while wanted not in (await said.get() or ""):
+                pass
+
+    async def refresh(_: PackBucket) -> set[str]:
+        raise KeyError
+
+    async with FleetFeed(Server(fleet.engine.url), FleetView(PARTITIONS, 0.0), said.put_nowait) as feed:
+        while await said.get() is not None:
+            pass
+        assert feed._nc
+        await feed._nc.close()  # as it is when the server puts somebody out
+        await until("the server has closed the connection: look at --creds")
+    monkeypatch.setattr(PackBucket, "refresh", refresh)
+    async with FleetFeed(Server(fleet.engine.url), FleetView(PARTITIONS, 0.0), said.put_nowait):
+        await until("a fault of the page")
+
+
+@in_module
 async def test_what_the_last_hour_said_before_the_page_was_there_is_read(fleet: Fleet) -> None:
     hour = json.dumps({"suspects": int(Suspect.OCV)}).encode()
     late = await nats.connect(fleet.engine.url)
