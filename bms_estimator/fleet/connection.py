@@ -16,14 +16,13 @@ from nats.aio.client import Client
 from nats.aio.transport import TcpTransport
 
 from bms_estimator.fleet.reasons import reason
+from bms_estimator.fleet.server_config import LET_IN_S
 from bms_estimator.model.errors import UserError
 
 RETRY_S = 1
 """Between two attempts to connect [s]."""
 PING_S = 10
 """After two pings without an answer a connection that broke in silence is made anew [s]."""
-LET_IN_S = 10
-"""So long a server may take for each step of letting somebody in: one that starts, or a far line [s]."""
 FLUSH_S = 5.0
 """So long who has much to say waits for a server that reads nothing [s]."""
 CLOSING_S = 3.0

@@ -25,8 +25,8 @@ from nats.errors import Error as NatsError
 from bms_estimator.fleet import credentials
 from bms_estimator.fleet.child import ends_with_us
 from bms_estimator.fleet.claims import Role
-from bms_estimator.fleet.connection import LET_IN_S, part
-from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
+from bms_estimator.fleet.connection import part
+from bms_estimator.fleet.server_config import LET_IN_S, Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.fleet.streams import NoAnswerError, make_streams
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fleet_settings import FleetSettings, TenantSettings, TlsSettings, reachable

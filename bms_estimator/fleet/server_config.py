@@ -17,6 +17,8 @@ LONGEST_BLOCK_BYTES = 1 << 20
 """Of a message: a block of 60 samples takes 700 bytes, one of a whole day at 1 Hz less than this."""
 MOST_CONNECTIONS = 200_000
 """Of a node: where two of three are away, one has all edges. The server's own limit is 65,536."""
+LET_IN_S = 10
+"""So long each step of letting somebody in may take, on a far line or while many come back at once. The server's own is 2 [s]."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,7 @@ class Node:
 def configuration(node: Node) -> str:
     """The server's configuration file."""
     tls = _tls(node.tls) if node.tls else ""
+    patience = f"authorization {{ timeout: {LET_IN_S} }}"
     lines = [
         f"server_name: {_text(node.name)}",
         f"listen: {_text(node.nats)}",
@@ -103,8 +106,9 @@ def configuration(node: Node) -> str:
         f"max_payload: {LONGEST_BLOCK_BYTES}",
         f"max_connections: {MOST_CONNECTIONS}",
         *([tls] if tls else []),
+        patience,
         f"jetstream {{ {_jetstream(node)} }}",
-        f"mqtt {{ listen: {_text(node.mqtt)}{f', {tls}' if tls else ''} }}",
+        f"mqtt {{ listen: {_text(node.mqtt)}, {patience}{f', {tls}' if tls else ''} }}",
         *_cluster(node),
         *_accounts(node),
     ]
@@ -146,7 +150,7 @@ def _tls(tls: Tls, *, mutual: bool = False) -> str:
     """Nodes show each other a certificate; clients show a token in place of one."""
     files = {"cert_file": tls.cert, "key_file": tls.key} | ({"ca_file": tls.ca} if tls.ca else {})
     told = ", ".join(f"{name}: {_text(str(path))}" for name, path in files.items())
-    return f"tls {{ {told}{', verify: true' if mutual else ''} }}"
+    return f"tls {{ {told}, timeout: {LET_IN_S}{', verify: true' if mutual else ''} }}"
 
 
 def _text(value: str) -> str:
