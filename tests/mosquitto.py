@@ -86,7 +86,7 @@ class Listener:
     """
 
     def __init__(self, broker: Broker, topic: str = "#", **options: Any) -> None:
-        self._client = aiomqtt.Client("127.0.0.1", broker.port, **options)
+        self._client = aiomqtt.Client("127.0.0.1", broker.port, timeout=LONG_S, **options)
         self._topic = topic
         self.messages: list[tuple[str, bytes, bool]] = []
         self._news = asyncio.Event()

@@ -5,8 +5,10 @@ What it says is what it hears: heartbeats of the workers, and estimates of some 
 
 import asyncio
 import contextlib
+import itertools
 import json
 import math
+import random
 import socket
 import sys
 import time
@@ -41,6 +43,9 @@ PATIENCE_S = 120.0
 """For what ought to come within seconds: a server, a worker, the last blocks [s]."""
 _WORKERS = ("ada", "bob")
 _KILLED = _WORKERS[0]
+_PORTS = range(20_000, 32_768)
+"""Below those that the kernel gives to connections, which may take one before a server listens there."""
+_numbers = itertools.count(random.randrange(len(_PORTS)))
 
 Say = Callable[[str], object]
 
@@ -169,7 +174,7 @@ async def _tell(demo: Demo, seen: Seen, processes: "Processes", stop: asyncio.Ev
     begin_s, kill_s, gone_s, spoke, done = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
     while not stop.is_set():
         now_s = time.monotonic() - begin_s
-        if now_s >= demo.seconds + (0.0 if gone_s == math.inf else PATIENCE_S):
+        if kill_s == math.inf and now_s >= demo.seconds + (0.0 if gone_s == math.inf else PATIENCE_S):
             return
         processes.check()
         if now_s >= kill_s:
@@ -343,7 +348,14 @@ class Processes:
 
 
 def free_port() -> int:
-    """A port of the loopback on which nobody listens."""
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        return int(probe.getsockname()[1])
+    """A port of the loopback on which nobody listens; never the same twice in a row.
+
+    Raises:
+        UserError: There is none.
+    """
+    for number in itertools.islice(_numbers, len(_PORTS)):
+        port = _PORTS[number % len(_PORTS)]
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind((LOOPBACK, port))
+            return port
+    raise UserError("no port is free")

@@ -8,6 +8,7 @@ bit, with one estimator that has taken all of the pack's samples in one go.
 
 import argparse
 import asyncio
+import contextlib
 import random
 import sys
 import tempfile
@@ -21,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from nats.aio.client import Client
 from nats.aio.msg import Msg
+from nats.errors import Error as NatsError
 
 from bms_estimator.estimator.estimator import Estimator, estimator_of
 from bms_estimator.fleet import subjects
@@ -44,7 +46,8 @@ LONGEST_AWAY_S = 2.0
 """Before who was killed is started again."""
 BLOCKS_AFTER = 2
 """That each edge sends after the last kill: what was lost is asked for again when the next block comes."""
-
+LOOKS = 20
+"""A tenth of a second apart, at what is counted and what there is, that have to agree."""
 MOST_WRONG = 20
 """Lines about what is wrong."""
 
@@ -175,8 +178,7 @@ async def _run(fleet_rig: Rig, plan: Plan, said: Callable[[str], object]) -> Out
         await _until_whole(nc, fleet)
         edges.terminate()
         await asyncio.to_thread(edges.wait, LONG_S)
-        last = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
-        await _until(lambda: _counted(heard) == last)
+        await _until_all_counted(nc, heard)
         await asyncio.to_thread(fleet_rig.stop_workers)
         await _judge(nc, fleet, plan, outcome)
     finally:
@@ -249,10 +251,28 @@ async def _until_whole(nc: Client, fleet: SimulatedFleet) -> None:
 async def _sent(nc: Client) -> dict[str, Sent]:
     """What the stream has, by pack."""
     sent: dict[str, Sent] = defaultdict(Sent)
-    last = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
+    last = await _last_sequence(nc)
     async for message in stored(nc, subjects.RAW_STREAM, "p.*.raw.*", 1, last):
         sent[message.subject.rpartition(".")[2]].add(decode(message.data).number)
     return sent
+
+
+async def _until_all_counted(nc: Client, heard: dict[str, tuple[float, Heartbeat]]) -> None:
+    """Until nothing comes any more, and all is counted: the server may still store what it has read from the edges."""
+    looks = 0
+    async with asyncio.timeout(LONG_S):
+        while looks < LOOKS:
+            looks = looks + 1 if _counted(heard) == await _last_sequence(nc) else 0
+            await asyncio.sleep(0.1)
+
+
+async def _last_sequence(nc: Client) -> int:
+    """Of the stream; asked until a server answers."""
+    async with asyncio.timeout(LONG_S):
+        while True:
+            with contextlib.suppress(NatsError, TimeoutError):
+                return (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
+            await asyncio.sleep(0.1)
 
 
 async def _until(true: Callable[[], bool]) -> None:
@@ -304,7 +324,7 @@ def _differences(pack: str, numbers: Counter[int], state: np.void, estimator: Es
 
 async def _last(nc: Client, number: int, bucket: PackBucket) -> Partition | None:
     """A partition as its last checkpoint has it; None: nobody had it."""
-    js = nc.jetstream()
+    js = nc.jetstream(timeout=LONG_S)
     checkpoints, states = await js.key_value(subjects.CHECKPOINTS_BUCKET), await js.object_store(subjects.STATES_BUCKET)
     entry = await checkpoints.get(f"p{number}")
     kept = Pointer.model_validate_json(entry.value or b"").kept

@@ -13,12 +13,13 @@ from bms_estimator.sources.replay import load_capture
 from tests.command_line import run
 from tests.fleet.engine import running
 from tests.fleet.test_captured import STORE, block, samples
+from tests.patience import LONG_S
 
 
 async def send(engine):
     async with await nats.connect(engine.url) as nc:
         await make_streams(nc)
-    async with aiomqtt.Client("127.0.0.1", engine.mqtt_port) as client:
+    async with aiomqtt.Client("127.0.0.1", engine.mqtt_port, timeout=LONG_S) as client:
         for number in (1, 2, 4, 3, 4, 6):
             await client.publish("raw/house", block(number), qos=1)
             await client.publish("raw/other", block(number), qos=1)

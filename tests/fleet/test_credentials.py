@@ -45,7 +45,8 @@ class Fleet:
         return credentials.edge_token(self.keys, tenant, pack, made, expires)
 
     def edge(self, token: str, **more: object) -> aiomqtt.Client:
-        return aiomqtt.Client("127.0.0.1", self.engine.mqtt_port, username="any", password=token, **more)  # type: ignore[arg-type]
+        port = self.engine.mqtt_port
+        return aiomqtt.Client("127.0.0.1", port, username="any", password=token, timeout=LONG_S, **more)  # type: ignore[arg-type]
 
     @asynccontextmanager
     async def program(self, role: Role, tenant: str = "acme") -> AsyncIterator[tuple[Client, list[str]]]:
@@ -56,7 +57,9 @@ class Fleet:
             refused.append(str(error))
 
         file = credentials.credentials_file(self.keys, tenant, role)
-        nc = await nats.connect(self.engine.url, user_credentials=file, error_cb=hear, allow_reconnect=False)
+        nc = await nats.connect(
+            self.engine.url, user_credentials=file, error_cb=hear, allow_reconnect=False, connect_timeout=LONG_S
+        )
         try:
             yield nc, refused
         finally:
@@ -71,7 +74,7 @@ class Fleet:
     async def kept(self, tenant: str = "acme") -> list[tuple[str, bytes]]:
         """What the stream of a tenant has: (pack, block)."""
         async with self.program(Role.READER, tenant) as (nc, _):
-            js = nc.jetstream()
+            js = nc.jetstream(timeout=LONG_S)
             last = (await js.stream_info(subjects.RAW_STREAM)).state.last_seq
             found = [await js.get_msg(subjects.RAW_STREAM, seq) for seq in range(1, last + 1)]
             return [((message.subject or "").rpartition(".")[2], message.data or b"") for message in found]
@@ -107,7 +110,13 @@ async def connect_with(url: str, token: str) -> None:
     """By the protocol of programs, with the token of an edge."""
     nc = Client()
     try:
-        await nc.connect(url, user_jwt_cb=token.encode, signature_cb=lambda _: b"", allow_reconnect=False)
+        await nc.connect(
+            url,
+            user_jwt_cb=token.encode,
+            signature_cb=lambda _: b"",
+            allow_reconnect=False,
+            connect_timeout=LONG_S,
+        )
     finally:
         if nc._transport:
             nc._transport.close()

@@ -88,7 +88,11 @@ async def test_what_a_killed_edge_had_ended_comes_once_and_one_that_is_asked_to_
             async with program(PROGRAM, "edge", pack, stderr=log) as process:
                 await receiver.until(1)
                 process.kill()
+            before = said.stat().st_size
             async with program(sys.executable, "-X", "importtime", PROGRAM, "edge", pack, stderr=log) as process:
+                async with asyncio.timeout(LONG_S):  # blocks of the first may still come while the second imports
+                    while b"store of blocks" not in said.read_bytes()[before:]:  # noqa: ASYNC110 - another process does it
+                        await asyncio.sleep(0.02)
                 await receiver.until(sum(block.samples.size for block in receiver.blocks) + 1)
                 process.send_signal(signal.SIGTERM)
                 assert await asyncio.wait_for(process.wait(), LONG_S) == 0

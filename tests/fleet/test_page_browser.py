@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import math
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +16,7 @@ import pytest_asyncio
 from nats.aio.client import Client
 from playwright.async_api import Browser
 
-from bms_estimator.fleet import subjects
+from bms_estimator.fleet import page_packs, subjects
 from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.page import FILES, STATIC, fleet_page
 from bms_estimator.fleet.page_feed import FleetFeed, Server
@@ -94,7 +95,9 @@ async def fleet(engine: Engine, hours: Path) -> AsyncIterator[Fleet]:
     settings = PageSettings(listen="127.0.0.1:0")
     async with fleet_page(Server(engine.url), settings, hours, step_s=STEP_S) as url:
         working = asyncio.create_task(work(nc))
-        yield Fleet(engine, nc, url)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(page_packs, "ALIVE_S", math.inf)  # however long it lasts, van-2 is not heard, but not silent
+            yield Fleet(engine, nc, url)
         working.cancel()
         await asyncio.gather(working, return_exceptions=True)
     await nc.close()
@@ -130,12 +133,12 @@ async def test_the_fleet_is_seen_at_a_glance(browser: Browser, fleet: Fleet) -> 
     async with looking(browser, fleet) as opened:
         await opened.until_text("partitions", "of 8")
         await opened.until_text("attention", "3")
-        assert await opened.text("held") == "7"
-        assert await opened.text("unheld") == "unheld: 7"
-        assert await opened.text("lag") == "0.4 s"
-        assert "1 not heard yet" in await opened.text("silent")
+        await opened.until_text("held", "7")
+        await opened.until_text("unheld", "unheld: 7")
+        await opened.until_text("lag", "0.4 s")
         page = opened.page
-        assert await page.get_by_role("img", name="8 partitions: 7 held by nobody").is_visible()
+        await page.locator('[data-q="silent"]', has_text="1 not heard yet").wait_for()
+        await page.get_by_role("img", name="8 partitions: 7 held by nobody").wait_for()
         await page.get_by_role(
             "img", name="State of charge: 1 pack 0 to 5 %, 1 pack 65 to 70 %, 1 pack 90 to 95 %"
         ).wait_for()
@@ -148,9 +151,10 @@ async def test_the_fleet_is_seen_at_a_glance(browser: Browser, fleet: Fleet) -> 
         )
         await page.get_by_role("button", name="ncr18650 14s10p").click()
         await page.get_by_role("img", name="State of charge: 1 pack 90 to 95 %").wait_for()
-        workers = await page.inner_text("#workers")
-        assert "alpha\t4\t2\t0.4 s" in workers
-        assert "no checkpoint" in workers
+        await opened.until(
+            "texts => texts.every((text) => document.getElementById('workers').innerText.includes(text))",
+            ["alpha\t4\t2\t0.4 s", "no checkpoint"],
+        )
         assert opened.errors == []
         assert all(url.startswith(fleet.url) for url in opened.requests), opened.requests
 
@@ -159,13 +163,18 @@ async def test_the_fleet_is_seen_at_a_glance(browser: Browser, fleet: Fleet) -> 
 async def test_who_needs_attention_is_ranked_and_names_are_no_markup(browser: Browser, fleet: Fleet) -> None:
     async with looking(browser, fleet) as opened:
         page = opened.page
-        await opened.until("() => document.querySelectorAll('#concerns tr').length === 3")
-        rows = [" ".join(text.split()) for text in await page.locator("#concerns tr").all_inner_texts()]
-        assert rows == [
+        wanted = [
             "home-2 Small margin stability margin −1.3 % Low SOC SOC 4.1 %",  # noqa: RUF001 - as shown
             "van-1 Suspected offset Uncertain SOC known to ± 14.2 %",
             f"{NASTY} Unknown its blocks are held: no <b>row</b>",
         ]
+        rows: list[str] = []
+        with contextlib.suppress(TimeoutError):  # a pack's reasons come one after the other
+            async with asyncio.timeout(LONG_S):
+                while rows != wanted:
+                    rows = [" ".join(text.split()) for text in await page.locator("#concerns tr").all_inner_texts()]
+                    await asyncio.sleep(STEP_S)
+        assert rows == wanted
         assert await page.locator("#concerns img").count() == 0
         await page.locator("[data-count=soc]").click()
         first = page.locator("#concerns tr").first
@@ -190,8 +199,10 @@ async def test_a_pack_is_found_by_how_its_name_begins_with_the_keyboard_alone(br
         assert page.url.endswith("#home-1")
         heard = await page.inner_text("#packwhat")
         assert heard.startswith("lfp 16s1p 280 Ah · heard")
-        rows = await page.locator("#parameters tr").count()
-        assert rows == len(ONE.parameters.elements) + len(ONE.parameters.state_of_health)
+        await opened.until(
+            "rows => document.querySelectorAll('#parameters tr').length === rows",
+            len(ONE.parameters.elements) + len(ONE.parameters.state_of_health),
+        )
         await page.keyboard.press("Escape")
         await page.get_by_role("dialog").wait_for(state="hidden")
         await opened.until("() => location.hash === ''")
@@ -213,7 +224,7 @@ async def test_what_the_hours_answer_is_seen(browser: Browser, fleet: Fleet) -> 
         assert (await outlier.inner_text()).startswith("p0\tcapacity ratio\t")
         await outlier.get_by_role("button", name="p0").click()
         await opened.page.get_by_role("dialog", name="p0").wait_for()
-        assert "Nothing was heard of this pack yet" in await opened.page.inner_text("#packwhat")
+        await opened.page.get_by_text("Nothing was heard of this pack yet").wait_for()
         assert await answers.locator("[data-answer=honest]").count() == 1
         assert [error for error in opened.errors if "404" not in error] == []
 
@@ -344,12 +355,11 @@ async def test_why_nothing_more_is_heard_is_said(fleet: Fleet, monkeypatch: pyte
 async def test_what_the_last_hour_said_before_the_page_was_there_is_read(fleet: Fleet) -> None:
     hour = json.dumps({"suspects": int(Suspect.OCV)}).encode()
     late = await nats.connect(fleet.engine.url)
-    await late.jetstream().publish(subjects.hours("early-1"), hour)
+    await late.jetstream(timeout=LONG_S).publish(subjects.hours("early-1"), hour)
     await late.close()
     view = FleetView(1, 0.0)
     async with FleetFeed(Server(fleet.engine.url), view, lambda _: None), asyncio.timeout(LONG_S):
-        while not view.packs.find("early"):  # noqa: ASYNC110 - nobody tells
+        while not (view.packs.find("early") and view.workers.partitions == PARTITIONS):  # noqa: ASYNC110 - nobody tells
             await asyncio.sleep(0.01)
     shown = view.picture(0.0, 0.0)
     assert ["early-1", "ocv"] in shown["concerns"]["suspects"]["packs"]
-    assert view.workers.partitions == PARTITIONS

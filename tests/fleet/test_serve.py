@@ -8,6 +8,7 @@ import socket
 import ssl
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import partial
@@ -64,25 +65,30 @@ class Serving:
     """``fleet serve FILE`` as a process."""
 
     def __init__(self, file: Path, folder: Path) -> None:
-        self._errors = folder.with_suffix(".err").open("w+")
-        self.process = subprocess.Popen(
-            [PROGRAM, "fleet", "serve", file, "--folder", folder],
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            text=True,
-        )
+        self._errors = folder.with_suffix(".err")
+        with self._errors.open("w") as errors:
+            self.process = subprocess.Popen(
+                [PROGRAM, "fleet", "serve", file, "--folder", folder],
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+            )
 
     def wait(self, wanted: str) -> None:
         """Until it says a line with ``wanted``."""
         assert self.process.stdout
-        for line in self.process.stdout:
-            if wanted in line:
-                return
+        late = threading.Timer(LONG_S, self.process.kill)
+        late.start()
+        try:
+            for line in self.process.stdout:
+                if wanted in line:
+                    return
+        finally:
+            late.cancel()
         raise AssertionError(f"ended without {wanted!r}: {self.errors()}")
 
     def errors(self) -> str:
-        self._errors.seek(0)
-        return self._errors.read()
+        return self._errors.read_text()
 
     def end(self) -> int:
         self.process.send_signal(signal.SIGTERM)
@@ -93,7 +99,6 @@ class Serving:
         self.process.wait(LONG_S)
         assert self.process.stdout
         self.process.stdout.close()
-        self._errors.close()
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +128,7 @@ async def send_block(folder: Path, context: ssl.SSLContext, tenant: str = "acme"
     port = port_of(settings_of(folder).server.mqtt)
     async with (
         asyncio.timeout(LONG_S),
-        aiomqtt.Client("127.0.0.1", port, username="p1", password=token, tls_context=context) as edge,
+        aiomqtt.Client("127.0.0.1", port, username="p1", password=token, tls_context=context, timeout=LONG_S) as edge,
     ):
         await edge.publish(subjects.raw("p1").replace(".", "/"), b"block", qos=1)
 
@@ -132,7 +137,7 @@ async def blocks(folder: Path, context: ssl.SSLContext, tenant: str = "acme") ->
     file = credentials.credentials_file(folder / "state" / "keys", tenant, Role.WORKER)
     nc = await nats.connect(f"tls://{settings_of(folder).server.listen}", tls=context, user_credentials=file)
     try:
-        return (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages
+        return (await nc.jetstream(timeout=LONG_S).stream_info(subjects.RAW_STREAM)).state.messages
     finally:
         await nc.close()
 
@@ -186,7 +191,7 @@ async def test_the_server_does_not_outlive_a_fleet_serve_that_is_killed(tmp_path
         made = Serving(tmp_path / "fleet.toml", tmp_path / "state")
         await asyncio.to_thread(made.wait, "streams ready")
         made.close()
-        await until(lambda: not heard(listen))
+        await until(lambda: not any(map(heard, (listen, mqtt, monitor))))
 
 
 def heard(port: int) -> bool:
@@ -247,7 +252,7 @@ async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authorit
         context = ssl.create_default_context(cafile=str(authority.certificate))
         last = settings_of(places[2].folder).server.listen
         nc = await nats.connect(f"tls://{last}", tls=context, user_credentials=file)
-        info = await nc.jetstream().stream_info(subjects.RAW_STREAM)
+        info = await nc.jetstream(timeout=LONG_S).stream_info(subjects.RAW_STREAM)
         await nc.close()
         assert info.config.num_replicas == 3
         assert (info.config.metadata or {})["bms.partitions"] == "4"

@@ -124,7 +124,7 @@ async def _be_given(nc: Client, partition: int, messages: int) -> None:
     await _subscribe(nc, f"{inbox}.*", consumer.receive)
     await consumer.renew()
     await until(lambda: len(consumer.waiting) == messages, lambda: len(consumer.waiting))
-    assert await consumer.is_pinned()
+    assert consumer.pinned
 
 
 async def _subscribe(nc: Client, subject: str, receive) -> None:

@@ -12,6 +12,7 @@ from bms_estimator.fleet.partition import Partition
 from bms_estimator.fleet.streams import make_streams
 from tests.fleet.engine import connected, running
 from tests.fleet.workers import Heartbeats, Process, block, end_states, estimated, know, send
+from tests.patience import LONG_S
 
 PARTITIONS = 4
 PACKS = [f"p{i}" for i in range(8)]
@@ -71,7 +72,7 @@ async def test_whatever_is_killed_the_states_are_those_of_one_run(tmp_path: Path
 
 async def _hours(nc) -> dict[str, bytes]:
     """All rows, by their ids; none came twice."""
-    js = nc.jetstream()
+    js = nc.jetstream(timeout=LONG_S)
     rows = {}
     state = (await js.stream_info(subjects.HOURS_STREAM)).state
     for sequence in range(1, state.last_seq + 1):

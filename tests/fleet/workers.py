@@ -1,6 +1,7 @@
 """Workers of a fleet as processes, what edges send them, and what is left of it in the end."""
 
 import asyncio
+import hashlib
 import json
 import signal
 import subprocess
@@ -61,11 +62,12 @@ async def know(nc: Client, packs: list[str]) -> KnownPacks:
 
 
 async def send(nc: Client, pack: str, data: bytes) -> None:
-    """Until the stream has it, maybe twice."""
+    """Until the stream has it; it drops what comes again because its answer was late."""
+    headers = {"Nats-Msg-Id": f"{pack} {hashlib.sha256(data).hexdigest()}"}
     deadline = time.monotonic() + LONG_S
     while time.monotonic() < deadline:
         with suppress(NatsError, TimeoutError):
-            await nc.jetstream().publish(subjects.raw(pack), data, timeout=1.0)
+            await nc.jetstream().publish(subjects.raw(pack), data, timeout=1.0, headers=headers)
             return
         await asyncio.sleep(0.05)
     raise AssertionError("the stream takes nothing")
@@ -82,8 +84,9 @@ class Process:
 
     @property
     def lines(self) -> list[dict[str, Any]]:
-        """Of its log."""
-        return [json.loads(line) for line in self._log.read_text().splitlines(keepends=True) if line.endswith("\n")]
+        """Of its log, what else comes to stderr left out."""
+        lines = self._log.read_text().splitlines(keepends=True)
+        return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]
 
     async def logged(self, text: str) -> dict[str, Any]:
         """The first line that says so."""
@@ -152,7 +155,7 @@ async def until(found: Callable[[], Any], or_else: Callable[[], object]) -> Any:
 
 async def end_states(nc: Client, known: KnownPacks, partitions: int) -> dict[int, Partition]:
     """What is in the last checkpoints."""
-    js = nc.jetstream()
+    js = nc.jetstream(timeout=LONG_S)
     checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
     keeping = Keeping(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))
     found = {}
