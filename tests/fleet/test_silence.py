@@ -40,10 +40,10 @@ async def test_what_a_dead_worker_was_given_is_taken_though_nobody_sends_more(tm
         working = asyncio.create_task(work(Options(engine.url, "w"), stop))
         async with Heartbeats(nc) as heard:
             await heard.until_held(PARTITIONS, "w")
-            await heard.until(lambda last: last["w"].blocks == (BLOCKS - 1) * len(PACKS))
+            await heard.until(lambda last: last["w"].blocks >= (BLOCKS - 1) * len(PACKS))
             for pack in PACKS:
                 await send(nc, pack, block(pack, BLOCKS))
-            await heard.until(lambda last: last["w"].blocks == BLOCKS * len(PACKS))
+            await heard.until(lambda last: last["w"].blocks >= BLOCKS * len(PACKS))
         stop.set()
         await working
         states = await end_states(nc, known, PARTITIONS)
@@ -72,7 +72,7 @@ async def test_a_fault_of_ours_costs_its_block_and_is_counted(tmp_path: Path) ->
         for pack in PACKS:
             await send(nc, pack, block(pack, 1))
         await holding.consumer.renew()
-        await until(lambda: holding.blocks == len(PACKS), lambda: holding.blocks)
+        await until(lambda: holding.blocks >= len(PACKS), lambda: holding.blocks)
         assert holding.faults == 1
         assert holding.partition
         assert holding.partition.counters["blocks"] == len(PACKS) - 1
@@ -94,7 +94,7 @@ async def test_who_was_fenced_out_and_is_given_the_partition_again_says_so_and_b
         for pack in PACKS:
             await send(nc, pack, block(pack, 1))
         await holding.consumer.renew()
-        await until(lambda: holding.blocks == len(PACKS), lambda: holding.blocks)
+        await until(lambda: holding.blocks >= len(PACKS), lambda: holding.blocks)
         await (await _keeping(nc, "other")).claim(0)  # and dies: its pin has lapsed when we ask for more
 
         def said() -> object:
@@ -103,7 +103,7 @@ async def test_who_was_fenced_out_and_is_given_the_partition_again_says_so_and_b
 
         with capture_logs() as logs:
             await until(said, lambda: logs)
-            await until(lambda: holding.blocks == 2 * len(PACKS), lambda: holding.blocks)
+            await until(lambda: holding.blocks >= 2 * len(PACKS), lambda: holding.blocks)
         assert holding.partition
         for pack in PACKS:
             state = holding.partition.state(pack)
