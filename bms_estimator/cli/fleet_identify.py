@@ -2,6 +2,7 @@
 
 import asyncio
 import csv
+import io
 import json
 import math
 import os
@@ -25,6 +26,7 @@ from bms_estimator.fleet.known_packs import KnownPacks
 from bms_estimator.fleet.pack_row import PackKind, stored
 from bms_estimator.fleet.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.text_file import write_text
 
 if TYPE_CHECKING:
     from bms_estimator.fleet.reidentify import Reidentified
@@ -71,7 +73,7 @@ def identify(
     ):
         found.append(outcome)
         if outcome.cell_file:
-            _write(out / f"{outcome.pack}.toml", outcome.cell_file)
+            write_text(out / f"{outcome.pack}.toml", outcome.cell_file, make_folder=True)
         if sys.stderr.isatty():
             typer.echo(f"{len(found)} of {len(names)}: {outcome.pack}", err=True)
     _write_results(out / RESULTS, found)
@@ -160,23 +162,11 @@ def _row(one: "Reidentified") -> dict[str, object]:
 
 
 def _write_results(path: Path, found: Sequence["Reidentified"]) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", encoding="utf-8", newline="") as file:
-            rows = list(map(_row, found))
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+    rows, table = list(map(_row, found)), io.StringIO()
+    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, table.getvalue(), make_folder=True)
 
 
 def _table(found: Sequence["Reidentified"]) -> Table:

@@ -15,6 +15,7 @@ from bms_estimator.fleet.pack_row import PackKind, model_key, settings_of
 from bms_estimator.fleet.pack_table import CELL_FILE, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.text_file import write_text
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Which cells each pack has.")
 
@@ -80,7 +81,7 @@ def show(
         typer.echo(files["pack.toml"].rstrip())
         return
     for name, text in files.items():
-        _write(out / name, text)
+        write_text(out / name, text, make_folder=True)
     typer.echo(f"{out}: {' and '.join(files)} written")
 
 
@@ -158,11 +159,3 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: cannot be read: {error}") from None
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None

@@ -16,6 +16,7 @@ from bms_estimator.fleet.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.settings import DeviceName, MqttSettings
+from bms_estimator.model.text_file import write_text
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.sinks.brokers import check
 
@@ -56,8 +57,9 @@ def simulate(
     if mqtt is None and table is None and truth is None:
         raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write the table of the packs alone")
     fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin), prefix=_prefix(prefix))
-    _write(table, fleet.table())
-    _write(truth, fleet.truth_table())
+    for path, text in ((table, fleet.table), (truth, fleet.truth_table)):
+        if path is not None:
+            write_text(path, text())
     if mqtt is not None:
         settings = _broker(mqtt, username=username, password_file=password_file, ca_file=ca)
         typer.echo(asyncio.run(_run(fleet, settings, connections, speed, blocks)))
@@ -109,17 +111,3 @@ def _with_options(said: str) -> str:
     for setting, option in (("url", "--mqtt"), ("password_file", "--password-file"), ("ca_file", "--ca")):
         said = said.replace(f"mqtt.{setting} = ", f"{option} ")
     return said
-
-
-def _write(path: Path | None, text: str) -> None:
-    """Write a file where one is wanted.
-
-    Raises:
-        UserError: It cannot be written.
-    """
-    if path is None:
-        return
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None

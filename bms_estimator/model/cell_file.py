@@ -6,8 +6,8 @@ from pathlib import Path
 import tomlkit
 
 from bms_estimator.model.cell import ELEMENTS
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.text_file import write_text
 
 SOURCES = {"r_ts": "(2.5)", "r_tl": "(2.6)", "c_ts": "(2.7)", "c_tl": "(2.8)", "r_s": "(2.9)"}
 """Section -> its equation."""
@@ -26,10 +26,7 @@ def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None
     Raises:
         UserError: The file cannot be written.
     """
-    try:
-        path.write_text(cell_text(cell, remarks), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+    write_text(path, cell_text(cell, remarks))
 
 
 def cell_text(cell: PackModel, remarks: Sequence[str] = ()) -> str:

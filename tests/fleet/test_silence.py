@@ -13,6 +13,7 @@ from bms_estimator.fleet import subjects
 from bms_estimator.fleet.consumer import PinnedConsumer
 from bms_estimator.fleet.holding import Holding
 from bms_estimator.fleet.keeping import Keeping
+from bms_estimator.fleet.partition import Table
 from bms_estimator.fleet.streams import make_streams
 from bms_estimator.fleet.worker import Options, work
 from tests.fleet.engine import running
@@ -65,14 +66,7 @@ async def test_a_fault_of_ours_costs_its_block_and_is_counted(tmp_path: Path) ->
         def table(pack: str):
             return known(pack) if pack != "p1" else {}[pack]
 
-        inbox = nc.new_inbox()
-        holding = Holding(nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock())
-        await _subscribe(nc, f"{inbox}.0.*", holding.receive)
-        taking = asyncio.create_task(holding.run())
-        for pack in PACKS:
-            await send(nc, pack, block(pack, 1))
-        await holding.consumer.renew()
-        await until(lambda: holding.blocks >= len(PACKS), lambda: holding.blocks)
+        holding, taking = await _holding_first_blocks(nc, table)
         assert holding.faults == 1
         assert holding.partition
         assert holding.partition.counters["blocks"] == len(PACKS) - 1
@@ -87,14 +81,7 @@ async def test_who_was_fenced_out_and_is_given_the_partition_again_says_so_and_b
         nc = await nats.connect(engine.url)
         await make_streams(nc, partitions=1)
         known = await know(nc, PACKS)
-        inbox = nc.new_inbox()
-        holding = Holding(nc, 0, known, await _keeping(nc, "w"), inbox, asyncio.Lock())
-        await _subscribe(nc, f"{inbox}.0.*", holding.receive)
-        taking = asyncio.create_task(holding.run())
-        for pack in PACKS:
-            await send(nc, pack, block(pack, 1))
-        await holding.consumer.renew()
-        await until(lambda: holding.blocks >= len(PACKS), lambda: holding.blocks)
+        holding, taking = await _holding_first_blocks(nc, known)
         await (await _keeping(nc, "other")).claim(0)  # and dies: its pin has lapsed when we ask for more
 
         def said() -> object:
@@ -105,6 +92,7 @@ async def test_who_was_fenced_out_and_is_given_the_partition_again_says_so_and_b
             await until(said, lambda: logs)
             await until(lambda: holding.blocks >= 2 * len(PACKS), lambda: holding.blocks)
         assert holding.partition
+        assert holding.partition.counters["blocks"] == len(PACKS)
         for pack in PACKS:
             state = holding.partition.state(pack)
             assert state is not None
@@ -115,6 +103,19 @@ async def test_who_was_fenced_out_and_is_given_the_partition_again_says_so_and_b
 
 def _packs_of(partition: int) -> int:
     return sum(subjects.partition_of(pack, PARTITIONS) == partition for pack in PACKS)
+
+
+async def _holding_first_blocks(nc: Client, table: Table) -> tuple[Holding, asyncio.Task[None]]:
+    """A worker's only partition, once it has stepped the first block of each pack; and what goes on with it."""
+    inbox = nc.new_inbox()
+    holding = Holding(nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock())
+    await _subscribe(nc, f"{inbox}.0.*", holding.receive)
+    taking = asyncio.create_task(holding.run())
+    for pack in PACKS:
+        await send(nc, pack, block(pack, 1))
+    await holding.consumer.renew()
+    await until(lambda: holding.blocks >= len(PACKS), lambda: holding.blocks)
+    return holding, taking
 
 
 async def _be_given(nc: Client, partition: int, messages: int) -> None:

@@ -57,8 +57,13 @@ class Tab:
         await self.until("text => document.getElementById('status').innerText.includes(text)", text)
 
     async def until_text(self, quantity: str, text: str) -> None:
+        """Until that is what ``text`` says of it."""
         await self.until(
-            '([name, text]) => document.querySelector(`[data-q="${name}"]`).innerText === text', [quantity, text]
+            """([name, text]) => {
+                const shown = document.querySelector(`[data-q="${name}"]`);
+                return (shown.checkVisibility() ? shown.innerText : "") === text;
+            }""",
+            [quantity, text],
         )
 
 
