@@ -105,7 +105,7 @@ def couple(cov: Floats, f: Floats, by_offset: float, moved: float) -> None:
 
 
 @njit(cache=True)
-def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, float]:
+def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, float, float]:
     """Take the mean voltage of the window in: the EKF's update, linear over what is known of the SOC afterwards.
 
     On a bend of the OCV the secant over what was known before may be many times too steep (posterior linearisation:
@@ -118,18 +118,18 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
         variance_v2: R [V^2].
 
     Returns:
-        The innovation [V] and its variance S [V^2], of the last linearisation.
+        Of the last linearisation: the innovation [V], its variance S, and S without what the OCV's secant leaves out [V^2].
     """
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     soc, variance = x[SOC], cov[SOC, SOC]
-    innovation_v, total_v2 = innovate(s, p, q, variance_v2, soc, variance)
+    innovation_v, total_v2, straight_v2 = innovate(s, p, q, variance_v2, soc, variance)
     for _ in range(MOST_TIMES):
         to_soc = min(max(x[SOC] + ph[SOC] * innovation_v / total_v2, LOWEST), HIGHEST)
         to_variance = cov[SOC, SOC] - ph[SOC] * ph[SOC] / total_v2
         if max(abs(to_soc - soc), abs(secant_reach(to_variance) - secant_reach(variance))) < NEAR:
             break
         soc, variance = to_soc, to_variance
-        innovation_v, total_v2 = innovate(s, p, q, variance_v2, soc, variance)
+        innovation_v, total_v2, straight_v2 = innovate(s, p, q, variance_v2, soc, variance)
     scale = 1.0 / math.sqrt(total_v2)
     for j in range(STATES):
         ph[j] *= scale
@@ -142,18 +142,18 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
     most = MOST_STDS * resistance_std(s, p)
     for j in (LN_R0, LN_R):
         x[j] = min(max(x[j], -most), most)
-    return innovation_v, total_v2
+    return innovation_v, total_v2, straight_v2
 
 
 @njit(cache=True)
 def innovate(
     s: Record, p: Record, q: int, variance_v2: float, about_soc: float, about_variance: float
-) -> tuple[float, float]:
-    """Innovation [V] and its variance S [V^2], linear about an SOC to a variance; P H' into ``s.ph``."""
+) -> tuple[float, float, float]:
+    """What ``update`` returns, linear about an SOC to a variance; P H' into ``s.ph``."""
     cov, h, ph = s.covariance[q], s.h, s.ph
     predicted_v, curved_v = linearise(s, p, q, about_soc, about_variance)
     innovation_v = s.window.sum_v / s.window.samples - predicted_v
-    total_v2 = variance_v2 + curved_v * curved_v
+    straight_v2 = variance_v2
     for j in range(STATES):
         ph[j] = 0.0
     for k in range(STATES):
@@ -161,8 +161,9 @@ def innovate(
             for j in range(STATES):
                 ph[j] += cov[k, j] * h[k]
     for j in range(STATES):
-        total_v2 += h[j] * ph[j]
-    return innovation_v, max(total_v2, (innovation_v / HUBER) ** 2)
+        straight_v2 += h[j] * ph[j]
+    least_v2 = (innovation_v / HUBER) ** 2
+    return innovation_v, max(straight_v2 + curved_v * curved_v, least_v2), max(straight_v2, least_v2)
 
 
 @njit(cache=True)

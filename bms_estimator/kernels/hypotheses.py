@@ -35,7 +35,7 @@ from bms_estimator.kernels.ekf_state import (
     STATES,
     X,
 )
-from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius, on_grid
 from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
@@ -261,9 +261,10 @@ def update_all(s: Record, p: Record) -> None:
     for q in range(s.count):
         if dt_s > 0.0:
             predict(s, p, q)
-        innovation_v, total_v2 = update(s, p, q, variance_v2)
+        innovation_v, total_v2, straight_v2 = update(s, p, q, variance_v2)
         u = innovation_v / math.sqrt(total_v2)
-        s.ln_weight[q] -= p.temper * (u * u + math.log(total_v2))
+        # a bend's part of S stays while nothing moves: counted each second, it would tell against the knee at full rest
+        s.ln_weight[q] -= p.temper * (innovation_v * innovation_v / straight_v2 + math.log(straight_v2))
         if dt_s > 0.0:
             inflate(s, q, dt_s, u)
         if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
@@ -279,11 +280,16 @@ def update_all(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def reopen(s: Record, p: Record) -> None:
-    """Begin again where the model would have to be wrong by far more than it is: then the SOC is, by any amount."""
+    """Begin again where the model would have to be wrong by far more than it is: then the SOC is, by any amount.
+
+    The biases take what is wrong with OCV and hysteresis, too: on a plateau that is most of it.
+    """
     if s.count > 1:
         return
     bias_v = s.mean[0, B_SLOW] + s.mean[0, B_FAST]
-    if bias_v * bias_v > REOPEN_STDS**2 * bias_variance(s, p, s.mean[0, SOC]):
+    soc = s.mean[0, SOC]
+    wrong_v2 = bias_variance(s, p, soc) + on_grid(soc, p.curve_error_v) ** 2 + on_grid(soc, p.hysteresis_v) ** 2
+    if bias_v * bias_v > REOPEN_STDS**2 * wrong_v2:
         forget_curve(s.mean[0], s.covariance[0])
         seed(s, p, s.mean[0, SOC], REOPEN_STD)
         s.reopened += 1

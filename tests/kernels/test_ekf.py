@@ -81,8 +81,11 @@ def test_by_the_soc_it_is_the_secant_of_the_ocv_over_one_std_and_nothing_of_the_
 
 
 def test_p_goes_by_the_derivative_of_the_mean() -> None:
-    """F P F' of the kernel, P with Q less P = 0 with Q, against F by finite differences."""
-    p = settings()
+    """F P F' of the kernel, P with Q less P = 0 with Q, against F by finite differences.
+
+    How fast the error of the OCV changes is itself another at another SOC, which is no part of F: here it is not.
+    """
+    p = settings(curve_soc=0.3)
 
     def after(mean, covariance):
         s = somewhere(p, time_s=20.0)
@@ -119,9 +122,10 @@ def test_the_update_is_that_of_the_textbook() -> None:
     r = 0.05**2
     total = h @ covariance @ h + r + curved_v**2
     s["window"]["sum_v"] = s["window"]["samples"] * (linearised(s, p)[0] + 0.3 * np.sqrt(total))
-    innovation_v, variance_v2 = ekf.update(s, p, 0, r)
+    innovation_v, variance_v2, straight_v2 = ekf.update(s, p, 0, r)
     gain = covariance @ h / total
     assert (innovation_v, variance_v2) == pytest.approx((0.3 * np.sqrt(total), total))
+    assert straight_v2 == pytest.approx(total - curved_v**2)
     assert s["mean"][0] == pytest.approx(mean + gain * innovation_v, rel=1e-9, abs=1e-12)
     assert s["covariance"][0] == pytest.approx(covariance - np.outer(gain, h @ covariance), rel=1e-9, abs=1e-15)
 
