@@ -20,16 +20,16 @@ STEEPEST_V = 5.0
 LEARNED, LEARNED_SLOPE_V = 0.97, 0.15
 """Part of the variance of the OCV that is learned for good, where its slope is at least so much everywhere [V]: on a
 plateau a voltage does not tell the error of the curve from the SOC, nor do the knees stay where they are."""
-CURVE_SOC, KNEE_V = 0.3, 1.0
-"""The error of the OCV changes over so much charge [SOC]; where a cell's curve is steeper than this [V], at its knees, over
-as much less as it is steeper: what is wrong there is the shape of the knee."""
+CURVE_SOC, KNEE_V, TURN = 0.3, 1.0, 4.0
+"""The error of the OCV changes over so much charge [SOC], and where a curve goes from flat to steep: on a plateau it is wrong
+in volts, at a knee in SOC, of slopes above ``KNEE_V`` a cell [V]. Both are as one error, e^-(TURN radians of that angle) alike."""
 COUNT_ERROR_SOC = 0.004
 """However well the curve is known: how full the cell was that it was measured on, std."""
 BEYOND_BRANCHES = 0.2
 """Two branches leave out diffusion that is slower: its resistance, as a part of theirs."""
 BRANCHES_STD = 0.35
 """Relative std of resistances that come from two branches."""
-BIAS_OF_STD = 0.2
+BIAS_OF_STD = 0.15
 """Resistances that are hardly known are wrong in their ratios, too: so much of their relative std is ``bias_relative``."""
 ROOM_C = 15.0, 35.0
 """Resistances of unknown temperature are those of a room [C]."""
@@ -107,7 +107,8 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
     """
     series, ocv = p["series"], cell.ocv
     slope_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_slope_v"].size), p["ocv_slope_v"])
-    p["curve_soc"] = CURVE_SOC * KNEE_V * series / np.maximum(slope_v, KNEE_V * series)
+    radians = np.abs(np.gradient(np.arctan(slope_v / (KNEE_V * series)), SOC_GRID))
+    p["curve_soc"] = 1.0 / (1.0 / CURVE_SOC + TURN * radians)
     slope_v = np.minimum(slope_v, STEEPEST_V * series)
     p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * slope_v)
     midway = False

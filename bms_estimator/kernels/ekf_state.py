@@ -41,14 +41,14 @@ class Noise:
     """R: error of the ladder in the mean of one second, std at 25 C [V]."""
     model_j: float = 27e3
     """It grows in the cold with this activation energy [J/mol]."""
-    bias_relative: float = 0.04
+    bias_relative: float = 0.03
     """B: error of the model that stays, relative to the sum of the resistances times the RMS current of 10 min."""
-    bias_grown: float = 0.15
+    bias_grown: float = 0.11
     """B: the same by which resistances have grown, in the cold and near empty, beyond those at 25 C and SOC 0.5."""
-    bias_soc: float = 0.025
+    bias_soc: float = 0.03
     """B: the same from a shift of resistances and of the OCV's last fall along SOC, at 25 C; it grows with ``model_j``."""
-    slow_s: float = 2.0 * 3600.0
-    fast_s: float = 90.0
+    slow_s: float = 3600.0
+    fast_s: float = 45.0
     """B: half of its variance each changes within so long [s]."""
     x_relative: float = 0.05
     """Q: current in the branches, relative to the current."""

@@ -1,0 +1,49 @@
+"""The same promises on other draws of load, cell file and noise: what one capture of a kind does not show.
+
+Two failures hid behind one capture each: an LFP cell, switched on full, that was searched anew on its plateau (20 % off, said
+to be 4), and hypotheses at the knee that lost their weight while nothing moved (40 % off).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE
+from tests.estimator.anywhere.cases import CASES
+from tests.estimator.anywhere.summary import rows
+
+SEEDS = range(100, 106)
+LIMITS = {
+    "full at -10C": (3.5, 4.2),
+    "knows 25C at 0C": (5.2, 7.7),
+    "LFP full 25C": (2.0, 2.4),
+    "LFP full -10C": (7.6, 9.0),
+    "LFP cut 25C": (5.0, 5.7),
+    "generic nmc": (3.2, 6.9),
+    "generic lfp": (3.7, 4.5),
+}
+"""Mean RMSE and mean std of all draws [%]."""
+LEAST_COVER = 95.0
+"""Mean share of time inside two std [%]."""
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_the_band_is_true_on_other_draws(name: str) -> None:
+    case = next(c for c in CASES if c.name == name)
+    scores = [row.score for row in rows([replace(case, seed=seed) for seed in SEEDS])]
+    rmse, std = LIMITS[name]
+    assert np.mean([score.cover for score in scores]) >= LEAST_COVER
+    assert np.mean([score.rmse for score in scores]) <= rmse
+    assert np.mean([score.std for score in scores]) <= std
+
+
+def test_a_full_cell_at_rest_stays_full() -> None:
+    """Half an hour in which nothing moves tells nothing new: hypotheses keep their weights."""
+    samples = np.zeros(1800, dtype=SAMPLE)
+    samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(1800.0), 3.575, 25.0
+    trace = Estimator(load_cell("lfp", 2.0), initial_soc=0.8).run(samples)
+    assert trace["soc"][-1] > 0.95
+    assert trace["soc_std"][-1] < 0.1
