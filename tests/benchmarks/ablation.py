@@ -28,12 +28,12 @@ Floats = NDArray[np.float64]
 Change = Callable[[np.void], None]
 
 KINDS = {
-    "oxide, 25, 10 C": ("PF 25 C", "PF 10 C", "NCR", "Leaf"),
+    "oxide, 25, 10 C": ("PF 25 C, US06", "PF 25 C, mixed", "PF 10 C", "NCR", "Leaf"),
     "oxide, 0, -10 C": ("PF 0 C", "PF -10 C", "PF 0 C from full", "PF -10 C from full"),
-    "file of 25 C": ("PF 10 C, file", "PF 0 C, file", "PF -10 C, file"),
+    "file of 25 C": tuple(f"PF {t} C, file of 25" for t in (10, 0, -10)),
     "wrong sensor": ("NCR, current", "NCR, -50", "NCR, +50", "NCR, capacity"),
     "LFP from full": tuple(f"LFP {t} C from full" for t in (25, 5, -15)),
-    "LFP": tuple(f"LFP {t} C (its" for t in (25, 5, -15)),
+    "LFP": ("LFP 25 C (its", "LFP 5 C", "LFP -15 C (its"),
     "generic": ("generic",),
 }
 """Groups by how their names begin; a name that is a group's own stands for that group alone."""

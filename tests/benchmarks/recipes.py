@@ -3,7 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -34,10 +34,15 @@ class Recipe:
     ocv: tuple[str, ...] = ()
     identify: tuple[str, ...] = ()
     generic: str = ""
+    measured: bool = False
+    """`ocv` is not told the capacity."""
 
 
-PF_ALL = Recipe(2.9, (PF + "25_hppc",), tuple(PF + f"{t}_hppc" for t in ("25", "10", "0", "n10")))
-PF_25 = Recipe(2.9, PF_ALL.ocv, (PF + "25_hppc",))
+PF_HPPC = tuple(PF + f"{t}_hppc" for t in ("25", "10", "0", "n10"))
+PF_PULSES = Recipe(2.9, PF_HPPC[:1], PF_HPPC)
+PF_US06 = Recipe(2.9, PF_HPPC[:1], (*PF_HPPC, PF + "25_us06"))
+PF_CYCLE = Recipe(2.9, PF_HPPC[:1], (*PF_HPPC, PF + "25_cycle1"))
+PF_25 = Recipe(2.9, PF_HPPC[:1], (PF_HPPC[0], PF + "25_us06"))
 NCR_CELL = Recipe(
     3.0,
     tuple(NCR + name for name in ("cell1_discharge_c20", "cell1_charge_c20", "cell5_relaxation_c2")),
@@ -48,7 +53,9 @@ LFP_CELL = Recipe(
     2.05,
     tuple(LFP + f"c30_{way}_{t}" for way in ("dis", "chg") for t in ("p25", "p05", "n15")),
     tuple(LFP + f"dyn_{t}" for t in ("p25", "p05", "n15")),
+    measured=True,
 )
+LFP_WITHOUT_5 = replace(LFP_CELL, identify=(LFP + "dyn_p25", LFP + "dyn_n15"))
 
 
 @dataclass(frozen=True)
@@ -82,11 +89,20 @@ PF_CAPTURES = {
     }.items()
 }
 LFP_CAPTURES = {t: ((LFP + name, 2.05, 1.0),) for t, name in (("25", "dyn_p25"), ("5", "dyn_p05"), ("-15", "dyn_n15"))}
+LFP_FILES = (
+    ("25", " (its own file)", LFP_CELL),
+    ("5", "", LFP_WITHOUT_5),
+    ("-15", " (its own file)", LFP_CELL),
+)
+"""The capture at 5 C is not in its file."""
 LEAF_CAPTURES = (("leaf/hppc_25c_from_full", 30.5, 1.0),)
 
 GROUPS = (
-    *(Group(f"PF {t} C", PF_ALL, captures) for t, captures in PF_CAPTURES.items()),
-    *(Group(f"PF {t} C from full", PF_ALL, PF_CAPTURES[t], FROM_START) for t in ("0", "-10")),
+    Group("PF 25 C, US06", PF_CYCLE, PF_CAPTURES["25"][:1]),
+    Group("PF 25 C, mixed cycle", PF_US06, PF_CAPTURES["25"][1:]),
+    *(Group(f"PF {t} C", PF_US06, PF_CAPTURES[t]) for t in ("10", "0", "-10")),
+    *(Group(f"PF {t} C from full", PF_US06, PF_CAPTURES[t], FROM_START) for t in ("0", "-10")),
+    *(Group(f"PF {t} C, file of pulses", PF_PULSES, captures) for t, captures in PF_CAPTURES.items()),
     *(Group(f"PF {t} C, file of 25 C", PF_25, PF_CAPTURES[t]) for t in ("10", "0", "-10")),
     Group("NCR", NCR_CELL, NCR_CHANGING),
     Group("NCR, constant current", NCR_CELL, NCR_CONSTANT),
@@ -97,11 +113,8 @@ GROUPS = (
         for q in (-0.05, 0.05, -0.2, 0.2)
     ),
     Group("Leaf (its own file)", LEAF, LEAF_CAPTURES),
-    *(
-        Group(f"LFP {t} C from full (its own file)", LFP_CELL, captures, FROM_START)
-        for t, captures in LFP_CAPTURES.items()
-    ),
-    *(Group(f"LFP {t} C (its own file)", LFP_CELL, captures) for t, captures in LFP_CAPTURES.items()),
+    *(Group(f"LFP {t} C from full{own}", recipe, LFP_CAPTURES[t], FROM_START) for t, own, recipe in LFP_FILES),
+    *(Group(f"LFP {t} C{own}", recipe, LFP_CAPTURES[t]) for t, own, recipe in LFP_FILES),
     Group("generic nca: PF", Recipe(2.9, generic="nca"), PF_CAPTURES["25"]),
     Group("generic nca: NCR", Recipe(3.0, generic="nca"), NCR_CHANGING),
     Group("generic lmo: Leaf", Recipe(30.5, generic="lmo"), LEAF_CAPTURES),
@@ -139,9 +152,10 @@ def cell_file(recipe: Recipe, folder: Path) -> CellModel:
     """By `ocv`, then `identify`; what they refuse to write is not used, and said."""
     if recipe.generic:
         return load_cell(recipe.generic, recipe.capacity_ah)
-    stem = f"{recipe.identify[0].replace('/', '_')}_{len(recipe.identify)}"
+    stem = f"{recipe.identify[0].replace('/', '_')}_{len(recipe.identify)}_{recipe.identify[-1].replace('/', '_')}"
     curve, whole = folder / f"{stem}_ocv.toml", folder / f"{stem}.toml"
-    command("ocv", *map(path_of, recipe.ocv), "--capacity-ah", recipe.capacity_ah, "--out", curve)
+    told = () if recipe.measured else ("--capacity-ah", recipe.capacity_ah)
+    command("ocv", *map(path_of, recipe.ocv), *told, "--out", curve)
     refused = command("identify", *map(path_of, recipe.identify), "--cell", curve, "--out", whole)
     return load_cell(curve if refused else whole)
 

@@ -16,7 +16,7 @@ from bms_estimator.estimator.filter_settings import BRANCHES_STD, SOC_GRID, TYPI
 from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.sample import SampleBlock
-from tests.benchmarks.recipes import LEAF, LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_ALL, Recipe, load
+from tests.benchmarks.recipes import LEAF, LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_PULSES, Recipe, load
 
 Floats = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ TRIALS = (
         ),
     ),
     *(
-        Trial(f"PF {c:g}", PF_ALL, Part(PF + f"{t}_hppc"), tuple(Part(PF + f"{t}_{name}") for name in names), c)
+        Trial(f"PF {c:g}", PF_PULSES, Part(PF + f"{t}_hppc"), tuple(Part(PF + f"{t}_{name}") for name in names), c)
         for t, c, names in (
             ("25", 25.0, ("us06", "cycle1")),
             ("10", 10.0, ("us06",)),
