@@ -197,15 +197,21 @@ def cell_file(case: Case) -> CellModel:
     slope_v = np.gradient(case.truth.ocv_v, GRID)
     std_v, std_soc_v = case.curve_error * OCV_STD_V[kind], case.curve_error * OCV_STD_SOC * slope_v
     wrong_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
-    told_v = (case.truth.ocv_v + wrong_v)[OCV_NODES]
+    told_v = rising((case.truth.ocv_v + wrong_v)[OCV_NODES])
     table = {
         "soc": GRID[OCV_NODES],
-        "ocv_v": np.maximum.accumulate(told_v) + 1e-6 * np.arange(OCV_NODES.size),
+        "ocv_v": told_v + 1e-6 * np.arange(OCV_NODES.size),
         "error_v": np.hypot(std_v, std_soc_v)[OCV_NODES],
         "hysteresis_v": np.full(OCV_NODES.size, case.truth.hysteresis_v[GRID.size // 2]),
     }
     ocv = TableOcv(form="table", **{name: tuple(column) for name, column in table.items()})
     return generic.model_copy(update={"ocv": ocv, "ladder": ladder(case.truth, case.file_c, rng)})
+
+
+def rising(curve_v: Floats) -> Floats:
+    """The same, level where it falls, from the middle outwards: an end that is wrong by its steepness moves nothing else."""
+    half = curve_v.size // 2
+    return np.r_[np.minimum.accumulate(curve_v[half - 1 :: -1])[::-1], np.maximum.accumulate(curve_v[half:])]
 
 
 def ladder(truth: Truth, temperatures_c: tuple[float, ...], rng: np.random.Generator) -> Ladder:
