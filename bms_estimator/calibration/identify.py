@@ -170,10 +170,13 @@ def identify(
     runs = [_run(load, cell, initial_soc, temperature_c) for load in loads]
     runs = _recounted(runs, cell, refine_ocv=refine_ocv)
     left_out = tuple(load.name for load in whole if without_excitation(load, cell))
-    candidates = [_Candidate(runs, cell, refine_ocv=refine) for refine in ((True, False) if refine_ocv else (False,))]
+    candidates = [_Candidate(runs, cell, refine_ocv=refine) for refine in ((False, True) if refine_ocv else (False,))]
     before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
     after = [candidate.scores() for candidate in candidates]
-    best = int(np.argmin([_mean(scores) for scores in after])) if np.isfinite(before).any() else 0
+    best = len(after) - 1  # where nothing can be judged
+    if np.isfinite(before).any():
+        judged = any(candidates[0].held_back(j) for j in range(len(runs)))
+        best = int((NO_WORSE if judged else 1.0) * _mean(after[-1]) < _mean(after[0]))
     outcome = candidates[best].outcome(before, after[best], left_out)
     if outcome.score_after > NO_WORSE * outcome.score_before:
         raise UserError(_worse(outcome))

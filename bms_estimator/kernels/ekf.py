@@ -211,6 +211,21 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
 
 
 @njit(cache=True)
+def learn(s: Record, q: int, j: int, value: float, variance: float) -> None:
+    """State ``j`` of hypothesis ``q`` is ``value``, to ``variance``: a textbook update, linear."""
+    x, cov, ph = s.mean[q], s.covariance[q], s.ph
+    scale = 1.0 / math.sqrt(cov[j, j] + variance)
+    innovation = scale * (value - x[j])
+    for k in range(STATES):
+        ph[k] = scale * cov[j, k]
+    for k in range(STATES):
+        x[k] += ph[k] * innovation
+        for m in range(STATES):
+            cov[k, m] -= ph[k] * ph[m]
+    x[SOC] = min(max(x[SOC], LOWEST), HIGHEST)
+
+
+@njit(cache=True)
 def inflate(s: Record, q: int, dt_s: float, u: float) -> None:
     """Let the variance of the biases follow what innovations have in common over a minute and over ten.
 

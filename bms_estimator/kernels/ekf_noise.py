@@ -68,13 +68,13 @@ def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> flo
 def bias_variance(s: Record, p: Record, soc: float) -> float:
     """Variance of B_SLOW + B_FAST [V^2] at a steady state: resistances are wrong in proportion, and along SOC.
 
-    A cold cell is empty early, and no file says well by how much: in its lower half the shift along SOC grows in the cold as R
-    does, and moves the last fall of the OCV, too.
+    A cold cell is empty early, and no file says well by how much: in its lower half the shift along SOC grows in the cold as
+    resistances do, and moves the last fall of the OCV, too.
     """
     ohm = total_resistance(s, p, soc)
     shift, early_v = p.bias_soc, 0.0
     if soc < LOWER_HALF:
-        shift *= arrhenius(p.model_j, s.temperature_c)
+        shift *= s.weak
         early_v = 0.5 * (ocv(soc + shift, p.ocv_v, p.ocv_slope_v) - ocv(soc - shift, p.ocv_v, p.ocv_slope_v))
         early_v = max(early_v - STEEP_V * p.series * shift, 0.0)
     steep = total_resistance(s, p, soc - shift) - total_resistance(s, p, soc + shift)

@@ -45,8 +45,8 @@ class Noise:
     """B: error of the model that stays, relative to the sum of the resistances times the RMS current of 10 min."""
     bias_grown: float = 0.11
     """B: the same by which resistances have grown, in the cold and near empty, beyond those at 25 C and SOC 0.5."""
-    bias_soc: float = 0.03
-    """B: the same from a shift of resistances and of the OCV's last fall along SOC, at 25 C; it grows with ``model_j``."""
+    bias_soc: float = 0.035
+    """B: the same from a shift of resistances and of the OCV's last fall along SOC, at 25 C; it grows with ``WEAK_J``."""
     slow_s: float = 3600.0
     fast_s: float = 45.0
     """B: half of its variance each changes within so long [s]."""
@@ -62,6 +62,8 @@ class Noise:
     """Offset of the current sensor, std [C] ..."""
     offset_s: float = 10.0 * 86400.0
     """... and the time in which it becomes another [s]."""
+    zero_std_c: float = 0.001
+    """The same of a sensor that shows no current at rest, std [C]."""
     capacity_std: float = 0.08
     """Capacity, relative std, ..."""
     aged_soc: float = 1000.0
@@ -78,8 +80,10 @@ class Noise:
     """... the std of that, constant for hours, ..."""
     load_s: float = 20.0
     """... and for how long it stays the same [s]."""
-    temper: float = 0.2
+    temper: float = 0.17
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
+    least_nis: float = 0.25
+    """For weights, S is as large as innovations are, down to this part of what R and B allow for."""
     hysteresis_soc: float = 0.05
     """Charge that leads from one branch of the hysteresis to the other [SOC]."""
 
@@ -153,10 +157,14 @@ EKF_STATE = np.dtype(
         ("count", "i8"),  # hypotheses in use
         ("best", "i8"),  # the likeliest
         ("started", "i8"),
+        ("nis", "f8"),  # mean of the likeliest's, over ``NIS_S``
         ("reopened", "i8"),  # times the SOC became unknown: the model would have to be wrong by too much
         ("window", WINDOW),
         ("current_a", "f8"),  # of the last sample
         ("same_s", "f8"),  # for so long the shown current has been the same, to a step [s]
+        ("rest_s", "f8"),  # for so long no load has been shown [s] ...
+        ("rest_as", "f8"),  # ... and the charge that was shown all the same [A s]
+        ("smallest_a", "f8"),  # the smallest that was shown and is not 0 [A]; 0: none yet
         ("step", STEP),
         ("x_a", "f8", BRANCHES),  # current filtered by the branches since switch-on [A]
         ("decay", "f8", BRANCHES),  # of the branches over ``decay_s``

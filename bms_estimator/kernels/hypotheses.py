@@ -18,6 +18,7 @@ from bms_estimator.kernels.ekf_noise import (
     bias_variance,
     measurement_variance,
     offset_variance,
+    outside,
     resistance_std,
     switch_on,
 )
@@ -48,6 +49,7 @@ from bms_estimator.kernels.unseen import (
     unseen_charge,
     watch_load,
 )
+from bms_estimator.kernels.zero_current import learn_from_zero, watch_smallest
 
 WINDOW_S = 0.99
 """Samples of about a second make one update [s]."""
@@ -71,6 +73,8 @@ COLDEST_C, HOTTEST_C = -60.0, 120.0
 """Where a cell's temperature may be [C]."""
 HYST_STD = 0.7
 """Std of the first hysteresis."""
+NIS_S = 1800.0
+"""How large innovations are is averaged over so long [s]."""
 REOPEN_STDS = 4.0
 """A model that would have to be wrong by so many std is not: the SOC is ..."""
 REOPEN_STD = 0.2
@@ -82,6 +86,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     """First sample: nothing is known but the told ``soc``, to ``p.soc_std``."""
     s.started, s.best = 1, 0
     s.current_a = current_a
+    s.rest_s = s.rest_as = s.smallest_a = 0.0
     s.sensed = 1 if is_temperature(temperature_c) else 0
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
@@ -141,6 +146,7 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
     for q in range(s.count, HYPOTHESES):
         vacate(s, q)
     s.best = (s.count - 1) // 2
+    s.nis = 1.0
     combine(s)
 
 
@@ -220,6 +226,7 @@ def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, tem
         w.rounded_as2 += rounded_charge(s, p, dt_s, current_a)
     s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
+    watch_smallest(s, current_a)
 
 
 @njit(cache=True)
@@ -257,14 +264,14 @@ def update_all(s: Record, p: Record) -> None:
         decay(s, p)
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
-    best = 0
+    share, best = size_of_errors(s, p), 0
     for q in range(s.count):
         if dt_s > 0.0:
             predict(s, p, q)
         innovation_v, total_v2, straight_v2 = update(s, p, q, variance_v2)
         u = innovation_v / math.sqrt(total_v2)
         # a bend's part of S stays while nothing moves: counted each second, it would tell against the knee at full rest
-        s.ln_weight[q] -= p.temper * (innovation_v * innovation_v / straight_v2 + math.log(straight_v2))
+        s.ln_weight[q] -= p.temper * (innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2))
         if dt_s > 0.0:
             inflate(s, q, dt_s, u)
         if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
@@ -272,10 +279,23 @@ def update_all(s: Record, p: Record) -> None:
             s.innovation_v, s.innovation_variance = innovation_v, total_v2
     s.voltage_v = w.sum_v / w.samples - s.innovation_v
     s.best = best
+    s.nis += min(1.0, dt_s / NIS_S) * (s.innovation_v**2 / s.innovation_variance - s.nis)
+    learn_from_zero(s, p)
     merge(s)
     combine(s)
     reopen(s, p)
     clear(s)
+
+
+@njit(cache=True)
+def size_of_errors(s: Record, p: Record) -> float:
+    """What S is in truth, over what the filters take it for, by the innovations of the last half hour.
+
+    R and the biases allow for loads and cells that the file fits worst. Where it fits better, innovations far within S would
+    leave it to ln S to judge, and the hypothesis of the smallest S would win. Outside the temperatures of the cell file small
+    innovations prove nothing: its errors there are the same all the time.
+    """
+    return min(max(s.nis, p.least_nis * outside(p, s.temperature_c) ** 2), 1.0)
 
 
 @njit(cache=True)
