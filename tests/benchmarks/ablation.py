@@ -69,10 +69,12 @@ PARTS: dict[str, Change] = {
     "knees as sure as the rest of the curve": setting(curve_soc=CURVE_SOC),
     "no hysteresis": setting(hysteresis_v=0.0),
     "no offset": setting(offset_c=0.0),
+    "a rest without current tells nothing": setting(zero_std_c=1.0),
     "no error of the capacity": setting(capacity_std=0.0),
     "offset and capacity do not change": setting(offset_s=1e12, aged_soc=1e9),
     "polarisation from the first current": setting(load_c=0.0, load_level_c=1e-3),
     "weights not tempered": setting(temper=0.5),
+    "weights by S as it is": setting(least_nis=1.0),
 }
 ONE_FILTER, NO_TEMPERATURE = "one hypothesis", "temperature not used"
 
