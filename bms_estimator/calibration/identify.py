@@ -175,8 +175,9 @@ def identify(
     after = [candidate.scores() for candidate in candidates]
     best = len(after) - 1  # where nothing can be judged
     if np.isfinite(before).any():
-        judged = any(candidates[0].held_back(j) for j in range(len(runs)))
-        best = int((NO_WORSE if judged else 1.0) * _mean(after[-1]) < _mean(after[0]))
+        judged = [j for j in range(len(runs)) if candidates[0].held_back(j)]
+        kept, own = (_mean(scores[judged] if judged else scores) for scores in (after[0], after[-1]))
+        best = int((NO_WORSE if judged else 1.0) * own < kept)
     outcome = candidates[best].outcome(before, after[best], left_out)
     if outcome.score_after > NO_WORSE * outcome.score_before:
         raise UserError(_worse(outcome))

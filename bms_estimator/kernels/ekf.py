@@ -211,7 +211,7 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
 
 
 @njit(cache=True)
-def learn(s: Record, q: int, j: int, value: float, variance: float) -> None:
+def observe(s: Record, q: int, j: int, value: float, variance: float) -> None:
     """State ``j`` of hypothesis ``q`` is ``value``, to ``variance``: a textbook update, linear."""
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     scale = 1.0 / math.sqrt(cov[j, j] + variance)

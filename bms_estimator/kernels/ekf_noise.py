@@ -69,7 +69,7 @@ def bias_variance(s: Record, p: Record, soc: float) -> float:
     """Variance of B_SLOW + B_FAST [V^2] at a steady state: resistances are wrong in proportion, and along SOC.
 
     A cold cell is empty early, and no file says well by how much: in its lower half the shift along SOC grows in the cold as
-    resistances do, and moves the last fall of the OCV, too.
+    their weak part does, and moves the last fall of the OCV, too.
     """
     ohm = total_resistance(s, p, soc)
     shift, early_v = p.bias_soc, 0.0

@@ -63,7 +63,7 @@ class Noise:
     offset_s: float = 10.0 * 86400.0
     """... and the time in which it becomes another [s]."""
     zero_std_c: float = 0.001
-    """The same of a sensor that shows no current at rest, std [C]."""
+    """Offset of a sensor that has shown no current at rest, std [C]."""
     capacity_std: float = 0.08
     """Capacity, relative std, ..."""
     aged_soc: float = 1000.0
@@ -82,8 +82,8 @@ class Noise:
     """... and for how long it stays the same [s]."""
     temper: float = 0.17
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
-    least_nis: float = 0.25
-    """For weights, S is as large as innovations are, down to this part of what R and B allow for."""
+    least_share: float = 0.25
+    """For weights S shrinks to this part of what R and B, which allow for the worst, make of it."""
     hysteresis_soc: float = 0.05
     """Charge that leads from one branch of the hysteresis to the other [SOC]."""
 
@@ -157,7 +157,7 @@ EKF_STATE = np.dtype(
         ("count", "i8"),  # hypotheses in use
         ("best", "i8"),  # the likeliest
         ("started", "i8"),
-        ("nis", "f8"),  # mean of the likeliest's, over ``NIS_S``
+        ("seeded_s", "f8"),  # for so long the hypotheses have been there [s]
         ("reopened", "i8"),  # times the SOC became unknown: the model would have to be wrong by too much
         ("window", WINDOW),
         ("current_a", "f8"),  # of the last sample

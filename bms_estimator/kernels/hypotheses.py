@@ -73,8 +73,8 @@ COLDEST_C, HOTTEST_C = -60.0, 120.0
 """Where a cell's temperature may be [C]."""
 HYST_STD = 0.7
 """Std of the first hysteresis."""
-NIS_S = 1800.0
-"""How large innovations are is averaged over so long [s]."""
+KNOWN_S = 1800.0
+"""What was before switch-on is forgotten in so long [s]."""
 REOPEN_STDS = 4.0
 """A model that would have to be wrong by so many std is not: the SOC is ..."""
 REOPEN_STD = 0.2
@@ -86,7 +86,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     """First sample: nothing is known but the told ``soc``, to ``p.soc_std``."""
     s.started, s.best = 1, 0
     s.current_a = current_a
-    s.rest_s = s.rest_as = s.smallest_a = 0.0
+    s.smallest_a = 0.0
     s.sensed = 1 if is_temperature(temperature_c) else 0
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
@@ -146,7 +146,7 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
     for q in range(s.count, HYPOTHESES):
         vacate(s, q)
     s.best = (s.count - 1) // 2
-    s.nis = 1.0
+    s.seeded_s = s.rest_s = s.rest_as = 0.0
     combine(s)
 
 
@@ -225,8 +225,8 @@ def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, tem
     if p.current_step_a > 0.0 or p.dead_band_a > 0.0:
         w.rounded_as2 += rounded_charge(s, p, dt_s, current_a)
     s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
-    s.current_a = current_a
     watch_smallest(s, current_a)
+    s.current_a = current_a
 
 
 @njit(cache=True)
@@ -263,6 +263,7 @@ def update_all(s: Record, p: Record) -> None:
             watch_load(s, w.charge_as / dt_s, dt_s)
         decay(s, p)
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
+    s.seeded_s += dt_s
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
     share, best = size_of_errors(s, p), 0
     for q in range(s.count):
@@ -279,7 +280,6 @@ def update_all(s: Record, p: Record) -> None:
             s.innovation_v, s.innovation_variance = innovation_v, total_v2
     s.voltage_v = w.sum_v / w.samples - s.innovation_v
     s.best = best
-    s.nis += min(1.0, dt_s / NIS_S) * (s.innovation_v**2 / s.innovation_variance - s.nis)
     learn_from_zero(s, p)
     merge(s)
     combine(s)
@@ -289,13 +289,13 @@ def update_all(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def size_of_errors(s: Record, p: Record) -> float:
-    """What S is in truth, over what the filters take it for, by the innovations of the last half hour.
+    """What S is in truth, over what the filters take it for.
 
-    R and the biases allow for loads and cells that the file fits worst. Where it fits better, innovations far within S would
-    leave it to ln S to judge, and the hypothesis of the smallest S would win. Outside the temperatures of the cell file small
-    innovations prove nothing: its errors there are the same all the time.
+    R and the biases allow for loads and cells that the file fits worst. Mostly it fits better, once what was before switch-on
+    is forgotten: innovations far within S would leave it to ln S to judge, and the hypothesis of the smallest S would win.
+    Outside the temperatures of the cell file nothing of the kind is known.
     """
-    return min(max(s.nis, p.least_nis * outside(p, s.temperature_c) ** 2), 1.0)
+    return min(max(math.exp(-s.seeded_s / KNOWN_S), p.least_share * outside(p, s.temperature_c) ** 2), 1.0)
 
 
 @njit(cache=True)
