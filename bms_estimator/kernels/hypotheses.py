@@ -38,6 +38,7 @@ from bms_estimator.kernels.ekf_state import (
 )
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius, on_grid
 from bms_estimator.kernels.ocv_learning import forget_curve
+from bms_estimator.kernels.self_heating import warm
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
 from bms_estimator.kernels.unseen import (
@@ -261,6 +262,8 @@ def update_all(s: Record, p: Record) -> None:
     if dt_s > 0.0:
         if not w.gap:
             watch_load(s, w.charge_as / dt_s, dt_s)
+        if not s.sensed:
+            warm(s, p, w.charge_as / dt_s, dt_s)
         decay(s, p)
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     s.seeded_s += dt_s

@@ -28,6 +28,8 @@ KINETIC = 2
 """The process of 3 s: charge transfer."""
 KINETIC_V = 0.051
 """2 R T / F: where its resistance begins to fall [V]."""
+COOLS_S = 900.0
+"""Time constant in which a cell gets warm [s]."""
 GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 LOOPS_SOC, FAST_LOOP = (0.015, 0.15), 0.6
 """Charge that leads from one branch of the hysteresis to the other, fast and slow, and the share of the fast one."""
@@ -55,20 +57,24 @@ def along(soc, values):
 
 
 @njit
-def simulate(dt_s, current_a, temperature_c, soc, branch, capacity_ah, ocv_v, per_kelvin_v, hysteresis_v, ohm):
-    """Terminal voltage [V] and SOC at each sample, from rest; the current holds until the next sample."""
+def simulate(dt_s, current_a, room_c, warms_k, soc, branch, capacity_ah, ocv_v, per_kelvin_v, hysteresis_v, ohm):
+    """Terminal voltage [V] and SOC at each sample, from rest; the current holds until the next sample.
+
+    A loss of 1 W warms the cell by ``warms_k`` above ``room_c``, in the end.
+    """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
-    x, fast, slow = np.zeros(len(TAU_S)), branch, branch
+    x, fast, slow, rise_k = np.zeros(len(TAU_S)), branch, branch, 0.0
     for n in range(len(current_a)):
-        i, kelvin = current_a[n], temperature_c[n] + KELVIN
-        cold = (1.0 / kelvin - 1.0 / REFERENCE_K) / GAS_J
+        i, celsius = current_a[n], room_c[n] + rise_k
+        cold = (1.0 / (celsius + KELVIN) - 1.0 / REFERENCE_K) / GAS_J
         x[0] = i
-        v = along(soc, ocv_v) + (temperature_c[n] - 25.0) * along(soc, per_kelvin_v)
-        v += along(soc, hysteresis_v) * (FAST_LOOP * fast + (1.0 - FAST_LOOP) * slow)
+        open_v = along(soc, ocv_v) + (celsius - 25.0) * along(soc, per_kelvin_v)
+        v = open_v + along(soc, hysteresis_v) * (FAST_LOOP * fast + (1.0 - FAST_LOOP) * slow)
         for k in range(len(TAU_S)):
             drop_v = x[k] * along(soc, ohm[:, k]) * math.exp(ENERGY_J[k] * cold)
             v -= KINETIC_V * math.asinh(drop_v / KINETIC_V) if k == KINETIC else drop_v
         voltage_v[n], true_soc[n] = v, soc
+        rise_k += (warms_k * i * (open_v - v) - rise_k) * dt_s / COOLS_S
         moved = i * dt_s / 3600.0 / capacity_ah
         soc -= moved
         for k in range(1, len(TAU_S)):
