@@ -342,8 +342,11 @@ def _temperature_range(runs: list[Run]) -> tuple[float, float]:
 
 
 def _share(ladder: Ladder) -> Floats:
-    """Weak part of each resistance, mean over SOC."""
-    weak, strong = np.array(ladder.weak_ohm).mean(axis=1), np.array(ladder.strong_ohm).mean(axis=1)
+    """Weak part of each resistance, at ``SOC_NODES``."""
+    weak, strong = (
+        np.array([np.interp(SOC_NODES, ladder.soc, ohm) for ohm in rows])
+        for rows in (ladder.weak_ohm, ladder.strong_ohm)
+    )
     return np.where(weak + strong > 0.0, weak / np.maximum(weak + strong, 1e-12), WEAK_SHARE)
 
 

@@ -34,9 +34,10 @@ KELVIN_NODES = np.array([0.0, 0.15, 0.3, 0.5, 0.75, 1.0])
 """Of dE/dT."""
 KNOTS = np.unique(np.round(np.r_[np.arange(0.0, 0.25, 0.025), np.arange(0.25, 1.0, 0.045), 1.0], 4))
 """Of the correction of the OCV."""
-WEAK_SHARE = np.array([0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57])
-"""Weak part of each resistance at 25 C where captures of one temperature cannot tell: of an 18650 NCA cell from -10 to
-33 C, mean over SOC 0.3 to 1."""
+WEAK_SHARE = np.outer([0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57], [0.45, 0.5, 0.8, 0.9, 1.0, 1.0, 1.0, 1.0])
+"""Weak part of each resistance, at ``SOC_NODES``, where captures of one temperature cannot tell: that of an 18650 NCA cell from
+-10 to 33 C above SOC 0.3, times what it falls by towards empty, between that cell (to 0.14 of it at
+SOC 0.1) and an LFP one (to 0.92)."""
 
 TYPICAL_V = 0.09
 """The scale of all resistances: what R_0 and the fast branches take at 1 C, per cell [V]."""
@@ -151,7 +152,7 @@ class Prior:
         per_kelvin_v: Std of u [V/K]; tiny: held.
         scale_ohm: Of the resistances [ohm].
         series: Cells in series.
-        weak_share: Of each resistance; None: the captures tell.
+        weak_share: Shape (RESISTANCES, SOC_NODES.size), of each resistance; None: the captures tell.
     """
 
     ocv_error_v: Floats
@@ -245,7 +246,7 @@ def fit_ladder(captures: list[Moments], prior: Prior) -> LadderFit:
     right = np.asarray(sum(one.right for one in captures))
     to_all = np.eye(FREE + 2 * PART)
     if prior.weak_share is not None:
-        share = np.repeat(prior.weak_share, SOC_NODES.size)
+        share = prior.weak_share.ravel()
         to_all = np.zeros((FREE + 2 * PART, FREE + PART))
         to_all[:FREE, :FREE] = np.eye(FREE)
         to_all[FREE : FREE + PART, FREE:], to_all[FREE + PART :, FREE:] = np.diag(share), np.diag(1.0 - share)

@@ -35,7 +35,7 @@ LOWER_HALF = 0.5
 """SOC below which a cell may be empty early."""
 STEEP_V = 1.0
 """Slope of the OCV of a cell that is its last fall [V]; where it is less, ``curve_error_v`` says how wrong the curve is."""
-OUTSIDE_K = 10.0
+OUTSIDE_K = 30.0
 """So far outside the temperatures of the cell file, errors are twice as large [K]."""
 
 

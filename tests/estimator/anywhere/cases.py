@@ -114,7 +114,7 @@ CASES: tuple[Case, ...] = (
     Case("knows 25C at -20C", temperature_c=-20.0, load_c=0.25, **KNOWS_25, seed=14),
     Case("rising 5..25C", temperature_c=5.0, rising_k=20.0, seed=15),
     Case("no sensor at 15C", temperature_c=15.0, sensed=False, seed=16),
-    Case("no sensor, warms itself", load="constant", load_c=1.2, sensed=False, **WARMS, seed=31),
+    Case("warms itself", load="constant", load_c=1.2, sensed=False, **WARMS, seed=31),
     Case("LFP full 25C", **LFP, soc=1.0, unseen_h=0.0, seed=17),
     Case("LFP full -10C", **LFP, temperature_c=-10.0, load_c=0.4, soc=1.0, unseen_h=0.0, seed=18),
     Case("LFP cut 25C", **LFP, hours=1.5, seed=19),
@@ -175,7 +175,7 @@ def capture(case: Case, current_a: Floats | None = None) -> Capture:
         t = replace(case.truth, capacity_ah=case.truth.capacity_ah * (case.weak_cell if n == 0 else 1.0))
         curves = t.ocv_v, t.per_kelvin_v, t.hysteresis_v, t.ohm
         branch = 1.0 if case.soc == 1.0 else -1.0
-        volt, true = simulate(dt_s, current_a, temperature_c, case.warms_k, case.soc, branch, t.capacity_ah, *curves)
+        volt, true = simulate(dt_s, current_a, temperature_c, case.soc, branch, t.capacity_ah, *curves, case.warms_k)
         voltage_v, soc = voltage_v + volt, np.minimum(soc, true)
     begin = int(np.searchsorted(time_s, PER_HOUR_S * case.unseen_h))
     empty = (soc < 0.02) | (voltage_v < 2.5 * cells if case.truth is OXIDE else voltage_v < 2.0)

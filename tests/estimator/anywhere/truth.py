@@ -57,7 +57,7 @@ def along(soc, values):
 
 
 @njit
-def simulate(dt_s, current_a, room_c, warms_k, soc, branch, capacity_ah, ocv_v, per_kelvin_v, hysteresis_v, ohm):
+def simulate(dt_s, current_a, room_c, soc, branch, capacity_ah, ocv_v, per_kelvin_v, hysteresis_v, ohm, warms_k=0.0):
     """Terminal voltage [V] and SOC at each sample, from rest; the current holds until the next sample.
 
     A loss of 1 W warms the cell by ``warms_k`` above ``room_c``, in the end.
