@@ -130,15 +130,7 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
             break
         soc, variance = to_soc, to_variance
         innovation_v, total_v2, straight_v2 = innovate(s, p, q, variance_v2, soc, variance)
-    scale = 1.0 / math.sqrt(total_v2)
-    for j in range(STATES):
-        ph[j] *= scale
-    for j in range(STATES):
-        along, row = ph[j], cov[j]
-        x[j] += along * scale * innovation_v
-        for k in range(STATES):
-            row[k] -= along * ph[k]  # the same at k, j to the last bit
-    x[SOC] = min(max(x[SOC], LOWEST), HIGHEST)
+    correct(x, cov, ph, innovation_v, total_v2)
     most = MOST_STDS * resistance_std(s, p)
     for j in (LN_R0, LN_R):
         x[j] = min(max(x[j], -most), most)
@@ -214,14 +206,22 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
 def observe(s: Record, q: int, j: int, value: float, variance: float) -> None:
     """State ``j`` of hypothesis ``q`` is ``value``, to ``variance``: a textbook update, linear."""
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
-    scale = 1.0 / math.sqrt(cov[j, j] + variance)
-    innovation = scale * (value - x[j])
     for k in range(STATES):
-        ph[k] = scale * cov[j, k]
-    for k in range(STATES):
-        x[k] += ph[k] * innovation
-        for m in range(STATES):
-            cov[k, m] -= ph[k] * ph[m]
+        ph[k] = cov[j, k]
+    correct(x, cov, ph, value - x[j], cov[j, j] + variance)
+
+
+@njit(cache=True)
+def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: float) -> None:
+    """State and P by an innovation e of variance S: x + P H' e / S, P - P H' H P / S. ``ph`` is P H', and scratch afterwards."""
+    scale = 1.0 / math.sqrt(variance)
+    for j in range(STATES):
+        ph[j] *= scale
+    for j in range(STATES):
+        along, row = ph[j], cov[j]
+        x[j] += along * scale * innovation
+        for k in range(STATES):
+            row[k] -= along * ph[k]  # the same at k, j to the last bit
     x[SOC] = min(max(x[SOC], LOWEST), HIGHEST)
 
 

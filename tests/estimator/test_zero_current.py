@@ -68,11 +68,15 @@ def test_what_may_be_a_load_or_hidden_tells_nothing(unknown) -> None:
     assert offset_after(**unknown)[1] > 0.7 * FIRST_STD_A
 
 
-def offset_of(steps):
-    """Offset and its std [A] after steps of (duration [s], current [A], pause between samples [s]) behind a load."""
-    estimator = Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6)
+LOAD = (100, 1.0, 1), (20, FINE_A, 1), (100, 1.0, 1)
+
+
+def offset_of(steps, estimator=None):
+    """Offset and its std [A] after steps of (duration [s], current [A], pause between samples [s]), if new behind a load."""
+    steps = [*LOAD, *steps] if estimator is None else steps
+    estimator = estimator or Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6)
     time_s, times, currents = 0.0, [], []
-    for duration_s, current_a, step_s in ((100, 1.0, 1), (20, FINE_A, 1), (100, 1.0, 1), *steps):
+    for duration_s, current_a, step_s in steps:
         for _ in range(round(duration_s / step_s)):
             time_s += step_s
             times.append(time_s)
@@ -87,6 +91,24 @@ def test_samples_on_both_sides_of_zero_are_no_rest() -> None:
     """A minute apart, as where the sun comes and goes: in the mean nothing, and no zero was shown."""
     crossing = [(60, current_a, 60) for current_a in (2.0, -2.0) * 10]
     assert offset_of(crossing)[1] > 0.7 * FIRST_STD_A
+
+
+def test_one_odd_small_sample_does_not_show_what_the_sensor_can() -> None:
+    """The mean over an edge may be anything; two in a row are a current."""
+    edge = [(100, 1.0, 1), (1, FINE_A, 1), (100, 1.0, 1), (120, 0.0, 1)]
+    estimators = [Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6) for _ in range(2)]
+    assert offset_of(edge, estimators[0])[1] > 0.7 * FIRST_STD_A
+    assert offset_of([*LOAD, *edge], estimators[1])[1] < 1.2 * ZERO_STD_A
+
+
+@pytest.mark.parametrize("behind", [(), LOAD], ids=["nothing shown", "shown again"])
+def test_after_a_restart_the_sensor_may_be_another_and_shows_anew_what_it_can(behind) -> None:
+    estimator = Estimator(load_cell("nmc", CAPACITY_AH), initial_soc=0.6)
+    offset_of([*LOAD, (50, 0.0, 1)], estimator)
+    estimator.resume(3600.0)
+    std_a = offset_of([*behind, (130, 0.0, 1)], estimator)[1]
+    assert (std_a < 1.2 * ZERO_STD_A) == bool(behind)
+    assert behind or std_a > 0.7 * FIRST_STD_A
 
 
 def test_a_small_load_that_begins_after_a_long_rest_is_judged_by_itself() -> None:
