@@ -148,7 +148,7 @@ class Estimator:
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
         if self.identifying:
             self.record["filter"]["soc"] = self.state["soc"]
-            self.record["filter"]["smallest_a"] = 0.0  # the sensor may be another
+            self.record["filter"]["smallest_a"] = 0.0  # a sensor shows anew what it can
         if math.isfinite(unseen_s):
             self.record["unlearned_s"] += unseen_s
 

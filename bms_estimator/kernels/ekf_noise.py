@@ -3,6 +3,8 @@
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
 
+import math
+
 from numba import njit
 
 from bms_estimator.kernels.cell import Floats, ocv
@@ -20,7 +22,7 @@ from bms_estimator.kernels.ekf_state import (
     SOC,
     X,
 )
-from bms_estimator.kernels.ladder import BRANCHES, RESISTANCES, TAUS, arrhenius, resistances
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, RESISTANCES, TAUS, arrhenius, resistances
 from bms_estimator.kernels.state import Record
 
 FLOOR_C = 0.1
@@ -29,6 +31,8 @@ INDEPENDENT_S = 30.0
 """A sample after a longer pause tells no more [s]."""
 UNSENSED_R_STD = 0.25
 """Std of ln of the resistances where nobody measures the temperature: 10 K either way."""
+WARMED_R_STD = 0.015
+"""The same for each kelvin by which it makes itself warmer: half of them may be wrong [1/K]."""
 AGED_SOC = 400.0
 """Charge over which the curve of a cell becomes another with age: 200 full cycles [SOC]."""
 LOWER_HALF = 0.5
@@ -48,7 +52,9 @@ def outside(p: Record, temperature_c: float) -> float:
 @njit(cache=True)
 def resistance_std(s: Record, p: Record) -> float:
     """Std of ln of the true over the file's resistances: without a temperature they may be anything near."""
-    return p.r_std if s.sensed else max(p.r_std, UNSENSED_R_STD)
+    if s.sensed:
+        return p.r_std
+    return max(p.r_std, math.hypot(UNSENSED_R_STD, WARMED_R_STD * (s.temperature_c - REFERENCE_C)))
 
 
 @njit(cache=True)
@@ -60,7 +66,8 @@ def offset_variance(p: Record) -> float:
 @njit(cache=True)
 def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> float:
     """R [V^2] of the mean voltage of a window: what the ladder leaves, far more than the sensor's noise."""
-    model_v = p.model_v * arrhenius(p.model_j, s.temperature_c) * outside(p, s.temperature_c)
+    measured_c = s.temperature_c if s.sensed else REFERENCE_C  # what is estimated makes nothing surer
+    model_v = p.model_v * arrhenius(p.model_j, measured_c) * outside(p, s.temperature_c)
     return model_v * model_v / min(max(dt_s, 1.0), INDEPENDENT_S) + p.sensor_v2 / samples
 
 

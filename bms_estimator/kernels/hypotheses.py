@@ -255,6 +255,14 @@ def gather(s: Record, current_a: float, voltage_v: float) -> None:
 
 
 @njit(cache=True)
+def pass_time(s: Record, p: Record) -> None:
+    """What the time of the window does to the temperature, where nobody measures it, and to F."""
+    if not s.sensed:
+        warm(s, p)
+    decay(s, p)
+
+
+@njit(cache=True)
 def update_all(s: Record, p: Record) -> None:
     """Take the window in, with every hypothesis."""
     w = s.window
@@ -262,9 +270,7 @@ def update_all(s: Record, p: Record) -> None:
     if dt_s > 0.0:
         if not w.gap:
             watch_load(s, w.charge_as / dt_s, dt_s)
-        if not s.sensed:
-            warm(s, p, w.charge_as / dt_s, dt_s)
-        decay(s, p)
+        pass_time(s, p)
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     s.seeded_s += dt_s
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
@@ -296,7 +302,7 @@ def size_of_errors(s: Record, p: Record) -> float:
 
     R and the biases allow for loads and cells that the file fits worst. Mostly it fits better, once what was before switch-on
     is forgotten: innovations far within S would leave it to ln S to judge, and the hypothesis of the smallest S would win.
-    Outside the temperatures of the cell file nothing of the kind is known.
+    Outside the temperatures of the cell file less of the kind is known, ``OUTSIDE_K`` away nothing.
     """
     return min(max(math.exp(-s.seeded_s / KNOWN_S), p.least_share * outside(p, s.temperature_c) ** 2), 1.0)
 

@@ -7,11 +7,21 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.ekf import decay, predict
+from bms_estimator.kernels.ekf import predict
 from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
 from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, equivalent, told, told_by_steps
-from bms_estimator.kernels.hypotheses import ONE_STD, WINDOW_S, clear, count_on, gather, seed, start, update_all
+from bms_estimator.kernels.hypotheses import (
+    ONE_STD,
+    WINDOW_S,
+    clear,
+    count_on,
+    gather,
+    pass_time,
+    seed,
+    start,
+    update_all,
+)
 from bms_estimator.kernels.input_checks import (
     SIGN_OF_CURRENT,
     believed,
@@ -80,7 +90,7 @@ def identify(
     count_on(f, p.filter, dt_s, gap, current_a, temperature_c)
     unknown = f.window.unknown_as / p.filter.capacity_as
     if gap and unknown > ONE_STD and not c.suspects & SIGN_OF_CURRENT:
-        decay(f, p.filter)
+        pass_time(f, p.filter)
         predict(f, p.filter, f.best)
         restart_filter(s, p, math.hypot(f.soc_std, unknown), current_a, voltage_v)
         return

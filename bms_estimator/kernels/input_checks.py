@@ -12,6 +12,7 @@ from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.ekf_state import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS
 from bms_estimator.kernels.hypotheses import clear, seed, start
+from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.unseen import first_load
 from bms_estimator.model.suspect import Suspect
@@ -144,7 +145,17 @@ def keep(c: Record, f: Record) -> None:
 @njit(cache=True)
 def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
     """Back to the last good state when anything of the filter is not finite; else keep it now and then."""
-    total = f.soc + f.soc_std + f.innovation_v + f.innovation_variance + f.mean_a + f.rms_a2 + f.usual_a + f.usual_a2
+    total = (
+        f.temperature_c
+        + f.soc
+        + f.soc_std
+        + f.innovation_v
+        + f.innovation_variance
+        + f.mean_a
+        + f.rms_a2
+        + f.usual_a
+        + f.usual_a2
+    )
     for q in range(f.count):
         total += f.ln_weight[q] + f.fast_inflation[q] + f.slow_inflation[q]
         for j in range(STATES):
@@ -159,6 +170,8 @@ def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
         f.mean[0, j] = c.good_mean[j]
         for k in range(STATES):
             f.covariance[0, j, k] = c.good_covariance[j, k]
+    if not math.isfinite(f.temperature_c):
+        f.temperature_c = REFERENCE_C
     first_load(f, p, f.current_a)
     seed(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + LOST_STD**2))
     clear(f)

@@ -11,6 +11,7 @@ from bms_estimator.kernels.cell import soc_from_ocv
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
 from bms_estimator.kernels.hypotheses import is_temperature, pack_std
 from bms_estimator.kernels.identification import UNSEEN_MOST, identify, restart_filter, start_filter
+from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.kernels.learning import begin_learning, learning_step, take_as_rest
 from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.state import Record
@@ -154,6 +155,8 @@ def sense(m: Record, temperature_c: float) -> None:
 def after_restart(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
     """The first sample of a new clock: nobody knows how long nobody measured. Records as in ``step``."""
     if p.identify:
+        if not s.filter.sensed:
+            s.filter.temperature_c = REFERENCE_C
         restart_filter(s, p, UNSEEN_MOST, current_a, voltage_v)
     if p.learning.enabled:
         take_as_rest(s, p, voltage_v)

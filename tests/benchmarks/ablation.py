@@ -63,6 +63,7 @@ PARTS: dict[str, Change] = {
     "no error of what R has grown by": setting(bias_grown=0.0),
     "scales of R as in the file": setting(r_std=1e-6),
     "R the same at any SOC": known_resistances_of_the_middle,
+    "outside the file's temperatures as inside": setting(low_c=-100.0, high_c=200.0),
     "no entropy": setting(per_kelvin_v=0.0),
     "no error of the OCV": setting(curve_error_v=0.0),
     "curve not learned": setting(learned=0.0),

@@ -66,6 +66,7 @@ def test_at_one_temperature_the_parts_are_shared_as_in_the_file_given(identified
     share, known = (weak / (weak + strong + 1e-15))[:, there]
     assert share == pytest.approx(known, abs=1e-6)
     assert np.ptp(known) > 0.2
+    assert (weak + strong).sum(axis=1)[0, 2:] == pytest.approx((weak + strong).sum(axis=1)[1, 2:], rel=0.1)
     assert found.temperature_c == (COLD_C, WARM_C)
 
 

@@ -1,26 +1,40 @@
 """How warm a cell makes itself, against one that was measured."""
 
+import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.ladder import REFERENCE_C
+from bms_estimator.kernels.self_heating import COOLS_S, WARMEST_C
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.replay import load_capture
 
 HALF_C = Path(__file__).parents[1] / "data" / "lgm50" / "rate_0p5c_25c.csv.gz"
 
 
-def rise_k(samples):
+def rise_k(samples, cell=None):
     """How much warmer than a room the estimator takes an LG M50 for, of which it knows chemistry and capacity [K]."""
-    estimator = Estimator(load_cell("nmc", 5.0), initial_soc=1.0)
-    filtered = estimator.record["filter"]
+    estimator = Estimator(cell or load_cell("nmc", 5.0), initial_soc=1.0)
     rise_k = np.zeros(samples.size)
     for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
         estimator.step(time_s, current_a, voltage_v, status, temperature_c)
-        rise_k[n] = filtered["temperature_c"][0] - REFERENCE_C
+        rise_k[n] = taken_c(estimator) - REFERENCE_C
     return rise_k
+
+
+def taken_c(estimator):
+    return estimator.record["filter"]["temperature_c"][0]
+
+
+def loaded(estimator, seconds=600):
+    """Draw 1C of a cell of 5 Ah."""
+    for second in range(seconds):
+        estimator.step(float(second), 5.0, 3.9)
+    return taken_c(estimator)
 
 
 def test_without_a_sensor_a_cell_is_as_warm_as_one_that_was_measured() -> None:
@@ -32,7 +46,37 @@ def test_without_a_sensor_a_cell_is_as_warm_as_one_that_was_measured() -> None:
     assert np.sqrt(np.mean(error_k**2)) < 0.6
 
 
+def test_a_pack_is_as_warm_as_its_cells() -> None:
+    samples = np.zeros(900, dtype=SAMPLE)
+    samples["time_s"], samples["temperature_c"] = np.arange(900.0), np.nan
+    samples["current_a"], samples["voltage_v"] = 5.0, 3.9
+    cell = load_cell("nmc", 5.0)
+    of_cell = rise_k(samples, cell)
+    samples["current_a"], samples["voltage_v"] = 2 * 5.0, 4 * 3.9
+    assert of_cell[-1] > 2.0
+    assert rise_k(samples, cell.pack(4, 2)) == pytest.approx(of_cell, rel=0.02)
+
+
 def test_a_sensor_is_believed() -> None:
     samples = load_capture(HALF_C).rows
     samples["temperature_c"] = 10.0
     assert np.all(rise_k(samples) == 10.0 - REFERENCE_C)
+
+
+@pytest.mark.parametrize("unseen_s", [COOLS_S, 8 * 3600.0, math.inf], ids=["minutes", "a night", "nobody knows"])
+def test_a_cell_cools_while_nobody_measures(unseen_s: float) -> None:
+    estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
+    warm_k = loaded(estimator) - REFERENCE_C
+    assert warm_k > 2.0
+    estimator.resume(unseen_s)
+    estimator.step(0.0, 0.0, 3.9)
+    estimator.step(1.0, 0.0, 3.9)
+    assert 0.0 <= taken_c(estimator) - REFERENCE_C < warm_k * (0.1 if unseen_s > COOLS_S else 0.9)
+
+
+def test_a_current_that_is_no_truth_makes_no_fire() -> None:
+    estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
+    for second in range(300):
+        estimator.step(float(second), 99.0, 3.9)
+    assert REFERENCE_C < taken_c(estimator) <= WARMEST_C
+    assert np.isfinite(estimator.record["filter"]["soc"][0])

@@ -115,11 +115,13 @@ CASES: tuple[Case, ...] = (
     Case("rising 5..25C", temperature_c=5.0, rising_k=20.0, seed=15),
     Case("no sensor at 15C", temperature_c=15.0, sensed=False, seed=16),
     Case("warms itself", load="constant", load_c=1.2, sensed=False, **WARMS, seed=31),
+    Case("kept cool", load_c=1.0, hours=0.6, temperature_c=20.0, sensed=False, warms_k=1.0, seed=32),
     Case("LFP full 25C", **LFP, soc=1.0, unseen_h=0.0, seed=17),
     Case("LFP full -10C", **LFP, temperature_c=-10.0, load_c=0.4, soc=1.0, unseen_h=0.0, seed=18),
     Case("LFP cut 25C", **LFP, hours=1.5, seed=19),
     Case("LFP cut 0C", **LFP, temperature_c=0.0, hours=1.5, seed=20),
     Case("generic nmc", file_c="generic", seed=21),
+    Case("generic nmc 0C", file_c="generic", temperature_c=0.0, load_c=0.4, seed=33),
     Case("generic lfp", truth=PHOSPHATE, file_c="generic", soc=1.0, unseen_h=0.0, seed=22),
     Case("gain +5%", gain=1.05, seed=23),
     Case("offset +50mA", offset_a=0.05, seed=24),
@@ -163,6 +165,7 @@ def load_a(case: Case, seconds: int) -> Floats:
 
 def capture(case: Case, current_a: Floats | None = None) -> Capture:
     """Simulate one; under ``current_a`` at ``rate_hz`` [A], where it is given."""
+    assert not (case.sensed and case.warms_k), "the sensor shows the room"
     rng = np.random.default_rng(1000 + case.seed)
     if current_a is None:
         current_a = np.repeat(load_a(case, round(PER_HOUR_S * (case.unseen_h + case.hours))), round(case.rate_hz))
