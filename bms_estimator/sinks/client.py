@@ -204,6 +204,14 @@ class Client(aiomqtt.Client):
         if said.startswith(SOCKET_BROKE):
             self._why = said.removeprefix(SOCKET_BROKE)
 
+    def _on_socket_open(self, client: Any, userdata: Any, sock: Any) -> None:
+        """As the base has it; a socket that nobody waits for any more is shut: the loop that would watch it may be about to end."""
+        if self._abandoned:
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
+        else:
+            super()._on_socket_open(client, userdata, sock)
+
     def _on_socket_register_write(self, client: Any, userdata: Any, sock: socket.socket) -> None:  # noqa: ARG002
         """As the base has it, which may watch a socket that was closed meanwhile, or another of its number."""
 

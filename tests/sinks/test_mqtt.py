@@ -8,6 +8,7 @@ from typing import Any
 import aiomqtt
 import pytest
 import structlog
+from aiomqtt import ProtocolVersion
 
 from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
@@ -16,6 +17,7 @@ from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import CORRECTION_S
 from bms_estimator.sinks.brokers import brokers, check
+from bms_estimator.sinks.client import PATIENCE, Client
 from bms_estimator.sinks.connection import Connection, Hello
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING, Inbox
@@ -108,6 +110,17 @@ async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_
         for _ in range(1000):
             sink.mqtt.publish(ONE)
     assert sink.delivery.drops == AT_START + 1000 - MOST_KEPT
+
+
+async def test_a_connection_that_comes_after_it_was_given_up_leaves_nothing_to_the_loop(broker: Broker) -> None:
+    """The thread that connects goes on when its task is cancelled, and a loop may be about to close."""
+    client = Client({"hostname": "127.0.0.1", "port": broker.port}, ProtocolVersion.V5, HELLO, PATIENCE)
+    before = asyncio.all_tasks()
+    client.abandon()
+    await asyncio.to_thread(client._client_connect)
+    await asyncio.sleep(0)  # what the thread left to the loop runs
+    assert client._client.socket() is None
+    assert asyncio.all_tasks() == before
 
 
 async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path: Path) -> None:
