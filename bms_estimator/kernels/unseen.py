@@ -26,11 +26,15 @@ IDLE_C = 0.1
 
 @njit(cache=True)
 def first_load(s: Record, p: Record, current_a: float) -> None:
-    """Before a load is seen: what ``switch_on`` takes one to be."""
+    """Before a load is seen: what ``switch_on`` takes one to be.
+
+    The first sample tells more of a load that is small than of one that is large: that may be a peak.
+    """
     one_c = p.capacity_as / 3600.0
-    s.mean_a, s.rms_a2 = current_a, max(current_a * current_a, (p.load_mean_c * one_c) ** 2)
     s.usual_a = p.load_mean_c * one_c
     s.usual_a2 = (p.load_mean_c**2 + p.load_level_c**2 + p.load_c**2) * one_c * one_c
+    least_a2 = (p.load_mean_c * one_c) ** 2
+    s.mean_a, s.rms_a2 = current_a, min(max(current_a * current_a, least_a2), s.usual_a2)
 
 
 @njit(cache=True)
@@ -57,7 +61,7 @@ def unseen_charge(s: Record, p: Record, held_a: float, dt_s: float) -> float:
     The current was one of the present load, and after a time of the usual one, at random and the same all the time.
     """
     same = math.exp(-dt_s / LOAD_S)
-    present_a2 = s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a
+    present_a2 = max(s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a, 0.0)  # below 0 from ``first_load``
     usual_a2 = s.usual_a2 - 2.0 * held_a * s.usual_a + held_a * held_a
     idle_a = IDLE_C * p.capacity_as / 3600.0
     return math.sqrt(max(same * present_a2 + (1.0 - same) * usual_a2, idle_a * idle_a)) * dt_s

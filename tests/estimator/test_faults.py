@@ -208,7 +208,7 @@ def test_not_finite_goes_back_to_the_last_good_state(load) -> None:
     estimator = Estimator(TRUTH, initial_soc=0.9)
     estimator.run(block[:3000])
     before = float(estimator.state["soc"][0])
-    for field in ("mean", "covariance", "rms_a2"):
+    for field in ("mean", "covariance", "rms_a2", "temperature_c"):
         estimator.record["filter"][field][0] = np.nan
     estimator.run(block[3000:3002])
     assert estimator.record["counters"]["reset"][0] == 1

@@ -9,7 +9,7 @@ from scipy.linalg import solve_continuous_lyapunov
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels import ekf, ekf_noise, hypotheses
+from bms_estimator.kernels import ekf, ekf_noise, hypotheses, unseen
 from bms_estimator.kernels.ekf_state import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.kernels.ladder import BRANCHES, TAUS
 from bms_estimator.model.cell import load_cell
@@ -190,6 +190,27 @@ def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
     expected_a = p["load_mean_c"] * one_c + known * (2.0 - p["load_mean_c"] * one_c)
     assert mean[BRANCH] == pytest.approx(expected_a)
     assert covariance[BRANCH, BRANCH] == pytest.approx(joint[1:, 1:] - np.outer(known, joint[0, 1:]))
+
+
+@pytest.mark.parametrize(("first_c", "rms_c"), [(0.0, 0.3), (-0.2, 0.3), (1.0, 1.0), (2.5, 1.285), (-6.0, 1.285)])
+def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float) -> None:
+    """The model errs by the RMS of the load: of the sample's current no more than that of the load before switch-on."""
+    p = settings()
+    one_c = p["capacity_as"] / 3600.0
+    s = np.zeros(1, EKF_STATE)[0]
+    hypotheses.start(s, p, 0.55, first_c * one_c, 12.0)
+    assert np.sqrt(s["rms_a2"]) == pytest.approx(rms_c * one_c, rel=1e-3)
+
+
+def test_a_gap_behind_a_peak_is_no_better_known_than_the_usual_load() -> None:
+    """What the first sample leaves open of the present load is nothing, not less: the further from the usual, the less is known."""
+    p = settings()
+    one_c, unknown_as = p["capacity_as"] / 3600.0, []
+    for first_a in (1.5 * one_c, 3.0 * one_c, 6.0 * one_c):
+        s = np.zeros(1, EKF_STATE)[0]
+        hypotheses.start(s, p, 0.55, first_a, 12.0)
+        unknown_as.append(unseen.unseen_charge(s, p, first_a, 60.0))
+    assert unseen.IDLE_C * one_c * 60.0 < unknown_as[0] < unknown_as[1] < unknown_as[2]
 
 
 def test_outside_the_temperatures_of_the_cell_file_r_grows() -> None:
