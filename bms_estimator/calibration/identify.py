@@ -105,7 +105,7 @@ class Identification:
         captures: In the order given.
         left_out: Names of captures without excitation.
         ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0: it is the given one.
-        score_before: Mean interval score of the replays with the given cell [%]; NaN when none could judge.
+        score_before: Geometric mean over the captures of the interval score with the given cell [%]; NaN when none could judge.
         score_after: The same with the identified one.
     """
 
@@ -392,8 +392,9 @@ def _rms(cell: CellModel, run: Run) -> float:
 
 
 def _mean(scores: Floats) -> float:
+    """Geometric: a capture that every cell file does badly in does not decide alone."""
     known = scores[np.isfinite(scores)]
-    return float(known.mean()) if known.size else float("nan")
+    return float(np.exp(np.log(known).mean())) if known.size else float("nan")
 
 
 def _worse(outcome: Identification) -> str:
