@@ -32,8 +32,8 @@ CELL_VOLTAGE_V = 3.7
 """Of one Li-ion cell in the middle of its discharge: tells how many are in series [V]."""
 LOWEST, HIGHEST = 0.55, 1.06
 """Limits of a good sample: of the median voltage, of the full one."""
-MEASURED_CAPACITY_STD = 0.015
-"""Of a capacity measured by a slow discharge, relative: gain of the current sensor, and the cell's next years."""
+MEASURED_CAPACITY_STD = 0.03
+"""Of a capacity measured by a slow discharge, relative: gain of the current sensor, other cells of the kind, some years."""
 CURRENT_MAX_C = 5.0
 """Limit of a good sample when the capture itself has no larger current [1/h]."""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import sample_step as kernel
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.hypotheses import seed
+from bms_estimator.kernels.hypotheses import believe
 from bms_estimator.kernels.input_checks import keep
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
@@ -26,8 +26,6 @@ VERDICTS = tuple(Verdict)
 """By value: ``Verdict(value)`` takes nearly as long as the kernel."""
 IDENTIFIER = IdentifierSettings()
 """How an estimator identifies unless told otherwise."""
-SET_SOC_STD = 0.01
-"""How far an SOC that someone sets may be off."""
 
 
 class Estimator:
@@ -121,7 +119,7 @@ class Estimator:
         return bool(self.settings_record["identify"][0])
 
     def set_soc(self, soc: float) -> None:
-        """Take ``soc`` as the state of charge from now on, known to ``SET_SOC_STD``; after the first sample.
+        """Take ``soc`` as the state of charge from now on, until the voltage shows that it is wrong; after the first sample.
 
         Raises:
             ValueError: It is outside 0..1; or this is a fuel cell, which has none.
@@ -133,7 +131,7 @@ class Estimator:
         self.state["soc"] = self.state["soc_coulomb"] = soc
         if self.identifying:
             f, c = self.record[0]["filter"], self.record[0]["checks"]
-            seed(f, self.settings_record[0]["filter"], soc, SET_SOC_STD)
+            believe(f, self.settings_record[0]["filter"], soc)
             c["outliers"] = 0.0
             keep(c, f)
 

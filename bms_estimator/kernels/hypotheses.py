@@ -80,6 +80,12 @@ REOPEN_STDS = 4.0
 """A model that would have to be wrong by so many std is not: the SOC is ..."""
 REOPEN_STD = 0.2
 """... by as much as at switch-on."""
+TOLD_STD = 0.01
+"""An SOC that is told is known to this std, ..."""
+WRONG_STD = 0.12
+"""... or it is wrong, by as much as this, ..."""
+LN_RIGHT = 5.0
+"""... which is less likely by so much, in ln: one or two per cent in all."""
 
 
 @njit(cache=True)
@@ -148,6 +154,18 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
         vacate(s, q)
     s.best = (s.count - 1) // 2
     s.seeded_s = s.rest_s = s.rest_as = 0.0
+    combine(s)
+
+
+@njit(cache=True)
+def believe(s: Record, p: Record, soc: float) -> None:
+    """Begin again at an SOC that somebody told: he is mostly right, and the voltage shows where he is not."""
+    seed(s, p, soc, WRONG_STD)
+    for q in range(s.count):
+        if q == s.best:
+            s.covariance[q, SOC, SOC] = TOLD_STD**2
+        else:
+            s.ln_weight[q] -= LN_RIGHT
     combine(s)
 
 

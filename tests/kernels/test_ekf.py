@@ -351,7 +351,7 @@ def test_from_several_socs_to_one(drive) -> None:
 
 
 def test_of_a_hypothesis_that_went_nothing_is_left(drive) -> None:
-    """Neither of those that others made superfluous nor, once the SOC is told, of all but one."""
+    """Neither of those that others made superfluous nor, once the SOC is known, of all but one."""
     estimator = start(drive)
     f = estimator.record[0]["filter"]
     rows = "mean", "covariance", "ln_weight", "minute_u", "ten_minutes_u", "fast_inflation", "slow_inflation"
@@ -361,18 +361,35 @@ def test_of_a_hypothesis_that_went_nothing_is_left(drive) -> None:
         counts.add(int(f["count"]))
         assert not any(f[name][f["count"] :].any() for name in rows)
     assert len(counts) > 1
-    hypotheses.seed(f, estimator.settings_record[0]["filter"], 0.5, 0.2)
-    assert f["count"] == len(f["mean"])
-    estimator.set_soc(0.5)
-    assert f["count"] == 1
+    for soc_std, count in ((0.2, len(f["mean"])), (0.01, 1)):
+        hypotheses.seed(f, estimator.settings_record[0]["filter"], 0.5, soc_std)
+        assert f["count"] == count
     assert not any(f[name][1:].any() for name in rows)
 
 
-def test_an_soc_that_was_told_with_confidence_and_is_wrong_by_far_is_given_up(drive) -> None:
+@pytest.mark.parametrize("wrong", [-0.3, -0.1, 0.0, 0.1, 0.3])
+def test_an_soc_that_is_told_is_believed_until_the_voltage_shows_that_it_is_wrong(drive, wrong: float) -> None:
+    """After five minutes the truth is inside the band, and after twenty nearby."""
+    estimator = start(drive)
+    estimator.run(drive.samples[:600])
+    told = float(drive.soc[600]) + wrong
+    estimator.set_soc(told)
+    f = estimator.record[0]["filter"]
+    assert f["soc"] == pytest.approx(told, abs=0.002)
+    assert 0.01 < f["soc_std"] < 0.025
+    trace = estimator.run(drive.samples[600:2400])
+    error = np.abs(trace["soc"] - drive.soc[600:2400])
+    assert (error < 2.0 * trace["soc_std"])[300:].all()
+    assert error[1200:].max() < 0.01
+
+
+def test_an_soc_that_was_known_and_is_wrong_by_far_is_given_up(drive) -> None:
     """0.3 too low, known to 0.01: within ten minutes the truth is inside the band, and after twenty nearby."""
     estimator = start(drive)
     estimator.run(drive.samples[:600])
-    estimator.set_soc(float(drive.soc[600]) - 0.3)
+    hypotheses.seed(
+        estimator.record[0]["filter"], estimator.settings_record[0]["filter"], float(drive.soc[600]) - 0.3, 0.01
+    )
     trace = estimator.run(drive.samples[600:2400])
     error = np.abs(trace["soc"] - drive.soc[600:2400])
     assert estimator.record[0]["filter"]["reopened"] >= 1
