@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import sample_step as kernel
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.hypotheses import believe
+from bms_estimator.kernels.hypotheses import tell
 from bms_estimator.kernels.input_checks import keep
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
@@ -131,7 +131,7 @@ class Estimator:
         self.state["soc"] = self.state["soc_coulomb"] = soc
         if self.identifying:
             f, c = self.record[0]["filter"], self.record[0]["checks"]
-            believe(f, self.settings_record[0]["filter"], soc)
+            tell(f, self.settings_record[0]["filter"], soc)
             c["outliers"] = 0.0
             keep(c, f)
 

@@ -229,7 +229,8 @@ def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: flo
 def inflate(s: Record, q: int, dt_s: float, u: float) -> None:
     """Let the variance of the biases follow what innovations have in common over a minute and over ten.
 
-    The mean over a time T of a white, normalised innovation has the variance dt / 2T; each follows its own ratio to that.
+    The mean over a time T of a white, normalised innovation has the variance a / (2 - a) with a = dt / T; each follows its own
+    ratio to that.
 
     Args:
         s: Record of EKF_STATE.
@@ -237,8 +238,9 @@ def inflate(s: Record, q: int, dt_s: float, u: float) -> None:
         dt_s: Step [s].
         u: Innovation over its std.
     """
-    s.minute_u[q] += min(1.0, dt_s / MINUTE_S) * (u - s.minute_u[q])
-    s.ten_minutes_u[q] += min(1.0, dt_s / TEN_MINUTES_S) * (u - s.ten_minutes_u[q])
-    fast, slow = 2.0 * MINUTE_S * s.minute_u[q] ** 2, 2.0 * TEN_MINUTES_S * s.ten_minutes_u[q] ** 2
+    a, b = min(1.0, dt_s / MINUTE_S), min(1.0, dt_s / TEN_MINUTES_S)
+    s.minute_u[q] += a * (u - s.minute_u[q])
+    s.ten_minutes_u[q] += b * (u - s.ten_minutes_u[q])
+    fast, slow = (2.0 - a) / a * s.minute_u[q] ** 2, (2.0 - b) / b * s.ten_minutes_u[q] ** 2
     s.fast_inflation[q] += min(1.0, dt_s / (INFLATION_OVER[0] * MINUTE_S)) * (max(fast, 1.0) - s.fast_inflation[q])
     s.slow_inflation[q] += min(1.0, dt_s / (INFLATION_OVER[1] * TEN_MINUTES_S)) * (max(slow, 1.0) - s.slow_inflation[q])

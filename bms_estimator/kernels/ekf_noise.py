@@ -116,7 +116,7 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     cov, f, w = s.covariance[q], s.f, s.window
     dt_s = w.time_s
     if w.unknown_as > 0.0:
-        add_unseen(cov, f, w.unknown_as / dt_s, dt_s / p.capacity_as)
+        add_unseen(p, cov, f, w.unknown_as / dt_s, dt_s / p.capacity_as)
     cov[SOC, SOC] += p.charge_error**2 * moved
     if w.between_as2 + w.rounded_as2 > 0.0:
         cov[SOC, SOC] += (w.between_as2 + w.rounded_as2) / (p.capacity_as * p.capacity_as)
@@ -138,10 +138,14 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
 
 
 @njit(cache=True)
-def add_unseen(cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
-    """A current that nobody saw, the same all the time, moved the SOC and the branches together.
+def add_unseen(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
+    """A current that nobody saw: the same all the time it moved the SOC and the branches together.
+
+    It changed, too, by as much: the branches, which know the last seconds or minutes, are of another mean than the SOC. Without
+    that the voltage after the gap would tell the SOC.
 
     Args:
+        p: Record of EKF_SETTINGS.
         cov: Shape (STATES, STATES), updated.
         f: Diagonal of F over that time.
         std_a: Of the current [A].
@@ -152,6 +156,16 @@ def add_unseen(cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
         for k in range(SOC, X + BRANCHES):
             by_k = -soc_per_a if k == SOC else 1.0 - f[k]
             cov[j, k] += std_a * std_a * by_j * by_k
+    for k in range(BRANCHES):
+        for m in range(BRANCHES):
+            changed = changing(p.load_s, TAUS[k], TAUS[m]) * (1.0 - f[X + k] * f[X + m])
+            cov[X + k, X + m] += std_a * std_a * changed
+
+
+@njit(cache=True)
+def changing(t: float, tau_k: float, tau_m: float) -> float:
+    """Stationary covariance of two branches under a Gauss-Markov load of time constant ``t`` and variance 1."""
+    return (t / (t + tau_m) / tau_k + t / (t + tau_k) / tau_m) / (1.0 / tau_k + 1.0 / tau_m)
 
 
 @njit(cache=True)
@@ -159,8 +173,7 @@ def switch_on(p: Record, current_a: float, mean: Floats, covariance: Floats) -> 
     """x_k of a load that nobody saw: mean and covariance, given the current at switch-on.
 
     The load was a level, normal with mean ``load_mean_c`` and std ``load_level_c``, and on it a Gauss-Markov process of
-    time constant t = ``load_s`` and std ``load_c``. Of that, the stationary covariance of branches k and l is
-    [t/(t+tau_l)/tau_k + t/(t+tau_k)/tau_l] / (1/tau_k + 1/tau_l), that of branch k and the current t/(t+tau_k).
+    time constant t = ``load_s`` and std ``load_c``. Of that, the stationary covariance of branch k and the current is t/(t+tau_k).
 
     Args:
         p: Record of EKF_SETTINGS.
@@ -176,6 +189,5 @@ def switch_on(p: Record, current_a: float, mean: Floats, covariance: Floats) -> 
         mean[X + k] += with_k / (level_a2 + load_a2) * (current_a - p.load_mean_c * one_c)
         for m in range(BRANCHES):
             with_m = level_a2 + load_a2 * t / (t + TAUS[m])
-            rate = t / (t + TAUS[m]) / TAUS[k] + t / (t + TAUS[k]) / TAUS[m]
-            both = level_a2 + load_a2 * rate / (1.0 / TAUS[k] + 1.0 / TAUS[m])
+            both = level_a2 + load_a2 * changing(t, TAUS[k], TAUS[m])
             covariance[X + k, X + m] = both - with_k * with_m / (level_a2 + load_a2)

@@ -158,14 +158,11 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
 
 
 @njit(cache=True)
-def believe(s: Record, p: Record, soc: float) -> None:
-    """Begin again at an SOC that somebody told: he is mostly right, and the voltage shows where he is not."""
+def tell(s: Record, p: Record, soc: float) -> None:
+    """Begin again at an SOC that somebody told: mostly it is right, and the voltage shows where it is not."""
     seed(s, p, soc, WRONG_STD)
-    for q in range(s.count):
-        if q == s.best:
-            s.covariance[q, SOC, SOC] = TOLD_STD**2
-        else:
-            s.ln_weight[q] -= LN_RIGHT
+    s.covariance[s.best, SOC, SOC] = TOLD_STD**2
+    s.ln_weight[s.best] += LN_RIGHT
     combine(s)
 
 
@@ -300,7 +297,7 @@ def update_all(s: Record, p: Record) -> None:
         u = innovation_v / math.sqrt(total_v2)
         # a bend's part of S stays while nothing moves: counted each second, it would tell against the knee at full rest
         s.ln_weight[q] -= p.temper * (innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2))
-        if dt_s > 0.0:
+        if dt_s > 0.0 and not w.gap:  # one innovation is no error that stays, however long the gap
             inflate(s, q, dt_s, u)
         if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
             best = q

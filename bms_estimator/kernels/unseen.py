@@ -33,8 +33,9 @@ def first_load(s: Record, p: Record, current_a: float) -> None:
     one_c = p.capacity_as / 3600.0
     s.usual_a = p.load_mean_c * one_c
     s.usual_a2 = (p.load_mean_c**2 + p.load_level_c**2 + p.load_c**2) * one_c * one_c
-    least_a2 = (p.load_mean_c * one_c) ** 2
-    s.mean_a, s.rms_a2 = current_a, min(max(current_a * current_a, least_a2), s.usual_a2)
+    most_a = math.sqrt(s.usual_a2)
+    s.mean_a = min(max(current_a, -most_a), most_a)
+    s.rms_a2 = max(s.mean_a * s.mean_a, (p.load_mean_c * one_c) ** 2)
 
 
 @njit(cache=True)
@@ -61,7 +62,7 @@ def unseen_charge(s: Record, p: Record, held_a: float, dt_s: float) -> float:
     The current was one of the present load, and after a time of the usual one, at random and the same all the time.
     """
     same = math.exp(-dt_s / LOAD_S)
-    present_a2 = max(s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a, 0.0)  # below 0 from ``first_load``
+    present_a2 = s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a
     usual_a2 = s.usual_a2 - 2.0 * held_a * s.usual_a + held_a * held_a
     idle_a = IDLE_C * p.capacity_as / 3600.0
     return math.sqrt(max(same * present_a2 + (1.0 - same) * usual_a2, idle_a * idle_a)) * dt_s

@@ -20,7 +20,7 @@ from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import GROUPS, chosen, runs
 from tests.estimator.anywhere.score import score
 
-NAMES = ("PF 25 C", "PF 0 C", "NCR", "NCR, constant current", "LFP 25 C (its own file)")
+NAMES = ("PF 25 C, US06", "PF 0 C", "NCR", "NCR, constant current", "LFP 25 C (its own file)")
 SEED = 1
 
 Floats = NDArray[np.float64]

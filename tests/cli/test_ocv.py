@@ -43,6 +43,7 @@ def test_real_cell(tmp_path, capsys, shared_data, form, limit_mv):
     cell = load_cell(out)
     assert cell.cell.name == "cell5"
     assert cell.cell.capacity_ah == 3.0
+    assert cell.cell.capacity_std is None
     soc, ocv_v = np.array(found["soc"]), np.array(found["ocv_v"])
     if form == "chen-mora":
         assert list(found["parameters"]) == ["a16", "a17", "a18", "a19", "a20", "a21"]
@@ -176,7 +177,9 @@ def test_what_each_capture_is_is_found_out(tmp_path, capsys, data):
     found = json.loads(text)
     assert [source["kind"] for source in found["sources"]] == ["C/10 discharge, 4.945 Ah", "given curve, 101 points"]
     assert found["capacity_ah"] == found["capacity_measured_ah"] == pytest.approx(4.945, abs=1e-3)
-    ocv = load_cell(out).ocv
+    cell = load_cell(out)
+    assert cell.cell.capacity_std == 0.03
+    ocv = cell.ocv
     assert ocv.hysteresis_v is not None
     assert ocv.per_kelvin_v is None
     given = np.loadtxt(folder / "ocv_25c.csv", delimiter=",", skiprows=1)
