@@ -229,8 +229,8 @@ def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: flo
 def inflate(s: Record, q: int, dt_s: float, u: float) -> None:
     """Let the variance of the biases follow what innovations have in common over a minute and over ten.
 
-    The mean over a time T of a white, normalised innovation has the variance a / (2 - a) with a = dt / T; each follows its own
-    ratio to that.
+    The mean over a time T of a white, normalised innovation has the variance a / (2 - a) with a = dt / T, where samples are
+    equally far apart; each follows its own ratio to that.
 
     Args:
         s: Record of EKF_STATE.

@@ -153,13 +153,13 @@ def add_unseen(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float
     """
     for j in range(SOC, X + BRANCHES):
         by_j = -soc_per_a if j == SOC else 1.0 - f[j]
-        for k in range(SOC, X + BRANCHES):
-            by_k = -soc_per_a if k == SOC else 1.0 - f[k]
-            cov[j, k] += std_a * std_a * by_j * by_k
-    for k in range(BRANCHES):
-        for m in range(BRANCHES):
-            changed = changing(p.load_s, TAUS[k], TAUS[m]) * (1.0 - f[X + k] * f[X + m])
-            cov[X + k, X + m] += std_a * std_a * changed
+        for k in range(SOC, j + 1):
+            added = by_j * (-soc_per_a if k == SOC else 1.0 - f[k])
+            if k >= X:
+                since = math.sqrt((1.0 - f[j] * f[j]) * (1.0 - f[k] * f[k]))
+                added += since * changing(p.load_s, TAUS[j - X], TAUS[k - X])
+            cov[j, k] += std_a * std_a * added
+            cov[k, j] = cov[j, k]
 
 
 @njit(cache=True)

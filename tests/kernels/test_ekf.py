@@ -13,6 +13,7 @@ from bms_estimator.kernels import ekf, ekf_noise, hypotheses, unseen
 from bms_estimator.kernels.ekf_state import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.kernels.ladder import BRANCHES, TAUS
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings
 from tests.estimator.anywhere.cases import CASES, Case, capture
 
@@ -274,6 +275,15 @@ def test_branches_in_a_gap_are_as_unsure_as_of_a_load_that_nobody_saw() -> None:
     assert np.sqrt(np.diag(covariance)[BRANCH]) == pytest.approx(x.std(axis=1), rel=0.15)
 
 
+@pytest.mark.parametrize("gap_s", [1.0, 6.0, 10.0, 30.0, 180.0, 3600.0])
+def test_what_a_gap_adds_is_a_covariance(gap_s: float) -> None:
+    p, covariance, f = settings(), np.zeros((STATES, STATES)), np.ones(STATES)
+    f[BRANCH] = np.exp(-gap_s / TAUS)
+    ekf_noise.add_unseen(p, covariance, f, 2.0, gap_s / p["capacity_as"])
+    assert covariance == pytest.approx(covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > -1e-12
+
+
 def mixture(mean, covariance, weight):
     """Mean and covariance of a mixture of normal distributions, by its definition."""
     weight = weight / weight.sum()
@@ -350,18 +360,32 @@ def test_the_covariance_stays_one_at_any_rate(drive, fast, rate_hz: float) -> No
     samples = {0.1: drive.samples[::10], 1.0: drive.samples, 100.0: fast.samples, 1000.0: fast.samples.copy()}[rate_hz]
     if rate_hz == 1000.0:
         samples["time_s"] = samples["time_s"][0] + np.arange(samples.size) / rate_hz
-    estimator = start(drive if rate_hz <= 1.0 else fast)
+    stays_a_covariance(start(drive if rate_hz <= 1.0 else fast), np.array_split(samples, 40))
+
+
+@pytest.mark.parametrize("gap_s", [2, 6, 12, 60])
+def test_the_covariance_stays_one_through_gaps(drive, gap_s: int) -> None:
+    parts = [part[: part.size - gap_s] for part in np.split(drive.samples[:3600], range(gap_s + 30, 3600, gap_s + 30))]
+    stays_a_covariance(start(drive), parts)
+
+
+def stays_a_covariance(estimator: Estimator, parts: list[SampleBlock]) -> None:
     f = estimator.record[0]["filter"]
-    for part in np.array_split(samples, 40):
-        estimator.run(part)
-        assert 1 <= f["count"] <= len(f["mean"])
-        for covariance in f["covariance"][: f["count"]]:
-            assert np.array_equal(covariance, covariance.T)
-            scale = np.sqrt(np.diag(covariance))
-            assert np.isfinite(scale).all()
-            assert (scale > 0.0).all()
-            assert np.linalg.eigvalsh(covariance / scale[:, None] / scale).min() > -1e-9
+    for part in parts:
+        for samples in (part[:1], part[1:]):
+            estimator.run(samples)
+            is_covariance(f)
     assert estimator.record[0]["counters"]["reset"] == 0
+
+
+def is_covariance(f) -> None:
+    assert 1 <= f["count"] <= len(f["mean"])
+    for covariance in f["covariance"][: f["count"]]:
+        assert np.array_equal(covariance, covariance.T)
+        scale = np.sqrt(np.diag(covariance))
+        assert np.isfinite(scale).all()
+        assert (scale > 0.0).all()
+        assert np.linalg.eigvalsh(covariance / scale[:, None] / scale).min() > -1e-9
 
 
 def test_a_hundred_samples_a_second_tell_the_same_as_one(fast) -> None:
