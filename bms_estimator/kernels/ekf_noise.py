@@ -164,7 +164,7 @@ def add_unseen(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float
 
 @njit(cache=True)
 def changing(t: float, tau_k: float, tau_m: float) -> float:
-    """Stationary covariance of two branches under a Gauss-Markov load of time constant ``t`` and variance 1."""
+    """Stationary covariance of branches of ``tau_k`` and ``tau_m`` [s] under a Gauss-Markov load of ``t`` [s], over its variance."""
     return (t / (t + tau_m) / tau_k + t / (t + tau_k) / tau_m) / (1.0 / tau_k + 1.0 / tau_m)
 
 

@@ -254,9 +254,11 @@ def test_one_innovation_after_a_gap_inflates_nothing(drive) -> None:
     f = estimator.record[0]["filter"]
     estimator.run(drive.samples[:1800])
     assert f["count"] == 1
-    before = f["fast_inflation"][0], f["slow_inflation"][0], f["minute_u"][0]
+    names = "fast_inflation", "slow_inflation", "minute_u", "ten_minutes_u"
+    before, seeded_s = [float(f[name][0]) for name in names], float(f["seeded_s"])
     estimator.run(drive.samples[1980:1981])
-    assert (f["fast_inflation"][0], f["slow_inflation"][0], f["minute_u"][0]) == before
+    assert [float(f[name][0]) for name in names] == before
+    assert f["seeded_s"] == seeded_s + 181.0  # the sample was taken in
     assert estimator.state["gaps"][0] == 1
 
 
