@@ -31,7 +31,8 @@ def pulse_table(folder: Path, wanted: list[str]) -> Table:
     for column in ("group", "pulses", "step s", "pulse mOhm", "ratio", "within 10 %", "inside", "std %"):
         table.add_column(column, justify="left" if column == "group" else "right")
     for group in chosen(GROUPS, wanted):
-        if group.gain == group.capacity == 1.0 and group.offset_a == 0.0 and group.cut != FROM_START:
+        sensors_right = group.gain == group.capacity == 1.0 and group.offset_a == 0.0
+        if sensors_right and group.cut != FROM_START and not group.charging:
             table.add_row(group.name, *cells_of(group, folder))
     return table
 

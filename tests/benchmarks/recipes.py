@@ -20,7 +20,7 @@ DATA = Path(__file__).parents[3] / "shared" / "data"
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 WRONG = (-0.2, 0.2)
 IN_MID_LOAD, FROM_START = 0.35, 0.0
-"""Part of the charge before the cut."""
+"""Part of the charge that is moved before the cut."""
 LOWEST_V, HIGHEST_V = 1.5, 4.5
 """What lies outside is no voltage of a cell."""
 PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
@@ -70,6 +70,8 @@ class Group:
     offset_a: float = 0.0
     capacity: float = 1.0
     """What the estimator is told over what is true."""
+    charging: bool = False
+    """Of the charge after the lowest SOC."""
 
 
 NCR_CHANGING = (
@@ -95,6 +97,14 @@ LFP_FILES = (
     ("-15", " (its own file)", LFP_CELL),
 )
 """The capture at 5 C is not in its file."""
+LFP_CHARGES = {
+    t: ((LFP + name, 2.05, soc),)
+    for t, name, soc in (("25", "c30_chg_p25", -0.006), ("5", "c30_chg_p05", 0.011), ("-15", "c30_chg_n15", 0.061))
+}
+NCR_CHARGE = ((NCR + "cell1_charge_c20", 3.064, 0.0),)
+"""Charges end full."""
+LG_CHARGES = (("lgm50/rate_0p1c_25c", 4.945, 1.0), ("lgm50/rate_1c_25c", 4.945, 1.0))
+"""Discharge, then charge at C/3."""
 LEAF_CAPTURES = (("leaf/hppc_25c_from_full", 30.5, 1.0),)
 
 GROUPS = (
@@ -115,11 +125,19 @@ GROUPS = (
     Group("Leaf (its own file)", LEAF, LEAF_CAPTURES),
     *(Group(f"LFP {t} C from full{own}", recipe, LFP_CAPTURES[t], FROM_START) for t, own, recipe in LFP_FILES),
     *(Group(f"LFP {t} C{own}", recipe, LFP_CAPTURES[t]) for t, own, recipe in LFP_FILES),
+    Group("NCR, charging (its own file)", NCR_CELL, NCR_CHARGE, charging=True),
+    *(
+        Group(f"LFP {t} C, charging (its own file)", LFP_CELL, charges, charging=True)
+        for t, charges in LFP_CHARGES.items()
+    ),
     Group("generic nca: PF", Recipe(2.9, generic="nca"), PF_CAPTURES["25"]),
     Group("generic nca: NCR", Recipe(3.0, generic="nca"), NCR_CHANGING),
     Group("generic lmo: Leaf", Recipe(30.5, generic="lmo"), LEAF_CAPTURES),
     Group("generic lfp: A123", Recipe(2.05, generic="lfp"), LFP_CAPTURES["25"]),
     Group("generic lfp: A123 from full", Recipe(2.05, generic="lfp"), LFP_CAPTURES["25"], FROM_START),
+    Group("generic nmc: LG M50, charging", Recipe(5.0, generic="nmc"), LG_CHARGES, charging=True),
+    Group("generic nca: NCR, charging", Recipe(3.0, generic="nca"), NCR_CHARGE, charging=True),
+    Group("generic lfp: A123, charging", Recipe(2.05, generic="lfp"), LFP_CHARGES["25"], charging=True),
 )
 
 
@@ -139,12 +157,19 @@ def runs(group: Group, folder: Path) -> Iterator[tuple[CellModel, SampleBlock, F
         cell = cell.model_copy(update={"cell": capacity})
     for name, capacity_ah, initial_soc in group.captures:
         samples, soc = load(name, capacity_ah, initial_soc)
-        drawn_ah = charge_ah(samples)
-        begin = int(np.argmax(drawn_ah >= group.cut * drawn_ah[-1])) if group.cut else 0
+        begin = first_sample(samples, group)
         seen, truth = samples[begin:].copy(), soc[begin:]
         seen["current_a"] = group.gain * seen["current_a"] + group.offset_a
         for wrong in WRONG:
             yield cell, seen, truth, float(np.clip(truth[0] + wrong, 0.0, 1.0))
+
+
+def first_sample(samples: SampleBlock, group: Group) -> int:
+    """That the estimator sees."""
+    drawn_ah = charge_ah(samples)
+    lowest = int(np.argmax(drawn_ah)) if group.charging else 0
+    moved_ah = np.abs(drawn_ah[lowest:] - drawn_ah[lowest])
+    return lowest + int(np.argmax(moved_ah >= group.cut * moved_ah[-1]))
 
 
 @cache
