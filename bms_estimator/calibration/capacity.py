@@ -8,6 +8,7 @@ Errors of the curve go together for anchors at SOCs near each other: a capacity 
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,10 @@ from bms_estimator.calibration.relaxation import Rest, find_rests, resting_sampl
 from bms_estimator.estimator.filter_settings import CURVE_SOC, filter_settings
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv, soc_from_ocv
-from bms_estimator.kernels.ladder import REFERENCE_C, on_grid
+from bms_estimator.kernels.ekf_noise import HYST_LEFT
+from bms_estimator.kernels.hypotheses import HYST_STD
+from bms_estimator.kernels.ladder import HYSTERESIS_J, REFERENCE_C, arrhenius, on_grid
+from bms_estimator.kernels.open_loop import hysteresis
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -39,10 +43,6 @@ BEYOND = 3.0
 """A rest so many standard deviations beyond the curve's ends is none of this cell."""
 DISAGREE = 9.0
 """Squared: anchors off by more than so many of their standard deviations do not go together."""
-HYST_LEFT = 0.3
-"""Part of the hysteresis that is not known even when the way is."""
-FAR = 20.0
-"""Charge further back, in those that the hysteresis forgets within, does not count."""
 
 
 @dataclass(frozen=True)
@@ -172,14 +172,16 @@ def of_part(name: str, part: int, good: SampleBlock, p: np.void, anchors: list[A
     capacity_ah, series = p["capacity_as"] / 3600.0, int(p["series"])
     step_ah = good["current_a"][:-1] * np.diff(good["time_s"]) / 3600.0
     counted_ah, moved_ah = np.r_[0.0, np.cumsum(step_ah)], np.r_[0.0, np.cumsum(np.abs(step_ah))]
+    soc = -counted_ah / capacity_ah
     resting = resting_samples(good, capacity_ah)
-    rests, why_not = find_rests(good, -counted_ah / capacity_ah, resting, series)
+    rests, why_not = find_rests(good, soc, resting, series)
     rejected += [f"{name}: {line}" for line in why_not]
+    up, down = (hysteresis(good["time_s"], soc, float(p["hysteresis_soc"]), before) for before in (1.0, -1.0))
     ends = {float(good["time_s"][first]): last - 1 for first, last in runs(resting)}
     for rest in rests:
         end = ends[rest.start_s]
-        hyst, hyst_std = _hysteresis(moved_ah[: end + 1] / capacity_ah, step_ah[:end], float(p["hysteresis_soc"]))
-        anchor = _anchor(name, part, rest, p, (hyst, hyst_std), (float(counted_ah[end]), float(moved_ah[end])))
+        hyst = 0.5 * (up[end] + down[end]), math.hypot(HYST_LEFT, 0.5 * HYST_STD * (up[end] - down[end]))
+        anchor = _anchor(name, part, rest, p, hyst, (float(counted_ah[end]), float(moved_ah[end])))
         if anchor.soc_std > LARGEST_STD:
             rejected.append(
                 f"{_where(anchor)}: {rest.ocv_v:.4f} V tells SOC to {anchor.soc_std:.2f} only, the curve rises by "
@@ -189,21 +191,13 @@ def of_part(name: str, part: int, good: SampleBlock, p: np.void, anchors: list[A
             anchors.append(anchor)
 
 
-def _hysteresis(moved: Floats, step_ah: Floats, length: float) -> tuple[float, float]:
-    """Hysteresis -1..1 after the charge moved, as the filter has it, and its standard deviation."""
-    back = (moved - moved[-1]) / length
-    near = back > -FAR
-    decay = np.exp(back[near])
-    steps = np.diff(decay) * -np.sign(step_ah[near[1:] & near[:-1]])
-    return float(steps.sum()), float(np.hypot(HYST_LEFT, 0.7 * decay[0]) if near.all() else HYST_LEFT)
-
-
 def _anchor(
     name: str, part: int, rest: Rest, p: np.void, hysteresis: tuple[float, float], charge_ah: tuple[float, float]
 ) -> Anchor:
-    hyst, hyst_std = hysteresis
     series, curve = p["series"], (p["ocv_v"], p["ocv_slope_v"])
-    warmer = float(np.nan_to_num(rest.temperature_c, nan=REFERENCE_C)) - REFERENCE_C
+    temperature_c = float(np.nan_to_num(rest.temperature_c, nan=REFERENCE_C))
+    warmer = temperature_c - REFERENCE_C
+    hyst, hyst_std = (arrhenius(HYSTERESIS_J, temperature_c) * part for part in hysteresis)
     soc = soc_from_ocv(rest.ocv_v, *curve)
     for _ in range(3):  # hysteresis and entropy hardly change with SOC
         beside_v = hyst * on_grid(soc, p["hysteresis_v"]) + warmer * on_grid(soc, p["per_kelvin_v"])

@@ -17,6 +17,7 @@ from bms_estimator.calibration.ladder_fit import (
     HELD_PER_KELVIN_V,
     HELD_V,
     KELVIN_NODES,
+    KNOWN_PER_KELVIN_V,
     PER_KELVIN_V,
     SOC_NODES,
     TYPICAL_V,
@@ -29,12 +30,14 @@ from bms_estimator.calibration.ladder_fit import (
 )
 from bms_estimator.calibration.ladder_voltage import arrhenius, hats, overpotential, temperature_of
 from bms_estimator.calibration.load import Load, whole_load
+from bms_estimator.calibration.ocv_sources import REST_SHARE_STD
 from bms_estimator.calibration.replays import interval_score
+from bms_estimator.calibration.slow_curve import PAIR_V
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import r_s, soc_from_ocv
 from bms_estimator.kernels.ekf_state import Noise
-from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J
+from bms_estimator.kernels.ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J
 from bms_estimator.kernels.open_loop import hysteresis
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
@@ -272,9 +275,10 @@ class _Candidate:
         known = self._cell.ladder
         tells = high_c - low_c >= SPAN_K
         series = self._cell.cell.series_count
+        entropy_v = PER_KELVIN_V if _per_kelvin(self._cell) is None else KNOWN_PER_KELVIN_V
         prior = Prior(
-            ocv_error_v=_ocv_error(self._cell) if self._refine else np.full(EVEN.size, HELD_V),
-            per_kelvin_v=(PER_KELVIN_V if tells and self._refine else HELD_PER_KELVIN_V) * series,
+            ocv_error_v=_middle_error(self._cell) if self._refine else np.full(EVEN.size, HELD_V),
+            per_kelvin_v=(entropy_v if tells and self._refine else HELD_PER_KELVIN_V) * series,
             scale_ohm=self._scale_ohm,
             series=series,
             weak_share=None if tells else WEAK_SHARE if known is None else _share(known),
@@ -324,7 +328,8 @@ def _beside_mean(cell: CellModel, run: Run) -> Floats:
     if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
         added_v += np.interp(run.soc, ocv.soc, ocv.per_kelvin_v) * (run.temperature_c - REFERENCE_C)
     if isinstance(ocv, TableOcv) and ocv.hysteresis_v is not None:
-        added_v += np.interp(run.soc, ocv.soc, ocv.hysteresis_v) * hysteresis(run.soc, Noise().hysteresis_soc)
+        size_v = np.interp(run.soc, ocv.soc, ocv.hysteresis_v) * arrhenius(HYSTERESIS_J, run.temperature_c)
+        added_v += size_v * hysteresis(run.load.time_s, run.soc, Noise().hysteresis_soc, 1.0)
     return added_v
 
 
@@ -358,6 +363,23 @@ def _ocv_error(cell: CellModel) -> Floats:
     return np.hypot(CURVE_ERROR_V * cell.cell.series_count, CURVE_ERROR_SOC * slope_v)
 
 
+def _middle_error(cell: CellModel) -> Floats:
+    """The same of the curve alone, at ``EVEN`` [V]: without what is not known of the hysteresis.
+
+    Drives are discharges: they would take what is wrong of the hysteresis for an error of the curve, and charges would find
+    it twice as far away.
+    """
+    error_v = _ocv_error(cell)
+    if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:
+        return error_v
+    hysteresis_v = REST_SHARE_STD * np.interp(EVEN, cell.ocv.soc, cell.ocv.hysteresis_v)
+    return np.sqrt(np.maximum(error_v**2 - hysteresis_v**2, (PAIR_V * cell.cell.series_count) ** 2))
+
+
+def _per_kelvin(cell: CellModel) -> tuple[float, ...] | None:
+    return cell.ocv.per_kelvin_v if isinstance(cell.ocv, TableOcv) else None
+
+
 def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOcv:
     """The cell's OCV with the correction, as an increasing table; its hysteresis stays, its error too."""
     given = cell.ocv if isinstance(cell.ocv, TableOcv) else None
@@ -383,7 +405,7 @@ def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOc
 def _rms(cell: CellModel, run: Run) -> float:
     """What the cell leaves of a capture's voltage, as at 25 C, each second weighing the same [V]."""
     grid_v = ocv_grid(cell)[0]
-    e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
+    e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v) + _beside_mean(cell, run)
     load = replace(run.load, temperature_c=run.temperature_c)
     error_v = run.load.voltage_v - e_o + overpotential(cell, load, run.soc)
     weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, 60.0)

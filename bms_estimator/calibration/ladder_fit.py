@@ -54,6 +54,8 @@ STRETCHES = 20
 """The error of the OCV is another in each of so many stretches of SOC."""
 PER_KELVIN_V = 1e-3
 """Std of u, per cell [V/K]."""
+KNOWN_PER_KELVIN_V = 5e-5
+"""The same where dE/dT was measured [V/K]."""
 HELD_V, HELD_PER_KELVIN_V = 1e-6, 1e-9
 """The same where it is not to be fitted."""
 

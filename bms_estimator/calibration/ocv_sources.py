@@ -34,6 +34,9 @@ GIVEN_V, GIVEN_COMMON_V = 1e-3, 2e-3
 REST_SHARE, REST_SHARE_STD = 0.7, 0.3
 """Part of the half difference of slow curves that a rest after a discharge keeps, the other is polarisation; and its
 standard deviation: 0.4 and 0.5 seen of an NCA cell, 1.0 of an LFP cell."""
+PLATEAU_SHARE, PLATEAU_V, PLATEAU_SOC = 0.9, 0.15, 0.05
+"""The same of a curve that rises by less, per cell and 1 of SOC, over so much SOC: two phases side by side keep it (Dreyer et al., Nature
+Materials 9, 2010, 448). 0.9 to 1.0 seen in drives of an LFP cell at 25, 5 and -15 C [V]."""
 LEAST_SHARE, SHARE_POINTS, SHARE_K, SHARE_SOC = 0.1, 6, 10.0, (0.1, 0.95)
 """Rests at SOC between these tell it themselves, if there are so many within this of the slow curves' temperature [K]."""
 OTHER_CAPACITY = 0.05
@@ -90,6 +93,7 @@ class Sources:
         tests: Those captures that are relaxation tests, as ``sources`` has them.
         hysteresis_v: At ``NODES`` [V], of the source nearest to 25 C that tells, as far as rests keep it; None when none
             does.
+        hysteresis_std_v: Its standard deviation [V].
     """
 
     capacity_ah: float
@@ -97,6 +101,7 @@ class Sources:
     sources: tuple[Source, ...]
     tests: tuple[RelaxationTest, ...]
     hysteresis_v: Floats | None
+    hysteresis_std_v: Floats
 
     @property
     def points(self) -> Points:
@@ -140,12 +145,13 @@ def find_sources(
     rests = [one for one in recordings if not branches[one.name]]
     found = _rests(rests, sources, every, known_ah, initial_soc, series_count)
     telling = _telling(sources)
-    hysteresis_v = None
+    hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
     if telling is not None and telling.hysteresis_v is not None:
         share = _share(telling, found)
-        kept_v = telling.hysteresis_v * (REST_SHARE if share is None else share)
+        kept_v = telling.hysteresis_v * (_usual_share(telling, series_count) if share is None else share)
         given = telling in sources[len(slow) :] and share is None  # who gives a curve means what it says
         hysteresis_v = np.interp(NODES, GRID, telling.hysteresis_v if given else kept_v)
+        hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, telling.hysteresis_v)
         found = [(test, _amid_hysteresis(points, test, kept_v)) for test, points in found]
         if share is not None:
             sources = [
@@ -153,7 +159,8 @@ def find_sources(
                 for one in sources
             ]
     of_rests = [_of_test(test, points) for test, points in found]
-    return Sources(known_ah, measured_ah, (*sources, *of_rests), tuple(test for test, _ in found), hysteresis_v)
+    tests = tuple(test for test, _ in found)
+    return Sources(known_ah, measured_ah, (*sources, *of_rests), tests, hysteresis_v, hysteresis_std_v)
 
 
 def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
@@ -203,6 +210,14 @@ def _share(telling: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> f
         tells = (points.soc > low) & (points.soc < high) & ~after_charge & (size_v > 0.0)
         shares += (below_v[tells] / size_v[tells]).tolist()
     return float(np.clip(np.median(shares), LEAST_SHARE, 1.0)) if len(shares) >= SHARE_POINTS else None
+
+
+def _usual_share(telling: Source, series_count: int) -> float:
+    """The same where no rest tells it."""
+    soc, ocv_v = telling.points.soc, telling.points.ocv_v
+    edges = np.linspace(*SHARE_SOC, 1 + round(np.ptp(SHARE_SOC) / PLATEAU_SOC))
+    slope_v = np.diff(np.interp(edges, soc, ocv_v)) / np.diff(edges)
+    return PLATEAU_SHARE if slope_v.min() < PLATEAU_V * series_count else REST_SHARE
 
 
 def _rests(

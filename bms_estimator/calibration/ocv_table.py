@@ -59,8 +59,6 @@ SOC_STD, CAPACITY_STD = 0.004, 0.01
 """Standard deviations of a source's first SOC and of its capacity, relative: charging ends differ, cells age."""
 EMPTY_STD_V, FULL_STD_V = 0.05, 0.005
 """What is known of the voltages at SOC 0 and 1 when no rest tells them, per cell [V]."""
-HYSTERESIS_UNSURE = 0.6
-"""Relative std of the hysteresis under a load: of an LFP cell's gap between slow curves 0.3 to 1 was seen."""
 STEEPEST_V = 2.0
 """The slope that turns an error of SOC into one of voltage is no larger: at the ends it is not known well enough [V]."""
 STD_OF_MEDIAN = 1.48
@@ -97,18 +95,18 @@ class TableFit:
         """Standard deviation of E_o(SOC) [V]."""
         return np.asarray(np.interp(soc, self.soc, self.error_v))
 
-    def table(self, hysteresis_v: Floats | None = None) -> TableOcv:
+    def table(self, hysteresis_v: Floats | None = None, hysteresis_std_v: Floats | float = 0.0) -> TableOcv:
         """As the ``[ocv]`` section of a cell file.
 
         Args:
-            hysteresis_v: At the nodes [V]; None: not known. How much of it a load leaves adds to the curve's error.
+            hysteresis_v: At the nodes [V]; None: not known.
+            hysteresis_std_v: Its std there, which adds to the curve's error [V].
         """
-        unsure_v = 0.0 if hysteresis_v is None else HYSTERESIS_UNSURE * hysteresis_v
         return TableOcv(
             form="table",
             soc=tuple(self.soc.tolist()),
             ocv_v=tuple(self.ocv_v.tolist()),
-            error_v=tuple(np.hypot(self.error_v, unsure_v).tolist()),
+            error_v=tuple(np.hypot(self.error_v, hysteresis_std_v).tolist()),
             hysteresis_v=None if hysteresis_v is None else tuple(hysteresis_v.tolist()),
             per_kelvin_v=None if self.per_kelvin_v is None else tuple(self.per_kelvin_v.tolist()),
         )

@@ -219,7 +219,7 @@ def _cell(
     else:
         samples = next(one.samples for one in recordings if one.name == test.name)
         elements = rest_elements(samples, test, found.capacity_ah)
-    ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(found.hysteresis_v)
+    ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(found.hysteresis_v, found.hysteresis_std_v)
     found_cell = CellModel.model_validate({"cell": cell, "ocv": ocv, **elements.sections})
     return found_cell if test is not None else found_cell.model_copy(update={"ladder": typical_ladder(found_cell)})
 

@@ -23,7 +23,7 @@ from bms_estimator.kernels.ekf_state import (
     STATES,
     X,
 )
-from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, TAUS, on_grid, resistances
+from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, TAUS, TREND, on_grid, resistances
 from bms_estimator.kernels.ocv_learning import learned_v, per_node_v, place
 from bms_estimator.kernels.state import Record
 
@@ -55,10 +55,17 @@ def decay(s: Record, p: Record) -> None:
     for k in range(BRANCHES):
         f[X + k] = math.exp(-dt_s / TAUS[k])
     f[B_SLOW], f[B_FAST] = math.exp(-dt_s / p.slow_s), math.exp(-dt_s / p.fast_s)
-    f[HYST] = math.exp(-through / p.hysteresis_soc)
+    f[HYST] = math.exp(-abs(trend(s)) / p.capacity_as / p.hysteresis_soc)
     f[OFFSET], f[LN_Q] = math.exp(-dt_s / p.offset_s), math.exp(-through / p.aged_soc)
     if not s.sensed:
         f[LN_R0] = f[LN_R] = math.exp(-dt_s / p.unsensed_s)
+
+
+@njit(cache=True)
+def trend(s: Record) -> float:
+    """Charge that moves the hysteresis in the window [A s]: of the current's trend, for no regeneration turns it."""
+    w = s.window
+    return w.charge_as if w.gap else s.x_a[TREND] * w.time_s
 
 
 @njit(cache=True)
@@ -79,7 +86,7 @@ def predict(s: Record, p: Record, q: int) -> None:
         for k in range(STATES if j < NODE else NODE):
             row[k] *= along * f[k]
     x[SOC] -= moved  # (2.1)
-    x[HYST] -= math.copysign(1.0 - f[HYST], w.charge_as)
+    x[HYST] -= math.copysign(1.0 - f[HYST], trend(s))
     for k in range(X, X + BRANCHES):
         x[k] -= (1.0 - f[k]) * x[OFFSET]
     couple(cov, f, w.time_s / capacity_as, moved)
@@ -192,7 +199,8 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
         h[LN_R] += h[X + k] * (w.sum_x_a[k] / w.samples + x[X + k])
     h[OFFSET] = first * ohm[0]
     h[B_SLOW] = h[B_FAST] = 1.0
-    h[HYST], h[CURVE] = on_grid(soc, p.hysteresis_v), math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v)
+    h[HYST] = s.hysteresis * on_grid(soc, p.hysteresis_v)
+    h[CURVE] = math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v)
     i, t = place(soc)
     node_v = per_node_v(p, soc, t)
     h[NODE + i], h[NODE + i + 1] = (1.0 - t) * node_v, t * node_v

@@ -35,6 +35,8 @@ WARMED_R_STD = 0.015
 """The same for each kelvin by which it makes itself warmer: half of them may be wrong [1/K]."""
 AGED_SOC = 400.0
 """Charge over which the curve of a cell becomes another with age: 200 full cycles [SOC]."""
+HYST_LEFT = 0.17
+"""Std of the hysteresis h where the way the charge went is known."""
 LOWER_HALF = 0.5
 """SOC below which a cell may be empty early."""
 STEEP_V = 1.0
@@ -131,7 +133,7 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     cov[LN_Q, LN_Q] += p.capacity_std**2 * (1.0 - f[LN_Q] ** 2)
     for j in (LN_R0, LN_R):
         cov[j, j] += resistance_std(s, p) ** 2 * (1.0 - f[j] * f[j])
-    cov[HYST, HYST] += 0.1 * (1.0 - f[HYST] ** 2)
+    cov[HYST, HYST] += HYST_LEFT**2 * (1.0 - f[HYST] ** 2)
     cov[CURVE, CURVE] += 1.0 - f[CURVE] ** 2
     for j in range(NODE, NODE + NODES):
         cov[j, j] += max(1.0 - cov[j, j], 0.0) * moved / AGED_SOC

@@ -84,7 +84,7 @@ class Noise:
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
     least_share: float = 0.25
     """For weights S shrinks to this part of what R and B, which allow for the worst, make of it."""
-    hysteresis_soc: float = 0.05
+    hysteresis_soc: float = 0.04
     """Charge that leads from one branch of the hysteresis to the other [SOC]."""
 
 
@@ -98,7 +98,7 @@ EKF_SETTINGS = np.dtype(
         ("learned", "f8"),  # part of its variance that is of the curve, the same each time: ``ocv_learning``
         ("curve_soc", "f8", GRID),  # charge over which that error changes [SOC]
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
-        ("hysteresis_v", "f8", GRID),  # half of what E_o is higher after charge than after discharge [V]
+        ("hysteresis_v", "f8", GRID),  # half of what E_o is higher after charge than after discharge, at 25 C [V]
         ("weak_ohm", "f8", (GRID, RESISTANCES)),  # at 25 C, activation energy WEAK_J [ohm]
         ("strong_ohm", "f8", (GRID, RESISTANCES)),  # the same with STRONG_J
         ("middle_ohm", "f8"),  # sum of all at SOC 0.5 and 25 C [ohm]
@@ -176,6 +176,7 @@ EKF_STATE = np.dtype(
         ("temperature_c", "f8"),
         ("weak", "f8"),  # Arrhenius factors at it
         ("strong", "f8"),
+        ("hysteresis", "f8"),  # the same of the hysteresis
         ("sensed", "i8"),  # 1: a temperature was told
         ("soc", "f8"),  # mean of the hypotheses
         ("soc_std", "f8"),

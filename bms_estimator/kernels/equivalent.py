@@ -116,5 +116,5 @@ def open_circuit(f: Record, p: Record, e: Record, current_a: float, voltage_v: f
     e_o = voltage_v + e.ohm[0] * (current_a - x[OFFSET])
     for k in range(BRANCHES):
         e_o += e.ohm[1 + k] * (f.x_a[k] + x[X + k])
-    e_o -= on_grid(x[SOC], p.hysteresis_v) * x[HYST] + learned_v(p, x, x[SOC])
+    e_o -= f.hysteresis * on_grid(x[SOC], p.hysteresis_v) * x[HYST] + learned_v(p, x, x[SOC])
     return e_o - (f.temperature_c - REFERENCE_C) * on_grid(x[SOC], p.per_kelvin_v)

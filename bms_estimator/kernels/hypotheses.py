@@ -36,7 +36,7 @@ from bms_estimator.kernels.ekf_state import (
     STATES,
     X,
 )
-from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius, on_grid
+from bms_estimator.kernels.ladder import BRANCHES, HYSTERESIS_J, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius, on_grid
 from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.self_heating import warm
 from bms_estimator.kernels.state import Record
@@ -96,7 +96,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     s.smallest_a = 0.0
     s.sensed = 1 if is_temperature(temperature_c) else 0
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
-    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
+    follow_temperature(s)
     first_load(s, p, current_a)
     for k in range(BRANCHES):
         s.x_a[k] = 0.0
@@ -118,6 +118,13 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
 def is_temperature(temperature_c: float) -> bool:
     """Whether a cell can have it: sensors say -127 or -300 C where a wire is off. NaN is none."""
     return COLDEST_C <= temperature_c <= HOTTEST_C
+
+
+@njit(cache=True)
+def follow_temperature(s: Record) -> None:
+    """The Arrhenius factors at the cell's temperature."""
+    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
+    s.hysteresis = arrhenius(HYSTERESIS_J, s.temperature_c)
 
 
 @njit(cache=True)
@@ -286,7 +293,7 @@ def update_all(s: Record, p: Record) -> None:
         if not w.gap:
             watch_load(s, w.charge_as / dt_s, dt_s)
         pass_time(s, p)
-    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
+    follow_temperature(s)
     s.seeded_s += dt_s
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
     share, best = size_of_errors(s, p), 0
@@ -332,7 +339,8 @@ def reopen(s: Record, p: Record) -> None:
         return
     bias_v = s.mean[0, B_SLOW] + s.mean[0, B_FAST]
     soc = s.mean[0, SOC]
-    wrong_v2 = bias_variance(s, p, soc) + on_grid(soc, p.curve_error_v) ** 2 + on_grid(soc, p.hysteresis_v) ** 2
+    hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)
+    wrong_v2 = bias_variance(s, p, soc) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
     if bias_v * bias_v > REOPEN_STDS**2 * wrong_v2:
         forget_curve(s.mean[0], s.covariance[0])
         seed(s, p, s.mean[0, SOC], REOPEN_STD)

@@ -172,7 +172,7 @@ def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
             f.covariance[0, j, k] = c.good_covariance[j, k]
     if not math.isfinite(f.temperature_c):
         f.temperature_c, f.sensed = REFERENCE_C, 0  # what is told next is taken at once
-        f.weak = f.strong = 1.0
+        f.weak = f.strong = f.hysteresis = 1.0
     first_load(f, p, f.current_a)
     seed(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + LOST_STD**2))
     clear(f)

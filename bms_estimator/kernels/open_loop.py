@@ -10,7 +10,7 @@ from numba import njit
 
 from bms_estimator.kernels.cell import Floats, c_tl, c_ts, r_s, r_tl, r_ts, rc_step
 from bms_estimator.kernels.charge import held_current
-from bms_estimator.kernels.ladder import BRANCHES, TAUS
+from bms_estimator.kernels.ladder import BRANCHES, TAUS, TREND
 
 LEAST_CAPACITANCE = 1e-3
 """C_ts, C_tl are held at this fraction of a9, a12 below delta1, delta2, where (2.7), (2.8) turn negative."""
@@ -37,19 +37,25 @@ def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
 
 
 @njit(cache=True)
-def hysteresis(soc: Floats, length: float) -> Floats:
-    """Hysteresis h over counted SOC: 1 after a charge, as at the first sample, towards -1 after discharge.
+def hysteresis(time_s: Floats, soc: Floats, length: float, first: float) -> Floats:
+    """Hysteresis h over counted SOC: towards 1 in a charge, towards -1 in a discharge.
+
+    It follows the current's trend, that of branch ``TREND``, as in the filter.
 
     Args:
+        time_s: Shape (n,), increasing [s].
         soc: Shape (n,), counted.
         length: Charge that leads from one branch to the other [SOC].
+        first: At the first sample.
 
     Returns:
         Shape (n,).
     """
-    h = np.ones(soc.size)
+    h = np.full(soc.size, first)
+    lagging = soc[0]
     for j in range(1, soc.size):
-        moved = soc[j] - soc[j - 1]
+        moved = (1.0 - math.exp(-(time_s[j] - time_s[j - 1]) / TAUS[TREND])) * (soc[j] - lagging)
+        lagging += moved
         decay = math.exp(-abs(moved) / length)
         h[j] = decay * h[j - 1] + math.copysign(1.0 - decay, moved)
     return h

@@ -91,6 +91,16 @@ def test_capacitances_of_a_flat_ladder_are_positive_down_to_empty():
         assert 0.0 < made[name].amplitude_farad < made[name].offset_farad
 
 
+def test_branches_that_a_slow_capture_does_not_tell_are_written_all_the_same():
+    """Samples a minute apart leave those of seconds at nothing."""
+    untold = LADDER.model_copy(
+        update={"weak_ohm": tuple((0.0 if 0 < k < 4 else 0.02,) * 3 for k in range(7)), "strong_ohm": ((0.0,) * 3,) * 7}
+    )
+    made = branches.sections(untold)
+    assert 0.0 < made["r_ts"].offset_ohm < 1e-3 * made["r_tl"].offset_ohm
+    assert 1.0 < made["r_ts"].offset_ohm * made["c_ts"].offset_farad < 30.0
+
+
 def test_captures_of_about_one_temperature_judge_cells_that_did_not_see_them(warm, cold):
     other = Columns(ladder_capture(steps(5), WARM_C + 3.0), "other")
     found = identify([warm, cold, other], wrong_start())
@@ -143,6 +153,26 @@ def test_a_wrong_ocv_is_corrected(warm):
     left_v = np.interp(soc, found.soc, found.ocv_v) - true_v
     assert np.sqrt(np.mean(left_v[middle] ** 2)) < 0.8 * np.sqrt(np.mean((wrong_v - true_v)[middle] ** 2))
     assert (np.diff(found.ocv_v) > 0.0).all()
+
+
+def test_what_may_be_hysteresis_is_no_error_of_the_curve(warm):
+    """The middle of two branches 10 mV to both sides: a drive that lies elsewhere by 4 mV tells nothing of the other branch."""
+    soc = np.linspace(0.0, 1.0, 101)
+    true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
+    moved_v = {}
+    for name, hysteresis_v in (("branches", 0.010), ("one", None)):
+        middle_v = true_v + 4e-3 + (hysteresis_v or 0.0)
+        told = TableOcv(
+            form="table",
+            soc=tuple(soc),
+            ocv_v=tuple(middle_v),
+            error_v=(4e-3,) * soc.size,
+            hysteresis_v=None if hysteresis_v is None else (hysteresis_v,) * soc.size,
+        )
+        found = identify([warm], TRUTH.model_copy(update={"ocv": told}), initial_soc=0.98).cell.ocv
+        moved_v[name] = np.mean((np.interp(soc, found.soc, found.ocv_v) - middle_v)[20:90])
+        assert found.hysteresis_v is None or found.hysteresis_v[0] == hysteresis_v
+    assert abs(moved_v["branches"]) < 0.5 * abs(moved_v["one"])
 
 
 def test_charge_that_the_rows_of_a_capture_miss_is_found(warm):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.ocv_sources import GivenCurve, Recording, find_sources
+from bms_estimator.calibration.ocv_sources import PLATEAU_SHARE, REST_SHARE_STD, GivenCurve, Recording, find_sources
 from bms_estimator.calibration.ocv_table import NODES, fit_table
+from bms_estimator.calibration.slow_curve import GRID
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture
@@ -152,7 +153,10 @@ def test_lfp_pairs_at_three_temperatures(shared_data):
     found = find_sources([Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=None)
     assert found.capacity_ah == pytest.approx(2.06, abs=0.005)
     assert [round(source.temperature_c) for source in found.sources] == [25, 5, -15]
-    assert 0.005 < found.hysteresis_v[INSIDE].min() < found.hysteresis_v[INSIDE].max() < 0.03
+    half_v = np.interp(NODES, GRID, found.sources[0].hysteresis_v)
+    assert 0.005 < half_v[INSIDE].min() < half_v[INSIDE].max() < 0.03
+    assert found.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v)
+    assert found.hysteresis_std_v == pytest.approx(REST_SHARE_STD * half_v)
     fit = fit_table(found.points)
     warm = found.sources[0].points
     plateau = (warm.soc > 0.15) & (warm.soc < 0.95)

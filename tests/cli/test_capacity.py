@@ -83,7 +83,7 @@ def test_a_wrong_sign_is_named_and_no_longer_rest_advised(capsys, capture):
             "lfp",
             "0.02 of SOC apart, the charge between them is 0.90 of the declared capacity: is the curve this cell's",
         ),
-        ("lmo", "anchors disagree, by 5.2 times what their errors explain: is the curve this cell's"),
+        ("lmo", "anchors disagree, by 5.3 times what their errors explain: is the curve this cell's"),
     ],
 )
 def test_a_wrong_cell_is_named_and_no_longer_rest_advised(capsys, capture, cell, said):

@@ -1,10 +1,14 @@
 """A simulated cell with the flat OCV of lithium iron phosphate, 30 mV higher after charge than after discharge."""
 
 import numpy as np
+import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import cell_step, ocv, r_s
+from bms_estimator.kernels.ekf_state import HYST
+from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.kernels.open_loop import hysteresis
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.model.settings import IdentifierSettings
@@ -61,3 +65,37 @@ def test_a_hysteresis_that_is_told_makes_the_soc_better_and_its_band_true() -> N
     assert told[0] < 0.012
     assert told[0] < 0.8 * untold[0]
     assert told[1] > 0.95
+
+
+@pytest.mark.parametrize("period_s", [1, 10])
+def test_regeneration_does_not_turn_it(period_s: int) -> None:
+    """Half an hour of 1.5 C and -1 C in turn, 20 s each: four times as much charge moves as the cell loses."""
+    estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=0.0), initial_soc=0.8)
+    time_s = np.arange(0.0, 1800.0, period_s)
+    current_a = CELL.cell.capacity_ah * np.where(time_s % 40.0 < 20.0, 1.5, -1.0)
+    drawn_as = np.concatenate([[0.0], np.cumsum(current_a[:-1] * period_s)])
+    for t, i in zip(time_s, current_a, strict=True):
+        estimator.step(t, i, 3.3 - 0.03 * i)
+    f = estimator.record[0]["filter"]
+    h = f["mean"][f["best"], HYST]
+    assert -1.0 <= h < -0.9
+    length = float(estimator.settings_record[0]["filter"]["hysteresis_soc"])
+    assert h == pytest.approx(hysteresis(time_s, -drawn_as / CAPACITY_AS, length, 0.0)[-1], abs=0.02)
+
+
+def test_it_grows_in_the_cold() -> None:
+    """What the filter predicts after a charge less what it predicts after a discharge."""
+    seen_v = {}
+    for h in (-1.0, 1.0):
+        for celsius in (-15.0, 25.0):
+            estimator = Estimator(CELL, identifier=IdentifierSettings(hysteresis_v=HYSTERESIS_V), initial_soc=0.5)
+            estimator.step(0.0, 0.0, 3.28, 0, celsius)
+            f = estimator.record[0]["filter"]
+            f["count"], f["mean"][:, HYST], f["covariance"][:, HYST] = 1, h, 0.0
+            f["covariance"][:, :, HYST] = 0.0
+            estimator.step(1.0, 0.0, 3.28, 0, celsius)
+            seen_v[h, celsius] = f["voltage_v"]
+    gap_v = {celsius: seen_v[1.0, celsius] - seen_v[-1.0, celsius] for celsius in (-15.0, 25.0)}
+    assert gap_v[25.0] == pytest.approx(HYSTERESIS_V, rel=0.01)
+    assert gap_v[-15.0] / gap_v[25.0] == pytest.approx(arrhenius(HYSTERESIS_J, -15.0), rel=0.01)
+    assert 1.5 < gap_v[-15.0] / gap_v[25.0] < 1.8

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import nnls
 
+from bms_estimator.calibration.ocv_sources import REST_SHARE_STD
 from bms_estimator.kernels.ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
@@ -94,6 +95,7 @@ class Case:
 
 KNOWS_25 = {"file_c": (25.0,)}
 LFP = {"truth": PHOSPHATE, "file_c": (25.0, 5.0, -15.0)}
+CHARGES = {"load": "constant", "load_c": -0.2, "soc": 0.15, "hours": 3.0}
 WARMS = {"warms_k": 15.0, "temperature_c": 20.0, "hours": 0.4, "unseen_h": 0.2}
 CASES: tuple[Case, ...] = (
     Case("oxide 25C", seed=1),
@@ -119,6 +121,9 @@ CASES: tuple[Case, ...] = (
     Case("LFP full 25C", **LFP, soc=1.0, unseen_h=0.0, seed=17),
     Case("LFP full -10C", **LFP, temperature_c=-10.0, load_c=0.4, soc=1.0, unseen_h=0.0, seed=18),
     Case("LFP cut 25C", **LFP, hours=1.5, seed=19),
+    Case("LFP charging", **LFP, **CHARGES, seed=34),
+    Case("LFP charging 0C", **LFP, **CHARGES, temperature_c=0.0, seed=37),
+    Case("oxide charging", **CHARGES, seed=36),
     Case("LFP cut 0C", **LFP, temperature_c=0.0, hours=1.5, seed=20),
     Case("generic nmc", file_c="generic", seed=21),
     Case("generic nmc 0C", file_c="generic", temperature_c=0.0, load_c=0.4, seed=33),
@@ -205,11 +210,12 @@ def cell_file(case: Case) -> CellModel:
     std_v, std_soc_v = case.curve_error * OCV_STD_V[kind], case.curve_error * OCV_STD_SOC * slope_v
     wrong_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
     told_v = rising((case.truth.ocv_v + wrong_v)[OCV_NODES])
+    hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # everywhere: an error that `ocv` allows for
     table = {
         "soc": GRID[OCV_NODES],
         "ocv_v": told_v + 1e-6 * np.arange(OCV_NODES.size),
-        "error_v": np.hypot(std_v, std_soc_v)[OCV_NODES],
-        "hysteresis_v": np.full(OCV_NODES.size, case.truth.hysteresis_v[GRID.size // 2]),
+        "error_v": np.hypot(np.hypot(std_v, std_soc_v)[OCV_NODES], REST_SHARE_STD * hysteresis_v),
+        "hysteresis_v": np.full(OCV_NODES.size, hysteresis_v),
     }
     ocv = TableOcv(form="table", **{name: tuple(column) for name, column in table.items()})
     return generic.model_copy(update={"ocv": ocv, "ladder": ladder(case.truth, case.file_c, rng)})

@@ -32,7 +32,8 @@ COOLS_S = 900.0
 """Time constant in which a cell gets warm [s]."""
 GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 LOOPS_SOC, FAST_LOOP = (0.015, 0.15), 0.6
-"""Charge that leads from one branch of the hysteresis to the other, fast and slow, and the share of the fast one."""
+"""Charge that leads halfway from one branch of the hysteresis to the other, fast and slow, and the share of the fast one:
+stop operators (Prandtl), which regeneration takes no further from the branch than its own charge does."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +80,8 @@ def simulate(dt_s, current_a, room_c, soc, branch, capacity_ah, ocv_v, per_kelvi
         soc -= moved
         for k in range(1, len(TAU_S)):
             x[k] = i + (x[k] - i) * math.exp(-dt_s / (TAU_S[k] * math.exp(0.5 * ENERGY_J[k] * cold)))
-        if moved != 0.0:
-            to = -math.copysign(1.0, moved)
-            fast = to + (fast - to) * math.exp(-abs(moved) / LOOPS_SOC[0])
-            slow = to + (slow - to) * math.exp(-abs(moved) / LOOPS_SOC[1])
+        fast = min(max(fast - moved / LOOPS_SOC[0], -1.0), 1.0)
+        slow = min(max(slow - moved / LOOPS_SOC[1], -1.0), 1.0)
     return voltage_v, true_soc
 
 
