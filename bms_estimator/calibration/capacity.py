@@ -21,7 +21,6 @@ from bms_estimator.calibration.relaxation import Rest, find_rests, resting_sampl
 from bms_estimator.estimator.filter_settings import CURVE_SOC, filter_settings
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import ocv, soc_from_ocv
-from bms_estimator.kernels.ekf_noise import HYST_LEFT
 from bms_estimator.kernels.hypotheses import HYST_STD
 from bms_estimator.kernels.ladder import HYSTERESIS_J, REFERENCE_C, arrhenius, on_grid
 from bms_estimator.kernels.open_loop import hysteresis
@@ -43,6 +42,8 @@ BEYOND = 3.0
 """A rest so many standard deviations beyond the curve's ends is none of this cell."""
 DISAGREE = 9.0
 """Squared: anchors off by more than so many of their standard deviations do not go together."""
+HYST_UNSURE = 0.3
+"""Std of the hysteresis h where the way is known, and of its size, which errs the other way after a charge."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def of_part(name: str, part: int, good: SampleBlock, p: np.void, anchors: list[A
     ends = {float(good["time_s"][first]): last - 1 for first, last in runs(resting)}
     for rest in rests:
         end = ends[rest.start_s]
-        hyst = 0.5 * (up[end] + down[end]), math.hypot(HYST_LEFT, 0.5 * HYST_STD * (up[end] - down[end]))
+        hyst = 0.5 * (up[end] + down[end]), math.hypot(HYST_UNSURE, 0.5 * HYST_STD * (up[end] - down[end]))
         anchor = _anchor(name, part, rest, p, hyst, (float(counted_ah[end]), float(moved_ah[end])))
         if anchor.soc_std > LARGEST_STD:
             rejected.append(

@@ -28,7 +28,7 @@ from bms_estimator.calibration.ladder_fit import (
     fit_ladder,
     moments,
 )
-from bms_estimator.calibration.ladder_voltage import arrhenius, hats, overpotential, temperature_of
+from bms_estimator.calibration.ladder_voltage import arrhenius, beside_ocv, hats, overpotential, temperature_of
 from bms_estimator.calibration.load import Load, whole_load
 from bms_estimator.calibration.ocv_sources import REST_SHARE_STD
 from bms_estimator.calibration.replays import interval_score
@@ -36,9 +36,7 @@ from bms_estimator.calibration.slow_curve import PAIR_V
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import r_s, soc_from_ocv
-from bms_estimator.kernels.ekf_state import Noise
-from bms_estimator.kernels.ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J
-from bms_estimator.kernels.open_loop import hysteresis
+from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -138,6 +136,11 @@ class Run:
         return replace(self, soc=self.soc[0] + (1.0 + miscount) * moved, miscount=miscount)
 
     @property
+    def warm_load(self) -> Load:
+        """``load`` at ``temperature_c``."""
+        return replace(self.load, temperature_c=self.temperature_c)
+
+    @property
     def mean_c(self) -> float:
         """Mean temperature [C]."""
         return float(self.temperature_c.mean())
@@ -205,7 +208,7 @@ class _Candidate:
         grid = np.linspace(0.0, 1.0, ocv_grid(cell)[0].size)
         self._moments = []
         for run in runs:
-            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + _beside_mean(cell, run)
+            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + beside_ocv(cell, run.warm_load, run.soc)
             self._moments.append(
                 moments(
                     run.load,
@@ -322,17 +325,6 @@ def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Ru
     return runs
 
 
-def _beside_mean(cell: CellModel, run: Run) -> Floats:
-    """What temperature and hysteresis add to the given OCV [V]."""
-    ocv, added_v = cell.ocv, np.zeros(run.soc.size)
-    if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
-        added_v += np.interp(run.soc, ocv.soc, ocv.per_kelvin_v) * (run.temperature_c - REFERENCE_C)
-    if isinstance(ocv, TableOcv) and ocv.hysteresis_v is not None:
-        size_v = np.interp(run.soc, ocv.soc, ocv.hysteresis_v) * arrhenius(HYSTERESIS_J, run.temperature_c)
-        added_v += size_v * hysteresis(run.load.time_s, run.soc, Noise().hysteresis_soc, 1.0)
-    return added_v
-
-
 def _wrong_temperature(load: Load, temperature_c: float | None) -> list[str]:
     temperature = temperature_of(load, REFERENCE_C if temperature_c is None else temperature_c)
     if temperature.min() >= LOWEST_C and temperature.max() <= HIGHEST_C:
@@ -364,7 +356,7 @@ def _ocv_error(cell: CellModel) -> Floats:
 
 
 def _middle_error(cell: CellModel) -> Floats:
-    """The same of the curve alone, at ``EVEN`` [V]: without what is not known of the hysteresis.
+    """The same of the curve alone, at ``EVEN`` [V]: without the least of what is not known of the hysteresis.
 
     Drives are discharges: they would take what is wrong of the hysteresis for an error of the curve, and charges would find
     it twice as far away.
@@ -405,9 +397,8 @@ def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOc
 def _rms(cell: CellModel, run: Run) -> float:
     """What the cell leaves of a capture's voltage, as at 25 C, each second weighing the same [V]."""
     grid_v = ocv_grid(cell)[0]
-    e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v) + _beside_mean(cell, run)
-    load = replace(run.load, temperature_c=run.temperature_c)
-    error_v = run.load.voltage_v - e_o + overpotential(cell, load, run.soc)
+    e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
+    error_v = run.load.voltage_v - e_o + overpotential(cell, run.warm_load, run.soc)
     weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, 60.0)
     weight *= (run.soc > JUDGED_SOC) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
     return float(np.sqrt((weight * error_v**2).sum() / max(weight.sum(), 1e-12)))

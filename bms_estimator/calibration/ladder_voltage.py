@@ -4,8 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.load import Load
-from bms_estimator.kernels.ladder import GAS_J, REFERENCE_C, STRONG_J, WEAK_J
-from bms_estimator.kernels.open_loop import branch_currents, two_branches
+from bms_estimator.kernels.ekf_state import Noise
+from bms_estimator.kernels.ladder import GAS_J, HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
+from bms_estimator.kernels.open_loop import branch_currents, hysteresis, two_branches
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 
 Floats = NDArray[np.float64]
@@ -31,7 +32,7 @@ def temperature_of(load: Load, otherwise_c: float = REFERENCE_C) -> Floats:
 
 
 def overpotential(cell: CellModel, load: Load, soc: Floats) -> Floats:
-    """What the voltage lies under E_o(SOC) at 25 C, dE/dT included [V].
+    """What the voltage lies under E_o(SOC) at 25 C, dE/dT and hysteresis included [V].
 
     Args:
         cell: Its ladder counts, else its a1..a15; these know no temperature.
@@ -43,9 +44,18 @@ def overpotential(cell: CellModel, load: Load, soc: Floats) -> Floats:
         drop_v = two_branches(load.time_s, load.current_a, soc, cell.a[:16])
     else:
         drop_v = of_ladder(cell.ladder, load, soc, temperature_c)
-    if isinstance(cell.ocv, TableOcv) and cell.ocv.per_kelvin_v is not None:
-        drop_v -= (temperature_c - REFERENCE_C) * np.interp(soc, cell.ocv.soc, cell.ocv.per_kelvin_v)
-    return drop_v
+    return drop_v - beside_ocv(cell, load, soc)
+
+
+def beside_ocv(cell: CellModel, load: Load, soc: Floats) -> Floats:
+    """What temperature and hysteresis add to E_o(SOC) at 25 C [V]; a load begins after a charge."""
+    ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(load)
+    if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
+        added_v += np.interp(soc, ocv.soc, ocv.per_kelvin_v) * (temperature_c - REFERENCE_C)
+    if isinstance(ocv, TableOcv) and ocv.hysteresis_v is not None:
+        size_v = np.interp(soc, ocv.soc, ocv.hysteresis_v) * arrhenius(HYSTERESIS_J, temperature_c)
+        added_v += size_v * hysteresis(load.time_s, soc, Noise().hysteresis_soc, 1.0)
+    return added_v
 
 
 def of_ladder(ladder: Ladder, load: Load, soc: Floats, temperature_c: Floats) -> Floats:

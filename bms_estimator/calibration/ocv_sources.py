@@ -22,6 +22,7 @@ from bms_estimator.calibration.slow_curve import (
     slow_branches,
     slow_curves,
 )
+from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
@@ -91,8 +92,8 @@ class Sources:
         measured_ah: By a whole slow discharge [Ah]; NaN when there is none.
         sources: Slow curves, given curves, rests.
         tests: Those captures that are relaxation tests, as ``sources`` has them.
-        hysteresis_v: At ``NODES`` [V], of the source nearest to 25 C that tells, as far as rests keep it; None when none
-            does.
+        hysteresis_v: At ``NODES`` and 25 C [V], of the source nearest to it that tells, as far as rests keep it; None when
+            none does.
         hysteresis_std_v: Its standard deviation [V].
     """
 
@@ -148,11 +149,12 @@ def find_sources(
     hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
     if telling is not None and telling.hysteresis_v is not None:
         share = _share(telling, found)
-        kept_v = telling.hysteresis_v * (_usual_share(telling, series_count) if share is None else share)
+        half_v = telling.hysteresis_v / _colder(telling.temperature_c)
+        kept_v = half_v * (_usual_share(telling, series_count) if share is None else share)
         given = telling in sources[len(slow) :] and share is None  # who gives a curve means what it says
-        hysteresis_v = np.interp(NODES, GRID, telling.hysteresis_v if given else kept_v)
-        hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, telling.hysteresis_v)
-        found = [(test, _amid_hysteresis(points, test, kept_v)) for test, points in found]
+        hysteresis_v = np.interp(NODES, GRID, half_v if given else kept_v)
+        hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_v)
+        found = [(test, _amid_hysteresis(points, test, kept_v * _colder(test.temperature_c))) for test, points in found]
         if share is not None:
             sources = [
                 replace(one, notes=(*one.notes, f"rests keep {share:.2f} of its hysteresis")) if one is telling else one
@@ -193,6 +195,11 @@ def _telling(sources: Sequence[Source]) -> Source | None:
 
 def _from_reference(temperature_c: float) -> float:
     return abs(float(np.nan_to_num(temperature_c, nan=REFERENCE_C)) - REFERENCE_C)
+
+
+def _colder(temperature_c: float) -> float:
+    """Hysteresis at a temperature over that at 25 C; NaN is 25 C."""
+    return float(arrhenius(HYSTERESIS_J, float(np.nan_to_num(temperature_c, nan=REFERENCE_C))))
 
 
 def _share(telling: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> float | None:

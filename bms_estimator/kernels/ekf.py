@@ -55,17 +55,17 @@ def decay(s: Record, p: Record) -> None:
     for k in range(BRANCHES):
         f[X + k] = math.exp(-dt_s / TAUS[k])
     f[B_SLOW], f[B_FAST] = math.exp(-dt_s / p.slow_s), math.exp(-dt_s / p.fast_s)
-    f[HYST] = math.exp(-abs(trend(s)) / p.capacity_as / p.hysteresis_soc)
+    f[HYST] = math.exp(-abs(trend(s, p)) / p.capacity_as / p.hysteresis_soc)
     f[OFFSET], f[LN_Q] = math.exp(-dt_s / p.offset_s), math.exp(-through / p.aged_soc)
     if not s.sensed:
         f[LN_R0] = f[LN_R] = math.exp(-dt_s / p.unsensed_s)
 
 
 @njit(cache=True)
-def trend(s: Record) -> float:
+def trend(s: Record, p: Record) -> float:
     """Charge that moves the hysteresis in the window [A s]: of the current's trend, for no regeneration turns it."""
     w = s.window
-    return w.charge_as if w.gap else s.x_a[TREND] * w.time_s
+    return w.charge_as if w.gap and w.time_s > p.unmeasured_s else s.x_a[TREND] * w.time_s
 
 
 @njit(cache=True)
@@ -86,7 +86,7 @@ def predict(s: Record, p: Record, q: int) -> None:
         for k in range(STATES if j < NODE else NODE):
             row[k] *= along * f[k]
     x[SOC] -= moved  # (2.1)
-    x[HYST] -= math.copysign(1.0 - f[HYST], trend(s))
+    x[HYST] -= math.copysign(1.0 - f[HYST], trend(s, p))
     for k in range(X, X + BRANCHES):
         x[k] -= (1.0 - f[k]) * x[OFFSET]
     couple(cov, f, w.time_s / capacity_as, moved)

@@ -19,7 +19,8 @@ RESISTANCES = 1 + BRANCHES
 WEAK_J, STRONG_J = 12e3, 45e3
 """Activation energies of the two parts of each resistance [J/mol]: of the electrolyte, and of reaction and diffusion."""
 HYSTERESIS_J = 8e3
-"""How hysteresis grows in the cold: 1.2 and 1.7 times that of 25 C at 5 and -15 C in an LFP cell, C/30 [J/mol]."""
+"""How hysteresis grows in the cold [J/mol]: between C/30 curves of an LFP cell lay, without what its ladder drops, 1.2 and 1.7
+times as much at 5 and -15 C as at 25 C."""
 GAS_J = 8.314462618
 """[J/(mol K)]"""
 REFERENCE_C = 25.0

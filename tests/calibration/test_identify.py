@@ -156,17 +156,17 @@ def test_a_wrong_ocv_is_corrected(warm):
 
 
 def test_what_may_be_hysteresis_is_no_error_of_the_curve(warm):
-    """The middle of two branches 10 mV to both sides: a drive that lies elsewhere by 4 mV tells nothing of the other branch."""
+    """The middle of two branches 25 mV to both sides: a drive that lies elsewhere by 8 mV tells nothing of the other branch."""
     soc = np.linspace(0.0, 1.0, 101)
     true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
     moved_v = {}
-    for name, hysteresis_v in (("branches", 0.010), ("one", None)):
-        middle_v = true_v + 4e-3 + (hysteresis_v or 0.0)
+    for name, hysteresis_v in (("branches", 0.025), ("one", None)):
+        middle_v = true_v + 8e-3 + (hysteresis_v or 0.0)
         told = TableOcv(
             form="table",
             soc=tuple(soc),
             ocv_v=tuple(middle_v),
-            error_v=(4e-3,) * soc.size,
+            error_v=(8e-3,) * soc.size,
             hysteresis_v=None if hysteresis_v is None else (hysteresis_v,) * soc.size,
         )
         found = identify([warm], TRUTH.model_copy(update={"ocv": told}), initial_soc=0.98).cell.ocv

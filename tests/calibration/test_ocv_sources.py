@@ -6,6 +6,7 @@ import pytest
 from bms_estimator.calibration.ocv_sources import PLATEAU_SHARE, REST_SHARE_STD, GivenCurve, Recording, find_sources
 from bms_estimator.calibration.ocv_table import NODES, fit_table
 from bms_estimator.calibration.slow_curve import GRID
+from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture
@@ -161,3 +162,17 @@ def test_lfp_pairs_at_three_temperatures(shared_data):
     warm = found.sources[0].points
     plateau = (warm.soc > 0.15) & (warm.soc < 0.95)
     assert np.abs(fit(warm.soc) - warm.ocv_v)[plateau].max() < 3e-3
+
+
+def test_the_hysteresis_of_a_cold_pair_is_brought_to_25_c(shared_data):
+    folder, mean_v = shared_data / "a123", {}
+    for at in ("p25", "n15"):
+        names = [f"c30_{way}_{at}.csv.gz" for way in ("dis", "chg")]
+        found = find_sources(
+            [Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=2.06
+        )
+        size = arrhenius(HYSTERESIS_J, found.sources[0].temperature_c)
+        half_v = np.interp(NODES, GRID, found.sources[0].hysteresis_v)
+        assert found.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v / size)
+        mean_v[at] = found.hysteresis_v[INSIDE].mean()
+    assert 0.7 < mean_v["n15"] / mean_v["p25"] < 1.8

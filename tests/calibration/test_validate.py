@@ -2,11 +2,13 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.validate import validate
-from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture
-from tests.calibration.simulated_load import TRUTH, capture, constant, steps
+from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps
 
 END_OF_CHARGE_S = 10_085.5
 """Of the first one in ``leaf/cc_1c``, and of the rest behind it [s]."""
@@ -32,6 +34,26 @@ def test_a_resistance_beside_the_cell_is_seen():
     assert found.extra_ohm == pytest.approx(0.005, abs=1e-4)
     assert found.without_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < found.above.voltage_rms_v
     assert found.resting.voltage_rms_v < 1e-3 < found.loaded.voltage_rms_v
+
+
+def test_temperature_and_hysteresis_are_taken_out_once():
+    """A discharge at -15 C, of a cell whose file knows what both do to its OCV."""
+    samples = ladder_capture(steps(), -15.0)
+    samples["voltage_v"] -= 40.0 * 2e-4 + 0.01 * arrhenius(HYSTERESIS_J, -15.0)
+    grid_v = ocv_grid(TRUTH)[0]
+    soc = np.linspace(0.0, 1.0, grid_v.size)
+    told = TableOcv(
+        form="table",
+        soc=tuple(soc),
+        ocv_v=tuple(grid_v),
+        hysteresis_v=(0.01,) * soc.size,
+        per_kelvin_v=(2e-4,) * soc.size,
+    )
+    found = validate(
+        Columns(samples, "cold"), TRUTH.model_copy(update={"ocv": told, "ladder": LADDER}), initial_soc=0.98
+    )
+    turned = (found.soc < 0.7) & (found.soc > 0.35)
+    assert np.sqrt(np.mean(found.error_v[turned] ** 2)) < 1.5e-3
 
 
 def test_initial_soc_can_be_given():
