@@ -66,8 +66,9 @@ def _outcome(group: Group, folder: Path) -> list[str]:
         return ["0"]
     there = np.array([x for pack in packs for x in judged(pack)])
     every = np.array([known.error / (known.hour.soc_mean_std or np.nan) for pack in packs for known in pack])
-    shares = (found[0]["within_2_std"], np.mean(np.abs(there) <= 2.0), np.mean(np.abs(every) <= 2.0))
-    return [str(found[0]["judgements"]), *(f"{100 * share:.0f}" for share in shares), f"{there.mean():+.1f}"]
+    judgements, within, of_all = found[0]["judgements"], found[0]["within_2_std"], np.mean(np.abs(every) <= 2.0)
+    same = (f"{100 * np.mean(np.abs(there) <= 2.0):.0f}", f"{there.mean():+.1f}") if there.size else ("", "")
+    return [str(judgements), f"{100 * within:.0f}", same[0], f"{100 * of_all:.0f}", same[1]]
 
 
 def judged(pack: list[Known]) -> list[float]:
