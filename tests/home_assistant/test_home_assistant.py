@@ -26,6 +26,7 @@ from tests.sinks.test_home_assistant import CELLS, MOST_ROWS_PER_MIN, noisy, res
 from tests.sinks.test_home_assistant import described as shown
 
 SOC, SET_SOC, LOW = "sensor.bms_pack_soc_percent", "number.bms_pack_set_soc", "binary_sensor.bms_pack_alarm_soc_low"
+NOT_GRANTED = '"event": "request not granted", "pack": "bench"'
 NOT_OURS = ("Skipping pip installation", "zlib_ng and isal are not available")
 """What this Home Assistant warns of itself."""
 CARDS = {"conditional", "entities", "entity-filter", "gauge", "history-graph", "statistics-graph", "tile"}
@@ -208,11 +209,14 @@ def changes(home: HomeAssistant, device: str) -> int:
 
 def test_the_present_current_becomes_zero_by_its_button(home: HomeAssistant, packs: Packs, broker: Broker) -> None:
     told(broker, "bms/bench/health", lambda health: health["uptime_s"] > WATCHED_S + 5.0)
-    home.call("button.press", entity_id="button.bms_bench_current_zero")
-    deadline = time.monotonic() + LONG_S
-    while '"present current taken as zero on request", "pack": "bench"' not in packs.log:
+    deadline, granted = time.monotonic() + LONG_S, '"present current taken as zero on request", "pack": "bench"'
+    refused = -1
+    while granted not in packs.log:
         assert time.monotonic() < deadline, packs.log[-2000:]
-        time.sleep(0.1)
+        if packs.log.count(NOT_GRANTED) > refused:  # a busy machine loses frames, and what was watched begins anew
+            refused = packs.log.count(NOT_GRANTED)
+            home.call("button.press", entity_id="button.bms_bench_current_zero")
+        time.sleep(1.0)
 
 
 def test_a_pack_whose_service_was_killed_is_unavailable_until_it_is_back(home: HomeAssistant, packs: Packs) -> None:
