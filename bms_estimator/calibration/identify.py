@@ -18,10 +18,10 @@ from bms_estimator.calibration.ladder_fit import (
     HELD_V,
     KELVIN_NODES,
     KNOWN_PER_KELVIN_V,
+    NOTHING,
     PER_KELVIN_V,
     SOC_NODES,
     TYPICAL_V,
-    WEAK_SHARE,
     LadderFit,
     Prior,
     correction_at,
@@ -30,13 +30,13 @@ from bms_estimator.calibration.ladder_fit import (
 )
 from bms_estimator.calibration.ladder_voltage import arrhenius, beside_ocv, hats, overpotential, temperature_of
 from bms_estimator.calibration.load import Load, whole_load
-from bms_estimator.calibration.ocv_sources import REST_SHARE_STD
+from bms_estimator.calibration.ocv_sources import REST_SHARE_STD, has_plateau
 from bms_estimator.calibration.replays import interval_score
 from bms_estimator.calibration.slow_curve import PAIR_V
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels.cell import r_s, soc_from_ocv
-from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J
+from bms_estimator.kernels.ladder import REFERENCE_C, RESISTANCES, STRONG_J, weak_share
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -59,6 +59,10 @@ PERCENTILES = (2.0, 98.0)
 """The temperatures of the captures are known between these."""
 LADDER_STD = 0.1
 """Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
+TYPICAL_STD = 0.3
+"""A ladder less sure than this was not identified: it does not know its temperatures."""
+MIDDLE_SOC, SHAPE = 0.4, (0.2, 20.0)
+"""Above it is the middle; no part is taken to be smaller or larger than this over what it is there."""
 JUDGED_SOC = 0.1
 """RMS errors are given above it."""
 COUNT_PASSES = 3
@@ -284,16 +288,18 @@ class _Candidate:
             per_kelvin_v=(entropy_v if tells and self._refine else HELD_PER_KELVIN_V) * series,
             scale_ohm=self._scale_ohm,
             series=series,
-            weak_share=None if tells else WEAK_SHARE if known is None else _share(known),
+            shapes=self._shapes(),
+            weak_share=None if tells else weak_share(SOC_NODES) if known is None else _share(known),
         )
         fit = fit_ladder([self._moments[k] for k in which], prior)
-        if not tells and known is not None:
+        if not tells and known is not None and known.std < TYPICAL_STD:
             low_c, high_c = min(low_c, known.temperature_c[0]), max(high_c, known.temperature_c[1])
+        ohm, ohm_std = fit.branches(0.5, 0, RESISTANCES)
         ladder = Ladder(
             soc=_tuple(SOC_NODES),
             weak_ohm=tuple(map(_tuple, fit.weak_ohm)),
             strong_ohm=tuple(map(_tuple, fit.strong_ohm)),
-            std=LADDER_STD,
+            std=round(float(np.hypot(LADDER_STD, ohm_std / max(ohm, 1e-9 * self._scale_ohm))), 3),
             error_v=1.0,
             temperature_c=(low_c, high_c),
         )
@@ -303,6 +309,21 @@ class _Candidate:
         new = self._cell.model_copy(update=update)
         error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), 1e-5)
         return fit, new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
+
+    def _shapes(self) -> Floats:
+        """How weak and strong part of each resistance usually go along SOC, at ``SOC_NODES``, over what they are in the middle.
+
+        As an identified ladder; halfway between level and a typical one: cells differ. Level for one with a plateau: the
+        LFP cell that there are captures of is not like the generic one there.
+        """
+        known, grid_v = self._cell.ladder, ocv_grid(self._cell)[0]
+        if known is None or has_plateau(np.linspace(0.0, 1.0, grid_v.size), grid_v, self._cell.cell.series_count):
+            return np.ones((2, RESISTANCES, SOC_NODES.size))
+        rows = _at_nodes(known)
+        middle = rows[:, :, SOC_NODES > MIDDLE_SOC].mean(axis=2, keepdims=True)
+        nothing = middle < NOTHING * self._scale_ohm
+        shapes = np.clip(np.where(nothing, 1.0, rows / np.where(nothing, 1.0, middle)), *SHAPE)
+        return np.asarray(np.sqrt(shapes) if known.std >= TYPICAL_STD else shapes)
 
 
 def _run(load: Load, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
@@ -338,13 +359,16 @@ def _temperature_range(runs: list[Run]) -> tuple[float, float]:
     return round(float(low_c), 1), round(float(high_c), 1)
 
 
+def _at_nodes(ladder: Ladder) -> Floats:
+    """Its weak and strong part at ``SOC_NODES``, shape (2, RESISTANCES, SOC_NODES.size) [ohm]."""
+    parts = ladder.weak_ohm, ladder.strong_ohm
+    return np.array([[np.interp(SOC_NODES, ladder.soc, ohm) for ohm in part] for part in parts])
+
+
 def _share(ladder: Ladder) -> Floats:
     """Weak part of each resistance, at ``SOC_NODES``."""
-    weak, strong = (
-        np.array([np.interp(SOC_NODES, ladder.soc, ohm) for ohm in rows])
-        for rows in (ladder.weak_ohm, ladder.strong_ohm)
-    )
-    return np.where(weak + strong > 0.0, weak / np.maximum(weak + strong, 1e-12), WEAK_SHARE)
+    weak, strong = _at_nodes(ladder)
+    return np.where(weak + strong > 0.0, weak / np.maximum(weak + strong, 1e-12), weak_share(SOC_NODES))
 
 
 def _ocv_error(cell: CellModel) -> Floats:

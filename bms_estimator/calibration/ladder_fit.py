@@ -34,10 +34,6 @@ KELVIN_NODES = np.array([0.0, 0.15, 0.3, 0.5, 0.75, 1.0])
 """Of dE/dT."""
 KNOTS = np.unique(np.round(np.r_[np.arange(0.0, 0.25, 0.025), np.arange(0.25, 1.0, 0.045), 1.0], 4))
 """Of the correction of the OCV."""
-WEAK_SHARE = np.outer([0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57], [0.45, 0.5, 0.8, 0.9, 1.0, 1.0, 1.0, 1.0])
-"""Weak part of each resistance, at ``SOC_NODES``, where captures of one temperature cannot tell: that of an 18650 NCA cell from
--10 to 33 C, mean over SOC 0.3 to 1, and what of it is left towards empty: at SOC 0.2 and 0.1 0.73 and 0.14 in that
-cell, 0.97 and 0.92 in an LFP one."""
 
 TYPICAL_V = 0.09
 """The scale of all resistances: what R_0 and the fast branches take at 1 C, per cell [V]."""
@@ -154,6 +150,7 @@ class Prior:
         per_kelvin_v: Std of u [V/K]; tiny: held.
         scale_ohm: Of the resistances [ohm].
         series: Cells in series.
+        shapes: Shape (2, RESISTANCES, SOC_NODES.size), how the weak and the strong part of each resistance usually go along SOC.
         weak_share: Shape (RESISTANCES, SOC_NODES.size), of each resistance; None: the captures tell.
     """
 
@@ -161,6 +158,7 @@ class Prior:
     per_kelvin_v: float
     scale_ohm: float
     series: int
+    shapes: Floats
     weak_share: Floats | None
 
 
@@ -271,9 +269,10 @@ def _prior_information(prior: Prior) -> Floats:
     bend[EVEN[1:-1] < EASY_BEND_SOC] /= EASY_BEND
     table[:SPLINES, :SPLINES] = near.T @ near + bend.T @ bend / STRETCHES
     table[SPLINES:FREE, SPLINES:FREE] = np.eye(KELVIN_NODES.size) / prior.per_kelvin_v**2
-    rough = _rough_rows() / (ROUGH * prior.scale_ohm)
-    both = rough.T @ rough + 1e-6 * np.eye(PART) / prior.scale_ohm**2
-    table[FREE : FREE + PART, FREE : FREE + PART] = table[FREE + PART :, FREE + PART :] = both
+    for first, shape in zip((FREE, FREE + PART), prior.shapes, strict=True):
+        rough = _rough_rows() / (ROUGH * prior.scale_ohm) / shape.ravel()
+        part = rough.T @ rough + 1e-6 * np.eye(PART) / prior.scale_ohm**2
+        table[first : first + PART, first : first + PART] = part
     return table
 
 

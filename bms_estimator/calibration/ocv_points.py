@@ -37,6 +37,7 @@ class Points:
         common_v: Shape (n,), standard deviation of what the point's source is off as a whole [V].
         cold_v: Shape (n,), standard deviation of what cold leaves unrelaxed in all sources alike [V].
         temperature_c: Shape (n,) [C]; NaN where it is not known.
+        way: Shape (n,), the hysteresis h that it was measured at: -1 after a discharge, 1 after a charge, 0 between.
         source: Shape (n,), which source each is of, from 0.
         empty_v: Voltage at SOC 0 as far as it is known [V]; NaN when it is not.
         full_v: Voltage at SOC 1 as far as it is known [V]; NaN when it is not.
@@ -48,18 +49,21 @@ class Points:
     common_v: Floats = field(default_factory=lambda: np.zeros(0))
     cold_v: Floats = field(default_factory=lambda: np.zeros(0))
     temperature_c: Floats = field(default_factory=lambda: np.zeros(0))
+    way: Floats = field(default_factory=lambda: np.zeros(0))
     source: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     empty_v: float = float("nan")
     full_v: float = float("nan")
 
     def __post_init__(self) -> None:
-        """Fill what was left out: no common error, no temperature, one source."""
+        """Fill what was left out: no common error, no temperature, no hysteresis, one source."""
         if self.common_v.size == 0:
             object.__setattr__(self, "common_v", np.zeros(self.soc.size))
         if self.cold_v.size == 0:
             object.__setattr__(self, "cold_v", np.zeros(self.soc.size))
         if self.temperature_c.size == 0:
             object.__setattr__(self, "temperature_c", np.full(self.soc.size, np.nan))
+        if self.way.size == 0:
+            object.__setattr__(self, "way", np.zeros(self.soc.size))
         if self.source.size == 0:
             object.__setattr__(self, "source", np.zeros(self.soc.size, dtype=np.int64))
 
@@ -84,6 +88,7 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
         common_v=(series_count * (RELAXED_V + COLD_OWN * cold_v))[order],
         cold_v=(series_count * cold_v)[order],
         temperature_c=temperature_c[order],
+        way=-1.0 * ~after_charge[order],  # a charge in between is too short to turn it
         empty_v=test.empty_v,
         full_v=test.full_v,
     )
@@ -110,6 +115,7 @@ def joined(sources: Sequence[Points]) -> Points:
         common_v=column("common_v"),
         cold_v=column("cold_v"),
         temperature_c=column("temperature_c"),
+        way=column("way"),
         source=np.repeat(np.arange(len(sources)), [one.soc.size for one in sources])[order],
         empty_v=_mean([one.empty_v for one in sources]),
         full_v=_mean([one.full_v for one in sources]),
@@ -136,6 +142,7 @@ def with_ends(points: Points, empty_std_v: float, full_std_v: float) -> Points:
             common_v=np.insert(points.common_v, at, points.common_v[nearest]),
             cold_v=np.insert(points.cold_v, at, points.cold_v[nearest]),
             temperature_c=np.insert(points.temperature_c, at, points.temperature_c[nearest]),
+            way=np.insert(points.way, at, points.way[nearest]),
             source=np.insert(points.source, at, points.source[nearest]),
         )
     return points

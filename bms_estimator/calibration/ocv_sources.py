@@ -38,6 +38,8 @@ standard deviation: 0.4 and 0.5 seen of an NCA cell, 1.0 of an LFP cell."""
 PLATEAU_SHARE, PLATEAU_V, PLATEAU_SOC = 0.9, 0.15, 0.05
 """The same of a curve that rises by less, per cell and 1 of SOC, over so much SOC: two phases side by side keep it (Dreyer et al., Nature
 Materials 9, 2010, 448). 0.9 to 1.0 seen in drives of an LFP cell at 25, 5 and -15 C [V]."""
+USUAL_STD = 0.6
+"""Relative standard deviation of a hysteresis that is no more than usual."""
 LEAST_SHARE, SHARE_POINTS, SHARE_K, SHARE_SOC = 0.1, 6, 10.0, (0.1, 0.95)
 """Rests at SOC between these tell it themselves, if there are so many within this of the slow curves' temperature [K]."""
 OTHER_CAPACITY = 0.05
@@ -95,6 +97,7 @@ class Sources:
         hysteresis_v: At ``NODES`` and 25 C [V], of the source nearest to it that tells, as far as rests keep it; None when
             none does.
         hysteresis_std_v: Its standard deviation [V].
+        usual_hysteresis: It is no source's: ``amid_usual_hysteresis``.
     """
 
     capacity_ah: float
@@ -103,6 +106,7 @@ class Sources:
     tests: tuple[RelaxationTest, ...]
     hysteresis_v: Floats | None
     hysteresis_std_v: Floats
+    usual_hysteresis: bool = False
 
     @property
     def points(self) -> Points:
@@ -154,7 +158,10 @@ def find_sources(
         given = telling in sources[len(slow) :] and share is None  # who gives a curve means what it says
         hysteresis_v = np.interp(NODES, GRID, half_v if given else kept_v)
         hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_v)
-        found = [(test, _amid_hysteresis(points, test, kept_v * _colder(test.temperature_c))) for test, points in found]
+        found = [
+            (test, _amid_hysteresis(points, kept_v * _colder(test.temperature_c), REST_SHARE_STD))
+            for test, points in found
+        ]
         if share is not None:
             sources = [
                 replace(one, notes=(*one.notes, f"rests keep {share:.2f} of its hysteresis")) if one is telling else one
@@ -182,6 +189,8 @@ def _of_given(curve: GivenCurve, series_count: int) -> Source:
     everywhere = np.full(curve.soc.size, float(series_count))
     points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, common_v=GIVEN_COMMON_V * everywhere)
     hysteresis_v = None
+    if curve.hysteresis_v is None:
+        points = replace(points, way=np.full(curve.soc.size, -1.0))
     if curve.hysteresis_v is not None:
         hysteresis_v = np.clip(np.interp(GRID, curve.soc, curve.hysteresis_v), 0.0, None)
     return Source(curve.name, f"given curve, {curve.soc.size} points", points, float("nan"), hysteresis_v, ())
@@ -209,22 +218,25 @@ def _share(telling: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> f
     for test, points in found:
         if _from_reference(test.temperature_c) > SHARE_K + _from_reference(telling.temperature_c):
             continue
-        after_charge = _after_charge(test)
         size_v = np.interp(
             points.soc, GRID, np.zeros(GRID.size) if telling.hysteresis_v is None else telling.hysteresis_v
         )
         below_v = np.interp(points.soc, telling.points.soc, telling.points.ocv_v) - points.ocv_v
-        tells = (points.soc > low) & (points.soc < high) & ~after_charge & (size_v > 0.0)
+        tells = (points.soc > low) & (points.soc < high) & (points.way < 0.0) & (size_v > 0.0)
         shares += (below_v[tells] / size_v[tells]).tolist()
     return float(np.clip(np.median(shares), LEAST_SHARE, 1.0)) if len(shares) >= SHARE_POINTS else None
 
 
 def _usual_share(telling: Source, series_count: int) -> float:
     """The same where no rest tells it."""
-    soc, ocv_v = telling.points.soc, telling.points.ocv_v
+    return PLATEAU_SHARE if has_plateau(telling.points.soc, telling.points.ocv_v, series_count) else REST_SHARE
+
+
+def has_plateau(soc: Floats, ocv_v: Floats, series_count: int) -> bool:
+    """Whether the curve rises so little somewhere that two phases lie side by side; ``soc`` increasing, voltage in V."""
     edges = np.linspace(*SHARE_SOC, 1 + round(np.ptp(SHARE_SOC) / PLATEAU_SOC))
     slope_v = np.diff(np.interp(edges, soc, ocv_v)) / np.diff(edges)
-    return PLATEAU_SHARE if slope_v.min() < PLATEAU_V * series_count else REST_SHARE
+    return float(slope_v.min()) < PLATEAU_V * series_count
 
 
 def _rests(
@@ -258,19 +270,31 @@ def _soc_at(curve: TableFit, voltage_v: float) -> float:
     return float(np.interp(voltage_v, curve(grid), grid))
 
 
-def _after_charge(test: RelaxationTest) -> NDArray[np.bool_]:
-    """Of the test's points, in the order of SOC."""
-    return np.array([rest.after_charge for rest in test.rests])[np.argsort(test.soc, kind="stable")]
-
-
-def _amid_hysteresis(points: Points, test: RelaxationTest, kept_v: Floats) -> Points:
-    """Rests moved to halfway between discharge and charge, ``kept_v`` above those after discharge."""
-    size_v, after_charge = np.interp(points.soc, GRID, kept_v), _after_charge(test)
+def _amid_hysteresis(points: Points, kept_v: Floats, relative_std: float) -> Points:
+    """Points moved to halfway between discharge and charge, ``kept_v`` above those after discharge, which may be wrong by so much."""
+    size_v = np.interp(points.soc, GRID, kept_v)
     return replace(
         points,
-        ocv_v=points.ocv_v + np.where(after_charge, 0.0, size_v),
-        std_v=np.hypot(points.std_v, np.where(after_charge, size_v, 0.0)),
-        common_v=np.hypot(points.common_v, REST_SHARE_STD * size_v),
+        ocv_v=points.ocv_v - points.way * size_v,
+        std_v=np.hypot(points.std_v, np.where(points.way == 0.0, size_v, 0.0)),
+        common_v=np.hypot(points.common_v, relative_std * size_v),
+    )
+
+
+def amid_usual_hysteresis(found: Sources, usual_v: Floats) -> Sources:
+    """Sources of which none tells of hysteresis, brought to the middle of what is usual: discharges alone lie below it.
+
+    Args:
+        found: Of ``find_sources``.
+        usual_v: That of cells of the kind, as rests keep it, at ``NODES`` and 25 C [V].
+    """
+    on_grid_v = np.interp(GRID, NODES, usual_v)
+    moved = tuple(
+        replace(one, points=_amid_hysteresis(one.points, on_grid_v * _colder(one.temperature_c), USUAL_STD))
+        for one in found.sources
+    )
+    return replace(
+        found, sources=moved, hysteresis_v=usual_v, hysteresis_std_v=USUAL_STD * usual_v, usual_hysteresis=True
     )
 
 

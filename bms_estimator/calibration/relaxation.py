@@ -16,6 +16,8 @@ Floats = NDArray[np.float64]
 
 GLITCH_FRACTION = 0.5
 """A voltage off the median by more than this fraction is a fault of the instrument: no Li-ion cell swings so far."""
+MOST_BACK = 0.1
+"""Part of the samples that may lie before others in time: a clock that is set back by a little."""
 LEAST_GOOD = 0.5
 """With a smaller share of good voltages nobody knows which ones are the faults."""
 REST_CURRENT_C = 0.01
@@ -136,7 +138,7 @@ def without_glitches(samples: SampleBlock, name: str) -> SampleBlock:
     """Samples that can be true: finite, time going on, voltage within half of the median of those above 0 V.
 
     Raises:
-        UserError: Nothing is left, or most voltages are glitches.
+        UserError: Nothing is left, most voltages are glitches, or time goes back and goes on from there.
     """
     finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
     good = samples[finite]
@@ -157,6 +159,14 @@ def without_glitches(samples: SampleBlock, name: str) -> SampleBlock:
         )
     good = good[~off]
     latest = np.maximum.accumulate(good["time_s"])
+    back = good["time_s"] < latest
+    if back.mean() > MOST_BACK:
+        first = int(np.argmax(back))
+        raise UserError(
+            f"{name}: time goes back {(np.diff(good['time_s']) < 0.0).sum()} times, first from {latest[first]:g} to "
+            f"{good['time_s'][first]:g} s, and {back.sum()} of {samples.size} samples lie before others: these are several "
+            "captures, or a clock was set; nobody knows what happened between them: give each stretch a file of its own"
+        )
     later = np.r_[True, good["time_s"][1:] > latest[:-1]]
     kept: SampleBlock = good[later]
     return kept

@@ -27,9 +27,6 @@ LOWEST_SOC = 0.1
 MOST_SAMPLES = 1000
 """Of a rest; a longer one is thinned."""
 LEAST_OHM = 1e-5
-TYPICAL_S, TYPICAL_TS, TYPICAL_TL = 0.08, 0.03, 0.06
-"""Voltage that R_s, R_ts and R_tl take at 1C, per cell [V]: 18650 cells of 2 to 3 Ah."""
-TYPICAL_TAU_TS_S, TYPICAL_TAU_TL_S = 20.0, 400.0
 
 
 @dataclass(frozen=True)
@@ -122,9 +119,3 @@ def _resistance(ohm: float) -> Resistance:
 
 def _capacitance(farad: float) -> Capacitance:
     return Capacitance(amplitude_farad=NEGLIGIBLE * farad, exponent=10.0, offset_farad=farad)
-
-
-def typical_elements(capacity_ah: float, series_count: int) -> RestElements:
-    """Of a common cell of this capacity, where no rest tells them."""
-    ohm = series_count / capacity_ah
-    return RestElements(TYPICAL_S * ohm, TYPICAL_TS * ohm, TYPICAL_TAU_TS_S, TYPICAL_TL * ohm, TYPICAL_TAU_TL_S)

@@ -253,7 +253,9 @@ def _lone(branch: Branch, soc: Floats, series_count: int, notes: tuple[str, ...]
     ohmic_v = float(np.nan_to_num(branch.step_v))
     ocv_v = _at(grid, soc, branch.voltage_v) + sign * ohmic_v
     common_v = LONE_V * series_count + 0.5 * ohmic_v
-    points = _points(grid, ocv_v, common_v, 1.0, branch.temperature_c, series_count)
+    points = replace(
+        _points(grid, ocv_v, common_v, 1.0, branch.temperature_c, series_count), way=-sign * np.ones(grid.size)
+    )
     return SlowCurve((branch,), points, None, branch.step_v, notes)
 
 

@@ -14,16 +14,23 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.calibration.generic_parts import curve, ladder_of, most_alike
 from bms_estimator.calibration.ocv import NAMES, ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv_points import REFERENCE_C, Points, max_v, rms_v
-from bms_estimator.calibration.ocv_sources import GivenCurve, Recording, Sources, find_sources
-from bms_estimator.calibration.ocv_table import TableFit, fit_table
+from bms_estimator.calibration.ocv_points import REFERENCE_C, max_v, rms_v
+from bms_estimator.calibration.ocv_sources import (
+    GivenCurve,
+    Recording,
+    Sources,
+    amid_usual_hysteresis,
+    find_sources,
+    has_plateau,
+)
+from bms_estimator.calibration.ocv_table import NODES, TableFit, fit_table
 from bms_estimator.calibration.relaxation import RelaxationTest, without_glitches
-from bms_estimator.calibration.rest_elements import rest_elements, typical_elements
+from bms_estimator.calibration.rest_elements import rest_elements
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
 from bms_estimator.cli.decimal_option import decimal, whole
-from bms_estimator.estimator.filter_settings import typical_ladder
-from bms_estimator.model.cell import Cell, CellModel
+from bms_estimator.model.cell import ELEMENTS, Cell, CellModel
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.sources.curve import read_curve
 from bms_estimator.sources.replay import load_capture
@@ -70,6 +77,8 @@ class OcvResult:
     form: str
     capacity_ah: float
     capacity_measured_ah: float | None  # by a slow discharge from full to empty
+    generic: str  # the generic cell most like it, which tells what the sources do not: resistances ...
+    usual_hysteresis: bool  # ... and hysteresis
     series_count: int
     points: int
     soc: list[float]
@@ -118,7 +127,7 @@ def ocv(
 
     From captures with rests (relaxation tests, thesis 5.2.1, or HPPC), from slow discharges with or without their charges,
     and from curves with columns soc, ocv_v[, hysteresis_v], at any temperatures, fitted jointly. What each is, is found out.
-    The file's elements are a first idea, one value each from the rests: `identify` makes them good.
+    The file's elements are a first idea, from the rests and the generic cell most like it: `identify` makes them good.
     """
     check_out(out, captures, force=force)
     recordings, curves = [], []
@@ -134,10 +143,13 @@ def ocv(
     middle_v = float(np.median(np.concatenate([*good, *(curve.ocv_v for curve in curves)])))
     count = series or max(round(middle_v / CELL_VOLTAGE_V), 1)
     found = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
-    points = found.points
-    fit = fit_table(points) if form is Form.TABLE else fit_chen_mora(points)
-    result = _result(form, count, points, fit, found)
-    write_cell(out, _cell(name_of(out), count, fit, found, recordings), _remarks(result))
+    fit = fit_table(found.points) if form is Form.TABLE else fit_chen_mora(found.points)
+    generic = most_alike(NODES, fit(NODES), found.capacity_ah, count)
+    if form is Form.TABLE and found.hysteresis_v is None and has_plateau(NODES, fit(NODES), count):
+        found = amid_usual_hysteresis(found, np.interp(NODES, *curve(generic, "hysteresis_v")))
+        fit = fit_table(found.points)
+    result = _result(form, generic, fit, found)
+    write_cell(out, _cell(name_of(out), generic, fit, found, recordings), _remarks(result))
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
@@ -146,8 +158,8 @@ def ocv(
         console.print(_sources_table(result))
 
 
-def _result(form: Form, series_count: int, points: Points, fit: ChenMoraFit | TableFit, found: Sources) -> OcvResult:
-    tests = found.tests
+def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, found: Sources) -> OcvResult:
+    tests, points = found.tests, found.points
     parameters: dict[str, dict[str, float | None]] = {}
     if isinstance(fit, ChenMoraFit):
         for name, value, std in zip(NAMES, fit.a, fit.std, strict=True):
@@ -156,7 +168,9 @@ def _result(form: Form, series_count: int, points: Points, fit: ChenMoraFit | Ta
         form=form.value,
         capacity_ah=found.capacity_ah,
         capacity_measured_ah=_or_none(found.measured_ah),
-        series_count=series_count,
+        generic=generic.cell.name,
+        usual_hysteresis=found.usual_hysteresis,
+        series_count=generic.cell.series_count,
         points=points.soc.size,
         soc=points.soc.tolist(),
         ocv_v=points.ocv_v.tolist(),
@@ -194,7 +208,7 @@ def _or_none(value: float) -> float | None:
 
 def _cell(
     name: str,
-    series_count: int,
+    generic: CellModel,
     fit: ChenMoraFit | TableFit,
     found: Sources,
     recordings: list[Recording],
@@ -207,21 +221,20 @@ def _cell(
         name=name,
         capacity_ah=round(found.capacity_ah, 4),
         capacity_std=MEASURED_CAPACITY_STD if found.capacity_ah == found.measured_ah else None,
-        series_count=series_count,
+        series_count=generic.cell.series_count,
         nominal_voltage_v=round(middle_v, 2),
         voltage_min_v=round(min(LOWEST * middle_v, lowest_v), 2),
         voltage_max_v=round(HIGHEST * full_v, 2),
         current_max_a=round(max(CURRENT_MAX_C * found.capacity_ah, 1.5 * largest_a), 3),
     )
     test = _warmest(found.tests)
-    if test is None:
-        elements = typical_elements(found.capacity_ah, series_count)
-    else:
-        samples = next(one.samples for one in recordings if one.name == test.name)
-        elements = rest_elements(samples, test, found.capacity_ah)
+    ladder, elements = ladder_of(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
+    if test is not None:
+        rests = rest_elements(next(r.samples for r in recordings if r.name == test.name), test, found.capacity_ah)
+        ladder = ladder_of(generic, rests, float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C)))
+        elements = rests.sections
     ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(found.hysteresis_v, found.hysteresis_std_v)
-    found_cell = CellModel.model_validate({"cell": cell, "ocv": ocv, **elements.sections})
-    return found_cell if test is not None else found_cell.model_copy(update={"ladder": typical_ladder(found_cell)})
+    return CellModel.model_validate({"cell": cell, "ocv": ocv, "ladder": ladder, **elements})
 
 
 def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
@@ -230,11 +243,14 @@ def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
 
 
 def _remarks(result: OcvResult) -> list[str]:
-    rests = "one value each from the rests of one capture" if result.captures else "typical of cells of this capacity"
+    like = f"the generic {result.generic}"
+    hysteresis = [f"Hysteresis: that of {like}, no source tells it."] if result.usual_hysteresis else []
+    elements = f"one value each from the rests of one capture, over SOC and temperature as those of {like}"
     return [
         f"OCV: {', '.join(f'{source.kind} of {source.name}' for source in result.sources)};",
         f"the {result.form} form lies {result.rms_mv:.2f} mV RMS off the points, {result.max_mv:.2f} mV at most.",
-        f"Elements: {rests}, a start for identify.",
+        *hysteresis,
+        f"Elements: {elements if result.captures else f'those of {like}'}, a start for identify.",
     ]
 
 

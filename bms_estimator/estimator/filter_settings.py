@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from bms_estimator.kernels import cell as chen_mora
 from bms_estimator.kernels.charge import PERIODS, UNMEASURED_S
 from bms_estimator.kernels.ekf_state import EKF_SETTINGS, Noise
-from bms_estimator.kernels.ladder import BRANCHES, GRID, RESISTANCES, TAU_S
-from bms_estimator.model.cell import CellModel, Ladder, TableOcv
+from bms_estimator.kernels.ladder import BRANCHES, GRID, RESISTANCES, TAU_S, weak_share
+from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.model.resolution import BOARD, Sampling
 from bms_estimator.model.settings import IdentifierSettings
 
@@ -33,8 +33,6 @@ BIAS_OF_STD = 0.15
 """Resistances that are hardly known are wrong in their ratios, too: so much of their relative std is ``bias_relative``."""
 ROOM_C = 15.0, 35.0
 """Resistances of unknown temperature are those of a room [C]."""
-TYPICAL_STD, TYPICAL_V = 0.7, 0.02
-"""Relative std of elements that are typical of a capacity, and what they leave of a voltage at 1 C [V]."""
 LEAST_SHARE = 1e-4
 """No branch has less than this part of the sum at SOC 0.5: time constants are means weighted by resistance."""
 LEAST_CAPACITANCE = 0.05
@@ -131,22 +129,13 @@ def _ladder(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     """Weak and strong part of the resistances, each (GRID, RESISTANCES) [ohm], their relative std, temperatures [C]."""
     ladder = cell.ladder
     if ladder is None:
-        half_ohm = 0.5 * ladder_of_branches(cell)
-        return half_ohm, half_ohm, BRANCHES_STD, ROOM_C
+        ohm, weak = ladder_of_branches(cell), weak_share(SOC_GRID).T
+        return weak * ohm, (1.0 - weak) * ohm, BRANCHES_STD, ROOM_C
     weak_ohm, strong_ohm = (
         np.column_stack([np.interp(SOC_GRID, ladder.soc, row) for row in rows])
         for rows in (ladder.weak_ohm, ladder.strong_ohm)
     )
     return weak_ohm, strong_ohm, ladder.std, ladder.temperature_c
-
-
-def typical_ladder(cell: CellModel) -> Ladder:
-    """The ladder of a cell whose elements are no more than typical of its capacity: a power cell has a quarter of them."""
-    half_ohm = 0.5 * ladder_of_branches(cell).T
-    rows = tuple(tuple(float(f"{ohm:.4g}") for ohm in row[:: GRID - 1]) for row in half_ohm)
-    return Ladder(
-        soc=(0.0, 1.0), weak_ohm=rows, strong_ohm=rows, std=TYPICAL_STD, temperature_c=ROOM_C, error_v=TYPICAL_V
-    )
 
 
 def ladder_of_branches(cell: CellModel) -> NDArray[np.float64]:

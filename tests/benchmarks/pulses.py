@@ -51,7 +51,7 @@ def cells_of(group: Group, folder: Path) -> Iterator[str]:
         said.append(np.interp(time_s, trace["time_s"], trace["r_s_ohm"]))
         std.append(np.interp(time_s, trace["time_s"], trace["r_s_std_ohm"]))
         step_s = float(np.median(np.diff(samples["time_s"])))
-    if not shown:
+    if sum(map(len, shown)) < AROUND:
         yield "none"
         return
     pulse, r_s, r_s_std = np.concatenate(shown), np.concatenate(said), np.concatenate(std)

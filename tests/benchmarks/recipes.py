@@ -28,7 +28,7 @@ PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a cell file is made of; a generic one of its chemistry and capacity alone."""
+    """What a cell file is made of: by `ocv`, and `identify` if there is something for it; a generic one of chemistry and capacity alone."""
 
     capacity_ah: float
     ocv: tuple[str, ...] = ()
@@ -55,6 +55,7 @@ LFP_CELL = Recipe(
     tuple(LFP + f"dyn_{t}" for t in ("p25", "p05", "n15")),
     measured=True,
 )
+LFP_PAIR = replace(LFP_CELL, ocv=(LFP + "c30_dis_p25", LFP + "c30_chg_p25"), identify=())
 LFP_WITHOUT_5 = replace(LFP_CELL, identify=(LFP + "dyn_p25", LFP + "dyn_n15"))
 
 
@@ -105,6 +106,7 @@ NCR_CHARGE = ((NCR + "cell1_charge_c20", 3.064, 0.0),)
 """Charges end full."""
 LG_CHARGES = (("lgm50/rate_0p1c_25c", 4.945, 1.0), ("lgm50/rate_1c_25c", 4.945, 1.0))
 """Discharge, then charge at C/3."""
+LG_DISCHARGES = (("lgm50/rate_0p5c_25c", 4.945, 1.0), ("lgm50/rate_1c_25c", 4.945, 1.0))
 LEAF_CAPTURES = (("leaf/hppc_25c_from_full", 30.5, 1.0),)
 
 GROUPS = (
@@ -125,15 +127,28 @@ GROUPS = (
     Group("Leaf (its own file)", LEAF, LEAF_CAPTURES),
     *(Group(f"LFP {t} C from full{own}", recipe, LFP_CAPTURES[t], FROM_START) for t, own, recipe in LFP_FILES),
     *(Group(f"LFP {t} C{own}", recipe, LFP_CAPTURES[t]) for t, own, recipe in LFP_FILES),
+    *(Group(f"PF {t} C, by ocv alone", Recipe(2.9, PF_HPPC[:1]), captures) for t, captures in PF_CAPTURES.items()),
+    Group("NCR, by ocv alone", replace(NCR_CELL, identify=()), NCR_CHANGING),
+    Group("LG M50, by ocv alone", Recipe(5.0, ("lgm50/rate_0p1c_25c",)), LG_DISCHARGES),
+    *(Group(f"LFP {t} C, by ocv alone", LFP_PAIR, captures) for t, captures in LFP_CAPTURES.items()),
     Group("NCR, charging (its own file)", NCR_CELL, NCR_CHARGE, charging=True),
     *(
         Group(f"LFP {t} C, charging (its own file)", LFP_CELL, charges, charging=True)
         for t, charges in LFP_CHARGES.items()
     ),
+    Group("LG M50, charging, by ocv alone", Recipe(5.0, ("lgm50/rate_0p1c_25c",)), LG_CHARGES, charging=True),
+    Group(
+        "LFP 25 C, charging, by ocv of a discharge",
+        replace(LFP_PAIR, ocv=LFP_PAIR.ocv[:1]),
+        LFP_CHARGES["25"],
+        charging=True,
+    ),
     Group("generic nca: PF", Recipe(2.9, generic="nca"), PF_CAPTURES["25"]),
+    *(Group(f"generic nca: PF {t} C", Recipe(2.9, generic="nca"), PF_CAPTURES[t]) for t in ("10", "0", "-10")),
     Group("generic nca: NCR", Recipe(3.0, generic="nca"), NCR_CHANGING),
     Group("generic lmo: Leaf", Recipe(30.5, generic="lmo"), LEAF_CAPTURES),
     Group("generic lfp: A123", Recipe(2.05, generic="lfp"), LFP_CAPTURES["25"]),
+    *(Group(f"generic lfp: A123 {t} C", Recipe(2.05, generic="lfp"), LFP_CAPTURES[t]) for t in ("5", "-15")),
     Group("generic lfp: A123 from full", Recipe(2.05, generic="lfp"), LFP_CAPTURES["25"], FROM_START),
     Group("generic nmc: LG M50, charging", Recipe(5.0, generic="nmc"), LG_CHARGES, charging=True),
     Group("generic nca: NCR, charging", Recipe(3.0, generic="nca"), NCR_CHARGE, charging=True),
@@ -177,10 +192,13 @@ def cell_file(recipe: Recipe, folder: Path) -> CellModel:
     """By `ocv`, then `identify`; what they refuse to write is not used, and said."""
     if recipe.generic:
         return load_cell(recipe.generic, recipe.capacity_ah)
-    stem = f"{recipe.identify[0].replace('/', '_')}_{len(recipe.identify)}_{recipe.identify[-1].replace('/', '_')}"
+    named = *recipe.ocv, *recipe.identify
+    stem = f"{named[0].replace('/', '_')}_{len(named)}_{named[-1].replace('/', '_')}"
     curve, whole = folder / f"{stem}_ocv.toml", folder / f"{stem}.toml"
     told = () if recipe.measured else ("--capacity-ah", recipe.capacity_ah)
     command("ocv", *map(path_of, recipe.ocv), *told, "--out", curve)
+    if not recipe.identify:
+        return load_cell(curve)
     refused = command("identify", *map(path_of, recipe.identify), "--cell", curve, "--out", whole)
     return load_cell(curve if refused else whole)
 

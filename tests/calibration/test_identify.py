@@ -71,6 +71,32 @@ def test_at_one_temperature_the_parts_are_shared_as_in_the_file_given(identified
     assert found.temperature_c == (COLD_C, WARM_C)
 
 
+def growth(ladder):
+    """Of the sum of all resistances, from SOC 0.65 to 0."""
+    ohm = (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).sum(axis=0)
+    return ohm[0] / np.interp(0.65, ladder.soc, ohm)
+
+
+def test_towards_empty_resistances_go_between_level_and_as_in_the_file_where_no_capture_was(warm):
+    above = Columns(warm.rows[: int(np.argmax(np.cumsum(warm.rows["current_a"]) > 0.6 * 3600.0 * 3.0))], "above")
+    found = {}
+    for name, times in (("level", 1.0), ("growing", 4.0)):
+        rows = ((0.004 * times, 0.004, 0.004),) * 7
+        parts = {"soc": (0.0, 0.3, 1.0), "weak_ohm": rows, "strong_ohm": rows, "std": 0.6}
+        given = TRUTH.model_copy(update={"ladder": LADDER.model_copy(update=parts)})
+        once = identify([above], given, refine_ocv=False).cell
+        found[name] = growth(once.ladder)
+        again = growth(identify([above], once, refine_ocv=False).cell.ladder)
+        assert again == pytest.approx(found[name], rel=0.1)  # what was identified does not wear away
+    assert 1.5 * found["level"] < found["growing"] < 3.0
+
+
+def test_a_capture_that_tells_little_makes_a_ladder_that_says_so(warm):
+    short = Columns(warm.rows[:700], "short")
+    stds = [identify([capture], wrong_start(), refine_ocv=False).cell.ladder.std for capture in (warm, short)]
+    assert module.LADDER_STD < stds[0] < 1.3 * module.LADDER_STD < 1.5 * stds[0] < stds[1]
+
+
 def test_the_two_branches_of_the_file_are_those_of_the_ladder(identified):
     ladder, a = identified.cell.ladder, identified.cell.a
     for soc in (0.35, 0.5, 0.9):

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.ocv_sources import PLATEAU_SHARE, REST_SHARE_STD, GivenCurve, Recording, find_sources
+from bms_estimator.calibration.ocv_sources import (
+    PLATEAU_SHARE,
+    REST_SHARE_STD,
+    USUAL_STD,
+    GivenCurve,
+    Recording,
+    amid_usual_hysteresis,
+    find_sources,
+)
 from bms_estimator.calibration.ocv_table import NODES, fit_table
 from bms_estimator.calibration.slow_curve import GRID
 from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
@@ -56,6 +64,26 @@ def test_a_lone_discharge_is_off_by_its_hysteresis_and_knows_it():
     assert found.hysteresis_v is None
     assert np.median(off_v(found)) < -5e-3
     assert (np.abs(off_v(found)) < 2.5 * fit.error_v[INSIDE]).all()
+
+
+@pytest.mark.parametrize(("direction", "lifted"), [(1.0, 1.0), (-1.0, -1.0)])
+def test_a_lone_branch_is_brought_to_the_middle_of_what_is_usual(direction, lifted):
+    found, usual_v = of(slow((direction,)), capacity_ah=CAPACITY_AH), hysteresis_v(NODES)
+    moved = amid_usual_hysteresis(found, usual_v)
+    plain, points = found.points, moved.points
+    assert points.ocv_v - plain.ocv_v == pytest.approx(lifted * hysteresis_v(plain.soc), abs=1e-4)
+    assert (points.common_v > plain.common_v).all()
+    assert moved.hysteresis_v == pytest.approx(usual_v)
+    assert moved.hysteresis_std_v == pytest.approx(USUAL_STD * usual_v)
+
+
+def test_rests_after_a_discharge_and_a_curve_given_without_hysteresis_are_brought_there_too():
+    soc = np.linspace(0.0, 1.0, 101)
+    found = of(relaxation(), curves=[GivenCurve("book", soc, true_v(soc), None)], capacity_ah=TRUTH.cell.capacity_ah)
+    moved = amid_usual_hysteresis(found, np.full(NODES.size, 0.01))
+    for before, after in zip(found.sources, moved.sources, strict=True):
+        assert after.points.ocv_v - before.points.ocv_v == pytest.approx(0.01)
+        assert after.points.std_v == pytest.approx(before.points.std_v)
 
 
 def test_a_charge_that_lacks_much_of_what_came_out_is_left_out_and_said():

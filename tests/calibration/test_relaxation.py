@@ -200,3 +200,17 @@ def test_a_dead_instrument(voltage_v, message):
     samples["voltage_v"] = voltage_v
     with pytest.raises(UserError, match=message):
         relaxation_test(samples, CAPACITY_AH, name="mine")
+
+
+def test_several_captures_in_one_file_are_none():
+    """Pulses at several SOCs, one below the other, each from 0 s: what lies between them nobody knows."""
+    pulse = relaxation(rounds=2)
+    for more in (1, 2):
+        together = np.concatenate([pulse] * (1 + more))
+        with pytest.raises(
+            UserError, match=rf"mine: time goes back {more} times, first from \d.* to 0 s, .* a file of its own"
+        ):
+            without_glitches(together, "mine")
+    late = pulse.copy()
+    late["time_s"][50] -= 30.0  # one stamp
+    assert without_glitches(late, "mine").size == pulse.size - 1

@@ -186,8 +186,38 @@ def test_what_each_capture_is_is_found_out(tmp_path, capsys, data):
     inside = (given[:, 0] > 0.1) & (given[:, 0] < 0.95)
     assert PchipInterpolator(ocv.soc, ocv.ocv_v)(given[inside, 0]) == pytest.approx(given[inside, 1], abs=8e-3)
     _, text, _ = run(capsys, *arguments, "--force")
-    for words in ("C/10 discharge, 4.945 Ah", "given curve, 101 points", "found to be", "typical"):
+    for words in (
+        "C/10 discharge, 4.945 Ah",
+        "given curve, 101 points",
+        "found to be",
+        "Elements: those of the generic nca",
+    ):
         assert words in text + out.read_text()
+
+
+@pytest.mark.parametrize("way", ["dis", "chg"])
+def test_a_lone_slow_curve_of_lfp_knows_that_the_other_lies_elsewhere(tmp_path, capsys, shared_data, way):
+    """A plateau is where hysteresis is worth a tenth of the charge and more: that of the generic cell is taken."""
+    folder, out, pair = shared_data / "a123", tmp_path / "lone.toml", tmp_path / "pair.toml"
+    files = {name: folder / f"c30_{name}_p25.csv.gz" for name in ("dis", "chg")}
+    for captures, to in (([files[way]], out), (list(files.values()), pair)):
+        assert run(capsys, "ocv", *captures, "--capacity-ah", "2.05", "--out", to)[0] == 0
+    lone, both = load_cell(out).ocv, load_cell(pair).ocv
+    inside = (np.array(both.soc) > 0.15) & (np.array(both.soc) < 0.95)
+    off_v = np.abs(np.array(lone.ocv_v) - np.array(both.ocv_v))[inside]
+    assert (off_v < 2.0 * np.array(lone.error_v)[inside]).mean() > 0.95
+    assert lone.hysteresis_v == pytest.approx(np.full(len(lone.soc), 0.01))
+    assert "Hysteresis: that of the generic lfp" in out.read_text()
+    assert "Hysteresis" not in pair.read_text()
+    assert "Elements: those of the generic lfp" in out.read_text()
+
+
+def test_a_lone_slow_curve_of_a_layered_oxide_is_left_where_it_was_measured(tmp_path, capsys, data):
+    out = tmp_path / "lone.toml"
+    assert run(capsys, "ocv", data / "lgm50" / "rate_0p1c_25c.csv.gz", "--out", out)[0] == 0
+    assert load_cell(out).ocv.hysteresis_v is None
+    found, usual = load_cell(out).ladder, load_cell("nca", 4.945).ladder
+    assert np.array(found.weak_ohm) == pytest.approx(np.array(usual.weak_ohm), rel=1e-3)
 
 
 def test_rests_of_a_pouch_cell(tmp_path, capsys, data):

@@ -9,7 +9,7 @@ from bms_estimator import Estimator
 from bms_estimator.estimator.filter_settings import BEYOND_BRANCHES, BRANCHES_STD, SOC_GRID, ladder_of_branches
 from bms_estimator.estimator.learned import present_elements
 from bms_estimator.kernels import cell as chen_mora
-from bms_estimator.kernels.ladder import GRID, RESISTANCES
+from bms_estimator.kernels.ladder import GRID, RESISTANCES, STRONG_J, WEAK_J, arrhenius
 from bms_estimator.model.cell import Ladder, TableOcv, load_cell
 from bms_estimator.model.settings import IdentifierSettings
 
@@ -38,6 +38,17 @@ def test_the_resistances_of_two_branches_are_kept_over_soc() -> None:
         branches = chen_mora.r_ts(soc, a) + chen_mora.r_tl(soc, a)
         assert row[0] == pytest.approx(chen_mora.r_s(soc, a))
         assert row[1:].sum() == pytest.approx((1.0 + BEYOND_BRANCHES) * branches)
+
+
+def test_resistances_of_two_branches_grow_in_the_cold_as_those_of_cells_do() -> None:
+    """By two fits 2.4 times as large at 0 C as at 25 C in the middle, and more towards empty: 4.6 (NCA) and 2.7 times (LFP) at SOC 0.1."""
+    p = Estimator(CELL.model_copy(update={"ladder": None})).settings_record[0]["filter"]
+    grown = {}
+    for soc in (0.5, 0.1):
+        weak, strong = (float(p[name][round(soc * (GRID - 1))].sum()) for name in ("weak_ohm", "strong_ohm"))
+        grown[soc] = (weak * arrhenius(WEAK_J, 0.0) + strong * arrhenius(STRONG_J, 0.0)) / (weak + strong)
+    assert 2.0 < grown[0.5] < 2.8
+    assert 1.2 * grown[0.5] < grown[0.1] < 4.6
 
 
 def test_a_ladder_of_a_pack_is_interpolated() -> None:

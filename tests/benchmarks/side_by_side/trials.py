@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.branches import sections
 from bms_estimator.calibration.relaxation import without_glitches
-from bms_estimator.estimator.filter_settings import BRANCHES_STD, SOC_GRID, TYPICAL_V, ladder_of_branches
-from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius
+from bms_estimator.estimator.filter_settings import BRANCHES_STD, SOC_GRID, ladder_of_branches
+from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius, weak_share
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import LEAF, LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_PULSES, Recipe, load
@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 
 WRONG_BY = (2.0, 0.5)
 """Resistances of the start over those of the cell file."""
+LEFT_V = 0.02
+"""What its elements are said to leave of a voltage [V]."""
 KNOWN_K = 10.0
 """The start is taken to know so far around its temperature, as a file without a ladder is."""
 
@@ -134,16 +136,20 @@ def wrong(cell: CellModel, factor: float, temperature_c: float) -> CellModel:
         ohms = {key: factor * getattr(part, key) for key in ("amplitude_ohm", "offset_ohm")}
         parts[name] = part.model_copy(update=ohms)
     changed = cell.model_copy(update=parts)
-    half_ohm = tuple(map(tuple, (0.5 * ladder_of_branches(changed).T).tolist()))
+    ohm, weak = ladder_of_branches(changed).T, weak_share(SOC_GRID)
     ladder = Ladder(
         soc=tuple(SOC_GRID.tolist()),
-        weak_ohm=_times(half_ohm, 1.0 / arrhenius(WEAK_J, temperature_c)),
-        strong_ohm=_times(half_ohm, 1.0 / arrhenius(STRONG_J, temperature_c)),
+        weak_ohm=_rows(weak * ohm / arrhenius(WEAK_J, temperature_c)),
+        strong_ohm=_rows((1.0 - weak) * ohm / arrhenius(STRONG_J, temperature_c)),
         std=BRANCHES_STD,
-        error_v=TYPICAL_V,
+        error_v=LEFT_V,
         temperature_c=(temperature_c - KNOWN_K, temperature_c + KNOWN_K),
     )
     return changed.model_copy(update={"ladder": ladder})
+
+
+def _rows(ohm: Floats) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, ohm.tolist()))
 
 
 def _times(rows: tuple[tuple[float, ...], ...], factor: float) -> tuple[tuple[float, ...], ...]:
