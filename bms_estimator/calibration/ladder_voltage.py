@@ -58,6 +58,24 @@ def beside_ocv(cell: CellModel, load: Load, soc: Floats) -> Floats:
     return added_v
 
 
+def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Floats, first: int) -> Floats:
+    """What resistances ``first`` and on take of a current that has flowed for hours [V].
+
+    Args:
+        ladder: Of the cell.
+        current_a: Positive on discharge [A].
+        soc: Shape (n,).
+        temperature_c: Shape (n,) [C].
+        first: 0 is the ohmic one.
+    """
+    weak_ohm, strong_ohm = (
+        hats(soc, np.array(ladder.soc)) @ np.array(part[first:]).sum(axis=0)
+        for part in (ladder.weak_ohm, ladder.strong_ohm)
+    )
+    ohm = arrhenius(WEAK_J, temperature_c) * weak_ohm + arrhenius(STRONG_J, temperature_c) * strong_ohm
+    return np.asarray(current_a * ohm)
+
+
 def of_ladder(ladder: Ladder, load: Load, soc: Floats, temperature_c: Floats) -> Floats:
     """Overpotential of the ladder with its ohmic drop [V]."""
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])

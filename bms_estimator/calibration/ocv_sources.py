@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.calibration.ladder_voltage import steady_drop
 from bms_estimator.calibration.ocv_points import REFERENCE_C, Points, joined, points_of
 from bms_estimator.calibration.ocv_table import NODES, TableFit, fit_table
 from bms_estimator.calibration.relaxation import (
@@ -23,6 +24,7 @@ from bms_estimator.calibration.slow_curve import (
     slow_curves,
 )
 from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.model.cell import Ladder
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
@@ -75,6 +77,7 @@ class Source:
         temperature_c: Mean [C]; NaN where it is not known.
         hysteresis_v: At ``GRID`` [V]; None where it does not tell.
         notes: What is to be known of it.
+        lone: The slow curve that it is, if its other half is missing; what the branches take is still in ``points``.
     """
 
     name: str
@@ -83,6 +86,7 @@ class Source:
     temperature_c: float
     hysteresis_v: Floats | None
     notes: tuple[str, ...]
+    lone: Branch | None = None
 
 
 @dataclass(frozen=True)
@@ -182,7 +186,8 @@ def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
     notes = curve.notes
     if abs(slow_ah / capacity_ah - 1.0) > OTHER_CAPACITY:
         notes = (*notes, f"counted against its own {slow_ah:.3f} Ah, not {capacity_ah:g} Ah")
-    return Source(name, kind, curve.points, first.temperature_c, curve.hysteresis_v, notes)
+    lone = None if others else first
+    return Source(name, kind, curve.points, first.temperature_c, curve.hysteresis_v, notes, lone)
 
 
 def _of_given(curve: GivenCurve, series_count: int) -> Source:
@@ -279,6 +284,31 @@ def _amid_hysteresis(points: Points, kept_v: Floats, relative_std: float) -> Poi
         std_v=np.hypot(points.std_v, np.where(points.way == 0.0, size_v, 0.0)),
         common_v=np.hypot(points.common_v, relative_std * size_v),
     )
+
+
+def without_branches(found: Sources, ladder: Ladder) -> Sources:
+    """Lone slow curves without what their current takes in the branches: a pair has it twice, with both signs.
+
+    Args:
+        found: Of ``find_sources``.
+        ladder: As far as it is known, with its relative standard deviation.
+    """
+    return replace(found, sources=tuple(_without_branches(one, ladder) for one in found.sources))
+
+
+def _without_branches(source: Source, ladder: Ladder) -> Source:
+    if source.lone is None:
+        return source
+    points, first = source.points, 1 if np.isfinite(source.lone.step_v) else 0  # a jump has told the ohmic part
+    temperature_c = np.nan_to_num(points.temperature_c, nan=REFERENCE_C)
+    drop_v = steady_drop(ladder, source.lone.current_a, points.soc, temperature_c, first)
+    points = replace(
+        points,
+        ocv_v=points.ocv_v - points.way * drop_v,
+        common_v=np.hypot(points.common_v, ladder.std * drop_v),
+    )
+    note = f"{1e3 * drop_v.mean():.0f} mV, by what such cells have, taken out for {'its' if first else 'ohmic drop and'} branches"
+    return replace(source, points=points, lone=None, notes=(*source.notes, note))
 
 
 def amid_usual_hysteresis(found: Sources, usual_v: Floats) -> Sources:

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.generic_parts import curve, ladder_of, most_alike
 from bms_estimator.calibration.ocv import NAMES, ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv_points import REFERENCE_C, max_v, rms_v
+from bms_estimator.calibration.ocv_points import REFERENCE_C, Points, max_v, rms_v
 from bms_estimator.calibration.ocv_sources import (
     GivenCurve,
     Recording,
@@ -24,13 +24,14 @@ from bms_estimator.calibration.ocv_sources import (
     amid_usual_hysteresis,
     find_sources,
     has_plateau,
+    without_branches,
 )
 from bms_estimator.calibration.ocv_table import NODES, TableFit, fit_table
 from bms_estimator.calibration.relaxation import RelaxationTest, without_glitches
 from bms_estimator.calibration.rest_elements import rest_elements
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
 from bms_estimator.cli.decimal_option import decimal, whole
-from bms_estimator.model.cell import ELEMENTS, Cell, CellModel
+from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.sources.curve import read_curve
 from bms_estimator.sources.replay import load_capture
@@ -143,13 +144,17 @@ def ocv(
     middle_v = float(np.median(np.concatenate([*good, *(curve.ocv_v for curve in curves)])))
     count = series or max(round(middle_v / CELL_VOLTAGE_V), 1)
     found = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
-    fit = fit_table(found.points) if form is Form.TABLE else fit_chen_mora(found.points)
-    generic = most_alike(NODES, fit(NODES), found.capacity_ah, count)
-    if form is Form.TABLE and found.hysteresis_v is None and has_plateau(NODES, fit(NODES), count):
+    fitted: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
+    curve_v = fitted(found.points)(NODES)
+    generic = most_alike(NODES, curve_v, found.capacity_ah, count)
+    ladder, elements = _elements(generic, found, recordings)
+    found = without_branches(found, ladder)
+    if form is Form.TABLE and found.hysteresis_v is None and has_plateau(NODES, curve_v, count):
         found = amid_usual_hysteresis(found, np.interp(NODES, *curve(generic, "hysteresis_v")))
-        fit = fit_table(found.points)
+    fit = fitted(found.points)
     result = _result(form, generic, fit, found)
-    write_cell(out, _cell(name_of(out), generic, fit, found, recordings), _remarks(result))
+    cell = _cell(name_of(out), count, fit, found, recordings)
+    write_cell(out, CellModel.model_validate({**cell, "ladder": ladder, **elements}), _remarks(result))
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
@@ -206,14 +211,19 @@ def _or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+def _elements(generic: CellModel, found: Sources, recordings: list[Recording]) -> tuple[Ladder, dict[str, object]]:
+    """Resistances over SOC, and a1..a15 by their sections: by the rests of one capture, else the generic cell's."""
+    test = _warmest(found.tests)
+    if test is None:
+        return ladder_of(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
+    rests = rest_elements(next(r.samples for r in recordings if r.name == test.name), test, found.capacity_ah)
+    return ladder_of(generic, rests, float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C))), dict(rests.sections)
+
+
 def _cell(
-    name: str,
-    generic: CellModel,
-    fit: ChenMoraFit | TableFit,
-    found: Sources,
-    recordings: list[Recording],
-) -> CellModel:
-    """The cell with its open-circuit voltage, and limits of what a good sample is."""
+    name: str, series_count: int, fit: ChenMoraFit | TableFit, found: Sources, recordings: list[Recording]
+) -> dict[str, object]:
+    """Its section with limits of what a good sample is, and that of its open-circuit voltage."""
     middle_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
     lowest_v = float(fit(np.array([0.0]))[0])
     largest_a = max((float(np.nanmax(np.abs(one.samples["current_a"]))) for one in recordings), default=0.0)
@@ -221,20 +231,14 @@ def _cell(
         name=name,
         capacity_ah=round(found.capacity_ah, 4),
         capacity_std=MEASURED_CAPACITY_STD if found.capacity_ah == found.measured_ah else None,
-        series_count=generic.cell.series_count,
+        series_count=series_count,
         nominal_voltage_v=round(middle_v, 2),
         voltage_min_v=round(min(LOWEST * middle_v, lowest_v), 2),
         voltage_max_v=round(HIGHEST * full_v, 2),
         current_max_a=round(max(CURRENT_MAX_C * found.capacity_ah, 1.5 * largest_a), 3),
     )
-    test = _warmest(found.tests)
-    ladder, elements = ladder_of(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
-    if test is not None:
-        rests = rest_elements(next(r.samples for r in recordings if r.name == test.name), test, found.capacity_ah)
-        ladder = ladder_of(generic, rests, float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C)))
-        elements = rests.sections
     ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(found.hysteresis_v, found.hysteresis_std_v)
-    return CellModel.model_validate({"cell": cell, "ocv": ocv, "ladder": ladder, **elements})
+    return {"cell": cell, "ocv": ocv}
 
 
 def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:

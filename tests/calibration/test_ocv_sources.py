@@ -11,15 +11,17 @@ from bms_estimator.calibration.ocv_sources import (
     Recording,
     amid_usual_hysteresis,
     find_sources,
+    without_branches,
 )
 from bms_estimator.calibration.ocv_table import NODES, fit_table
 from bms_estimator.calibration.slow_curve import GRID
 from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture
 from tests.calibration.simulated_relaxation import relaxation, schedule
-from tests.calibration.simulated_slow import CAPACITY_AH, hysteresis_v, slow, true_v
+from tests.calibration.simulated_slow import CAPACITY_AH, CURRENT_A, hysteresis_v, slow, true_v
 
 INSIDE = (NODES > 0.1) & (NODES < 0.95)
 
@@ -75,6 +77,36 @@ def test_a_lone_branch_is_brought_to_the_middle_of_what_is_usual(direction, lift
     assert (points.common_v > plain.common_v).all()
     assert moved.hysteresis_v == pytest.approx(usual_v)
     assert moved.hysteresis_std_v == pytest.approx(USUAL_STD * usual_v)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize("rested", [True, False])
+def test_what_branches_take_of_a_lone_curve_is_taken_out(direction, rested):
+    """With the ohmic drop where no jump to or from a rest has told it."""
+    samples, ladder = slow((direction,)), load_cell("nca", CAPACITY_AH).ladder
+    found = of(samples if rested else samples[samples["current_a"] != 0.0], capacity_ah=CAPACITY_AH)
+    plain, (source,) = found.points, without_branches(found, ladder).sources
+    rows = [row for part in (ladder.weak_ohm, ladder.strong_ohm) for row in part[int(rested) :]]
+    drop_v = CURRENT_A * sum(np.interp(plain.soc, ladder.soc, row) for row in rows)
+    assert source.points.ocv_v - plain.ocv_v == pytest.approx(direction * drop_v, rel=1e-3)
+    assert source.points.common_v == pytest.approx(np.hypot(plain.common_v, ladder.std * drop_v), rel=1e-3)
+    assert source.notes[-1].startswith(f"{1e3 * drop_v.mean():.0f} mV")
+
+
+def test_a_cold_lone_curve_is_further_from_rest():
+    samples, ladder = slow((1.0,)), load_cell("nca", CAPACITY_AH).ladder
+    lifted_v = []
+    for temperature_c in (25.0, 0.0):
+        samples["temperature_c"] = temperature_c
+        found = of(samples)
+        lifted_v.append((without_branches(found, ladder).points.ocv_v - found.points.ocv_v).mean())
+    assert 1.5 < lifted_v[1] / lifted_v[0] < 5.0
+
+
+def test_pairs_rests_and_given_curves_have_nothing_to_take_out():
+    soc, ladder = np.linspace(0.0, 1.0, 101), load_cell("nca", CAPACITY_AH).ladder
+    found = of(slow((1.0, -1.0)), relaxation(), curves=[GivenCurve("book", soc, true_v(soc), None)])
+    assert without_branches(found, ladder) == found
 
 
 def test_rests_after_a_discharge_and_a_curve_given_without_hysteresis_are_brought_there_too():
