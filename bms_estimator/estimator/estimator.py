@@ -147,8 +147,6 @@ class Estimator:
         if self.identifying:
             self.record["filter"]["soc"] = self.state["soc"]
             self.record["filter"]["smallest_a"] = 0.0  # a sensor shows anew what it can
-        if math.isfinite(unseen_s):
-            self.record["unlearned_s"] += unseen_s
 
 
 def estimator_of(settings: Settings, cell: PackModel) -> Estimator:

@@ -36,7 +36,7 @@ def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]
         return np.array([emf(x, a) for x in soc]), slope
     from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - half a second that a start without table saves
 
-    curve = PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v, extrapolate=True)
+    curve = PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v)
     return curve(soc), curve.derivative()(soc)
 
 

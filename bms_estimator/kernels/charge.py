@@ -18,3 +18,15 @@ def held_current(dt_s: float, before_a: float, now_a: float, unmeasured_s: float
     if before_a * now_a <= 0.0:
         return 0.0
     return min(before_a, now_a) if now_a > 0.0 else max(before_a, now_a)
+
+
+@njit(cache=True)
+def along_line(change_a: float, taus: float, decay: float) -> float:
+    """What a branch gains when the current goes straight from one sample to the next, beyond its mean [A].
+
+    Args:
+        change_a: From one sample to the next [A].
+        taus: Between them, in time constants of the branch.
+        decay: e^-taus.
+    """
+    return change_a * (0.5 * (1.0 + decay) - (1.0 - decay) / taus)

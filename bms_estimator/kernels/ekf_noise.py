@@ -22,7 +22,16 @@ from bms_estimator.kernels.ekf_state import (
     SOC,
     X,
 )
-from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, RESISTANCES, TAUS, arrhenius, resistances
+from bms_estimator.kernels.ladder import (
+    BRANCHES,
+    REFERENCE_C,
+    RESISTANCES,
+    STRONG_J,
+    TAUS,
+    WEAK_J,
+    arrhenius,
+    resistances,
+)
 from bms_estimator.kernels.state import Record
 
 FLOOR_C = 0.1
@@ -52,6 +61,12 @@ def outside(p: Record, temperature_c: float) -> float:
 
 
 @njit(cache=True)
+def known_c(p: Record) -> float:
+    """Above it a cell that the file does not know has smaller resistances, but nothing is surer [C]."""
+    return max(p.high_c, REFERENCE_C)
+
+
+@njit(cache=True)
 def resistance_std(s: Record, p: Record) -> float:
     """Std of ln of the true over the file's resistances: without a temperature they may be anything near."""
     if s.sensed:
@@ -69,7 +84,7 @@ def offset_variance(p: Record) -> float:
 def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> float:
     """R [V^2] of the mean voltage of a window: what the ladder leaves, far more than the sensor's noise."""
     measured_c = s.temperature_c if s.sensed else REFERENCE_C  # what is estimated makes nothing surer
-    model_v = p.model_v * arrhenius(p.model_j, measured_c) * outside(p, s.temperature_c)
+    model_v = p.model_v * arrhenius(p.model_j, min(measured_c, known_c(p))) * outside(p, s.temperature_c)
     return model_v * model_v / min(max(dt_s, 1.0), INDEPENDENT_S) + p.sensor_v2 / samples
 
 
@@ -96,8 +111,11 @@ def bias_variance(s: Record, p: Record, soc: float) -> float:
 
 @njit(cache=True)
 def total_resistance(s: Record, p: Record, soc: float) -> float:
-    """Sum of the resistances at ``soc`` [ohm]."""
-    resistances(soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
+    """Sum of the resistances at ``soc``, no smaller than where the file knows them [ohm]."""
+    weak, strong, most_c = s.weak, s.strong, known_c(p)
+    if s.temperature_c > most_c:
+        weak, strong = arrhenius(WEAK_J, most_c), arrhenius(STRONG_J, most_c)
+    resistances(soc, p.weak_ohm, p.strong_ohm, weak, strong, s.ohm)
     total = 0.0
     for k in range(RESISTANCES):
         total += s.ohm[k]

@@ -68,8 +68,9 @@ class Noise:
     """Capacity, relative std, ..."""
     aged_soc: float = 1000.0
     """... and the charge in which it becomes another with age: 500 full cycles [SOC]."""
-    cell_spread: float = 0.05
-    """Cells in series: by how much of the charge drawn the emptiest lies below their mean, std of SOC."""
+    cell_spread: float = 0.1
+    """Cells in series: by how much of the charge drawn the emptiest lies below their mean, std of SOC. One that is smaller by a
+    fifth is within two of it."""
     soc_std: float = 0.2
     """SOC at switch-on, std."""
     load_c: float = 1.2
@@ -84,6 +85,9 @@ class Noise:
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
     least_share: float = 0.25
     """For weights S shrinks to this part of what R and B, which allow for the worst, make of it."""
+    strain: float = 0.1
+    """A hypothesis that holds the model for wrong by more than two std loses this part of their square from its ln weight, with each
+    update."""
     hysteresis_soc: float = 0.04
     """Charge that leads from one branch of the hysteresis to the other [SOC]."""
 

@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-from bms_estimator.kernels.charge import LONGEST_FLOW_S, held_current
+from bms_estimator.kernels.charge import LONGEST_FLOW_S, along_line, held_current
 from bms_estimator.kernels.ekf import HIGHEST, LOWEST, decay, inflate, predict, update
 from bms_estimator.kernels.ekf_noise import (
     bias_variance,
@@ -70,6 +70,10 @@ ALIKE_STDS = 0.7
 """Two hypotheses closer than this many std of SOC are one."""
 TEMPERATURE_S = 10.0
 """A temperature sensor's noise is averaged over so long [s]."""
+FASTEST_K_S = 0.1
+"""No cell warms or cools faster [K/s], ..."""
+SETTLED_S = 60.0
+"""... once a minute has shown that the first sample was right: some sensors begin with 85 C."""
 COLDEST_C, HOTTEST_C = -60.0, 120.0
 """Where a cell's temperature may be [C]."""
 HYST_STD = 0.7
@@ -78,6 +82,9 @@ KNOWN_S = 1800.0
 """What was before switch-on is forgotten in so long [s]."""
 REOPEN_STDS = 4.0
 """A model that would have to be wrong by so many std is not: the SOC is ..."""
+STRAINED_STDS = 2.0
+"""Beyond so many of them a hypothesis loses weight: as its biases follow what they see, its innovations are small, whatever the
+biases have become."""
 REOPEN_STD = 0.2
 """... by as much as at switch-on."""
 TOLD_STD = 0.01
@@ -219,7 +226,8 @@ def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, tem
     """Charge and branches from the sample before to this one; ``gap``: samples are missing between them."""
     if is_temperature(temperature_c):
         share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
-        s.temperature_c += share * (temperature_c - s.temperature_c)
+        most_k = FASTEST_K_S * dt_s if s.sensed and s.seeded_s > SETTLED_S else math.inf
+        s.temperature_c += min(max(share * (temperature_c - s.temperature_c), -most_k), most_k)
         s.sensed = 1
     w = s.window
     held_a, change_a = held_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
@@ -250,18 +258,6 @@ def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, tem
     s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
     watch_smallest(s, current_a)
     s.current_a = current_a
-
-
-@njit(cache=True)
-def along_line(change_a: float, taus: float, decay: float) -> float:
-    """What a branch gains when the current goes straight from one sample to the next, beyond its mean [A].
-
-    Args:
-        change_a: From one sample to the next [A].
-        taus: Between them, in time constants of the branch.
-        decay: e^-taus.
-    """
-    return change_a * (0.5 * (1.0 + decay) - (1.0 - decay) / taus)
 
 
 @njit(cache=True)
@@ -304,6 +300,8 @@ def update_all(s: Record, p: Record) -> None:
         u = innovation_v / math.sqrt(total_v2)
         # a bend's part of S stays while nothing moves: counted each second, it would tell against the knee at full rest
         s.ln_weight[q] -= p.temper * (innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2))
+        if s.count > 1:
+            s.ln_weight[q] -= p.strain * max(strain2(s, p, q) - STRAINED_STDS**2, 0.0)
         if dt_s > 0.0 and not w.gap:  # one innovation is no error that stays, however long the gap
             inflate(s, q, dt_s, u)
         if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
@@ -331,20 +329,23 @@ def size_of_errors(s: Record, p: Record) -> float:
 
 @njit(cache=True)
 def reopen(s: Record, p: Record) -> None:
-    """Begin again where the model would have to be wrong by far more than it is: then the SOC is, by any amount.
-
-    The biases take what is wrong with OCV and hysteresis, too: on a plateau that is most of it.
-    """
-    if s.count > 1:
-        return
-    bias_v = s.mean[0, B_SLOW] + s.mean[0, B_FAST]
-    soc = s.mean[0, SOC]
-    hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)
-    wrong_v2 = bias_variance(s, p, soc) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
-    if bias_v * bias_v > REOPEN_STDS**2 * wrong_v2:
+    """Begin again where the model would have to be wrong by far more than it is: then the SOC is, by any amount."""
+    if s.count == 1 and strain2(s, p, 0) > REOPEN_STDS**2:
         forget_curve(s.mean[0], s.covariance[0])
         seed(s, p, s.mean[0, SOC], REOPEN_STD)
         s.reopened += 1
+
+
+@njit(cache=True)
+def strain2(s: Record, p: Record, q: int) -> float:
+    """By how many std a hypothesis holds the model for wrong, squared.
+
+    The biases take what is wrong with OCV and hysteresis, too: on a plateau that is most of it.
+    """
+    bias_v, soc = s.mean[q, B_SLOW] + s.mean[q, B_FAST], s.mean[q, SOC]
+    hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)
+    wrong_v2 = bias_variance(s, p, soc) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
+    return bias_v * bias_v / wrong_v2
 
 
 @njit(cache=True)

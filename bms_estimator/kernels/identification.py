@@ -16,6 +16,7 @@ from bms_estimator.kernels.hypotheses import (
     WINDOW_S,
     clear,
     count_on,
+    follow_temperature,
     gather,
     pass_time,
     seed,
@@ -23,12 +24,13 @@ from bms_estimator.kernels.hypotheses import (
     update_all,
 )
 from bms_estimator.kernels.input_checks import (
-    SIGN_OF_CURRENT,
+    UNUSABLE,
     believed,
     guard,
     judge,
     keep,
-    wait_for_sign,
+    wait,
+    watch_frozen,
     watch_sign,
 )
 from bms_estimator.kernels.margins import delta
@@ -59,6 +61,7 @@ def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, volta
     """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, to ``soc_std``; the load before is not known."""
     f = s.filter
     f.current_a, f.step.phase = current_a, UNHELD
+    follow_temperature(f)
     seed(f, p.filter, f.soc, min(soc_std, UNSEEN_MOST))
     clear(f)
     s.checks.slow_v = 0.0
@@ -88,16 +91,21 @@ def identify(
     if gap and f.window.samples > 0:
         take_window(s, p)  # what was measured before tells nothing of what flowed in the gap
     count_on(f, p.filter, dt_s, gap, current_a, temperature_c)
+    if dt_s > p.filter.unmeasured_s:
+        for e in range(ELEMENTS):
+            s.unlearned_s[e] += dt_s
     unknown = f.window.unknown_as / p.filter.capacity_as
-    if gap and unknown > ONE_STD and not c.suspects & SIGN_OF_CURRENT:
+    if gap and unknown > ONE_STD and not c.suspects & UNUSABLE:
         pass_time(f, p.filter)
         predict(f, p.filter, f.best)
         restart_filter(s, p, math.hypot(f.soc_std, unknown), current_a, voltage_v)
+        s.fit_age_s += dt_s
         return
+    watch_frozen(c, p.filter, dt_s, current_a, voltage_v)
     watch_sign(c, p.filter, dt_s, current_a, voltage_v)
-    if c.suspects & SIGN_OF_CURRENT:
-        wait_for_sign(c, f, p.filter, dt_s, current_a)
-    elif believed(c, s.counters, f, s.elements, dt_s, change_a, current_a, voltage_v):
+    if c.suspects & UNUSABLE:
+        wait(c, f, p.filter, dt_s, current_a)
+    elif believed(c, s.counters, f, p.filter, s.elements, dt_s, change_a, current_a, voltage_v):
         watch_steps(f, p.filter, dt_s, change_a, voltage_v)
         gather(f, current_a, voltage_v)
     else:

@@ -8,7 +8,6 @@ import math
 import numpy as np
 from numba import njit
 
-from bms_estimator.kernels.charge import UNMEASURED_S
 from bms_estimator.kernels.ekf_state import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS
 from bms_estimator.kernels.hypotheses import clear, seed, start
@@ -37,6 +36,13 @@ VISIBLE_V = 0.003
 """A change of the overpotential of one cell that shows fully [V]."""
 CLIP = 5.0
 """A change of voltage counts up to so many times what the resistances explain: not a glitch to zero."""
+FROZEN_S = 60.0
+"""A reading that stays the same to the last digit while the other moves for so long is none [s]: ..."""
+SWING_V, RESOLVED = 0.03, 3.0
+"""... the current, where the voltage of one cell moves by so much [V]; the voltage, where what the current drops is visible. Both
+are more than so many steps of the voltage's resolution."""
+UNCOUNTED = 0.1
+"""Charge that goes wrong while the voltage tells nothing, relative."""
 OUTLIERS_S = 3600.0
 """Memory of single samples that were not believed [s]."""
 MANY_OUTLIERS, FEW_OUTLIERS = 5.0, 1.0
@@ -54,7 +60,9 @@ MANY_SEARCHES = 4.0
 UNKNOWN_K = 5.0
 """So far outside the temperatures of the cell file nothing is known of it [K]."""
 
-SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE = (int(bit) for bit in Suspect)
+SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT = (int(bit) for bit in Suspect)
+UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT
+"""No voltage is believed meanwhile."""
 
 CHECKS = np.dtype(
     [
@@ -67,6 +75,11 @@ CHECKS = np.dtype(
         ("sign_evidence", "f8"),  # 0..1: how much was seen of
         ("change_v_a", "f8"),  # running mean of the fast change of voltage times that of current [V A]
         ("change_a2", "f8"),  # the same of the current's squared [A^2]
+        ("last_v", "f8"),  # of the sample before; 0: none
+        ("last_a", "f8"),
+        ("step_v", "f8"),  # the smallest change of voltage seen [V]; 0: none yet
+        ("frozen_v_s", "f8"),  # for so long the voltage has stayed the same while the current moved [s]
+        ("frozen_a_s", "f8"),  # for so long the current has while the voltage moved
         ("wrong_v", "f8"),  # running mean of the error that stays [V]
         ("searches", "f8"),  # times the filter began again of late
         ("seen_reopened", "i8"),
@@ -92,7 +105,15 @@ COUNTERS = np.dtype(
 
 @njit(cache=True)
 def believed(
-    c: Record, n: Record, f: Record, e: Record, dt_s: float, change_a: float, current_a: float, voltage_v: float
+    c: Record,
+    n: Record,
+    f: Record,
+    p: Record,
+    e: Record,
+    dt_s: float,
+    change_a: float,
+    current_a: float,
+    voltage_v: float,
 ) -> bool:
     """Whether the filter may see a sample: its voltage is near what was predicted, or stays where it is.
 
@@ -100,6 +121,7 @@ def believed(
         c: Record of CHECKS.
         n: Record of COUNTERS.
         f: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
         e: Record of EQUIVALENT.
         dt_s: Since the sample before [s].
         change_a: Of the current since then [A].
@@ -110,7 +132,7 @@ def believed(
     predicted_v = f.voltage_v - e.value[R_S] * away_a
     jump_v = (e.value[R_S] + e.value[R_TS] + e.value[R_TL]) * max(abs(away_a), abs(change_a))
     limit_v = GATE_STDS * math.sqrt(f.innovation_variance) + jump_v
-    if abs(voltage_v - predicted_v) <= limit_v or dt_s > UNMEASURED_S:
+    if abs(voltage_v - predicted_v) <= limit_v or dt_s > p.unmeasured_s:
         if c.gated_in_row > 0 and not enough(c):
             c.outliers += c.gated_in_row
         c.gated_in_row, c.gated_s = 0, 0.0
@@ -200,6 +222,36 @@ def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: f
 
 
 @njit(cache=True)
+def watch_frozen(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
+    """For how long one of the two has been the same to the last digit while the other moved; before ``watch_sign``."""
+    if c.last_v == 0.0 or dt_s > FAST_S:
+        c.frozen_v_s = c.frozen_a_s = 0.0
+    else:
+        resolved_v = RESOLVED * c.step_v
+        change_v = abs(voltage_v - c.last_v)
+        if change_v > 0.0:
+            c.step_v = change_v if c.step_v == 0.0 else min(c.step_v, change_v)
+            c.frozen_v_s = 0.0
+        elif p.middle_ohm * abs(current_a - c.slow_a) > max(VISIBLE_V * p.series, resolved_v):
+            c.frozen_v_s += dt_s
+        if current_a != c.last_a:
+            c.frozen_a_s = 0.0
+        elif abs(voltage_v - c.slow_v) > max(SWING_V * p.series, resolved_v):
+            c.frozen_a_s += dt_s
+    c.last_v, c.last_a = voltage_v, current_a
+
+
+@njit(cache=True)
+def unusable(c: Record, p: Record) -> int:
+    """The bit of why no voltage can be believed, 0: it can."""
+    if sign_is_wrong(c, p):
+        return SIGN_OF_CURRENT
+    if c.frozen_v_s > FROZEN_S:
+        return VOLTAGE
+    return CURRENT if c.frozen_a_s > FROZEN_S else 0
+
+
+@njit(cache=True)
 def sign_is_wrong(c: Record, p: Record) -> bool:
     """Whether the voltage rises with what is said to be discharge; what is suspected already is so until it falls."""
     middle = p.weak_ohm.shape[0] // 2
@@ -208,19 +260,27 @@ def sign_is_wrong(c: Record, p: Record) -> bool:
 
 
 @njit(cache=True)
-def wait_for_sign(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
-    """A sample while the current has the wrong sign: no voltage can be explained, and the charge counts the wrong way.
+def wait(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
+    """A sample while voltage and current do not belong together: no voltage can be believed.
 
-    The SOC errs by twice the charge, always the same way. What was learned meanwhile is worth nothing: once the sign is right
-    again the filter starts anew.
+    With the wrong sign of the current the SOC errs by twice the charge, always the same way; a current that is not measured may be
+    anything common. What was learned with the wrong sign is worth nothing: the filter starts anew afterwards.
     """
-    wrong = 2.0 * abs(current_a) * min(dt_s, UNMEASURED_S) / p.capacity_as
+    moved = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
+    wrong = 2.0 * moved if c.suspects & SIGN_OF_CURRENT else UNCOUNTED * moved
+    if c.suspects & CURRENT:
+        wrong = p.load_mean_c * min(dt_s, p.unmeasured_s) / 3600.0
     f.soc_std = min(f.soc_std + wrong, LOST_AT_MOST)
-    if sign_is_wrong(c, p):
+    now = unusable(c, p)
+    if now:
         return
-    soc_std = max(f.soc_std, p.soc_std)
-    start(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
-    seed(f, p, f.soc, soc_std)
+    if c.suspects & SIGN_OF_CURRENT:
+        soc_std = max(f.soc_std, p.soc_std)
+        start(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
+        seed(f, p, f.soc, soc_std)
+    else:
+        seed(f, p, f.soc, max(f.soc_std, LOST_STD))
+    clear(f)
     c.suspects = 0
 
 
@@ -229,10 +289,10 @@ def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
     """Set and take back the bits of ``c.suspects`` after an update of the filter over ``dt_s``."""
     before = c.suspects
     c.outliers -= c.outliers * min(1.0, dt_s / OUTLIERS_S)
-    if sign_is_wrong(c, p):
-        c.suspects = SIGN_OF_CURRENT
+    bits = unusable(c, p)
+    if bits:
+        c.suspects = bits
         return
-    bits = 0
     if c.outliers > (FEW_OUTLIERS if before & OUTLIERS else MANY_OUTLIERS):
         bits |= OUTLIERS
     x, cov = f.mean[f.best], f.covariance[f.best]

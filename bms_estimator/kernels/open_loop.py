@@ -1,6 +1,7 @@
 """What a cell's branches do under a measured current, from rest: no voltage is looked at.
 
-Between two samples the current is taken as the filter takes it (``held_current``).
+Between two samples the current is taken as the filter takes it (``held_current``, ``along_line``), of a source that is no slower
+than one a minute.
 """
 
 import math
@@ -9,8 +10,9 @@ import numpy as np
 from numba import njit
 
 from bms_estimator.kernels.cell import Floats, c_tl, c_ts, r_s, r_tl, r_ts, rc_step
-from bms_estimator.kernels.charge import held_current
+from bms_estimator.kernels.charge import UNMEASURED_S, along_line, held_current
 from bms_estimator.kernels.ladder import BRANCHES, TAUS, TREND
+from bms_estimator.kernels.unseen import SLOW_S
 
 LEAST_CAPACITANCE = 1e-3
 """C_ts, C_tl are held at this fraction of a9, a12 below delta1, delta2, where (2.7), (2.8) turn negative."""
@@ -31,8 +33,10 @@ def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
     for j in range(1, time_s.size):
         dt_s = time_s[j] - time_s[j - 1]
         held_a = held_current(dt_s, current_a[j - 1], current_a[j])
+        straight_a = current_a[j] - current_a[j - 1] if SLOW_S < dt_s <= UNMEASURED_S else 0.0
         for k in range(BRANCHES):
-            x[j, k] = held_a + (x[j - 1, k] - held_a) * math.exp(-dt_s / TAUS[k])
+            decay = math.exp(-dt_s / TAUS[k])
+            x[j, k] = held_a + (x[j - 1, k] - held_a) * decay + along_line(straight_a, dt_s / TAUS[k], decay)
     return x
 
 

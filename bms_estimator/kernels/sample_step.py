@@ -105,7 +105,7 @@ def step(
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
         if new_clock:
-            after_restart(state[0], settings[0], current_a, voltage_v)
+            after_restart(state[0], settings[0], current_a, voltage_v, temperature_c)
         else:
             s.time_steps_back += 1
         return verdict
@@ -152,10 +152,12 @@ def sense(m: Record, temperature_c: float) -> None:
 
 
 @njit(cache=True)
-def after_restart(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
+def after_restart(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """The first sample of a new clock: nobody knows how long nobody measured. Records as in ``step``."""
     if p.identify:
-        if not s.filter.sensed:
+        if is_temperature(temperature_c):
+            s.filter.temperature_c, s.filter.sensed = temperature_c, 1
+        elif not s.filter.sensed:
             s.filter.temperature_c = REFERENCE_C
         restart_filter(s, p, UNSEEN_MOST, current_a, voltage_v)
     if p.learning.enabled:

@@ -98,6 +98,8 @@ class TableOcv(Strict):
             if not (steps > 0).all():
                 i = int(np.argmax(steps <= 0))
                 raise ValueError(f"{name} must increase, but {values[i + 1]} follows {values[i]} at point {i + 2}")
+        if (self.soc[0], self.soc[-1]) != (0.0, 1.0):
+            raise ValueError(f"soc runs from {self.soc[0]} to {self.soc[-1]}: give the voltages at 0 and at 1, too")
         for name in ("error_v", "hysteresis_v", "per_kelvin_v"):
             column = getattr(self, name)
             if column is not None and len(column) != len(self.soc):

@@ -40,7 +40,10 @@ class Estimate(Report):
     )
     soc: float | None = Field(description="state of charge, 0..1; null of a fuel cell, as all that follows from it")
     soc_percent: float | None = Field(description="state of charge [%]")
-    soc_std: float | None = Field(description="standard deviation of soc; null without the identifier")
+    soc_std: float | None = Field(
+        description="standard deviation of soc; with cells in series as of the emptiest, which may lie below by a tenth of what is "
+        "drawn; null without the identifier"
+    )
     soc_coulomb: float | None = Field(description="state of charge by coulomb counting alone, 0..1")
     soc_ocv: float | None = Field(description="state of charge by the inverted OCV (7.1), 0..1")
     remaining_capacity_ah: float | None = Field(description="charge down to SOC 0 [Ah]")

@@ -24,7 +24,7 @@ from bms_estimator.model.suspect import Suspect
 from bms_estimator.snapshot.alarm_state import AlarmState, Floats, Raising, Turn
 from bms_estimator.snapshot.alarm_text import alarm_text
 
-SENSOR_SUSPECTS = Suspect.SIGN_OF_CURRENT | Suspect.OFFSET | Suspect.OUTLIERS
+SENSOR_SUSPECTS = Suspect.SIGN_OF_CURRENT | Suspect.OFFSET | Suspect.OUTLIERS | Suspect.VOLTAGE | Suspect.CURRENT
 MODEL_SUSPECTS = Suspect.CAPACITY | Suspect.OCV
 ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """These are watched before anything was measured."""

@@ -196,7 +196,8 @@ def _identified(learned: Learned, held: Parameter, limit: float, now_s: float) -
     if held.value is None:
         return held
     why = f"identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
-    return held.model_copy(update={"reason": why})
+    std = math.hypot(learned.std, learned.value - held.value)  # of what is held, by what is known
+    return held.model_copy(update={"std": finite(std), "reason": why})
 
 
 def _configured(value: float, why_missing: str) -> Parameter:

@@ -34,6 +34,13 @@ KINDS = {
     "wrong sensor": ("NCR, current", "NCR, -50", "NCR, +50", "NCR, capacity"),
     "LFP from full": tuple(f"LFP {t} C from full" for t in (25, 5, -15)),
     "LFP": ("LFP 25 C (its", "LFP 5 C", "LFP -15 C (its"),
+    "by ocv alone": (
+        *(f"PF {t} C, by ocv" for t in (25, 10, 0, -10)),
+        *(f"LFP {t} C, by ocv" for t in (25, 5, -15)),
+        "NCR, by ocv",
+        "LG M50, by ocv",
+    ),
+    "charging": ("NCR, charging", "LG M50, charging", *(f"LFP {t} C, charging" for t in (25, 5, -15))),
     "generic": ("generic",),
 }
 """Groups by how their names begin; a name that is a group's own stands for that group alone."""
@@ -76,6 +83,7 @@ PARTS: dict[str, Change] = {
     "polarisation from the first current": setting(load_c=0.0, load_level_c=1e-3),
     "weights not tempered": setting(temper=0.5),
     "weights by S as it is": setting(least_share=1.0),
+    "weights by innovations alone": setting(strain=0.0),
 }
 ONE_FILTER, NO_TEMPERATURE = "one hypothesis", "temperature not used"
 

@@ -49,6 +49,16 @@ def spikes(block: SampleBlock, during: np.ndarray) -> None:
     block["current_a"][now_and_then(during)] = 4.6
 
 
+def stuck(block: SampleBlock, during: np.ndarray) -> None:
+    """The voltage: its wire is off, or an old value comes again and again."""
+    block["voltage_v"][during] = block["voltage_v"][np.argmax(during)]
+
+
+def dead(block: SampleBlock, during: np.ndarray) -> None:
+    """The current sensor."""
+    block["current_a"][during] = 0.0
+
+
 def repeated(block: SampleBlock, during: np.ndarray) -> None:
     """Every second stamp is that of the sample before."""
     twice = np.flatnonzero(during)[1::2]
@@ -95,7 +105,7 @@ def capture(captures: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", CHANGING)
-@pytest.mark.parametrize("fault", [flipped, offset, glitches, spikes, repeated])
+@pytest.mark.parametrize("fault", [flipped, offset, glitches, spikes, repeated, stuck, dead])
 def test_an_hour_of_bad_input(captures: Path, name: str, fault: Fault) -> None:
     """Within an hour of good input the SOC is right again, and stays so."""
     run = Run(capture(captures, name), TRUTH, fault)
@@ -105,7 +115,15 @@ def test_an_hour_of_bad_input(captures: Path, name: str, fault: Fault) -> None:
 
 
 @pytest.mark.parametrize("name", CHANGING)
-@pytest.mark.parametrize(("fault", "suspect"), [(flipped, Suspect.SIGN_OF_CURRENT), (glitches, Suspect.OUTLIERS)])
+@pytest.mark.parametrize(
+    ("fault", "suspect"),
+    [
+        (flipped, Suspect.SIGN_OF_CURRENT),
+        (glitches, Suspect.OUTLIERS),
+        (stuck, Suspect.VOLTAGE),
+        (dead, Suspect.CURRENT),
+    ],
+)
 def test_a_passing_fault_is_named_and_then_forgotten(captures: Path, name: str, fault: Fault, suspect: Suspect) -> None:
     run = Run(capture(captures, name), TRUTH, fault)
     named = run.suspects & suspect != 0

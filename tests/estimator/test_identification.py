@@ -102,11 +102,19 @@ def test_a_fit_that_is_negative_at_the_present_soc_is_not_handed_over(load) -> N
 def test_time_that_nobody_measured_teaches_the_map_nothing(load) -> None:
     estimator = Estimator(TRUTH, identifier=ON, initial_soc=1.0)
     estimator.run(load[0][:5000])
-    before = estimator.record[0]["map"]["weight"].copy()
-    last = load[0][5000:5001].copy()
-    last["time_s"] += 36000.0
-    estimator.run(last)
-    assert (estimator.record[0]["map"]["weight"] <= before).all()  # it forgets meanwhile
+    before, gap_s = estimator.record[0]["map"]["weight"].copy(), 36000.0
+    unlearned_s = estimator.record[0]["unlearned_s"].copy()
+    later = load[0][5000:5300].copy()
+    later["time_s"] += gap_s
+    later["current_a"] = 0.0
+    estimator.run(later[:1])
+    assert estimator.record[0]["map"]["weight"] == pytest.approx(before)
+    assert estimator.record[0]["unlearned_s"] - unlearned_s == pytest.approx(gap_s, abs=2.0)
+    estimator.run(later[1:])
+    left = np.exp(-gap_s / estimator.settings_record["map_memory_s"][0])
+    known = before > 0.0
+    kept = estimator.record[0]["map"]["weight"][known] / before[known]
+    assert np.median(kept) == pytest.approx(left, rel=2e-3)  # at the present SOC it learns on
 
 
 def test_a_long_pause_leaves_what_was_learned_of_capacity_and_of_the_sensor_what_stays(load) -> None:

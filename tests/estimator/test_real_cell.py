@@ -5,6 +5,8 @@ import pytest
 
 from bms_estimator import Estimator, estimate, load_capture, load_cell
 from bms_estimator.model.columns import Columns
+from tests.estimator.anywhere.run import run_of
+from tests.estimator.anywhere.score import score
 
 
 @pytest.mark.parametrize("first", [0, 3000, 6000], ids=["from full", "under 10 A", "mid way"])
@@ -18,6 +20,20 @@ def test_soc_wrong_by_a_fifth_is_right_within_an_hour(data, first):
     error = found["soc"][judged] - soc[judged]
     assert np.abs(error).max() < 0.02
     assert (np.abs(error) < 2.0 * found["soc_std"][judged]).mean() > 0.95
+
+
+@pytest.mark.parametrize("wrong", [-0.2, 0.2])
+def test_errors_and_innovations_in_mid_load_are_of_the_size_of_their_std(data, wrong):
+    """Nissan Leaf from 35 % of its charge on: NIS of ten minutes, NEES, and a band that is narrow."""
+    cell, samples = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz").rows
+    drawn_as = np.r_[0.0, np.cumsum(samples["current_a"][:-1] * np.diff(samples["time_s"]))]
+    soc, first = 1.0 - drawn_as / (3600.0 * cell.cell.capacity_ah), int(np.argmax(drawn_as >= 0.35 * drawn_as[-1]))
+    run = run_of(Estimator(cell, initial_soc=soc[first] + wrong), samples[first:])
+    found = score(samples["time_s"][first:], run.soc, run.soc_std, soc[first:])
+    assert 0.3 < run.nis(900.0) < 2.0
+    assert found.cover > 95.0
+    assert found.std < 1.5
+    assert found.nees < 2.0
 
 
 def test_blocks_of_a_real_capture_leave_what_its_samples_leave_to_the_last_bit(data):

@@ -12,8 +12,9 @@ from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels import ekf, ekf_noise, hypotheses, unseen
 from bms_estimator.kernels.ekf_state import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.kernels.ladder import BRANCHES, TAUS
+from bms_estimator.kernels.open_loop import branch_currents
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.model.settings import IdentifierSettings
 from tests.estimator.anywhere.cases import CASES, Case, capture
 
@@ -224,6 +225,18 @@ def test_outside_the_temperatures_of_the_cell_file_r_grows() -> None:
     assert variances == pytest.approx([1.0, 1.0, 4.0, 9.0])
 
 
+def test_above_the_temperatures_of_the_cell_file_nothing_is_surer() -> None:
+    """Resistances fall there, and what is relative to them would."""
+    p = settings(low_c=0.0, high_c=30.0)
+    s = somewhere(p)
+    sizes = []
+    for s["temperature_c"] in (30.0, 45.0, 60.0):
+        hypotheses.follow_temperature(s)
+        sizes.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0.55)))
+    assert sizes[1] == pytest.approx(1.5**2 * np.array(sizes[0]), rel=0.01)
+    assert sizes[2] == pytest.approx(2.0**2 * np.array(sizes[0]), rel=0.01)
+
+
 def test_inflation_is_one_for_white_innovations_and_follows_those_that_stay() -> None:
     s = np.zeros(1, EKF_STATE)[0]
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
@@ -338,12 +351,47 @@ def test_what_is_unlikely_goes_and_what_agrees_becomes_one() -> None:
     assert s["mean"][:2, SOC] == pytest.approx([0.3, 0.5025])
 
 
+@pytest.mark.parametrize("true", [0, 1])
+def test_a_hypothesis_that_holds_its_model_for_wrong_loses_against_one_that_does_not(true: int) -> None:
+    """Its biases have followed what they saw, 0.2 V: no innovation tells."""
+    p, apart = settings(), (0.4, 0.7)
+    s, _ = several(p, 2)
+    voltage_v = 0.0
+    for q in (1 - true, true):
+        s["mean"][q], s["covariance"][q] = 0.0, 1e-6 * np.eye(STATES)
+        s["mean"][q, SOC] = apart[q]
+        voltage_v = ekf.linearise(s, p, q, apart[q], 1e-6)[0]
+    s["mean"][1 - true, B_SLOW] = voltage_v - ekf.linearise(s, p, 1 - true, apart[1 - true], 1e-6)[0]
+    s["ln_weight"][:2] = 0.0
+    assert abs(s["mean"][1 - true, B_SLOW]) > 0.2
+    for _ in range(60):
+        hypotheses.count_on(s, p, 1.0, False, s["current_a"], 25.0)
+        s["window"]["samples"] = 0
+        hypotheses.gather(s, s["current_a"], voltage_v)
+        hypotheses.update_all(s, p)
+    likely = s["mean"][: s["count"], SOC][s["ln_weight"][: s["count"]] > -3.0]
+    assert likely == pytest.approx([apart[true]], abs=0.05)
+
+
 DRIVE = next(case for case in CASES if case.name == "oxide 25C")
 FAST = Case("100 Hz", rate_hz=100.0, hours=0.25, unseen_h=0.3, seed=5)
 
 
 def start(seen, wrong=0.2):
     return Estimator(seen.cell, initial_soc=float(seen.soc[0] + wrong))
+
+
+@pytest.mark.parametrize("dt_s", [1.0, 10.0, 60.0])
+def test_calibration_takes_the_current_between_samples_as_the_filter_does(dt_s: float) -> None:
+    current_a = np.repeat(np.random.default_rng(0).uniform(0.0, 3.0, 50), 4)
+    samples = np.zeros(current_a.size, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"] = dt_s * np.arange(current_a.size), current_a
+    samples["voltage_v"], samples["temperature_c"] = 3.7, 25.0
+    estimator, x_a = Estimator(load_cell("nmc", 30.0)), []
+    for sample in samples:
+        estimator.run(sample[None])
+        x_a.append(estimator.record[0]["filter"]["x_a"].copy())
+    assert branch_currents(samples["time_s"], current_a) == pytest.approx(np.array(x_a), abs=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -476,6 +524,34 @@ def test_a_temperature_that_is_lost_is_that_of_the_next_sample(drive) -> None:
     estimator.run(samples[600:610])
     assert estimator.record[0]["counters"]["reset"] == 1
     assert f["temperature_c"] == 8.0
+
+
+def test_a_sensor_that_says_85_degrees_now_and_then_is_not_followed(drive) -> None:
+    estimator, samples = start(drive), drive.samples[:1200].copy()
+    samples["temperature_c"] = 25.0
+    samples["temperature_c"][[0, 1]] = samples["temperature_c"][600:630] = 85.0
+    taken_c = []
+    for sample in samples:
+        estimator.run(sample[None])
+        taken_c.append(float(estimator.record[0]["filter"]["temperature_c"]))
+    assert max(taken_c[60:]) < 28.5
+    assert taken_c[-1] == pytest.approx(25.0, abs=0.1)
+
+
+@pytest.mark.parametrize("unseen_s", [7200.0, np.inf])
+def test_after_a_restart_the_cell_is_as_cold_as_its_sensor_says_at_once(drive, unseen_s: float) -> None:
+    """What the hypotheses may be wrong by is that of the cold, not of the warm cell that it was."""
+    bias_v = []
+    for before_c in (25.0, -15.0):
+        estimator, samples = start(drive), drive.samples[:602].copy()
+        samples["temperature_c"][:600], samples["temperature_c"][600:] = before_c, -15.0
+        estimator.run(samples[:600])
+        estimator.resume(unseen_s)
+        estimator.run(samples[600:])
+        f = estimator.record[0]["filter"]
+        assert f["temperature_c"] == pytest.approx(-15.0, abs=0.1)
+        bias_v.append(np.sqrt(f["covariance"][: f["count"], B_SLOW, B_SLOW]))
+    assert bias_v[0].max() == pytest.approx(bias_v[1].max(), rel=0.3)
 
 
 @pytest.mark.parametrize("field", ["mean", "covariance", "ln_weight"])

@@ -60,15 +60,25 @@ def test_missing_cell_names_the_shipped_ones() -> None:
         load_cell("lifepo5")
 
 
-def test_table_ocv_must_increase(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (
+            "soc = [0.0, 0.3, 0.6, 1.0]\nocv_v = [3.0, 3.6, 3.5, 4.1]",
+            r"ocv_v must increase, but 3\.5 follows 3\.6 at point 3",
+        ),
+        (
+            "soc = [0.1, 0.3, 0.6, 0.9]\nocv_v = [3.0, 3.4, 3.6, 4.1]",
+            r"soc runs from 0\.1 to 0\.9: give the voltages at 0 and at 1",
+        ),
+    ],
+)
+def test_table_ocv_must_increase_from_empty_to_full(tmp_path: Path, table: str, message: str) -> None:
     text = CHEN_MORA.read_text()
     head, rest = text.split("[ocv]", 1)
     path = tmp_path / "cell.toml"
-    path.write_text(
-        head + '[ocv]\nform = "table"\nsoc = [0.0, 0.3, 0.6, 1.0]\nocv_v = [3.0, 3.6, 3.5, 4.1]\n'
-        "[adaptation]" + rest.split("[adaptation]", 1)[1]
-    )
-    with pytest.raises(UserError, match=r"ocv_v must increase, but 3\.5 follows 3\.6 at point 3"):
+    path.write_text(head + f'[ocv]\nform = "table"\n{table}\n' + "[adaptation]" + rest.split("[adaptation]", 1)[1])
+    with pytest.raises(UserError, match=message):
         load_cell(path)
 
 

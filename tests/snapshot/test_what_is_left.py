@@ -105,6 +105,9 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert target != estimator.settings["target"][0, 1]
     # not valid, for the SOC was swept little
     assert (a1.value, a1.source, a1.valid) == (pytest.approx(target, rel=1e-3), "identified", False)
+    assert abs(a1.value - CELL.a[1]) < 3.0 * a1.std
+    unsure = [p for p in (*report.a.values(), *report.elements.values()) if p.source == "identified" and not p.valid]
+    assert all(p.std is not None for p in unsure)
     assert "identified to" in (a1.reason or "")
     assert "configured" not in (a1.reason or "")
 

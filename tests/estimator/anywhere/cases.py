@@ -120,6 +120,8 @@ CASES: tuple[Case, ...] = (
     Case("kept cool", load_c=1.0, hours=0.6, temperature_c=20.0, sensed=False, warms_k=1.0, seed=32),
     Case("LFP full 25C", **LFP, soc=1.0, unseen_h=0.0, seed=17),
     Case("LFP full -10C", **LFP, temperature_c=-10.0, load_c=0.4, soc=1.0, unseen_h=0.0, seed=18),
+    Case("LFP full -25C", **LFP, temperature_c=-25.0, load_c=0.2, soc=1.0, unseen_h=0.0, seed=38),
+    Case("LFP full 45C", **LFP, temperature_c=45.0, soc=1.0, unseen_h=0.0, seed=39),
     Case("LFP cut 25C", **LFP, hours=1.5, seed=19),
     Case("LFP charging", **LFP, **CHARGES, seed=34),
     Case("LFP charging 0C", **LFP, **CHARGES, temperature_c=0.0, seed=37),
@@ -136,6 +138,7 @@ CASES: tuple[Case, ...] = (
     Case("capacity +20%", capacity=1.2, seed=28),
     Case("capacity -20%", capacity=0.8, seed=29),
     Case("6S one cell -10%", weak_cell=0.9, seed=30),
+    Case("6S one cell -20%", weak_cell=0.8, seed=35),
 )
 WRONG = (-0.2, 0.2)
 """How far off the SOC is that the estimator is told."""
