@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.load import Load
 from bms_estimator.calibration.relaxation import REST_CURRENT_C, SOC_SLACK, runs
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.cell import ocv, r_s, soc_from_ocv
+from bms_estimator.kernels.cell import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 
 Floats = NDArray[np.float64]
@@ -26,16 +26,25 @@ SOC_OFF, VOLTAGE_OFF_V = 0.1, 0.1
 GAP_STEPS, GAP_CHARGE = 10.0, 0.01
 """A step this many times the median one, over which the current of its start would draw this part of the capacity, is
 a gap in which nobody knows the charge."""
+SHORTEST_S = 30.0
+"""A capture lasts at least so long [s]."""
+LEAST_ANSWER_V = 1e-3
+"""A cell whose voltage moves less at steps of 1 C, per cell, is none: most have 20 to 100 mV [V]."""
 LEAST_SWEEP = 0.05
 """SOC that must have moved for the sign to show in the voltage's trend."""
 
 
-def contradictions(load: Load, cell: CellModel) -> list[str]:
-    """One line for each, with what to do; empty where all is well. The first one found explains the others."""
-    for found in (_no_excitation(load, cell), _sign(load, cell), _gap(load, cell), _capacity(load, cell)):
-        if found:
-            return [f"{load.name}: {found}"]
-    return []
+def contradictions(load: Load, cell: CellModel, start: float) -> list[str]:
+    """One line with what to do; empty where all is well. The first one found explains the others.
+
+    Args:
+        load: The capture.
+        cell: That it is said to come from.
+        start: SOC at the first sample, 0..1.
+    """
+    found = _short(load) or _no_excitation(load, cell) or _sign(load, cell) or _answer(load, cell) or _gap(load, cell)
+    found = found or _capacity(load, cell, start)
+    return [f"{load.name}: {found}"] if found else []
 
 
 def without_excitation(load: Load, cell: CellModel) -> bool:
@@ -65,6 +74,12 @@ def soc_outside(load: Load, capacity_ah: float, start: float) -> str | None:
     )
 
 
+def _short(load: Load) -> str | None:
+    if load.time_s[-1] >= SHORTEST_S:
+        return None
+    return f"it lasts {load.time_s[-1]:.3g} s, which tells nothing of a battery: is time_s in seconds?"
+
+
 def _no_excitation(load: Load, cell: CellModel) -> str | None:
     largest_a = float(np.abs(load.current_a).max())
     least_a = LEAST_CURRENT_C * cell.cell.capacity_ah
@@ -92,6 +107,17 @@ def _sign(load: Load, cell: CellModel) -> str | None:
     return None
 
 
+def _answer(load: Load, cell: CellModel) -> str | None:
+    ohm, least_ohm = step_resistance(load), LEAST_ANSWER_V * cell.cell.series_count / cell.cell.capacity_ah
+    if np.ptp(load.voltage_v) == 0.0:
+        moves = "does not move"
+    elif ohm is not None and ohm < least_ohm:
+        moves = f"moves by {1e3 * ohm:.3f} mV per ampere at the current's steps (median)"
+    else:
+        return None
+    return f"the voltage {moves}: it is not this current's; check the column, and that no old value was repeated"
+
+
 def _gap(load: Load, cell: CellModel) -> str | None:
     step_s = np.diff(load.time_s)
     charge_ah = np.abs(load.current_a[:-1]) * step_s / 3600.0
@@ -105,10 +131,8 @@ def _gap(load: Load, cell: CellModel) -> str | None:
     )
 
 
-def _capacity(load: Load, cell: CellModel) -> str | None:
+def _capacity(load: Load, cell: CellModel, start: float) -> str | None:
     capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
-    start_a = 0.0 if load.resting_samples else float(load.current_a[0])
-    start = soc_from_ocv(load.start_v + start_a * r_s(0.5, cell.a), *grid)
     outside = soc_outside(load, capacity_ah, start)
     if outside:
         return outside

@@ -173,11 +173,11 @@ def identify(
     """
     whole = [whole_load(capture.name, capture.rows, cell) for capture in captures]
     loads = [load for load in whole if not without_excitation(load, cell)]
-    found = [line for load in loads or whole for line in contradictions(load, cell)]
+    runs = [_run(load, cell, initial_soc, temperature_c) for load in loads or whole]
+    found = [line for run in runs for line in contradictions(run.load, cell, float(run.soc[0]))]
     found += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
     if found:
         raise UserError("\n".join(found))
-    runs = [_run(load, cell, initial_soc, temperature_c) for load in loads]
     runs = _recounted(runs, cell, refine_ocv=refine_ocv)
     left_out = tuple(load.name for load in whole if without_excitation(load, cell))
     candidates = [_Candidate(runs, cell, refine_ocv=refine) for refine in ((False, True) if refine_ocv else (False,))]

@@ -25,6 +25,7 @@ from bms_estimator.calibration.load import Load
 from bms_estimator.calibration.relaxation import runs
 from bms_estimator.kernels.ladder import REFERENCE_C, RESISTANCES, STRONG_J, WEAK_J
 from bms_estimator.kernels.open_loop import branch_currents
+from bms_estimator.model.errors import UserError
 
 Floats = NDArray[np.float64]
 
@@ -196,11 +197,18 @@ def moments(
         scale_ohm: Of the resistances [ohm].
         series: Cells in series.
         miscount: What the count was taken to be off, relative.
+
+    Raises:
+        UserError: No sample is within the SOCs that count.
     """
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
     weight, last = _weights(load)
     inside = (soc > LOWEST) & (soc < HIGHEST)
     kept = (_apart(load.time_s) | last) & inside
+    if not kept.any():
+        raise UserError(
+            f"{load.name}: no sample between SOC {LOWEST:g} and {HIGHEST:g} [--soc]: nothing tells of resistances"
+        )
     load_a = np.abs(currents[:, :4]).max(axis=1)
     std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE * scale_ohm * load_a)
     std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)

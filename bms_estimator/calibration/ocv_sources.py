@@ -329,7 +329,5 @@ def amid_usual_hysteresis(found: Sources, usual_v: Floats) -> Sources:
 
 
 def _of_test(test: RelaxationTest, points: Points) -> Source:
-    temperatures = points.temperature_c[np.isfinite(points.temperature_c)]
-    temperature_c = float(temperatures.mean()) if temperatures.size else float("nan")
     notes = () if test.start_soc > 0.9995 else (f"starts at SOC {test.start_soc:.3f}",)
-    return Source(test.name, f"{len(test.rests)} rests", points, temperature_c, None, notes)
+    return Source(test.name, f"{len(test.rests)} rests", points, test.temperature_c, None, notes)

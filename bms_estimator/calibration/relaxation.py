@@ -115,8 +115,9 @@ class RelaxationTest:
 
     @property
     def temperature_c(self) -> float:
-        """Mean of the rests [C]; NaN without a sensor."""
-        return float(np.mean([rest.temperature_c for rest in self.rests]))
+        """Mean of the rests that tell it [C]; NaN without a sensor."""
+        told = [rest.temperature_c for rest in self.rests if np.isfinite(rest.temperature_c)]
+        return float(np.mean(told)) if told else float("nan")
 
     @property
     def soc(self) -> Floats:

@@ -94,7 +94,7 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     """
     load = whole_load(capture.name, capture.rows, cell)
     start = soc_of_first_rest(load, cell) if initial_soc is None else initial_soc
-    warnings = contradictions(load, cell)
+    warnings = contradictions(load, cell, start)
     outside = soc_outside(load, cell.cell.capacity_ah, start)
     if outside:
         raise UserError("\n".join(dict.fromkeys([*warnings, f"{capture.name}: {outside}"])))

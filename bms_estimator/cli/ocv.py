@@ -33,6 +33,7 @@ from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder
 from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.errors import UserError
 from bms_estimator.sources.curve import read_curve
 from bms_estimator.sources.replay import load_capture
 
@@ -40,6 +41,8 @@ CELL_VOLTAGE_V = 3.7
 """Of one Li-ion cell in the middle of its discharge: tells how many are in series [V]."""
 LOWEST, HIGHEST = 0.55, 1.06
 """Limits of a good sample: of the median voltage, of the full one."""
+LEAST_EMPTY = 0.25
+"""An empty cell has at least this part of the voltage of a half full one."""
 MEASURED_CAPACITY_STD = 0.03
 """Of a capacity measured by a slow discharge, relative: gain of the current sensor, other cells of the kind, some years."""
 CURRENT_MAX_C = 5.0
@@ -152,6 +155,7 @@ def ocv(
     if form is Form.TABLE and found.hysteresis_v is None and has_plateau(NODES, curve_v, count):
         found = amid_usual_hysteresis(found, np.interp(NODES, *curve(generic, "hysteresis_v")))
     fit = fitted(found.points)
+    _check_ends(fit, found)
     result = _result(form, generic, fit, found)
     cell = _cell(name_of(out), count, fit, found, recordings)
     write_cell(out, CellModel.model_validate({**cell, "ladder": ladder, **elements}), _remarks(result))
@@ -161,6 +165,21 @@ def ocv(
         console = Console()
         console.print(_table(out, result, found))
         console.print(_sources_table(result))
+
+
+def _check_ends(fit: ChenMoraFit | TableFit, found: Sources) -> None:
+    """That the curve does not fall to nothing where no point is.
+
+    Raises:
+        UserError: It does.
+    """
+    lowest_v, middle_v = (float(v) for v in fit(np.array([0.0, 0.5])))
+    if lowest_v > LEAST_EMPTY * middle_v:
+        return
+    raise UserError(
+        f"the points begin at SOC {found.points.soc[0]:.2f}, and their curve would be {lowest_v:.2f} V at SOC 0: give captures "
+        f"down to empty, or the right capacity; {found.capacity_ah:g} Ah is too much if the cell was emptied [--capacity-ah]"
+    )
 
 
 def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, found: Sources) -> OcvResult:
@@ -242,8 +261,9 @@ def _cell(
 
 
 def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
-    """The one nearest to 25 C; the first of those that do not say."""
-    return min(tests, key=lambda test: abs(test.temperature_c - REFERENCE_C), default=None)
+    """The one nearest to 25 C; the first where none says."""
+    away_k = [np.nan_to_num(abs(test.temperature_c - REFERENCE_C), nan=np.inf) for test in tests]
+    return tests[int(np.argmin(away_k))] if tests else None
 
 
 def _remarks(result: OcvResult) -> list[str]:

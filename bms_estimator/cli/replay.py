@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AsyncExitStack, contextmanager, nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -32,10 +32,14 @@ from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sinks.table import TableSink, table_sink
 from bms_estimator.snapshot.health import dropped_text
+from bms_estimator.snapshot.impossible import impossible_sample
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources.replay import RawCapture, Replay, open_capture
 from bms_estimator.sources.standard_input import standard_input
 from bms_estimator.store.outbox import Outbox
+
+MANY = 0.01
+"""Part of the samples that is more than a glitch now and then."""
 
 
 def replay(
@@ -73,12 +77,13 @@ def replay(
     with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
         with compiling_shown():
             source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
-        result = asyncio.run(_replay(settings, model, Replay(source, speed=speed), table_sink(out) if out else None))
+        replayed = Replay(source, speed=speed)
+        result = asyncio.run(_replay(settings, model, replayed, table_sink(out) if out else None))
         if isinstance(source, RawCapture):
             for warning in _unread(source, result.duration_s or 0.0):
                 typer.echo(f"warning: {capture}: {warning}", err=True)
         if result.samples == 0:
-            raise UserError(f"{path}: no usable sample; dropped: {dropped_text(result.dropped)}")
+            raise UserError(f"{path}: no usable sample; dropped: {_dropped(result)}")
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
@@ -101,10 +106,12 @@ async def _replay(settings: Settings, cell: PackModel, source: Replay, table: Ta
         publisher = await _publisher(stack, settings, cell, estimator, source)
         stack.enter_context(table or nullcontext())
         show = stack.enter_context(_progress(source))
-        started_s = time.perf_counter()
+        started_s, impossible = time.perf_counter(), None
         async for block in source:
             trace = estimator.run(block)
             summary.add(trace)
+            if trace.size < block.size:
+                impossible = impossible_sample(block, estimator.settings[0]) or impossible
             if table:
                 table.write(trace)
             if publisher:
@@ -114,7 +121,8 @@ async def _replay(settings: Settings, cell: PackModel, source: Replay, table: Ta
         wall_s = time.perf_counter() - started_s
         if publisher:
             publisher.publish_last()
-    return summary.result(estimator, source.samples, wall_s)
+    result = summary.result(estimator, source.samples, wall_s)
+    return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))
 
 
 async def _publisher(
@@ -149,7 +157,7 @@ def result_table(title: str, result: Result) -> Table:
     lock = f"[red]lost {result.lock_losses} times[/]" if result.lock_lost else "[green]kept[/]"
     rows = {
         "samples": f"{result.samples:,}",
-        "dropped": dropped_text(result.dropped),
+        "dropped": _dropped(result),
         **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
         **({"clock set back": f"{result.time_steps_back:,} times"} if result.time_steps_back else {}),
         "duration": _text(result.duration_s, ",.1f", "s"),
@@ -175,7 +183,22 @@ def _soc(result: Result) -> dict[str, str]:
     return {
         "SOC": f"{_text(result.soc_initial, '.2%')} to {_text(result.soc_final, '.2%')}",
         "SOC, std at the end": _text(result.soc_std_final, ".2%"),
+        **_temperature(result),
     }
+
+
+def _temperature(result: Result) -> dict[str, str]:
+    unusable = f"{result.temperatures_dropped:,} values that no cell has"
+    if not result.temperature_sensor:
+        none = unusable if result.temperatures_dropped else "not measured"
+        return {"temperature": f"{none}: the band is wider"}
+    return {"temperature": unusable} if result.temperatures_dropped else {}
+
+
+def _dropped(result: Result) -> str:
+    """What was not used, and, where that is more than single samples, why."""
+    text, number = dropped_text(result.dropped), sum(result.dropped.values())
+    return f"{text}; {result.impossible}" if result.impossible and number > MANY * result.samples else text
 
 
 def _text(value: float | None, form: str, unit: str = "", scale: float = 1.0) -> str:

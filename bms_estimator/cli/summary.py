@@ -37,11 +37,15 @@ class Result:
     lock_lost: bool
     lock_losses: int
     k_final: float | None
+    temperature_sensor: bool  # the capture has told the cell's temperature
     suspects: list[str]
     """What the identifier suspects of its input at the end."""
     gain_rearms: int
     dropped: dict[str, int]
     """Kind of fault -> samples that were not used."""
+    impossible: str | None
+    """The last sample that no such cell can give, and what may be the matter."""
+    temperatures_dropped: int  # values that no cell has
     gaps: int
     time_steps_back: int
     parameters: dict[str, LearnedParameter]
@@ -99,11 +103,14 @@ class Summary:
             lock_lost=bool(state["lock_losses"]),
             lock_losses=int(state["lock_losses"]),
             k_final=finite(state["k"]),
+            temperature_sensor=bool(record["filter"]["sensed"]),
             suspects=suspicions(record, settings),
             gain_rearms=int(state["gain_rearms"]),
             dropped={
                 name.removeprefix("dropped_"): count for name, count in counters.items() if name.startswith("dropped_")
             },
+            impossible=None,
+            temperatures_dropped=0,
             gaps=counters["gaps"],
             time_steps_back=counters["time_steps_back"],
             parameters=_learned(estimator),

@@ -202,7 +202,7 @@ class CheckpointFile:
         except NotOursError as error:
             return Restored({}, 0.0, new, f"{REFUSED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return Restored({}, 0.0, new, f"{REFUSED}unreadable ({type(error).__name__}: {error})")
+            return Restored({}, 0.0, new, f"{REFUSED}damaged, perhaps by a power cut ({type(error).__name__})")
 
     def set_aside(self) -> str:
         """Keep a file that was refused out of the way of the next save. Returns what was done, for people.

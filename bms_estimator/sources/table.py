@@ -20,6 +20,8 @@ from bms_estimator.model.sample import LEAST_C, MOST_C, SAMPLE, CurrentSign, Sam
 from bms_estimator.sources.number import measured
 
 BLOCK_ROWS = 65_536
+SHOWN = 40
+"""Of what is no number so many characters are told."""
 
 
 class Spelling(NamedTuple):
@@ -156,7 +158,7 @@ class CsvTable:
         try:
             return measured(cell) if cell.strip() else np.nan
         except ValueError:
-            raise UserError(f"{self._path}: line {line}: {column} = {cell!r}: must be a number") from None
+            raise UserError(f"{self._path}: line {line}: {column} = {cell[:SHOWN]!r}: must be a number") from None
 
 
 class ParquetTable:

@@ -5,7 +5,7 @@ from scipy.stats import gmean
 from bms_estimator.calibration import branches
 from bms_estimator.calibration import identify as module
 from bms_estimator.calibration.capture_checks import contradictions
-from bms_estimator.calibration.identify import identify
+from bms_estimator.calibration.identify import identify, initial_soc
 from bms_estimator.calibration.ladder_voltage import hats
 from bms_estimator.calibration.load import whole_load
 from bms_estimator.calibration.replays import interval_score
@@ -291,6 +291,16 @@ def with_gap(samples):
     return samples
 
 
+def stuck(samples, first):
+    samples["voltage_v"][first:] = samples["voltage_v"][first]
+    return samples
+
+
+def in_hours(samples):
+    samples["time_s"] /= 3600.0
+    return samples
+
+
 @pytest.mark.parametrize(
     ("samples", "cell", "words"),
     [
@@ -299,10 +309,24 @@ def with_gap(samples):
         (flipped(capture(constant())), TRUTH, ["sign is wrong", "Ah drawn while the voltage went from"]),
         (capture(steps()), with_capacity(2.0), ["outside 0..1", "capacity of 2 Ah"]),
         (capture(steps()), with_capacity(5.0), ["charge and voltage disagree", "capacity of 5 Ah"]),
+        (stuck(capture(steps()), 0), TRUTH, ["the voltage does not move", "no old value was repeated"]),
+        (stuck(capture(steps()), 2000), TRUTH, ["the voltage moves by 0.000 mV per ampere"]),
+        (in_hours(capture(steps())[:9000]), TRUTH, ["it lasts 2.5 s", "is time_s in seconds?"]),
         (with_gap(capture(steps())), TRUTH, ["a gap of 3601 s", "A: the charge drawn in it is unknown"]),
         (capture(steps()), load_cell("thunder_power_6s"), ["lie within the cell's limits", "is it this cell's?"]),
     ],
-    ids=["rest", "sign, steps", "sign, constant", "capacity too small", "capacity too large", "gap", "another cell"],
+    ids=[
+        "rest",
+        "sign, steps",
+        "sign, constant",
+        "capacity too small",
+        "capacity too large",
+        "dead",
+        "stuck",
+        "hours",
+        "gap",
+        "another cell",
+    ],
 )
 def test_bad_input_is_named_with_its_numbers(samples, cell, words):
     with pytest.raises(UserError) as caught:
@@ -311,8 +335,18 @@ def test_bad_input_is_named_with_its_numbers(samples, cell, words):
     assert all(word in str(caught.value) for word in words)
 
 
-def test_a_good_capture_contradicts_nothing():
-    assert contradictions(whole_load("good", capture(steps()), TRUTH), TRUTH) == []
+def test_a_good_capture_contradicts_nothing_but_an_soc_that_it_does_not_start_at():
+    load = whole_load("good", capture(steps()), TRUTH)
+    start = initial_soc(load, TRUTH)
+    assert contradictions(load, TRUTH, start) == []
+    (line,) = contradictions(load, TRUTH, start - 0.4)
+    assert "outside 0..1" in line
+
+
+def test_a_capture_that_stays_empty_tells_nothing_of_resistances():
+    current_a = np.tile(np.r_[np.full(20, 2.0), np.full(20, -2.0)], 50)
+    with pytest.raises(UserError, match=r"near.csv: no sample between SOC 0.02 and 1.01"):
+        identify([Columns(capture(current_a, soc=0.5), "near.csv")], TRUTH, initial_soc=0.0)
 
 
 def test_real_cell_from_its_relaxation_test_predicts_random_steps(shared_data):

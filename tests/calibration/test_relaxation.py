@@ -1,5 +1,7 @@
 """Voltage relaxation tests of a simulated cell whose open-circuit voltage is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,6 +41,12 @@ def test_every_rest_is_found_at_its_time_and_soc(noisy):
     assert noisy.soc == pytest.approx(1.0 - 0.05 * np.arange(1 + ROUNDS), abs=1e-9)
     assert noisy.mean_load_a == pytest.approx(1.5)
     assert noisy.full_v == pytest.approx(true_ocv([1.0])[0], abs=2e-3)
+
+
+def test_its_temperature_is_that_of_the_rests_that_tell_one(noisy):
+    rests = [replace(rest, temperature_c=c) for rest, c in zip(noisy.rests, (-10.0, -12.0, np.nan), strict=False)]
+    assert replace(noisy, rests=tuple(rests)).temperature_c == pytest.approx(-11.0)
+    assert np.isnan(replace(noisy, rests=tuple(rests[2:])).temperature_c)
 
 
 def test_points_lie_on_the_open_circuit_voltage(noisy):

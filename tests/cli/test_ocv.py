@@ -229,6 +229,15 @@ def test_a_lone_slow_curve_of_a_layered_oxide_is_brought_to_rest(tmp_path, capsy
     assert np.array(found.weak_ohm) == pytest.approx(np.array(usual.weak_ohm), rel=1e-3)
 
 
+def test_a_curve_that_would_fall_to_nothing_is_none(tmp_path, capsys, shared_data):
+    """Told that 2.9 Ah are 4, the points end far from empty."""
+    capture = shared_data / "panasonic18650pf" / "25_hppc.csv.gz"
+    code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "4", "--out", tmp_path / "large.toml")
+    assert code == 2
+    assert "at SOC 0: give captures down to empty, or the right capacity; 4 Ah is too much" in err
+    assert not (tmp_path / "large.toml").exists()
+
+
 def test_rests_of_a_pouch_cell(tmp_path, capsys, data):
     out = tmp_path / "leaf.toml"
     code, text, _ = run(

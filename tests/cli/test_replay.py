@@ -224,6 +224,33 @@ def test_a_capture_without_a_usable_sample_is_an_error(tmp_path, capsys):
     assert "nan.csv: no usable sample; dropped: 1 not finite, 1 outside the cell's range" in err
 
 
+def test_what_is_in_another_unit_is_guessed(capture, tmp_path, capsys):
+    """All of it, or what is above a few milliamperes."""
+    rows = read_csv(capture).to_pylist()
+    head = ",".join(rows[0])
+    tables = {
+        "volt.csv": ("voltage_v", "are these millivolts?"),
+        "ampere.csv": ("current_a", "are these milliamperes?"),
+    }
+    for name, (column, guess) in tables.items():
+        lines = [",".join(str(1e3 * v if k == column else v) for k, v in row.items()) for row in rows]
+        (tmp_path / name).write_text("\n".join([head, *lines]))
+        _, out, err = run(capsys, "replay", tmp_path / name, "--cell", "chen_mora")
+        assert guess in " ".join((out + err).split())
+
+
+def test_a_temperature_that_is_none_or_was_not_measured_is_said(tmp_path, capsys):
+    for cell_c, words in (
+        (297.0, "10 values that no cell has: the band is wider"),
+        (math.nan, "not measured: the band is wider"),
+    ):
+        table = tmp_path / "warm.csv"
+        lines = [f"{j},0.1,3.8,{cell_c}" for j in range(10)]
+        table.write_text("\n".join(["time_s,current_a,voltage_v,temperature_c", *lines]))
+        _, out, _ = run(capsys, "replay", table, "--cell", "ncr18650")
+        assert words in " ".join(out.split())
+
+
 def test_time_that_runs_backwards_is_said(tmp_path, capsys):
     backwards = tmp_path / "backwards.csv"
     backwards.write_text("time_s,current_a,voltage_v\n" + "".join(f"{9 - j},0.1,3.8\n" for j in range(10)))

@@ -244,7 +244,7 @@ async def test_a_checkpoint_that_is_foreign_or_insane_is_refused_with_the_reason
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     estimator = new_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
-    reason = "refused: unreadable"
+    reason = "refused: damaged, perhaps by a power cut"
     if damage == "nan":
         estimator.state["a"][0][3], reason = np.nan, "refused: a of the observer is not finite"
     if damage == "range":
