@@ -74,7 +74,7 @@ compare: ## methods side by side on all real captures, PyBOP among them, e.g. ma
 	@[ -x $(COMPARE)/bin/python ] || $(PYTHON) -m venv $(COMPARE)
 	@$(COMPARE)/bin/pip install --quiet --disable-pip-version-check -e . pybop==26.3
 	@$(COMPARE)/bin/python -m tests.benchmarks.side_by_side $(ARGS)
-	@$(COMPARE)/bin/python -m tests.benchmarks.anywhere
+	@[ -n "$(findstring --json,$(ARGS))" ] || $(COMPARE)/bin/python -m tests.benchmarks.anywhere $(ARGS)
 
 anywhere: venv ## the SOC when switched on anywhere, on real captures, e.g. make anywhere ARGS=PF: minutes
 	@$(BIN)/python -m tests.benchmarks.anywhere $(ARGS)
