@@ -31,6 +31,8 @@ HEAD_BYTES = 16
 """What a published message has beside topic and payload, at most."""
 SOCKET_BROKE = "failed to receive on socket: "
 """How paho's line of an error of the socket begins."""
+TLS_ALERT = "[SSL: "
+"""How the text of an error begins that TLS itself has a name for: the broker told us what it does not like."""
 
 log = structlog.get_logger(__name__)
 
@@ -264,4 +266,4 @@ def may_know_3_1_1(error: aiomqtt.MqttError) -> bool:
     """Whether what refused MQTT 5 so may be a broker of the older one."""
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
         return error.rc.value == UNSUPPORTED_VERSION
-    return isinstance(error, ClosedError)
+    return isinstance(error, ClosedError) and not str(error).startswith(TLS_ALERT)
