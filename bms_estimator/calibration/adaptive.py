@@ -77,11 +77,6 @@ class AdaptiveRun:
     lock_losses: int
     outcome: str
 
-    @property
-    def converged(self) -> bool:
-        """Whether Algorithm 1 returned parameters."""
-        return self.outcome == "converged"
-
     def condition(self, parameter: str) -> Floats:
         """The bound that a8 (a11) must exceed, over time: right side of the condition in Lemma 4.1.1, Fig. 19."""
         amplitude, offset = {"a8": (7, 9), "a11": (10, 12)}[parameter]

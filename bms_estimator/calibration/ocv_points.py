@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.relaxation import LEAST_POINTS, RelaxationTest
+from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.model.errors import UserError
 
 Floats = NDArray[np.float64]
 
 RELAXED_V = 0.002
 """What rests of a warm cell are off as a whole [V]: hours follow after the quarter of an hour that is extrapolated."""
-COLD_V, DOUBLING_K, REFERENCE_C = 0.012, 25.0, 25.0
+COLD_V, DOUBLING_K = 0.012, 25.0
 """What is more of it in the cold [V]: 12 mV at 0 C, 20 mV at -10 C, of rests up to an hour; relaxation slows down by half
 in ``DOUBLING_K``."""
 COLD_OWN = 0.3

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.ladder_voltage import steady_drop
-from bms_estimator.calibration.ocv_points import REFERENCE_C, Points, joined, points_of
+from bms_estimator.calibration.ocv_points import Points, joined, points_of
 from bms_estimator.calibration.ocv_table import NODES, TableFit, fit_table
 from bms_estimator.calibration.relaxation import (
     RelaxationTest,
@@ -23,7 +23,7 @@ from bms_estimator.calibration.slow_curve import (
     slow_branches,
     slow_curves,
 )
-from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.kernels.ladder import HYSTERESIS_J, REFERENCE_C, arrhenius
 from bms_estimator.model.cell import Ladder
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock

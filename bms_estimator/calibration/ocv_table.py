@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, PchipInterpolator
 from scipy.optimize import lsq_linear
 
+from bms_estimator.calibration.ladder_voltage import hats
 from bms_estimator.calibration.ocv_points import Points, check_points, rms_v, with_ends
+from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.model.cell import TableOcv
 
 Floats = NDArray[np.float64]
@@ -45,8 +47,6 @@ LEAST_SLOPE_V = 1e-3
 """Least slope of the curve, per cell of 4 V and 1 of SOC: monotone means invertible [V]."""
 CELL_V = 4.0
 """Of the cell that the voltages above are for [V]."""
-REFERENCE_C = 25.0
-"""Temperature of the table [C]."""
 TEMPERATURE_SPAN_C = 10.0
 """Sources that differ by less say nothing of dE/dT [K]."""
 ENTROPY_V_PER_K, ENTROPY_NODES = 3.5e-4, np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
@@ -149,7 +149,7 @@ def fit_table(points: Points) -> TableFit:
         slope_v = np.clip(_spline(points.soc, 1) @ x[: model.splines], 0.0, STEEPEST_V * cells)
         steepness_v = _spline(middles, 1) @ x[: model.splines]
         noise, common = _sizes(points, model, x, common)
-    basis, entropy = _spline(NODES), _hats(NODES, ENTROPY_NODES)
+    basis, entropy = _spline(NODES), hats(NODES, ENTROPY_NODES)
     rows = np.vstack([model.points / std_v[:, None], model.prior])
     covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)[: model.splines, : model.splines]
     u = x[model.splines : model.splines + ENTROPY_NODES.size]
@@ -171,13 +171,13 @@ def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells:
     warmer = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
     columns, stds = [spline], [np.zeros(0)]
     if np.ptp(warmer) >= TEMPERATURE_SPAN_C:
-        hats = _hats(points.soc, ENTROPY_NODES)
-        columns += [warmer[:, None] * hats, points.cold_v[:, None] * hats]
+        by_soc = hats(points.soc, ENTROPY_NODES)
+        columns += [warmer[:, None] * by_soc, points.cold_v[:, None] * by_soc]
         stds += [np.full(ENTROPY_NODES.size, ENTROPY_V_PER_K * cells), np.ones(ENTROPY_NODES.size)]
     warmths = sum(one.size for one in stds)
     for source in range(int(points.source.max()) + 1):
         own = (points.source == source)[:, None]
-        off_v = common * points.common_v[:, None] * _hats(points.soc, DEVIATION_NODES)
+        off_v = common * points.common_v[:, None] * hats(points.soc, DEVIATION_NODES)
         columns += [own * off_v, own * _shifts(points.soc, slope_v)]
         stds += [np.ones(DEVIATION_NODES.size), np.array([SOC_STD, CAPACITY_STD])]
     weights = 1.0 / np.concatenate(stds)
@@ -259,8 +259,3 @@ def _bend_rows(size_v: Floats) -> Floats:
     """d2V/dSOC2 of each stretch over its size [V], weighted by the share of ``BEND_LENGTH`` that the stretch is."""
     weight = np.sqrt(np.diff(_edges()) / BEND_LENGTH) / size_v
     return np.asarray(_spline(_middles(), 2) * weight[:, None])
-
-
-def _hats(soc: Floats, nodes: Floats) -> Floats:
-    """Linear interpolation between ``nodes`` as columns. Shape (n, nodes)."""
-    return np.column_stack([np.interp(soc, nodes, row) for row in np.eye(nodes.size)])

@@ -65,7 +65,6 @@ class Rest:
         voltage_v: Voltage at its end [V].
         ocv_v: Voltage after an infinite rest, by exponential extrapolation [V].
         std_v: Standard deviation of ``ocv_v`` [V].
-        tau_s: Time constant of the exponential [s].
         temperature_c: Mean over the rest [C]; NaN without a sensor.
         after_charge: The cell was charged last.
     """
@@ -76,7 +75,6 @@ class Rest:
     voltage_v: float
     ocv_v: float
     std_v: float
-    tau_s: float
     temperature_c: float
     after_charge: bool
 
@@ -97,7 +95,6 @@ class RelaxationTest:
         glitches: Samples dropped as faults of the instrument.
         start_soc: SOC at the first sample.
         end_soc: SOC at the last sample.
-        mean_load_a: Mean current of the loads [A].
         empty_v: Open-circuit voltage at SOC 0 [V]: where the last load ended, plus what the load before it hid from the
             rest after it. NaN when the capture ends above SOC 0.02.
         full_v: Open-circuit voltage at SOC 1 [V]: the first sample's, when it is at rest and full; else NaN.
@@ -109,7 +106,6 @@ class RelaxationTest:
     glitches: int
     start_soc: float
     end_soc: float
-    mean_load_a: float
     empty_v: float
     full_v: float
 
@@ -216,7 +212,6 @@ def relaxation_test(
         glitches=samples.size - good.size,
         start_soc=initial_soc,
         end_soc=float(soc[-1]),
-        mean_load_a=float(np.mean(good["current_a"], where=~resting)) if not resting.all() else 0.0,
         empty_v=_empty_v(good, soc, resting, rests),
         full_v=float(good["voltage_v"][0]) if resting[0] and initial_soc > NEAR_FULL else float("nan"),
     )
@@ -326,7 +321,7 @@ def _relaxed(rest: SampleBlock, soc: float, *, after_charge: bool) -> Rest:
     time_s = rest["time_s"] - rest["time_s"][0]
     duration_s = float(time_s[-1])
     late = time_s >= LATE_FROM * duration_s
-    ocv_v, tau_s, spread_v = _extrapolate(time_s[late], rest["voltage_v"][late], duration_s)
+    ocv_v, spread_v = _extrapolate(time_s[late], rest["voltage_v"][late], duration_s)
     voltage_v = float(rest["voltage_v"][time_s >= 0.98 * duration_s].mean())
     slow, _, _ = _with_tau(time_s[late], rest["voltage_v"][late], SLOWEST_S)  # what a short rest cannot rule out
     unseen_v = SLOW_PART * (float(slow[0]) - ocv_v) if duration_s < SLOWEST_S else 0.0
@@ -337,7 +332,6 @@ def _relaxed(rest: SampleBlock, soc: float, *, after_charge: bool) -> Rest:
         voltage_v=voltage_v,
         ocv_v=ocv_v,
         std_v=float(np.sqrt(spread_v**2 + unseen_v**2 + (FORM_ERROR * (ocv_v - voltage_v)) ** 2 + LEAST_STD_V**2)),
-        tau_s=tau_s,
         temperature_c=mean_temperature_c(rest),
         after_charge=after_charge,
     )
@@ -349,8 +343,8 @@ def mean_temperature_c(samples: SampleBlock) -> float:
     return float(told.mean()) if told.size else float("nan")
 
 
-def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[float, float, float]:
-    """Fit v = v_inf + b e^(-t/tau): v_inf [V], tau [s], standard deviation of v_inf [V].
+def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[float, float]:
+    """Fit v = v_inf + b e^(-t/tau): v_inf and its standard deviation [V].
 
     For each tau of a grid, v_inf and b are linear least squares. What comes out is the mean over the taus, each with
     its likelihood: noise or few samples that cannot tell them apart leave v_inf uncertain.
@@ -366,7 +360,7 @@ def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[
     of_each = variance * np.array([np.linalg.pinv(basis.T @ basis)[0, 0] for _, basis, _ in fits])
     mean_v = float(likelihood @ v_inf)
     spread_v = float(np.sqrt(likelihood @ (of_each + (v_inf - mean_v) ** 2)))
-    return mean_v, float(np.exp(likelihood @ np.log(taus))), spread_v
+    return mean_v, spread_v
 
 
 def _with_tau(elapsed: Floats, voltage_v: Floats, tau_s: float) -> tuple[Floats, Floats, float]:

@@ -95,14 +95,12 @@ class SlowCurve:
         branches: One, or discharge and charge.
         points: On a grid of SOC.
         hysteresis_v: At ``GRID`` [V]; None of a lone branch.
-        ohmic_v: What was taken out as ohmic [V]; NaN when it is not known.
         notes: What is to be known of it, one line each.
     """
 
     branches: tuple[Branch, ...]
     points: Points
     hysteresis_v: Floats | None
-    ohmic_v: float
     notes: tuple[str, ...]
 
 
@@ -235,14 +233,13 @@ def _pair(down: Branch, soc: Floats, up: Branch, up_soc: Floats, series_count: i
     known = (grid >= soc[-1]) & (grid <= soc[0])
     ocv_v = np.where(known, _at(grid, soc, down.voltage_v) + half, _at(grid, up_soc, up.voltage_v) - half)
     steps = [branch.step_v for branch in (down, up) if np.isfinite(branch.step_v)]
-    ohmic_v = float(np.mean(steps)) if steps else float("nan")
+    ohmic_v = float(np.mean(steps)) if steps else 0.0
     points = _points(grid, ocv_v, PAIR_V * series_count, COLD_PART, down.temperature_c, series_count)
     alone = (grid < low) | (grid > high)
     return SlowCurve(
         branches=(down, up),
         points=replace(points, common_v=points.common_v + np.where(alone, ALONE_PART, PAIR_PART) * np.abs(half)),
-        hysteresis_v=_smooth(half_v - (ohmic_v if steps else 0.0)),
-        ohmic_v=ohmic_v,
+        hysteresis_v=_smooth(half_v - ohmic_v),
         notes=() if steps else ("hysteresis with its ohmic part",),
     )
 
@@ -256,7 +253,7 @@ def _lone(branch: Branch, soc: Floats, series_count: int, notes: tuple[str, ...]
     points = replace(
         _points(grid, ocv_v, common_v, 1.0, branch.temperature_c, series_count), way=-sign * np.ones(grid.size)
     )
-    return SlowCurve((branch,), points, None, branch.step_v, notes)
+    return SlowCurve((branch,), points, None, notes)
 
 
 def _at(grid: Floats, soc: Floats, voltage_v: Floats) -> Floats:

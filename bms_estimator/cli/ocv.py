@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.generic_parts import curve, ladder_of, most_alike
 from bms_estimator.calibration.ocv import NAMES, ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv_points import REFERENCE_C, Points, max_v, rms_v
+from bms_estimator.calibration.ocv_points import Points, max_v, rms_v
 from bms_estimator.calibration.ocv_sources import (
     GivenCurve,
     Recording,
@@ -31,6 +31,7 @@ from bms_estimator.calibration.relaxation import RelaxationTest, without_glitche
 from bms_estimator.calibration.rest_elements import rest_elements
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
 from bms_estimator.cli.decimal_option import decimal, whole
+from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError

@@ -57,8 +57,8 @@ def emf(soc: float, a: Floats) -> float:
 
 
 @njit(cache=True)
-def ocv_and_slope(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> tuple[float, float]:
-    """Open-circuit voltage [V] at ``soc`` and its slope [V] from a grid of values and slopes (cubic Hermite).
+def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
+    """Open-circuit voltage [V] at ``soc`` from a grid of values and slopes (cubic Hermite).
 
     Beyond 0..1 the end slope goes on, so that a drifting SOC still meets a finite, increasing curve.
 
@@ -69,23 +69,15 @@ def ocv_and_slope(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> tuple[float
     """
     last = ocv_v.shape[0] - 1
     if soc <= 0.0:
-        return ocv_v[0] + soc * ocv_slope_v[0], ocv_slope_v[0]
+        return ocv_v[0] + soc * ocv_slope_v[0]
     if soc >= 1.0:
-        return ocv_v[last] + (soc - 1.0) * ocv_slope_v[last], ocv_slope_v[last]
+        return ocv_v[last] + (soc - 1.0) * ocv_slope_v[last]
     position = soc * last
     i = min(int(position), last - 1)
     t = position - i
     u = 1.0 - t
     rise, left, right = ocv_v[i + 1] - ocv_v[i], ocv_slope_v[i], ocv_slope_v[i + 1]
-    value = ocv_v[i] + t * t * (3.0 - 2.0 * t) * rise + t * u * (1.0 / last) * (u * left - t * right)
-    slope = 6.0 * t * u * rise * last + u * (1.0 - 3.0 * t) * left + t * (3.0 * t - 2.0) * right
-    return value, slope
-
-
-@njit(cache=True)
-def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
-    """Open-circuit voltage [V] alone, of ``ocv_and_slope``."""
-    return ocv_and_slope(soc, ocv_v, ocv_slope_v)[0]
+    return ocv_v[i] + t * t * (3.0 - 2.0 * t) * rise + t * u * (1.0 / last) * (u * left - t * right)
 
 
 @njit(cache=True)

@@ -33,10 +33,10 @@ from bms_estimator.kernels.ekf_state import (
     LN_R0,
     OFFSET,
     SOC,
-    STATES,
     X,
 )
 from bms_estimator.kernels.ladder import BRANCHES, HYSTERESIS_J, REFERENCE_C, STRONG_J, TAUS, WEAK_J, arrhenius, on_grid
+from bms_estimator.kernels.mixture import combine, copy, forget, merge, vacate
 from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.self_heating import warm
 from bms_estimator.kernels.state import Record
@@ -64,10 +64,6 @@ OVERLAP = 0.62
 """Std of a hypothesis over the distance to the next."""
 BEYOND_STD = 0.03
 """How far outside 0..1 a told SOC may mean, std."""
-UNLIKELY = -9.0
-"""ln of a relative weight below which a hypothesis goes."""
-ALIKE_STDS = 0.7
-"""Two hypotheses closer than this many std of SOC are one."""
 TEMPERATURE_S = 10.0
 """A temperature sensor's noise is averaged over so long [s]."""
 FASTEST_K_S = 0.1
@@ -105,13 +101,10 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
     follow_temperature(s)
     first_load(s, p, current_a)
-    for k in range(BRANCHES):
-        s.x_a[k] = 0.0
+    s.x_a[:] = 0.0
     x, cov = s.mean[0], s.covariance[0]
-    for j in range(STATES):
-        x[j] = 0.0
-        for k in range(STATES):
-            cov[j, k] = 0.0
+    x[:] = 0.0
+    cov[:, :] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
     s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
@@ -145,7 +138,7 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
         forget(known[0], known[1], j)
     for k in range(BRANCHES):
         forget(known[0], known[1], X + k)
-        s.x_a[k] = 0.0
+    s.x_a[:] = 0.0
     switch_on(p, s.current_a, known[0], known[1])
     known[1][HYST, HYST], known[1][CURVE, CURVE] = HYST_STD**2, 1.0
     s.count = HYPOTHESES if soc_std > ONE_STD else 1
@@ -181,44 +174,13 @@ def tell(s: Record, p: Record, soc: float) -> None:
 
 
 @njit(cache=True)
-def forget(mean: Record, covariance: Record, j: int) -> None:
-    """State ``j`` is 0 and belongs to none."""
-    mean[j] = 0.0
-    for k in range(STATES):
-        covariance[j, k] = covariance[k, j] = 0.0
-
-
-@njit(cache=True)
-def copy(s: Record, source: int, to: int) -> None:
-    """Hypothesis ``to`` becomes as ``source``."""
-    for j in range(STATES):
-        s.mean[to, j] = s.mean[source, j]
-        for k in range(STATES):
-            s.covariance[to, j, k] = s.covariance[source, j, k]
-    s.ln_weight[to] = s.ln_weight[source]
-    s.minute_u[to], s.ten_minutes_u[to] = s.minute_u[source], s.ten_minutes_u[source]
-    s.fast_inflation[to], s.slow_inflation[to] = s.fast_inflation[source], s.slow_inflation[source]
-
-
-@njit(cache=True)
-def vacate(s: Record, q: int) -> None:
-    """Row ``q`` holds no hypothesis: all 0, so that a state that is kept without its zeros costs what it knows."""
-    for j in range(STATES):
-        s.mean[q, j] = 0.0
-        for k in range(STATES):
-            s.covariance[q, j, k] = 0.0
-    s.ln_weight[q] = s.minute_u[q] = s.ten_minutes_u[q] = s.fast_inflation[q] = s.slow_inflation[q] = 0.0
-
-
-@njit(cache=True)
 def clear(s: Record) -> None:
     """Begin a new window."""
     w = s.window
     w.samples = w.gap = 0
     w.time_s = w.charge_as = w.throughput_as = w.unknown_as = w.between_as2 = w.rounded_as2 = 0.0
     w.sum_v = w.sum_a = w.sum_as = 0.0
-    for k in range(BRANCHES):
-        w.sum_x_a[k] = 0.0
+    w.sum_x_a[:] = 0.0
 
 
 @njit(cache=True)
@@ -346,71 +308,6 @@ def strain2(s: Record, p: Record, q: int) -> float:
     hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)
     wrong_v2 = bias_variance(s, p, soc) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
     return bias_v * bias_v / wrong_v2
-
-
-@njit(cache=True)
-def merge(s: Record) -> None:
-    """Drop what is unlikely, and make one of neighbours that agree."""
-    top, q = s.ln_weight[s.best], 0
-    while q < s.count:
-        s.ln_weight[q] -= top
-        if s.ln_weight[q] < UNLIKELY:
-            remove(s, q)
-        else:
-            q += 1
-    q = 1
-    while q < s.count:
-        apart = abs(s.mean[q, SOC] - s.mean[q - 1, SOC])
-        if apart * apart < ALIKE_STDS**2 * min(s.covariance[q, SOC, SOC], s.covariance[q - 1, SOC, SOC]):
-            unite(s, q - 1, q)
-            remove(s, q)
-        else:
-            q += 1
-
-
-@njit(cache=True)
-def unite(s: Record, a: int, b: int) -> None:
-    """Hypothesis ``a`` becomes the normal distribution with mean and covariance of both."""
-    most = max(s.ln_weight[a], s.ln_weight[b])
-    weight_a, weight_b = math.exp(s.ln_weight[a] - most), math.exp(s.ln_weight[b] - most)
-    share = weight_b / (weight_a + weight_b)
-    apart = s.ph
-    for j in range(STATES):
-        apart[j] = s.mean[b, j] - s.mean[a, j]
-        s.mean[a, j] += share * apart[j]
-    for j in range(STATES):
-        for k in range(j, STATES):
-            both = s.covariance[a, j, k] + share * (s.covariance[b, j, k] - s.covariance[a, j, k])
-            s.covariance[a, j, k] = s.covariance[a, k, j] = both + share * (1.0 - share) * apart[j] * apart[k]
-    s.ln_weight[a] = most + math.log(weight_a + weight_b)
-    if s.best == b:
-        s.best = a
-
-
-@njit(cache=True)
-def remove(s: Record, q: int) -> None:
-    """Close the row."""
-    for j in range(q, s.count - 1):
-        copy(s, j + 1, j)
-    s.count -= 1
-    vacate(s, s.count)
-    if s.best > q:
-        s.best -= 1
-
-
-@njit(cache=True)
-def combine(s: Record) -> None:
-    """Mean and std of SOC of the mixture."""
-    total = mean = variance = 0.0
-    for q in range(s.count):
-        weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
-        total += weight
-        mean += weight * s.mean[q, SOC]
-    mean /= total
-    for q in range(s.count):
-        weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best]) / total
-        variance += weight * (s.covariance[q, SOC, SOC] + (s.mean[q, SOC] - mean) ** 2)
-    s.soc, s.soc_std = min(max(mean, 0.0), 1.0), math.sqrt(variance)
 
 
 @njit(cache=True)

@@ -157,10 +157,8 @@ def enough(c: Record) -> bool:
 @njit(cache=True)
 def keep(c: Record, f: Record) -> None:
     """Keep what the likeliest filter knows as the last good state."""
-    for j in range(STATES):
-        c.good_mean[j] = f.mean[f.best, j]
-        for k in range(STATES):
-            c.good_covariance[j, k] = f.covariance[f.best, j, k]
+    c.good_mean[:] = f.mean[f.best]
+    c.good_covariance[:, :] = f.covariance[f.best]
     c.good_soc, c.good_soc_std, c.good_age_s = f.soc, f.soc_std, 0.0
 
 
@@ -188,10 +186,8 @@ def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
             keep(c, f)
         return
     f.best = 0
-    for j in range(STATES):
-        f.mean[0, j] = c.good_mean[j]
-        for k in range(STATES):
-            f.covariance[0, j, k] = c.good_covariance[j, k]
+    f.mean[0, :] = c.good_mean
+    f.covariance[0, :, :] = c.good_covariance
     if not math.isfinite(f.temperature_c):
         f.temperature_c, f.sensed = REFERENCE_C, 0  # what is told next is taken at once
         f.weak = f.strong = f.hysteresis = 1.0

@@ -51,10 +51,9 @@ def learned_v(p: Record, x: Floats, soc: float) -> float:
 @njit(cache=True)
 def forget_curve(x: Floats, covariance: Floats) -> None:
     """Nothing is learned yet."""
-    for j in range(NODE, NODE + NODES):
-        x[j] = 0.0
-        for k in range(x.shape[0]):
-            covariance[j, k] = covariance[k, j] = 0.0
+    x[NODE : NODE + NODES] = 0.0
+    covariance[NODE : NODE + NODES, :] = 0.0
+    covariance[:, NODE : NODE + NODES] = 0.0
     for j in range(NODES):
         for k in range(NODES):
             covariance[NODE + j, NODE + k] = NEIGHBOURS ** abs(j - k)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.ekf_noise import offset_variance
 from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET, STATES
-from bms_estimator.kernels.hypotheses import forget
 from bms_estimator.kernels.input_checks import COUNTERS, keep
+from bms_estimator.kernels.mixture import forget
 from bms_estimator.kernels.ocv_learning import forget_curve
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.service.checkpoint import fields

@@ -39,7 +39,6 @@ def test_every_rest_is_found_at_its_time_and_soc(noisy):
     assert [rest.start_s for rest in noisy.rests] == starts
     assert [rest.duration_s for rest in noisy.rests] == [FIRST_REST_S - 1.0] + [REST_S - 1.0] * ROUNDS
     assert noisy.soc == pytest.approx(1.0 - 0.05 * np.arange(1 + ROUNDS), abs=1e-9)
-    assert noisy.mean_load_a == pytest.approx(1.5)
     assert noisy.full_v == pytest.approx(true_ocv([1.0])[0], abs=2e-3)
 
 
@@ -75,9 +74,6 @@ def test_extrapolation_to_infinite_rest_is_nearer_than_the_end_and_knows_how_nea
 def test_without_noise_a_long_rest_is_extrapolated_to_a_fifth_of_a_millivolt():
     found = relaxation_test(relaxation(noise_v=0.0), CAPACITY_AH, name="mine")
     assert np.abs(found.ocv_v - true_ocv(found.soc)).max() < 2e-4
-    late = [rest.tau_s for rest in found.rests if 0.2 < rest.soc < 0.96]
-    assert min(late) > 350.0  # the long branch's, 380 to 440 s
-    assert max(late) < 500.0
 
 
 @pytest.mark.parametrize("rest_s", [240, 400, 3600])

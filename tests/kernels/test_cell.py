@@ -71,16 +71,6 @@ def test_grid_stands_for_the_formula_to_a_microvolt() -> None:
         assert kernel.ocv(soc, value, slope) == pytest.approx(kernel.emf(soc, A), abs=1e-6)
 
 
-@pytest.mark.parametrize("soc", [-0.1, 0.0013, 0.42371, 0.9991, 1.1])
-def test_slope_of_the_open_circuit_voltage_is_its_derivative(soc: float) -> None:
-    grid = ocv_grid(CHEN_MORA)
-    h = 1e-6
-    expected = (kernel.ocv(soc + h, *grid) - kernel.ocv(soc - h, *grid)) / (2.0 * h)
-    value, slope = kernel.ocv_and_slope(soc, *grid)
-    assert value == kernel.ocv(soc, *grid)
-    assert slope == pytest.approx(expected, rel=1e-6)
-
-
 @given(st.floats(0, 1))
 def test_soc_from_ocv_inverts_the_curve(soc: float) -> None:
     value, slope = ocv_grid(CHEN_MORA)

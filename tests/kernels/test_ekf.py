@@ -12,6 +12,7 @@ from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.kernels import ekf, ekf_noise, hypotheses, unseen
 from bms_estimator.kernels.ekf_state import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.kernels.ladder import BRANCHES, TAUS
+from bms_estimator.kernels.mixture import combine, merge, unite
 from bms_estimator.kernels.open_loop import branch_currents
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
@@ -325,7 +326,7 @@ def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
     p = settings(series=series)
     s, weight = several(p)
     mean, covariance = mixture(s["mean"][:3], s["covariance"][:3], weight)
-    hypotheses.combine(s)
+    combine(s)
     assert s["soc"] == pytest.approx(mean[SOC])
     assert s["soc_std"] == pytest.approx(np.sqrt(covariance[SOC, SOC]))
     spread = p["cell_spread"] * (1.0 - mean[SOC]) if series > 1.0 else 0.0
@@ -335,7 +336,7 @@ def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
 def test_two_that_become_one_keep_mean_and_covariance() -> None:
     s, weight = several(settings(), 2)
     mean, covariance = mixture(s["mean"][:2], s["covariance"][:2], weight)
-    hypotheses.unite(s, 0, 1)
+    unite(s, 0, 1)
     assert s["mean"][0] == pytest.approx(mean)
     assert s["covariance"][0] == pytest.approx(covariance)
     assert np.exp(s["ln_weight"][0]) == pytest.approx(weight.sum())
@@ -346,7 +347,7 @@ def test_what_is_unlikely_goes_and_what_agrees_becomes_one() -> None:
     s["covariance"][:4, SOC, SOC] = 0.02**2
     s["mean"][:4, SOC] = 0.3, 0.5, 0.505, 0.7
     s["ln_weight"][:4] = 0.0, -0.1, -0.1, -20.0
-    hypotheses.merge(s)
+    merge(s)
     assert s["count"] == 2
     assert s["mean"][:2, SOC] == pytest.approx([0.3, 0.5025])
 
