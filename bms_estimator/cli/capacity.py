@@ -12,7 +12,7 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.capacity import Anchor, Capacity, measure_capacity
-from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, SignOfCurrent
+from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, SignOfCurrent, check_once
 from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.sources.replay import load_capture
@@ -73,6 +73,7 @@ def capacity(
     `cell.capacity_ah` and `cell.capacity_std` of a cell file are the place for what was measured.
     """
     model = load_cell(cell, capacity_ah)
+    check_once(captures)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     result = _result(measure_capacity(loaded, model, offset_std_a=current_offset_std_a), model)
     if as_json:
@@ -107,6 +108,11 @@ def _anchor(anchor: Anchor, off: float) -> AnchorResult:
     )
 
 
+def _counted(anchors: int) -> str:
+    more = f", the first {SHOWN_ANCHORS} above (--json: all)" if anchors > SHOWN_ANCHORS else ""
+    return f"{anchors} anchors{more}"
+
+
 def _shown(result: CapacityResult) -> Group:
     """The outcome for people."""
     anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "off", box=box.SIMPLE_HEAD)
@@ -125,6 +131,6 @@ def _shown(result: CapacityResult) -> Group:
     lines = [
         f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah, declared {result.declared_ah:.4g} Ah",
         f"offset of the current sensor {1e3 * result.current_offset_a:+.1f} ± {1e3 * result.current_offset_std_a:.1f} mA",
-        f"{len(result.anchors)} anchors, {len(result.rejected)} rests that are none",
+        f"{_counted(len(result.anchors))}, {len(result.rejected)} rests that are none",
     ]
     return Group(anchors, *lines)

@@ -40,6 +40,22 @@ def check_out(out: Path, read: Sequence[Path], *, force: bool) -> None:
         raise UserError(f"--out {out}: exists already; --force replaces it")
 
 
+def check_once(captures: Sequence[Path]) -> None:
+    """Refuse a capture that is given twice.
+
+    Raises:
+        UserError: Which one.
+    """
+    for i, path in enumerate(captures):
+        if path.exists() and any(other.exists() and path.samefile(other) for other in captures[:i]):
+            raise UserError(f"{path}: given twice; it would count twice")
+
+
+def unlike(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
+    """Names of files, and the path in place of one that another has too."""
+    return [name if names.count(name) == 1 else str(path) for name, path in zip(names, paths, strict=True)]
+
+
 def name_of(path: Path) -> str:
     """What to call a capture: its file's name without the endings."""
     return path.name.split(".")[0]

@@ -20,6 +20,7 @@ from bms_estimator.cli.captures import (
     Force,
     NewCellFile,
     SignOfCurrent,
+    check_once,
     check_out,
     name_of,
 )
@@ -63,6 +64,7 @@ def identify_command(
     Of a fuel cell: polarisation curves (columns current_a, voltage_v) and records, docs/fuel-cell.md.
     """
     check_out(out, captures, force=force)
+    check_once(captures)
     if is_fuel_cell(cell):
         if capacity_ah is not None or soc is not None or keep_ocv:
             raise UserError(f"{cell} is a fuel cell: --capacity-ah, --soc and --keep-ocv are of batteries")

@@ -15,7 +15,7 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.fuel_cell import KEYS, Floats, FuelCellFit, Source, fit_fuel_cell
-from bms_estimator.cli.captures import name_of
+from bms_estimator.cli.captures import name_of, unlike
 from bms_estimator.kernels.hypotheses import COLDEST_C, HOTTEST_C
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
@@ -55,7 +55,8 @@ def identify_fuel_cell(
     if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
         raise UserError(f"--temperature-c {temperature_c:g}: must lie within {COLDEST_C:g} and {HOTTEST_C:g} C")
     start = load_fuel_cell(cell)
-    sources = [_source(path, start, temperature_c, current_sign) for path in paths]
+    names = unlike([name_of(path) for path in paths], paths)
+    sources = [_source(*one, start, temperature_c, current_sign) for one in zip(names, paths, strict=True)]
     started_s = time.perf_counter()
     fit = fit_fuel_cell(sources, start)
     seconds = time.perf_counter() - started_s
@@ -78,7 +79,9 @@ def identify_fuel_cell(
         Console().print(_tables(out, values, fit, seconds))
 
 
-def _source(path: Path, model: FuelCellModel, temperature_c: float | None, sign: CurrentSign | None) -> Source:
+def _source(
+    name: str, path: Path, model: FuelCellModel, temperature_c: float | None, sign: CurrentSign | None
+) -> Source:
     """A polarisation curve where the file has no times, else a record, without what no such stack can give."""
     points = read_polarisation(path)
     if points is not None:
@@ -95,7 +98,7 @@ def _source(path: Path, model: FuelCellModel, temperature_c: float | None, sign:
     sensed = (sensed_c >= COLDEST_C) & (sensed_c <= HOTTEST_C)
     celsius = np.where(sensed, sensed_c, math.nan if temperature_c is None else temperature_c)
     return Source(
-        name=name_of(path),
+        name=name,
         time_s=None if time_s is None else time_s[good],
         current_a=np.ascontiguousarray(current_a[good]),
         voltage_v=voltage_v[good],

@@ -29,7 +29,7 @@ from bms_estimator.calibration.ocv_sources import (
 from bms_estimator.calibration.ocv_table import NODES, TableFit, fit_table
 from bms_estimator.calibration.relaxation import RelaxationTest, without_glitches
 from bms_estimator.calibration.rest_elements import rest_elements
-from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_out, name_of
+from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_once, check_out, name_of, unlike
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder
@@ -135,10 +135,9 @@ def ocv(
     The file's elements are a first idea, from the rests and the generic cell most like it: `identify` makes them good.
     """
     check_out(out, captures, force=force)
+    check_once(captures)
     recordings, curves = [], []
-    names = [path.name for path in captures]
-    for path in captures:
-        name = path.name if names.count(path.name) == 1 else str(path)
+    for name, path in zip(unlike([path.name for path in captures], captures), captures, strict=True):
         columns = read_curve(path)
         if columns is None:
             recordings.append(Recording(name, load_capture(path, current_sign=current_sign).rows))

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bms_estimator.cli.captures import CELL_HELP, CapacityAh, SignOfCurrent, name_of
+from bms_estimator.cli.captures import CELL_HELP, CapacityAh, SignOfCurrent, check_once, name_of
 from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.pack import TABLE_RESOLUTION_V
 from bms_estimator.model.cell import load_cell
@@ -70,6 +70,7 @@ def _recorded(
 ) -> Recorded:
     if cell is None:
         raise UserError("captures need --cell NAME|CELL.toml: its capacity, limits and bounds")
+    check_once(captures)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     named = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
     return Recorded(load_cell(cell, capacity_ah), named, resolution_v)
