@@ -83,12 +83,12 @@ STRAINED_STDS = 2.0
 biases have become."""
 REOPEN_STD = 0.2
 """... by as much as at switch-on."""
-TOLD_STD = 0.01
+TOLD_STD = 0.03
 """An SOC that is told is known to this std, ..."""
 WRONG_STD = 0.12
 """... or it is wrong, by as much as this, ..."""
-LN_RIGHT = 5.0
-"""... which is less likely by so much, in ln: one or two per cent in all."""
+LN_RIGHT = 3.0
+"""... which is less likely by so much, in ln: one in ten in all."""
 
 
 @njit(cache=True)

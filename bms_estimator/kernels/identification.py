@@ -11,6 +11,7 @@ from bms_estimator.kernels.ekf import predict
 from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
 from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, equivalent, told, told_by_steps
+from bms_estimator.kernels.frozen import watch_frozen
 from bms_estimator.kernels.hypotheses import (
     ONE_STD,
     WINDOW_S,
@@ -30,7 +31,6 @@ from bms_estimator.kernels.input_checks import (
     judge,
     keep,
     wait,
-    watch_frozen,
     watch_sign,
 )
 from bms_estimator.kernels.margins import delta
@@ -51,8 +51,7 @@ EXCITING_C = 0.05
 def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """Begin at the SOC of the observer's first sample."""
     start(s.filter, p.filter, s.observer.soc, current_a, temperature_c)
-    for e in range(ELEMENTS):
-        s.unlearned_s[e] = math.inf
+    s.unlearned_s[:] = math.inf
     take_first(s, p, current_a, voltage_v)
 
 
@@ -66,7 +65,8 @@ def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, volta
     clear(f)
     s.checks.slow_v = 0.0
     s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
-    take_first(s, p, current_a, voltage_v)
+    if not s.checks.suspects & UNUSABLE:
+        take_first(s, p, current_a, voltage_v)
 
 
 @njit(cache=True)
@@ -92,8 +92,7 @@ def identify(
         take_window(s, p)  # what was measured before tells nothing of what flowed in the gap
     count_on(f, p.filter, dt_s, gap, current_a, temperature_c)
     if dt_s > p.filter.unmeasured_s:
-        for e in range(ELEMENTS):
-            s.unlearned_s[e] += dt_s
+        s.unlearned_s[:] += dt_s
     unknown = f.window.unknown_as / p.filter.capacity_as
     if gap and unknown > ONE_STD and not c.suspects & UNUSABLE:
         pass_time(f, p.filter)
@@ -101,11 +100,11 @@ def identify(
         restart_filter(s, p, math.hypot(f.soc_std, unknown), current_a, voltage_v)
         s.fit_age_s += dt_s
         return
-    watch_frozen(c, p.filter, dt_s, current_a, voltage_v)
+    sound = watch_frozen(c, f, p.filter, dt_s, current_a, voltage_v)
     watch_sign(c, p.filter, dt_s, current_a, voltage_v)
     if c.suspects & UNUSABLE:
         wait(c, f, p.filter, dt_s, current_a)
-    elif believed(c, s.counters, f, p.filter, s.elements, dt_s, change_a, current_a, voltage_v):
+    elif sound and believed(c, s.counters, f, p.filter, s.elements, dt_s, change_a, current_a, voltage_v):
         watch_steps(f, p.filter, dt_s, change_a, voltage_v)
         gather(f, current_a, voltage_v)
     else:

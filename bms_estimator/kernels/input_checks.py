@@ -10,9 +10,11 @@ from numba import njit
 
 from bms_estimator.kernels.ekf_state import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS
+from bms_estimator.kernels.frozen import FAST_S, FROZEN_S, OUTLIERS_S, UNCOUNTED, VISIBLE_V, series_ohm, take_back
 from bms_estimator.kernels.hypotheses import clear, seed, start
 from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.kernels.state import Record
+from bms_estimator.kernels.step_resistance import UNHELD
 from bms_estimator.kernels.unseen import first_load
 from bms_estimator.model.suspect import Suspect
 
@@ -26,25 +28,12 @@ LOST_STD = 0.05
 """How far the SOC may have gone from the last good one, std."""
 LOST_AT_MOST = 0.4
 """No SOC is less certain than this, std."""
-FAST_S = 10.0
-"""Changes of voltage and current within this time belong together [s]."""
 SIGN_S = 300.0
 """Memory of how the voltage goes with the current, counted while it changes [s]."""
 LEAST_EVIDENCE = 0.1
 """Share of that memory which must be filled."""
-VISIBLE_V = 0.003
-"""A change of the overpotential of one cell that shows fully [V]."""
 CLIP = 5.0
 """A change of voltage counts up to so many times what the resistances explain: not a glitch to zero."""
-FROZEN_S = 60.0
-"""A reading that stays the same to the last digit while the other moves for so long is none [s]: ..."""
-SWING_V, RESOLVED = 0.03, 3.0
-"""... the current, where the voltage of one cell moves by so much [V]; the voltage, where what the current drops is visible. Both
-are more than so many steps of the voltage's resolution."""
-UNCOUNTED = 0.1
-"""Charge that goes wrong while the voltage tells nothing, relative."""
-OUTLIERS_S = 3600.0
-"""Memory of single samples that were not believed [s]."""
 MANY_OUTLIERS, FEW_OUTLIERS = 5.0, 1.0
 OFFSET_STDS, CAPACITY_STDS = 4.0, 2.0
 """Offset and capacity are suspicious beyond so many of their first std, ..."""
@@ -72,14 +61,23 @@ CHECKS = np.dtype(
         ("outliers", "f8"),  # single samples not believed of late
         ("slow_v", "f8"),  # voltage and ...
         ("slow_a", "f8"),  # ... current without their fast changes
+        ("slower_v", "f8"),  # the same of these two
+        ("slower_a", "f8"),
         ("sign_evidence", "f8"),  # 0..1: how much was seen of
         ("change_v_a", "f8"),  # running mean of the fast change of voltage times that of current [V A]
         ("change_a2", "f8"),  # the same of the current's squared [A^2]
         ("last_v", "f8"),  # of the sample before; 0: none
         ("last_a", "f8"),
         ("step_v", "f8"),  # the smallest change of voltage seen [V]; 0: none yet
-        ("frozen_v_s", "f8"),  # for so long the voltage has stayed the same while the current moved [s]
-        ("frozen_a_s", "f8"),  # for so long the current has while the voltage moved
+        ("frozen_v_s", "f8"),  # for so long the voltage has stayed the same though it cannot [s]
+        ("frozen_a_s", "f8"),  # for so long the current has
+        ("held_as", "f8"),  # charge since the voltage last changed [A s]; what was there then:
+        ("held_a", "f8"),  # current [A],
+        ("held_soc", "f8"),
+        ("held_soc_std", "f8"),
+        ("same_s", "f8"),  # for so long the current has stayed the same [s]; SOC and its std then
+        ("same_soc", "f8"),
+        ("same_soc_std", "f8"),
         ("wrong_v", "f8"),  # running mean of the error that stays [V]
         ("searches", "f8"),  # times the filter began again of late
         ("seen_reopened", "i8"),
@@ -199,17 +197,23 @@ def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
 
 @njit(cache=True)
 def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
-    """How fast changes of the voltage go with those of the current: by -R_s when the sign is right."""
+    """How fast changes of the voltage go with those of the current: by -R_s when the sign is right.
+
+    A ramp is no change: where the curve ends, the voltage has one by itself.
+    """
     if dt_s > FAST_S or c.slow_v == 0.0:  # too long to tell, or the first sample
-        c.slow_v, c.slow_a = voltage_v, current_a
+        c.slow_v = c.slower_v = voltage_v
+        c.slow_a = c.slower_a = current_a
         return
     ohm = p.middle_ohm
-    change_a = current_a - c.slow_a
+    change_a = current_a - 2.0 * c.slow_a + c.slower_a
     limit_v = CLIP * ohm * abs(change_a)
-    change_v = min(max(voltage_v - c.slow_v, -limit_v), limit_v)
+    change_v = min(max(voltage_v - 2.0 * c.slow_v + c.slower_v, -limit_v), limit_v)
     share = min(1.0, dt_s / FAST_S)
+    c.slower_v += share * (c.slow_v - c.slower_v)
+    c.slower_a += share * (c.slow_a - c.slower_a)
     c.slow_v += share * (voltage_v - c.slow_v)
-    c.slow_a += share * change_a
+    c.slow_a += share * (current_a - c.slow_a)
     visible = min(1.0, (ohm * change_a / (VISIBLE_V * p.series)) ** 2)
     weight = visible * min(1.0, dt_s / SIGN_S)
     c.sign_evidence += weight * (1.0 - c.sign_evidence)
@@ -218,40 +222,17 @@ def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: f
 
 
 @njit(cache=True)
-def watch_frozen(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
-    """For how long one of the two has been the same to the last digit while the other moved; before ``watch_sign``."""
-    if c.last_v == 0.0 or dt_s > FAST_S:
-        c.frozen_v_s = c.frozen_a_s = 0.0
-    else:
-        resolved_v = RESOLVED * c.step_v
-        change_v = abs(voltage_v - c.last_v)
-        if change_v > 0.0:
-            c.step_v = change_v if c.step_v == 0.0 else min(c.step_v, change_v)
-            c.frozen_v_s = 0.0
-        elif p.middle_ohm * abs(current_a - c.slow_a) > max(VISIBLE_V * p.series, resolved_v):
-            c.frozen_v_s += dt_s
-        if current_a != c.last_a:
-            c.frozen_a_s = 0.0
-        elif abs(voltage_v - c.slow_v) > max(SWING_V * p.series, resolved_v):
-            c.frozen_a_s += dt_s
-    c.last_v, c.last_a = voltage_v, current_a
-
-
-@njit(cache=True)
 def unusable(c: Record, p: Record) -> int:
-    """The bit of why no voltage can be believed, 0: it can."""
+    """The bits of why no voltage can be believed, 0: it can."""
     if sign_is_wrong(c, p):
         return SIGN_OF_CURRENT
-    if c.frozen_v_s > FROZEN_S:
-        return VOLTAGE
-    return CURRENT if c.frozen_a_s > FROZEN_S else 0
+    return (VOLTAGE if c.frozen_v_s > FROZEN_S else 0) | (CURRENT if c.frozen_a_s > FROZEN_S else 0)
 
 
 @njit(cache=True)
 def sign_is_wrong(c: Record, p: Record) -> bool:
     """Whether the voltage rises with what is said to be discharge; what is suspected already is so until it falls."""
-    middle = p.weak_ohm.shape[0] // 2
-    steep = 0.25 * (p.weak_ohm[middle, 0] + p.strong_ohm[middle, 0]) * c.change_a2
+    steep = 0.25 * series_ohm(p) * c.change_a2
     return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > LEAST_EVIDENCE
 
 
@@ -263,12 +244,17 @@ def wait(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None
     anything common. What was learned with the wrong sign is worth nothing: the filter starts anew afterwards.
     """
     moved = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
-    wrong = 2.0 * moved if c.suspects & SIGN_OF_CURRENT else UNCOUNTED * moved
+    wrong = UNCOUNTED * moved
     if c.suspects & CURRENT:
         wrong = p.load_mean_c * min(dt_s, p.unmeasured_s) / 3600.0
-    f.soc_std = min(f.soc_std + wrong, LOST_AT_MOST)
-    now = unusable(c, p)
-    if now:
+    elif c.suspects & SIGN_OF_CURRENT:
+        wrong = 2.0 * moved
+    f.soc_std = min(math.hypot(f.soc_std + wrong, f.window.unknown_as / p.capacity_as), LOST_AT_MOST)
+    f.window.unknown_as = 0.0
+    f.step.phase = UNHELD
+    bits = unusable(c, p)
+    if bits:
+        c.suspects = bits
         return
     if c.suspects & SIGN_OF_CURRENT:
         soc_std = max(f.soc_std, p.soc_std)
@@ -287,6 +273,8 @@ def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
     c.outliers -= c.outliers * min(1.0, dt_s / OUTLIERS_S)
     bits = unusable(c, p)
     if bits:
+        if bits != SIGN_OF_CURRENT:
+            take_back(c, f, p)
         c.suspects = bits
         return
     if c.outliers > (FEW_OUTLIERS if before & OUTLIERS else MANY_OUTLIERS):

@@ -486,8 +486,8 @@ def test_an_soc_that_is_told_is_published(drive, soc: float) -> None:
     estimator.run(drive.samples[:600])
     estimator.set_soc(soc)
     f = estimator.record[0]["filter"]
-    assert f["soc"] == pytest.approx(soc, abs=0.001)
-    assert 0.01 < f["soc_std"] < 0.025
+    assert f["soc"] == pytest.approx(soc, abs=0.01)
+    assert 0.03 < f["soc_std"] < 0.06
 
 
 @pytest.mark.parametrize("wrong", [-0.3, -0.1, 0.0, 0.1, 0.3])
