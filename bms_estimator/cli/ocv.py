@@ -10,6 +10,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -40,6 +41,8 @@ from bms_estimator.sources.replay import load_capture
 
 CELL_VOLTAGE_V = 3.7
 """Of one Li-ion cell in the middle of its discharge: tells how many are in series [V]."""
+LOWEST_CELL_V, HIGHEST_CELL_V, MOST_CELLS = 1.5, 4.5, 300
+"""Where that is of any of them [V], and how many are in series at most."""
 LOWEST, HIGHEST = 0.55, 1.06
 """Limits of a good sample: of the median voltage, of the full one."""
 LEAST_EMPTY = 0.25
@@ -143,9 +146,8 @@ def ocv(
             recordings.append(Recording(name, load_capture(path, current_sign=current_sign).rows))
         else:
             curves.append(GivenCurve(name, *columns))
-    good = [without_glitches(one.samples, one.name)["voltage_v"] for one in recordings]
-    middle_v = float(np.median(np.concatenate([*good, *(curve.ocv_v for curve in curves)])))
-    count = series or max(round(middle_v / CELL_VOLTAGE_V), 1)
+    good = [_moving(one) for one in recordings]
+    count = _cells_in_series(np.concatenate([*good, *(curve.ocv_v for curve in curves)]), series)
     found = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
     fitted: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
     curve_v = fitted(found.points)(NODES)
@@ -165,6 +167,35 @@ def ocv(
         console = Console()
         console.print(_table(out, result, found))
         console.print(_sources_table(result))
+
+
+def _moving(one: Recording) -> NDArray[np.float64]:
+    """The voltage without glitches [V].
+
+    Raises:
+        UserError: It is always the same.
+    """
+    voltage_v = without_glitches(one.samples, one.name)["voltage_v"]
+    if np.ptp(voltage_v) == 0.0:
+        raise UserError(f"{one.name}: the voltage is {voltage_v[0]:g} V throughout: is the sensor connected?")
+    return voltage_v
+
+
+def _cells_in_series(voltage_v: NDArray[np.float64], told: int | None) -> int:
+    """As told, else by the usual voltage of a cell.
+
+    Raises:
+        UserError: No cell has what each of them would have.
+    """
+    middle_v = float(np.median(voltage_v))
+    count = told or max(round(middle_v / CELL_VOLTAGE_V), 1)
+    if not told and count > MOST_CELLS:
+        raise UserError(
+            f"the voltage is {middle_v:g} V, that of {count} cells in series: are these millivolts? else give --series"
+        )
+    if not LOWEST_CELL_V <= middle_v / count <= HIGHEST_CELL_V:
+        raise UserError(f"--series {count}: {middle_v:g} V would be {middle_v / count:.2f} V per cell")
+    return count
 
 
 def _check_ends(fit: ChenMoraFit | TableFit, found: Sources) -> None:

@@ -21,8 +21,8 @@ FROZEN_S = 60.0
 SWING_V, RESOLVED = 0.02, 3.0
 """... where the voltage of one cell changes by so much [V], that the voltage is where what the current drops is visible, ..."""
 HELD_V, LOAD_C = 0.01, 0.1
-"""... or where the open-circuit voltage of one cell has moved by so much [V], under a discharge of more than this [C]: chargers hold
-a voltage. All are more than ``RESOLVED`` steps of the voltage's resolution."""
+"""... or where the open-circuit voltage of one cell has moved by so much [V]. Below a discharge of this [C] only sudden changes count:
+chargers hold a voltage. All are more than ``RESOLVED`` steps of the voltage's resolution."""
 UNCOUNTED = 0.1
 """Charge that goes wrong while the voltage tells nothing, relative."""
 OUTLIERS_S = 3600.0
@@ -44,8 +44,10 @@ def watch_frozen(c: Record, f: Record, p: Record, dt_s: float, current_a: float,
         c.held_a, c.held_soc, c.held_soc_std = current_a, f.soc, f.soc_std
     else:
         c.held_as += 0.5 * (c.last_a + current_a) * min(dt_s, p.unmeasured_s)
-        dropped_v = series_ohm(p) * abs(current_a - c.held_a) if fast else 0.0
-        moved = has_moved(c, f, p, current_a, resolved_v)
+        loaded = current_a >= LOAD_C * p.capacity_as / 3600.0
+        moved = loaded and has_moved(c, f, p, current_a, resolved_v)
+        change_a = abs(current_a - c.held_a) if loaded else min(abs(current_a - c.held_a), abs(current_a - c.slow_a))
+        dropped_v = series_ohm(p) * change_a if fast else 0.0
         stuck = moved or dropped_v > max(VISIBLE_V * p.series, resolved_v)
         if stuck:
             c.frozen_v_s += counted_s
@@ -71,7 +73,7 @@ def series_ohm(p: Record) -> float:
 @njit(cache=True)
 def has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: float) -> bool:
     """Whether the charge since the voltage last changed has moved the open-circuit voltage, whatever the current drops."""
-    if f.count > 1 or current_a < LOAD_C * p.capacity_as / 3600.0:
+    if f.count > 1:
         return False
     now_soc = c.held_soc - c.held_as / p.capacity_as
     moved_v = ocv(c.held_soc, p.ocv_v, p.ocv_slope_v) - ocv(now_soc, p.ocv_v, p.ocv_slope_v)

@@ -72,6 +72,8 @@ SETTLED_S = 60.0
 """... once a minute has shown that the first sample was right: some sensors begin with 85 C."""
 COLDEST_C, HOTTEST_C = -60.0, 120.0
 """Where a cell's temperature may be [C]."""
+LEAST_STD = 0.005
+"""What full and empty are of a cell is known no better, std of SOC."""
 HYST_STD = 0.7
 """Std of the first hysteresis."""
 KNOWN_S = 1800.0
@@ -314,4 +316,4 @@ def strain2(s: Record, p: Record, q: int) -> float:
 def pack_std(s: Record, p: Record) -> float:
     """Std of the SOC as of the emptiest of cells in series: nobody sees how far below their mean it lies."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
-    return math.hypot(s.soc_std, spread)
+    return math.hypot(max(s.soc_std, LEAST_STD), spread)

@@ -121,6 +121,25 @@ def test_bad_input_ends_with_code_2_and_the_numbers_that_show_it(tmp_path, capsy
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("volt", "options", "why"),
+    [
+        (lambda v: 0.0 * v + 3.7, (), "bad.csv: the voltage is 3.7 V throughout: is the sensor connected?"),
+        (lambda v: 1e3 * v, (), "cells in series: are these millivolts? else give --series"),
+        (lambda v: v, ("--series", 4), "V per cell"),
+    ],
+    ids=["dead", "millivolts", "too many cells"],
+)
+def test_a_voltage_that_no_cells_have_is_refused(volt, options, why, tmp_path, capsys):
+    samples = relaxation()
+    samples["voltage_v"] = volt(samples["voltage_v"])
+    capture, out = save(tmp_path / "bad.csv", samples), tmp_path / "c.toml"
+    code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "3", *options, "--out", out)
+    assert code == 2
+    assert why in " ".join(err.split())
+    assert not out.exists()
+
+
 def test_a_capture_is_not_overwritten(captures, capsys):
     before = captures[0].read_bytes()
     code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0], "--force")

@@ -1,0 +1,126 @@
+"""A voltage or a current that stays the same to the last digit: found, taken back, and never where that is so by itself."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell import ocv
+from bms_estimator.kernels.ladder import BRANCHES
+from bms_estimator.kernels.open_loop import branch_currents
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.resolution import Sampling
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.suspect import Suspect
+from tests.estimator.simulated_cell import TRUTH, measured
+
+HOUR = 3600
+STUCK = slice(HOUR, 3 * HOUR)
+FROZEN = Suspect.VOLTAGE | Suspect.CURRENT
+
+
+def load_a(seconds: int, levels: tuple[float, ...], each_s: int = 60, seed: int = 1) -> np.ndarray:
+    """Levels at random [A]."""
+    return np.repeat(np.random.default_rng(seed).choice(levels, seconds // each_s), each_s)
+
+
+DRIVE = load_a(HOUR, (0.0, 0.5, 1.0, 2.0, -0.5))
+PULSES = np.where(np.arange(2 * HOUR) % 120 < 5, 3.0, 0.3)
+AFTER = load_a(HOUR, (0.0, 0.2, 0.4))
+
+
+def run(estimator: Estimator, samples: SampleBlock) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """SOC, its std and the bits of what is suspected, at each sample."""
+    out = []
+    for n in range(samples.size):
+        trace = estimator.run(samples[n : n + 1])
+        out.append((trace["soc"][0], trace["soc_std"][0], estimator.record[0]["checks"]["suspects"]))
+    soc, std, suspects = np.array(out).T
+    return soc, std, suspects.astype(int)
+
+
+CONSTANT, STEPS = np.full(2 * HOUR, 0.45), load_a(2 * HOUR, (0.0, 0.3, 0.6, 1.2))
+VOLTAGE, BOTH = ("voltage_v",), ("voltage_v", "current_a")
+
+
+@pytest.mark.parametrize(
+    ("fields", "during_a", "every"),
+    [
+        (VOLTAGE, CONSTANT, lambda n: n >= 0),
+        (VOLTAGE, STEPS, lambda n: n % 300 >= 12),
+        (VOLTAGE, STEPS, lambda n: n % 60 == 0),
+        (VOLTAGE, PULSES, lambda n: n >= 0),
+        (BOTH, STEPS, lambda n: n >= 0),
+    ],
+    ids=["constant load", "gaps of 12 s", "a sample a minute", "at a pulse", "whole frames"],
+)
+def test_the_truth_stays_inside(fields: tuple[str, ...], during_a: np.ndarray, every: Callable[[int], bool]) -> None:
+    samples, true_soc = measured(np.r_[DRIVE, during_a, AFTER], 0.8, np.random.default_rng(3))
+    for name in fields:
+        samples[name][STUCK] = samples[name][HOUR]
+    kept = every(np.arange(samples.size))
+    samples, true_soc = samples[kept], true_soc[kept]
+    step_s = float(np.median(np.diff(samples["time_s"])))
+    soc, std, suspects = run(Estimator(TRUTH, initial_soc=0.7, sampling=Sampling(step_s)), samples)
+    before = samples["time_s"] < HOUR
+    named = suspects & Suspect.VOLTAGE != 0
+    assert named.any()
+    assert not (suspects[before] & FROZEN).any()
+    assert suspects[-1] & FROZEN == 0
+    judged = named if fields is BOTH else ~before  # a current that is repeated counts until it is found
+    assert (np.abs(soc - true_soc)[judged] < 2.5 * std[judged]).all()
+
+
+def test_what_a_dead_current_sensor_made_of_the_voltage_is_taken_back() -> None:
+    samples, true_soc = measured(np.r_[DRIVE, PULSES, AFTER], 0.8, np.random.default_rng(3))
+    samples["current_a"][STUCK] = 0.0
+    soc, std, suspects = run(Estimator(TRUTH, initial_soc=0.7), samples)
+    named = suspects & Suspect.CURRENT != 0
+    assert named.any()
+    assert (np.abs(soc - true_soc)[named] < 2.0 * std[named]).all()
+
+
+def lfp(current_a: np.ndarray, soc: float) -> SampleBlock:
+    """Samples of the generic cell, to the millivolt."""
+    p = Estimator(load_cell("lfp", 2.3)).settings_record[0]["filter"]
+    samples = np.zeros(current_a.size, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
+    true_soc = soc - np.cumsum(current_a) / p["capacity_as"]
+    ohm = p["weak_ohm"] + p["strong_ohm"]
+    grid = np.linspace(0.0, 1.0, ohm.shape[0])
+    flows = np.column_stack([current_a, branch_currents(samples["time_s"], current_a)])
+    dropped_v = sum(np.interp(true_soc, grid, ohm[:, k]) * flows[:, k] for k in range(1 + BRANCHES))
+    open_v = np.array([ocv(x, p["ocv_v"], p["ocv_slope_v"]) for x in true_soc])
+    samples["voltage_v"] = np.round(open_v - dropped_v, 3)
+    return samples
+
+
+@pytest.mark.parametrize(
+    ("samples", "soc"),
+    [
+        (lfp(np.r_[np.zeros(60), np.full(1740, 4.6), np.zeros(900)], 0.98), 0.98),
+        (lfp(np.r_[np.zeros(600), np.full(4280, -1.15), np.zeros(HOUR)], 0.4), 0.4),
+    ],
+    ids=["to empty", "to full"],
+)
+def test_a_knee_under_a_constant_current_is_no_fault(samples: SampleBlock, soc: float) -> None:
+    """The voltage ramps by itself; where the charge ends, it falls with the current."""
+    assert np.ptp(samples["voltage_v"]) > 0.2
+    assert not (
+        run(Estimator(load_cell("lfp", 2.3), initial_soc=soc), samples)[2] & (FROZEN | Suspect.SIGN_OF_CURRENT)
+    ).any()
+
+
+def test_a_charger_that_holds_the_voltage_is_no_fault() -> None:
+    current_a = np.r_[np.full(HOUR, -1.5), -1.5 * np.exp(-np.arange(HOUR) / 1200.0)]
+    samples, _ = measured(current_a, 0.3, np.random.default_rng(3))
+    samples["voltage_v"][HOUR:] = samples["voltage_v"][HOUR]
+    assert not (run(Estimator(TRUTH, initial_soc=0.3), samples)[2] & FROZEN).any()
+
+
+def test_a_coarse_voltage_that_is_told_to_be_so_is_not_frozen() -> None:
+    samples, _ = measured(load_a(2 * HOUR, (0.3, 0.6, 1.2)), 0.8, np.random.default_rng(3))
+    samples["voltage_v"] = np.round(samples["voltage_v"], 1)
+    estimator = Estimator(TRUTH, initial_soc=0.8, voltage_resolution_v=0.1)
+    assert not (run(estimator, samples)[2] & FROZEN).any()
