@@ -12,12 +12,15 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.capacity import Anchor, Capacity, measure_capacity
-from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, SignOfCurrent, check_once
+from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, SignOfCurrent
 from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture
 
 SHOWN_ANCHORS = 30
+UNITS = 30.0
+"""No capacity is declared so many times too large or too small."""
 """So many are listed for people; all with ``--json``."""
 
 
@@ -73,9 +76,13 @@ def capacity(
     `cell.capacity_ah` and `cell.capacity_std` of a cell file are the place for what was measured.
     """
     model = load_cell(cell, capacity_ah)
-    check_once(captures)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
-    result = _result(measure_capacity(loaded, model, offset_std_a=current_offset_std_a), model)
+    found = measure_capacity(loaded, model, offset_std_a=current_offset_std_a)
+    if not 1.0 / UNITS < found.capacity_ah / model.cell.capacity_ah < UNITS:
+        raise UserError(
+            f"{found.capacity_ah:.4g} Ah where {model.cell.capacity_ah:.4g} Ah is declared: is the current in amperes, the time in seconds?"
+        )
+    result = _result(found, model)
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:

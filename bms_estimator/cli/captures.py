@@ -1,5 +1,6 @@
 """What the commands that work on recordings have in common: their options, and that nothing is overwritten unasked."""
 
+import filecmp
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -41,14 +42,16 @@ def check_out(out: Path, read: Sequence[Path], *, force: bool) -> None:
 
 
 def check_once(captures: Sequence[Path]) -> None:
-    """Refuse a capture that is given twice.
+    """Refuse a capture that is given twice, under one name or two.
 
     Raises:
         UserError: Which one.
     """
     for i, path in enumerate(captures):
-        if path.exists() and any(other.exists() and path.samefile(other) for other in captures[:i]):
-            raise UserError(f"{path}: given twice; it would count twice")
+        for other in captures[:i]:
+            if path.is_file() and other.is_file() and filecmp.cmp(path, other, shallow=False):
+                same = "given twice" if path.samefile(other) else f"the same as {other}"
+                raise UserError(f"{path}: {same}; it would count twice")
 
 
 def unlike(names: Sequence[str], paths: Sequence[Path]) -> list[str]:

@@ -159,7 +159,7 @@ def result_table(title: str, result: Result) -> Table:
         "samples": f"{result.samples:,}",
         "dropped": _dropped(result),
         **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
-        **({"clock set back": f"{result.time_steps_back:,} times"} if result.time_steps_back else {}),
+        **({"clock set back": _set_back(result)} if result.time_steps_back else {}),
         "duration": _text(result.duration_s, ",.1f", "s"),
         **({} if result.parameters else _soc(result)),
         "innovation, RMS": _text(result.innovation_rms_v, ".3f", "mV", 1e3),
@@ -193,6 +193,12 @@ def _temperature(result: Result) -> dict[str, str]:
         none = unusable if result.temperatures_dropped else "not measured"
         return {"temperature": f"{none}: the band is wider"}
     return {"temperature": unusable} if result.temperatures_dropped else {}
+
+
+def _set_back(result: Result) -> str:
+    """How often, and what that looks like."""
+    text = f"{result.time_steps_back:,} times"
+    return f"{text}: are the rows in the order of time?" if result.time_steps_back > MANY * result.samples else text
 
 
 def _dropped(result: Result) -> str:

@@ -103,6 +103,7 @@ class Publisher:
         self._due_s = self._started_s
         self._sample_s = -math.inf  # monotonic, of the last accepted sample
         self._impossible = ""  # why the last sample that was dropped is none, where that can be said
+        self._dropped_before: dict[str, int] = {}  # by kind, when a block was last good
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -126,7 +127,9 @@ class Publisher:
         if trace.size:
             self._window.add(trace, self._clock.wall(), self._source.cells)
             self._sample_s = now_s
-        if trace.size < block.size:
+        if trace.size == block.size:
+            self._impossible, self._dropped_before = "", self._dropped()
+        else:
             self._impossible = impossible_sample(block, self._estimator.settings[0]) or ""
         self.watch.add(block, trace, now_s)
         if now_s >= self._due_s:
@@ -259,7 +262,12 @@ class Publisher:
             return self._source.message
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
-        counted = sample_counters(self._estimator.state[0]).items()
-        dropped = {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}
-        text = f"no usable sample for {silent_s:.1f} s; dropped so far: {dropped_text(dropped)}"
+        dropped = {kind: n - self._dropped_before.get(kind, 0) for kind, n in self._dropped().items()}
+        text = f"no usable sample for {silent_s:.1f} s"
+        text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
         return f"{text}; {self._impossible}" if self._impossible else text
+
+    def _dropped(self) -> dict[str, int]:
+        """Samples that were not used, by kind."""
+        counted = sample_counters(self._estimator.state[0]).items()
+        return {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}

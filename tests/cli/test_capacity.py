@@ -49,6 +49,16 @@ def test_people_see_the_anchors_and_the_capacity(capsys, capture):
     assert "Ah, declared 3 Ah" in text
 
 
+def test_milliamperes_are_no_capacity(capsys, capture, tmp_path):
+    rows = np.loadtxt(capture, delimiter=",", skiprows=1)
+    rows[:, 1] *= 1e3
+    wrong = tmp_path / "ma.csv"
+    np.savetxt(wrong, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
+    code, _, err = run(capsys, "capacity", wrong, "--cell", "ncr18650")
+    assert code == 2
+    assert "Ah where 3 Ah is declared: is the current in amperes" in " ".join(err.split())
+
+
 def test_a_real_cell_holds_what_a_slow_discharge_gave(capsys, shared_data):
     """C/20 gave 2.99 Ah of cell 1."""
     capture = shared_data / "ncr18650" / "cell1_hppc.csv.gz"

@@ -1,5 +1,8 @@
 """What a command writes with ``--out`` never replaces a file unasked, and what it reads it reads once."""
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -43,17 +46,25 @@ def test_a_file_that_is_there_is_replaced_with_force_alone(command, options, nam
     [
         ("ocv", "--capacity-ah", "3", "--out", "mine.toml"),
         ("identify", "--cell", "ncr18650", "--out", "mine.toml"),
-        ("capacity", "--cell", "ncr18650"),
         ("thesis", "--cell", "ncr18650", "--out", "report"),
     ],
     ids=lambda command: command[0],
 )
-def test_a_capture_that_is_given_twice_does_not_count_twice(command, capture, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("again_by", "why"),
+    [(Path.symlink_to, "given twice"), (lambda again, path: shutil.copy(path, again), "the same as")],
+    ids=["link", "copy"],
+)
+def test_a_capture_that_is_given_twice_does_not_count_twice(
+    command, again_by, why, capture, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     again = tmp_path / "again.csv"
-    again.symlink_to(capture)
+    again_by(again, capture)
     with pytest.raises(SystemExit) as ended:
         main([command[0], str(capture), str(again), *command[1:]])
     assert ended.value.code == 2
-    assert "error: again.csv: given twice; it would count twice" in capsys.readouterr().err.replace(f"{tmp_path}/", "")
+    err = capsys.readouterr().err.replace(f"{tmp_path}/", "")
+    assert f"error: again.csv: {why}" in err
+    assert "it would count twice" in err
     assert not list(tmp_path.glob("mine*"))

@@ -256,7 +256,7 @@ def test_time_that_runs_backwards_is_said(tmp_path, capsys):
     backwards.write_text("time_s,current_a,voltage_v\n" + "".join(f"{9 - j},0.1,3.8\n" for j in range(10)))
     code, out, _ = run(capsys, "replay", backwards, "--cell", "ncr18650")
     assert code == 0
-    assert re.search(r"clock set back +9 times", out)
+    assert re.search(r"clock set back +9 times: are the rows in the order of time\?", out)
     assert re.search(r"duration +0.0 s", out)
 
 

@@ -134,8 +134,13 @@ async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> Non
         assert silent.estimate is None
         assert "no usable sample" in (silent.health.sensor_message or "")
         seen = len(run.sink.snapshots)
-        run.source.give((1.0, 0.1, 3.8))
+        run.source.give((1.0, 0.1, 380.0))
+        told = await run.sink.until(lambda s: "dropped" in (s.health.sensor_message or ""), skip=seen)
+        assert "dropped since: 1 outside the cell's range" in (told.health.sensor_message or "")
+        run.source.give((2.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.health.sensor_online, skip=seen)
+        later = await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
+        assert "dropped" not in (later.health.sensor_message or "")
 
 
 @pytest.mark.parametrize("sensor", [SensorSettings(sample_rate_hz=1), SensorSettings(protocol="text")])
