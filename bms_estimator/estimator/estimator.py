@@ -11,7 +11,7 @@ from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.kernels import sample_step as kernel
 from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
 from bms_estimator.kernels.hypotheses import tell
-from bms_estimator.kernels.input_checks import keep
+from bms_estimator.kernels.input_checks import UNUSABLE, keep
 from bms_estimator.kernels.sample_step import Verdict
 from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.columns import Columns
@@ -133,6 +133,8 @@ class Estimator:
             f, c = self.record[0]["filter"], self.record[0]["checks"]
             tell(f, self.settings_record[0]["filter"], soc)
             c["outliers"] = 0.0
+            if not c["suspects"] & UNUSABLE:
+                c["last_v"] = 0.0  # what is found frozen later is not taken back to before
             keep(c, f)
 
     def resume(self, unseen_s: float) -> None:

@@ -66,6 +66,7 @@ def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, volta
     s.checks.slow_v = 0.0
     s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
     if not s.checks.suspects & UNUSABLE:
+        s.checks.last_v = 0.0
         take_first(s, p, current_a, voltage_v)
 
 
