@@ -71,11 +71,12 @@ def test_identify_writes_a_file_that_replays_use(capsys, curve: Path, steps: Pat
 def test_what_the_fit_leaves_is_told_of_each_file_though_two_have_one_name(capsys, steps: Path, tmp_path: Path) -> None:
     (tmp_path / "later").mkdir()
     later = tmp_path / "later" / steps.name
-    later.write_bytes(steps.read_bytes())
+    later.write_text("".join(steps.read_text().splitlines(keepends=True)[:-20]))
     out = tmp_path / "mine.toml"
     _, printed, _ = run(capsys, "identify", steps, later, "--cell", "pem_30w", "--out", out, "--json")
     found = json.loads(printed)
-    assert found[f"{steps}_rms_mv"] == found[f"{later}_rms_mv"] == pytest.approx(3.0, rel=0.05)
+    assert found[f"{steps}_rms_mv"] == pytest.approx(3.0, rel=0.05)
+    assert found[f"{later}_rms_mv"] == pytest.approx(3.0, rel=0.05)
 
 
 def test_identify_says_what_the_data_do_not_tell(capsys, curve: Path, tmp_path: Path) -> None:
