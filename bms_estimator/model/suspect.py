@@ -34,8 +34,8 @@ _TEXT = {
     "and that voltage and current are taken at the same time",
     Suspect.TEMPERATURE: "errors are larger there: check the temperature sensor, or make the cell file with captures "
     "at this temperature",
-    Suspect.VOLTAGE: "the voltage stays the same to the last digit while the current moves: check its wire, "
+    Suspect.VOLTAGE: "the voltage stays the same to the last digit though current or charge move it: check its wire, "
     "and that the source does not repeat an old value",
-    Suspect.CURRENT: "the current stays the same to the last digit while the voltage moves: check the current sensor, "
+    Suspect.CURRENT: "the current stays the same to the last digit though the voltage changes: check the current sensor, "
     "and that all loads flow through it",
 }

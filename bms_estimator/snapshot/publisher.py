@@ -102,8 +102,8 @@ class Publisher:
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._sample_s = -math.inf  # monotonic, of the last accepted sample
-        self._impossible = ""  # why the last sample that was dropped is none, where that can be said
-        self._dropped_before: dict[str, int] = {}  # by kind, when a block was last good
+        self._impossible: str | None = None  # why the last sample that was dropped is none; None: all are good
+        self._dropped_before = self._dropped()  # by kind, when that began
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -127,10 +127,10 @@ class Publisher:
         if trace.size:
             self._window.add(trace, self._clock.wall(), self._source.cells)
             self._sample_s = now_s
-        if trace.size == block.size:
-            self._impossible, self._dropped_before = "", self._dropped()
-        else:
+        if trace.size < block.size:
             self._impossible = impossible_sample(block, self._estimator.settings[0]) or ""
+        elif self._impossible is not None:
+            self._impossible, self._dropped_before = None, self._dropped()
         self.watch.add(block, trace, now_s)
         if now_s >= self._due_s:
             self.publish()
@@ -262,7 +262,7 @@ class Publisher:
             return self._source.message
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
-        dropped = {kind: n - self._dropped_before.get(kind, 0) for kind, n in self._dropped().items()}
+        dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped().items()}
         text = f"no usable sample for {silent_s:.1f} s"
         text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
         return f"{text}; {self._impossible}" if self._impossible else text
