@@ -1,8 +1,8 @@
 """The high-gain adaptive observer, Algorithm 1: one sample in, one record updated.
 
-Over a sample y, i, N and a_i are held. Then (3.18) is a first-order lag, and (3.2)-(3.3) with
-u = -N e is linear with a symmetric 2x2 matrix: both are solved exactly, so the step is stable for every
-N >= 0 and every step length. ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+Over a sample y, i, N and a_i are held. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix, e
+decays with one of its eigenvalues, and (3.18) is a first-order lag driven by the mean of e^2 over the sample. Each is
+solved exactly, so the step is stable for every N >= 0 and every step length. ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
 """
 
 import math
@@ -67,17 +67,17 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop  # (3.15) with (3.14) or (4.1)
     s.innovation_v = e
 
-    if s.adapting:
-        adapt(s, p, dt_s, e * e)
-        update_margins(s)
-        soc = max(s.soc, floor(s, p))
+    tau_ts, tau_tl = r_ts(soc, s.a) * c_ts(soc, s.a), r_tl(soc, s.a) * c_tl(soc, s.a)
+    rate_e = states_step(s, s.gain / loop, voltage_v - e_o, tau_ts, tau_tl, dt_s)
+    mean_square = integral_of_exponential(2.0 * rate_e * dt_s, 1.0)  # mean of e^2 over the sample / e^2 at its start
 
-    ohm_ts, ohm_tl = r_ts(soc, s.a), r_tl(soc, s.a)
-    rate_e = states_step(s, s.gain / loop, voltage_v - e_o, ohm_ts * c_ts(soc, s.a), ohm_tl * c_tl(soc, s.a), dt_s)
+    if s.adapting:
+        adapt(s, p, dt_s, e * e * mean_square)
+        update_margins(s)
 
     excess = max(abs(e) - p.dead_zone_v, 0.0)
     if excess > 0.0:
-        s.k += excess * excess * integral_of_exponential(2.0 * rate_e, dt_s)  # (3.13) with the dead zone of E2
+        s.k += excess * excess * mean_square * dt_s  # (3.13) with the dead zone of E2
         s.gain = nussbaum_gain(s.k, p)
     s.voltage_estimate_v = e_o - s.v_ts - s.v_tl  # (4.1)
     if p.output_r_s > 0.0:
@@ -87,7 +87,7 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
 
 @njit(cache=True)
 def adapt(s: Record, p: Record, dt_s: float, e_squared: float) -> None:
-    """Adaptation laws (3.16)-(3.18), exact for held e: a' = drive e^2 + rate (target - a)."""
+    """Adaptation laws (3.16)-(3.18), a' = drive e^2 + rate (target - a), exact for an e^2 held at its mean over the sample."""
     if dt_s != s.decay_dt_s:
         s.decay_dt_s = dt_s
         for i in range(1, 16):

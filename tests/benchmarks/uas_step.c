@@ -241,19 +241,19 @@ static void observer_step(state_t *s, const settings_t *p, double dt_s, double c
     double e = (voltage_v - e_o + s->v_ts + s->v_tl) / loop; /* (3.15) */
     s->innovation_v = e;
 
-    if (s->adapting) {
-        adapt(s, p, dt_s, e * e);
-        update_margins(s);
-        soc = fmax(s->soc, lowest(s, p));
-    }
-
     double tau_ts = element(a[1], a[2], a[3], soc) * element(-a[7], a[8], a[9], soc);
     double tau_tl = element(a[4], a[5], a[6], soc) * element(-a[10], a[11], a[12], soc);
     double rate_e = states_step(s, s->gain / loop, voltage_v - e_o, tau_ts, tau_tl, dt_s);
+    double mean_square = integral_of_exponential(2.0 * rate_e * dt_s, 1.0);
+
+    if (s->adapting) {
+        adapt(s, p, dt_s, e * e * mean_square);
+        update_margins(s);
+    }
 
     double excess = fmax(fabs(e) - p->dead_zone_v, 0.0);
     if (excess > 0.0) {
-        s->k += excess * excess * integral_of_exponential(2.0 * rate_e, dt_s); /* (3.13) */
+        s->k += excess * excess * mean_square * dt_s; /* (3.13) */
         s->gain = nussbaum_gain(s->k, p);
     }
     s->voltage_estimate_v = e_o - s->v_ts - s->v_tl; /* (4.1) */
