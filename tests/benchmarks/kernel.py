@@ -46,6 +46,7 @@ def rows() -> Iterator[Row]:
     apart, agreed = steps_at_1_hz()
     yield Row("whole step at 1 Hz, seven filters side by side", "at most 20 us", f"{apart / 1e3:.1f} us", apart <= 20e3)
     yield Row("  once they agree", "at most 4 us", f"{agreed / 1e3:.1f} us", agreed <= 4e3)
+    yield Row("  the learning law without the filter", "-", f"{learning_at_1_hz() / 1e3:.2f} us", None)
     call, bare = calls_from_python(block)
     overhead = call - ours
     yield Row("Estimator.step from Python", "-", f"{call / 1e3:.2f} us", None)
@@ -95,6 +96,19 @@ def whole_step(block: SampleBlock) -> float:
         estimator.state["started"] = 0
         best = min(best, elapsed_ns(lambda: estimator.run(block)))
     return best / BLOCK
+
+
+def learning_at_1_hz() -> float:
+    """Time per sample of ``run`` with the learning law on a counted SOC, at the samples of ``steps_at_1_hz`` [ns]."""
+    block = pulses(AT_1_HZ, rate_hz=1)
+    estimator = Estimator(load_cell(CELL), ObserverSettings(law="learning"), identifier=None)
+    estimator.run(block)
+    best = np.inf
+    for _ in range(ROUNDS):
+        estimator.state["started"] = 0
+        estimator.run(block[:AGREED])
+        best = min(best, elapsed_ns(lambda: estimator.run(block[AGREED:])))
+    return best / (AT_1_HZ - AGREED)
 
 
 def steps_at_1_hz() -> tuple[float, float]:
