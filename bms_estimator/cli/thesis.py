@@ -99,4 +99,4 @@ def _show(console: Console, report: Report) -> None:
             Console(width=max(console.width, WIDE)).print(shown)
         else:
             console.print(f"Figure {item.key}  {item.title}", highlight=False)
-        console.print(f"{item.verdict.value}: {item.reason}", highlight=False)
+        console.print(f"{items.label(item)}: {item.reason}", highlight=False)

@@ -70,12 +70,12 @@ class Experiment:
         Nothing is tested on the simulated pack: it has the model's own form.
         """
         if self.recorded is None:
-            return Verdict.NOT, ""
+            return Verdict.NO_DATA, ""
         found = [claim(key, [self.protocol]) for key in keys]
         words = "".join(f"{one.words} " for one in found)
-        verdicts = {one.verdict for one in found} - {Verdict.NOT}
+        verdicts = {one.verdict for one in found} - {Verdict.NO_DATA}
         if not verdicts:
-            return Verdict.NOT, words
+            return Verdict.NO_DATA, words
         return (Verdict.CLAIM_FAILS if Verdict.CLAIM_FAILS in verdicts else Verdict.CLAIM_HOLDS), words
 
     @property

@@ -24,7 +24,7 @@ PER_FIGURE = 4
 def _figure(
     key: str, title: str, svg: str, experiment: Experiment, reason: str, *, claims: tuple[str, ...] = ()
 ) -> Figure:
-    verdict, tested = experiment.tested(*claims) if claims else (Verdict.NOT, "")
+    verdict, tested = experiment.tested(*claims) if claims else (Verdict.NO_DATA, "")
     return Figure(key, title, svg, verdict, f"{experiment.unpublished} {tested}{reason}")
 
 

@@ -4,15 +4,16 @@ from html import escape
 from pathlib import Path
 
 from bms_estimator import __version__
-from bms_estimator.reports.items import Figure, Item, Table, Verdict, name
+from bms_estimator.reports.items import Figure, Item, Table, Verdict, label, name
 from bms_estimator.reports.thesis import Report
 
 BADGE = {
-    Verdict.CORRECTED: "corrected",
+    Verdict.FITTED: "fitted",
     Verdict.RECOMPUTED: "recomputed",
     Verdict.CLAIM_HOLDS: "holds",
     Verdict.CLAIM_FAILS: "fails",
-    Verdict.NOT: "not",
+    Verdict.NO_DATA: "no-data",
+    Verdict.CONTRADICTED: "contradicted",
     Verdict.GIVEN: "given",
     Verdict.ADDED: "added",
 }
@@ -38,11 +39,12 @@ h3 { font-size: 1.02rem; margin: 0 0 .5rem; display: flex; flex-wrap: wrap; gap:
 h3 .no { color: var(--accent); white-space: nowrap; }
 p { margin: .5rem 0; } .reason { color: var(--soft); font-size: .9rem; max-width: 54rem; }
 .badge { font-size: .72rem; font-weight: 600; padding: .08rem .5rem; border-radius: 1rem; white-space: nowrap; }
-.corrected { background: #e0ecfa; color: #174c88; border-color: #1f5fa8; }
+.fitted { background: #e0ecfa; color: #174c88; border-color: #1f5fa8; }
 .recomputed { background: #e3f1f3; color: #1d5661; border-color: #4aa3b5; }
 .holds { background: #dff2e6; color: #17613a; border-color: #2f8f5b; }
 .fails { background: #f9dfdf; color: #8a1c1c; border-color: #c23b3b; }
-.not { background: #fbeadf; color: #8c3b12; border-color: #d1602b; }
+.no-data { background: #fbeadf; color: #8c3b12; border-color: #d1602b; }
+.contradicted { background: #f9dfdf; color: #8a1c1c; border-color: #c23b3b; }
 .given { background: #eceff2; color: #515c68; border-color: #8a97a6; }
 .added { background: #f0e6f5; color: #643579; border-color: #8a4fa3; }
 .scroll { overflow-x: auto; }
@@ -69,8 +71,8 @@ LONG_CELL = 40
 
 DECLARED = """
 <p>Every table and figure of “Adaptive estimation of Li-ion battery model parameters”, recomputed beside what is printed.
-Where the two differ the reason stands with it; <a href="#table-errata">E1 to E26</a> are the errata of the thesis that this project
-carries corrected.
+Where the two differ the reason is given with it; <a href="#table-errata">E1 to E36</a> are the errata of the thesis that this project
+carries corrected. Only the text of the thesis was available, with its numbers and tables: what its figures show was not seen.
 What the thesis does not print is declared: N(k) = E<sub>2.5</sub>(-k<sup>2.5</sup>), k<sub>0</sub> = 0,
 x<sub>2</sub>(0) = x<sub>3</sub>(0) = 0 (schemes 1 and 2: start and λ of E25), simulations at 100 Hz (C/10 runs at 10 Hz) with the semi-exact step, which is stable at
 any step length. Errors are always in percent of the true value.</p>
@@ -126,17 +128,17 @@ def _counts(report: Report) -> str:
     for verdict, css in BADGE.items():
         count = sum(item.verdict is verdict for item in report.items)
         if count:
-            label = "diagram, photograph or input" if verdict is Verdict.GIVEN else verdict.value
-            parts.append(f'<li class="{css}"><strong>{count}</strong>{escape(label)}</li>')
+            words = "diagram, photograph or input" if verdict is Verdict.GIVEN else verdict.value
+            parts.append(f'<li class="{css}"><strong>{count}</strong>{escape(words)}</li>')
     return f'<ul class="counts">{"".join(parts)}</ul>'
 
 
-def _badge(verdict: Verdict) -> str:
-    return f'<span class="badge {BADGE[verdict]}">{escape(verdict.value)}</span>'
+def _badge(item: Item) -> str:
+    return f'<span class="badge {BADGE[item.verdict]}">{escape(label(item))}</span>'
 
 
 def _article(item: Item) -> str:
-    head = f'<h3><span class="no">{escape(name(item))}</span> {escape(item.title)} {_badge(item.verdict)}</h3>'
+    head = f'<h3><span class="no">{escape(name(item))}</span> {escape(item.title)} {_badge(item)}</h3>'
     body = item.svg if isinstance(item, Figure) else _table(item)
     brief = ' class="brief"' if isinstance(item, Figure) and not item.svg and item.verdict is Verdict.GIVEN else ""
     return f'<article id="{_anchor(item)}"{brief}>{head}{body}<p class="reason">{escape(item.reason)}</p></article>'
@@ -162,7 +164,7 @@ def _table(table: Table) -> str:
 def _account(report: Report) -> str:
     rows = "".join(
         f'<tr><td><a href="#{_anchor(item)}">{_short(item)}</a></td><td>{escape(item.title)}</td>'
-        f"<td>{_badge(item.verdict)}</td><td>{escape(item.reason)}</td></tr>"
+        f"<td>{_badge(item)}</td><td>{escape(item.reason)}</td></tr>"
         for item in report.items
     )
     return (

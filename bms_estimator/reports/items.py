@@ -7,10 +7,14 @@ from enum import Enum
 class Verdict(Enum):
     """What became of a table or figure."""
 
-    CORRECTED = "reproduced after correction"
+    FITTED = "fitted"
+    """Comes out as printed once errata are corrected and free parameters, which the thesis does not print, are fitted to it."""
     RECOMPUTED = "recomputed"
     """Computed from printed values, compared with nothing: the thesis prints no value of it."""
-    NOT = "cannot be reproduced"
+    NO_DATA = "no data printed"
+    """The recording, load or model behind it is not published."""
+    CONTRADICTED = "contradicted by the thesis's own numbers"
+    """Other printed numbers of the thesis give another result."""
     CLAIM_HOLDS = "claim tested on other data: holds"
     """What the thesis claims of its recordings, tested on others."""
     CLAIM_FAILS = "claim tested on other data: fails"
@@ -31,6 +35,7 @@ class Table:
         rows: One list of cells for each row.
         verdict: What became of it.
         reason: Why it differs from print, or what the agreement rests on.
+        free: Free parameters of a fit; 0 without one.
     """
 
     key: str
@@ -39,6 +44,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     verdict: Verdict
     reason: str
+    free: int = 0
 
     kind: str = field(default="Table", init=False)
 
@@ -70,6 +76,13 @@ Item = Table | Figure
 def name(item: Item) -> str:
     """Table 5, Figure 19; what is not in the thesis by its key alone."""
     return item.key if item.verdict is Verdict.ADDED else f"{item.kind} {item.key}"
+
+
+def label(item: Item) -> str:
+    """Verdict in words; of a fit with the number of its free parameters."""
+    if item.verdict is Verdict.FITTED and isinstance(item, Table):
+        return f"{item.verdict.value}, {item.free} free parameters"
+    return item.verdict.value
 
 
 def number(value: float, digits: int = 4) -> str:

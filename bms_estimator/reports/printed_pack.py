@@ -40,9 +40,31 @@ def mean_current_a(ohm: float) -> float:
 
     The mean over time of a charge Q is Q over the integral of dq / i.
     """
-    inner = element("R_ts", A, GRID) + element("R_tl", A, GRID) + np.array([r_s(x, A) for x in GRID])
-    current_a = np.array([emf(x, A) for x in GRID]) / (ohm + inner)
+    current_a = np.array([emf(x, A) for x in GRID]) / (ohm + _inner_ohm())
     return float(1.0 / np.mean(1.0 / current_a))
+
+
+def _inner_ohm() -> Floats:
+    """R_s + R_ts + R_tl of Tables 8 to 10 over ``GRID`` [ohm]."""
+    ohm: Floats = element("R_ts", A, GRID) + element("R_tl", A, GRID) + np.array([r_s(x, A) for x in GRID])
+    return ohm
+
+
+def mean_voltage_v(current_a: float) -> float:
+    """Mean terminal voltage of a slow discharge at ``current_a`` by Tables 8 to 10 [V]."""
+    return float(np.mean(np.array([emf(x, A) for x in GRID]) - current_a * _inner_ohm()))
+
+
+def current_differences_a() -> dict[str, float]:
+    """Each printed current less that of Ohm's law [A]."""
+    return {load: printed.CURRENTS_A[load] - mean_current_a(ohm) for load, ohm in printed.RESISTORS_OHM.items()}
+
+
+def current_sensor() -> tuple[float, float]:
+    """Offset [A] and gain error of a current sensor that would explain these differences, by least squares."""
+    true_a = np.array([mean_current_a(ohm) for ohm in printed.RESISTORS_OHM.values()])
+    gain, offset_a = np.polyfit(true_a, list(current_differences_a().values()), 1)
+    return float(offset_a), float(gain)
 
 
 def current_errors_percent() -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What (3.1)-(3.3) do under a constant current with every parameter true: E15 and E16.
+"""What (3.1)-(3.3) do under a constant current with every parameter true: E15, E16 and E27.
 
 Both branches are driven by one u, where the cell's are by i/C_ts and i/C_tl. Once x2^, x3^ change slowly, u = x2^/tau_ts =
 x3^/tau_tl: they stand as tau_ts to tau_tl, the cell's as R_ts to R_tl. And u = -N e is not zero, so e is not.
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell import c_tl, c_ts, cell_step, r_tl, r_ts, terminal_voltage
+from bms_estimator.kernels.cell import c_tl, c_ts, cell_step, r_s, r_tl, r_ts, terminal_voltage
 from bms_estimator.model.cell import Bounds, CellModel
 from bms_estimator.reports.simulation import block, observer_settings, with_bounds
 
@@ -26,6 +26,8 @@ class QuasiSteady:
         cell_v: x2 and x3 of the cell [V].
         observer_v: x2^ and x3^ [V].
         tau_s: tau_ts and tau_tl of both [s].
+        ohmic_v: i R_s, which (2.4) takes off the terminal voltage [V].
+        driven_v: u R_s, which (3.14) takes off in its place [V ohm/s].
         error_v: e as the observer has it [V].
         predicted_v: -x2^ / (N tau_ts), the e that keeps x2^ where it is [V].
     """
@@ -33,6 +35,8 @@ class QuasiSteady:
     cell_v: tuple[float, float]
     observer_v: tuple[float, float]
     tau_s: tuple[float, float]
+    ohmic_v: float
+    driven_v: float
     error_v: float
     predicted_v: float
 
@@ -59,11 +63,14 @@ def quasi_steady(cell: CellModel, current_a: float) -> QuasiSteady:
     )
     estimator.run(block(time_s, np.full(time_s.size, current_a), voltage_v))
     s = estimator.state[0]
+    ohm_s = r_s(x[0], a)
     tau_ts, tau_tl = r_ts(x[0], a) * c_ts(x[0], a), r_tl(x[0], a) * c_tl(x[0], a)
     return QuasiSteady(
         cell_v=(x[1], x[2]),
         observer_v=(float(s["v_ts"]), float(s["v_tl"])),
         tau_s=(tau_ts, tau_tl),
+        ohmic_v=current_a * ohm_s,
+        driven_v=-float(s["gain"]) * float(s["innovation_v"]) * ohm_s,
         error_v=float(s["innovation_v"]),
         predicted_v=-float(s["v_ts"]) / (float(s["gain"]) * tau_ts),
     )

@@ -248,7 +248,7 @@ def figure_20(s: Simulation) -> Figure:
         "20",
         "R_ts·C_ts and R_tl·C_tl: estimated and true",
         plot(lambda axes: products_plot(axes, s.cell.a, s.improved.average), columns=2, salt="figure-20"),
-        Verdict.NOT,
+        Verdict.CONTRADICTED,
         "The printed products lie on each other. Recomputed they do not: from the printed estimates they are "
         f"{printed_errors[0]:.1f} and {printed_errors[1]:.1f} % off, and the recomputed ones go with the bounds (E3, E9, "
         "Theorem 4.1.2 measured).",
@@ -353,7 +353,7 @@ def figure_39(s: Simulation) -> Figure:
         "39",
         "Dynamic and static model, simulation",
         plot(lambda axes: dynamic_static_plot(axes, dynamic, static), columns=2, salt="figure-39"),
-        Verdict.NOT,
+        Verdict.NO_DATA,
         f"Load and freezing point are not printed: here pulses of 0.275 A, frozen at SOC {STATIC_SOC:g}, parameters of Tables 5 "
         "and 6. As printed, the two differ where SOC is low.",
     )
@@ -394,7 +394,7 @@ def figure_43(s: Simulation) -> Figure:
         "43",
         "E_o of a healthy bank and of one with two weak batteries",
         plot(draw, salt="figure-43"),
-        Verdict.NOT,
+        Verdict.NO_DATA,
         "The bank's batteries and their SOC are not printed; here three of Chen and Mora in series, two of them begin at SOC "
         f"{WEAK_SOC[0]:g} and {WEAK_SOC[1]:g}. As printed, each shows as a dip when it runs empty.",
     )

@@ -111,7 +111,7 @@ def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Calla
 
 
 def _diagram(key: str) -> Callable[[], Item]:
-    verdict = Verdict.NOT if key in FUEL_CELL else Verdict.GIVEN
+    verdict = Verdict.NO_DATA if key in FUEL_CELL else Verdict.GIVEN
     reason = FUEL_CELL.get(key, "A diagram or photograph: there is nothing to compute.")
     return lambda: Figure(key, DIAGRAMS[key], "", verdict, reason)
 

@@ -1,5 +1,6 @@
 """Lemma 4.1.3 and (2.11), (2.12) against digits worked out by hand from the printed bounds and weights."""
 
+import numpy as np
 import pytest
 
 from bms_estimator.kernels.margins import delta
@@ -24,13 +25,13 @@ TABLES_5_AND_10 = {
 }
 """(x upper + y lower) / (x + y); a8 with the weights of E4, a5 of Table 10 as E5."""
 INFERRED = {("5", 7): 759.3, ("10", 7): 759.3, ("10", 4): 6.250}
-"""With the weights of E24."""
-PRINTED_ESTIMATES = {
-    "5": (0.5555, 29.9996, 0.0557, 5.6095, 149.9983, 0.0630, 759.2573, 10.6712, 684.61, 5999.6, 27.5014, 3666.6),
-    "10": (0.5505, 30.0475, 0.0551, 6.2585, 30.0, 0.0551, 760.2266, 10.7686, 685.7457, 6036.4, 27.5422, 3696.0),
-}
-WORST_PERCENT = {"5": 0.075, "10": 0.28}
-"""a6 of Table 5 has three digits; a8 of Table 10."""
+"""With the weights of E24 and E32."""
+TABLE_5 = "0.5555 29.9996 0.0557 5.6095 149.9983 0.0630 759.2573 10.6712 684.61 5999.6 27.5014 3666.6"
+"""Digits of the printed estimates."""
+TABLE_10 = (0.5505, 30.0475, 0.0551, 6.2585, 150.0, 0.0551, 760.2266, 10.7686, 685.7457, 6036.4, 27.5422, 3696.0)
+"""a5 is printed as 30 (E5)."""
+WORST_PERCENT = 0.28
+"""a8 of Table 10."""
 
 
 def digits(value):
@@ -58,26 +59,56 @@ def test_printed_weights_of_a8_have_another_limit():
     assert digits((x * upper + y * lower) / (x + y)) == 25.17  # E4
 
 
-@pytest.mark.parametrize("index", range(1, 13))
-@pytest.mark.parametrize("table", ["5", "10"])
-def test_printed_estimates_are_means_from_the_first_sample_on(table, index):
-    """Bounds, weights and initial values alone, no data, give what Tables 5 and 10 print (E3)."""
-    estimate = PRINTED_ESTIMATES[table][index - 1]
-    mean = printed.mean_from_start(table, index)
-    if (table, index) == ("10", 5):
-        assert mean == pytest.approx(150.0, rel=1e-4)  # E5: printed 30
-    else:
-        assert mean == pytest.approx(estimate, rel=1e-2 * WORST_PERCENT[table])
+@pytest.mark.parametrize(("index", "digits"), list(enumerate(TABLE_5.split(), 1)))
+def test_means_from_the_first_sample_on_have_every_digit_of_table_5(index, digits):
+    """Bounds, weights and initial values alone, no data (E3), with the weights of E32."""
+    assert printed.TABLE_5[index][1] == float(digits)
+    decimals = len(digits.partition(".")[2])
+    assert f"{printed.mean_from_start('5', index):.{decimals}f}" == digits
+    assert printed.DECIMALS_5[index] == decimals
 
 
-def test_worst_of_the_means():
-    for table, worst in WORST_PERCENT.items():
-        assert printed.worst_mean_percent(table) == pytest.approx(worst, abs=0.005)
+@pytest.mark.parametrize("index", [7, 8, 10, 11, 12])
+def test_printed_weights_do_not_give_the_digits_of_table_5(index):
+    upper, lower, x, y = printed.BOUNDS[index]
+    x, y = {7: (70.0, 65.0), 8: (10.0, 20.0)}.get(index, (x, y))  # the right limit, by E24 and E4
+    limit = (x * upper + y * lower) / (x + y)
+    mean = limit + (printed.initial("5", index) - limit) / ((x + y) * printed.START_MEAN_S["5"])
+    decimals = printed.DECIMALS_5[index]
+    assert round(mean, decimals) != printed.TABLE_5[index][1]
+    low, high = printed.implied_rates(index)
+    assert not low <= x + y <= high
+
+
+def test_no_other_weights_up_to_800_give_the_digits_of_a7():
+    """E32: 196, 182 is the only pair of whole numbers with the time that a4 allows."""
+    seconds, start, digits = (328.12, 328.4), 510.0, 759.2573
+    x, y = (grid.ravel() for grid in np.mgrid[1:801, 1:801])
+    limit = (1000.0 * x + 500.0 * y) / (x + y)
+    means = [limit + (start - limit) / ((x + y) * over_s) for over_s in seconds]
+    fits = (np.minimum(*means) <= digits + 5e-5) & (np.maximum(*means) >= digits - 5e-5)
+    assert list(zip(x[fits], y[fits], strict=True)) == [(196, 182)]
+
+
+@pytest.mark.parametrize(("index", "estimate"), list(enumerate(TABLE_10, 1)))
+def test_means_from_the_first_sample_on_are_near_table_10(index, estimate):
+    assert printed.mean_from_start("10", index) == pytest.approx(estimate, rel=1e-2 * WORST_PERCENT)
+
+
+def test_worst_of_the_means_of_table_10():
+    assert printed.worst_mean_percent() == pytest.approx(WORST_PERCENT, abs=0.005)
+
+
+def test_free_parameters_are_counted_from_the_inferred_weights():
+    """The time, the rate of each inferred pair, and its ratio unless it is the printed one."""
+    for table, pairs in printed.INFERRED_WEIGHTS.items():
+        ratios = [x / y != printed.BOUNDS[i][2] / printed.BOUNDS[i][3] for i, (x, y) in pairs.items()]
+        assert printed.FREE_PARAMETERS[table] == 1 + len(pairs) + sum(ratios)
 
 
 def test_weights_of_e24_give_the_printed_estimates_and_the_printed_weights_do_not():
     for table, index, mean, estimate in (
-        ("5", 7, 759.2536, 759.2573),
+        ("5", 7, 759.2573, 759.2573),
         ("10", 7, 760.1875, 760.2266),
         ("10", 4, 6.2583, 6.2585),
     ):

@@ -172,7 +172,7 @@ def test_leaf_figures(leaf):
 
 def test_leaf_verdicts(leaf):
     found = {key: claim(key, [leaf]).verdict for key in CLAIMS}
-    fails, none = Verdict.CLAIM_FAILS, Verdict.NOT
+    fails, none = Verdict.CLAIM_FAILS, Verdict.NO_DATA
     assert list(found.values()) == [fails, fails, none, none, fails, Verdict.CLAIM_HOLDS, fails]
 
 
