@@ -1,0 +1,150 @@
+"""delta1, delta2 and N of Algorithm 1: bytes on the line -> the real program -> the real broker -> values on the topic."""
+
+import asyncio
+import contextlib
+import math
+import signal
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.cell import load_cell
+from tests.command_line import PROGRAM
+from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
+from tests.serial_line import Line, line
+
+__all__ = ["line"]
+
+CELL = load_cell("chen_mora")
+STEP_S, START_SOC, LAMBDA = 0.1, 0.5, 50_000.0
+"""lambda is large, so that N falls within seconds."""
+N_ERROR = 0.005
+"""The program lets e decay with one rate over a sample, which is good to half a percent of k; N falls by 0.5 here."""
+REPEAT_S = 0.05
+"""The first line is repeated at this interval until the program reads the port."""
+
+
+def rows() -> list[tuple[float, float, float]]:
+    """Time [s], current [A], voltage [V] of each line: the voltage is 0.25 V off the observer's start, then a load step."""
+    return [
+        (n * STEP_S, 0.1 if n < 20 else 0.4, round(4.05 - 0.001 * n - (0.02 if n >= 20 else 0.0), 4)) for n in range(40)
+    ]
+
+
+def text(row: tuple[float, float, float]) -> bytes:
+    return b"time_s=%.1f I=%.1f V=%.4f\r\n" % row
+
+
+def element(a: np.ndarray, first: int, soc: float, sign: float) -> float:
+    """(2.5) to (2.8)."""
+    return float(sign * a[first] * math.exp(-a[first + 1] * soc) + a[first + 2])
+
+
+def mittag_leffler(k: float) -> float:
+    """N(k) = E_2.5(-lambda k^2.5) by its series (3.11)."""
+    return math.fsum((-LAMBDA * k**2.5) ** j / math.gamma(2.5 * j + 1.0) for j in range(60))
+
+
+def algorithm_1(samples: list[tuple[float, float, float]]) -> Iterator[tuple[float, float, float]]:
+    """delta1, delta2 and N after each sample: (3.1) to (3.3), (3.12), (3.13), (3.15), (3.18), (4.1) in small steps.
+
+    N and y are held over a sample, as the program holds them.
+    """
+    bounds = [CELL.bounds(i) for i in range(1, 13)]
+    limit = np.array([0.0, *(b.limit for b in bounds)])
+    rate = np.array([1.0, *(b.rate for b in bounds)])
+    a = np.array([0.0, *(b.limit if b.initial is None else b.initial for b in bounds)])
+    soc, x2, x3, k, before_a = START_SOC, 0.0, 0.0, 0.0, samples[0][1]
+    a16, a17, a18, a19, a20, a21 = CELL.a[16:22]
+    steps = 4000
+    dt_s = STEP_S / steps
+    for n, (_, current_a, voltage_v) in enumerate(samples):
+        if n:
+            soc -= 0.5 * (before_a + current_a) * STEP_S / (CELL.cell.capacity_ah * 3600.0)
+            e_o = -a16 * math.exp(-a17 * soc) + a18 + a19 * soc - a20 * soc**2 + a21 * soc**3
+            tau_ts = element(a, 1, soc, 1.0) * element(a, 7, soc, -1.0)
+            tau_tl = element(a, 4, soc, 1.0) * element(a, 10, soc, -1.0)
+            gain = mittag_leffler(k)
+            for _ in range(steps):
+                e = voltage_v - e_o + x2 + x3
+                x2 += dt_s * (-x2 / tau_ts - gain * e)
+                x3 += dt_s * (-x3 / tau_tl - gain * e)
+                k += dt_s * e * e
+                a += dt_s * (e * e + rate * (limit - a))
+        before_a = current_a
+        yield -math.log(a[9] / a[7]) / a[8], -math.log(a[12] / a[10]) / a[11], mittag_leffler(k)
+
+
+@contextlib.asynccontextmanager
+async def program(folder: Path, line: Line, broker: Broker) -> AsyncIterator[None]:
+    pack = folder / "pack.toml"
+    pack.write_text(f"""
+[pack]
+cell = "chen_mora"
+initial_soc = {START_SOC}
+[sensor]
+port = "{line.path}"
+protocol = "text"
+[observer]
+law = "improved"
+lambda = {LAMBDA}
+dead_zone_v = 0.0
+rearm_gain = "never"
+lock_error_v = 10.0
+[identifier]
+enabled = false
+[publish]
+rate_hz = 10
+[mqtt]
+url = "{broker.url}"
+[state]
+folder = "{folder / "state"}"
+""")
+    process = await asyncio.create_subprocess_exec(str(PROGRAM), "run", str(pack), stdout=asyncio.subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGTERM)
+        assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+
+
+async def state_after(listener: Listener, row: tuple[float, float, float]) -> Any:
+    """The state that was published with this line as the latest."""
+    return await listener.wait_json("bms/pack/state", lambda s: s["board_time_s"] == pytest.approx(row[0], abs=1e-6))
+
+
+async def test_delta_1_delta_2_and_n_on_the_topic_are_algorithm_1_of_the_bytes_on_the_line(
+    tmp_path: Path, line: Line, broker: Broker
+) -> None:
+    samples, expected = rows(), list(algorithm_1(rows()))
+    line.plug()
+
+    async def repeat() -> None:
+        while True:
+            line.write(text(samples[0]))
+            await asyncio.sleep(REPEAT_S)
+
+    async with Listener(broker, "bms/#") as listener, program(tmp_path, line, broker):
+        repeating = asyncio.create_task(repeat())
+        await state_after(listener, samples[0])
+        repeating.cancel()
+        published = []
+        first = 1
+        for last in (1, 2, 12, 39):
+            line.write(b"".join(map(text, samples[first : last + 1])))
+            published.append((last, await state_after(listener, samples[last])))
+            first = last + 1
+    for last, state in published:
+        delta_1, delta_2, gain = expected[last]
+        assert state["delta_1"] == pytest.approx(delta_1, rel=2e-3), last
+        assert state["delta_2"] == pytest.approx(delta_2, rel=2e-3), last
+        assert state["nussbaum_gain"] == pytest.approx(gain, abs=N_ERROR), last
+        assert state["stability_margin"] == pytest.approx(state["soc"] - max(delta_1, delta_2), abs=1e-4), last
+    gains = [state["nussbaum_gain"] for _, state in published]
+    assert gains[0] - gains[-1] > 0.4
+    assert published[0][1]["delta_1"] < 0.8 * published[-1][1]["delta_1"]
