@@ -20,6 +20,7 @@ from bms_estimator.calibration.ocv import ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv_points import pooled
 from bms_estimator.calibration.ocv_table import TableFit, fit_table
 from bms_estimator.calibration.prediction import Prediction, predict, static_elements
+from bms_estimator.calibration.printed_bounds import printed_bounds
 from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, rest_current_a, without_glitches
 from bms_estimator.calibration.series_resistance import (
     SeriesResistance,
@@ -30,7 +31,7 @@ from bms_estimator.calibration.series_resistance import (
 )
 from bms_estimator.calibration.soc_lookup import soc_by_interpolation
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.cell import Bounds, CellModel, load_cell
+from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import ObserverSettings
@@ -88,24 +89,6 @@ def kind_of(name: str, samples: SampleBlock, capacity_ah: float) -> Kind:
     if loaded.size and loaded.std() < STEADY * abs(loaded.mean()):
         return Kind.RELAXATION
     return Kind.STEPS
-
-
-def printed_bounds(cell: CellModel) -> dict[str, Bounds]:
-    """Table 10's bounds and initial values of a1..a12, scaled from its pack to ``cell``.
-
-    Resistances go with the cells in series over the capacity, capacitances against it; exponents stay. They are known
-    before anything is measured: no capture has a part in them.
-    """
-    printed = load_cell("thunder_power_6s")
-    ohm = (cell.cell.series_count * printed.cell.capacity_ah) / (printed.cell.series_count * cell.cell.capacity_ah)
-    found = {}
-    for name, bounds in printed.adaptation.items():
-        element, place = divmod(int(name[1:]) - 1, 3)
-        factor = 1.0 if place == 1 else 1.0 / ohm if element in (2, 3) else ohm
-        table = bounds.model_dump()
-        scaled = {key: factor * table[key] for key in ("upper", "lower", "initial") if table[key] is not None}
-        found[name] = Bounds.model_validate(table | scaled)
-    return found
 
 
 class Protocol:

@@ -11,6 +11,13 @@ from bms_estimator.kernels.ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
 
 EKF_VOLTAGE_SIGMA_V = 0.005
 """Measurement noise of the textbook filter [V]."""
+ELEMENT_STD, ELEMENT_WALK = 0.7, 1e-6
+"""Joint filter: std of ln of each element at the start, a factor of two, and the variance of its random walk [1/s]: of 1e-8,
+1e-7 and 1e-6 what suits NCR 5 best."""
+NOISE_WINDOW_S = 60.0
+"""Joint filter: time constant with which the noise of the voltage follows the innovations [s]."""
+LN_SPAN = math.log(4.0)
+"""Joint filter: elements stay within a quarter and four times the start, as those of the observer do."""
 FIVE_SIGMA_V = 0.1
 """The same in the mean of a second, of the filter with five time constants [V]: of 5, 20, 50, 100 and 200 mV what suits it best."""
 FIVE_TAU_S = np.array([2.0, 15.0, 80.0, 400.0, 2000.0])
@@ -56,6 +63,69 @@ def fixed_ekf(
         p = p - np.outer(ph, ph) / s
         soc[k], std[k] = x[0], math.sqrt(p[0, 0])
     return soc, std
+
+
+@njit
+def joint_ekf(
+    time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats
+) -> tuple[Floats, Floats]:
+    """Joint extended Kalman filter over (soc, v1, v2, ln R_s, ln R_1, ln tau_1, ln R_2, ln tau_2).
+
+    The noise of the voltage is adapted from the innovations of the last minute, as an adaptive EKF does.
+
+    Args:
+        time_s: Shape (n,) [s].
+        current_a: Shape (n,), positive on discharge [A].
+        voltage_v: Shape (n,) [V].
+        soc0: SOC at the first sample, 0..1.
+        cell: Start: capacity [A s], R_s, R_1 [ohm], tau_1 [s], R_2 [ohm], tau_2 [s].
+        grid: Shape (2, m): OCV and its slope over SOC 0..1 [V].
+
+    Returns:
+        SOC at each sample, shape (n,), and R_s, R_1, tau_1, R_2, tau_2, shape (n, 5).
+    """
+    x = np.zeros(8)
+    x[0], x[3:] = soc0, np.log(cell[1:])
+    p = np.diag(np.array([0.2**2, 0.01**2, 0.01**2, 1.0, 1.0, 1.0, 1.0, 1.0]) * np.ones(8))
+    p[3:, 3:] *= ELEMENT_STD**2
+    q = np.array([1e-10, 1e-9, 1e-9, 0.0, 0.0, 0.0, 0.0, 0.0])
+    q[3:] = ELEMENT_WALK
+    soc, elements = np.empty(len(time_s)), np.empty((len(time_s), 5))
+    noise_v2, h = EKF_VOLTAGE_SIGMA_V**2, np.zeros(8)
+    h[1], h[2] = -1.0, -1.0
+    for k in range(len(time_s)):
+        dt = 0.0
+        if k > 0:
+            dt = max(time_s[k] - time_s[k - 1], 0.0)
+            f, i = np.eye(8), current_a[k - 1]
+            x[0] -= dt / cell[0] * i
+            for branch in range(2):
+                r, tau = math.exp(x[4 + 2 * branch]), math.exp(x[5 + 2 * branch])
+                decay = math.exp(-dt / tau)
+                v = x[1 + branch]
+                f[1 + branch, 1 + branch] = decay
+                f[1 + branch, 4 + 2 * branch] = r * (1.0 - decay) * i  # by ln R
+                f[1 + branch, 5 + 2 * branch] = (v - r * i) * decay * dt / tau  # by ln tau
+                x[1 + branch] = decay * v + r * (1.0 - decay) * i
+            p = f @ p @ f.T + np.diag(q * dt)
+        ohmic_v = current_a[k] * math.exp(x[3])
+        h[0] = (ocv(x[0] + 1e-4, grid[0], grid[1]) - ocv(x[0] - 1e-4, grid[0], grid[1])) / 2e-4
+        h[3] = -ohmic_v
+        innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1] - x[2] - ohmic_v)
+        ph = p @ h
+        model_v2 = h @ ph
+        noise_v2 += min(dt / NOISE_WINDOW_S, 1.0) * (innovation**2 - model_v2 - noise_v2)
+        noise_v2 = max(noise_v2, EKF_VOLTAGE_SIGMA_V**2)
+        s = model_v2 + noise_v2
+        x = x + ph / s * innovation
+        x[0] = min(max(x[0], 0.0), 1.0)
+        for j in range(5):  # the bounds that every method has
+            start = math.log(cell[1 + j])
+            x[3 + j] = min(max(x[3 + j], start - LN_SPAN), start + LN_SPAN)
+        p = p - np.outer(ph, ph) / s
+        p = 0.5 * (p + p.T)
+        soc[k], elements[k] = x[0], np.exp(x[3:])
+    return soc, elements
 
 
 def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]:

@@ -31,7 +31,7 @@ def thinned(samples: SampleBlock, change_a: float) -> SampleBlock:
 
 
 def fit(
-    cell: CellModel, samples: SampleBlock, initial_soc: float, start: dict[str, float]
+    cell: CellModel, samples: SampleBlock, initial_soc: float, start: dict[str, float], seed: int
 ) -> tuple[float, float, float, float, float] | None:
     """R_s, R_1 [ohm], C_1 [F], R_2 [ohm], C_2 [F] of least squares on a capture that begins rested.
 
@@ -42,6 +42,7 @@ def fit(
         samples: Of the capture.
         initial_soc: At its first sample.
         start: Elements by their names at PyBOP.
+        seed: Seed of the random numbers that CMA-ES draws.
 
     Returns:
         None where it would take more than a minute or so: a capture without longer rests or steps cannot be thinned.
@@ -88,6 +89,7 @@ def fit(
         pybop.pybamm.Simulator(model, parameter_values=values, protocol=dataset, solver=solver),
         pybop.SumSquaredError(dataset),
     )
+    np.random.seed(seed)  # noqa: NPY002 - the generator that pints draws CMA-ES's own seed from
     result = pybop.CMAES(problem, options=pybop.PintsOptions(max_iterations=100)).run()
     best = result.best_inputs
     return tuple(float(best[name]) for name in ("R0 [Ohm]", "R1 [Ohm]", "C1 [F]", "R2 [Ohm]", "C2 [F]"))  # type: ignore[return-value]

@@ -12,7 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.calibration.adapt_steps import Start, steps_2_and_3
 from bms_estimator.calibration.prediction import open_circuit, predict
+from bms_estimator.calibration.printed_bounds import printed_bounds
 from bms_estimator.calibration.relaxation import soc_by_counting
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter
@@ -22,7 +24,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
-from tests.benchmarks.baselines import fixed_ekf, rls_arx, simulate_arx
+from tests.benchmarks.baselines import fixed_ekf, joint_ekf, rls_arx, simulate_arx
 
 Floats = NDArray[np.float64]
 Reader = Callable[[Estimator, CellModel], Floats]
@@ -35,6 +37,8 @@ WHOLE = 0.9
 TRACED_S = 30.0
 """How often R_s is read from the observer's parameters."""
 RLS_EVERY_S, RLS_FORGETTING = 1.0, 0.9995
+SEEDS = range(1, 6)
+"""PyBOP's optimizer draws random numbers: one fit for each seed."""
 
 
 class Learned(Protocol):
@@ -53,6 +57,9 @@ class Learned(Protocol):
         """Times [s] and R_s [ohm] while it goes on learning from a capture."""
 
 
+Learn = Callable[[CellModel, SampleBlock, float], Learned | None]
+
+
 @dataclass(frozen=True)
 class Method:
     """A method by its name in the tables.
@@ -61,11 +68,13 @@ class Method:
         name: Of the method.
         learn: From the cell of the start, the samples and the SOC at the first of them; None: it cannot.
         run: What a step costs is measured with: a call that takes all samples; None: it is offline.
+        other_seeds: ``learn`` with other random numbers, of a method that draws any.
     """
 
     name: str
-    learn: Callable[[CellModel, SampleBlock, float], Learned | None]
+    learn: Learn
     run: Callable[[CellModel, SampleBlock], Callable[[], object]] | None
+    other_seeds: tuple[Learn, ...] = ()
 
 
 class Elements:
@@ -106,6 +115,37 @@ class FixedEkf(Elements):
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
         """As ``Learned``."""
         return fixed_ekf(*_columns(samples), start_soc, textbook(self.cell), np.array(ocv_grid(self.cell)))[0]
+
+
+class Counted(Elements):
+    """Elements of a method whose SOC is coulomb counting."""
+
+    def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
+        """As ``Learned``."""
+        return np.clip(soc_by_counting(samples, self.cell.cell.capacity_ah, start_soc), 0.0, 1.0)
+
+
+class JointEkf(Elements):
+    """A filter over SOC, two RC voltages and five elements; these are its geometric mean over the last half of a capture."""
+
+    def __init__(self, cell: CellModel, samples: SampleBlock, initial_soc: float) -> None:
+        _, elements = joint_ekf(*_columns(samples), initial_soc, textbook(cell), np.array(ocv_grid(cell)))
+        learned = np.exp(np.log(elements[len(elements) // 2 :]).mean(axis=0))
+        r_s, r1, tau1, r2, tau2 = learned.tolist()
+        super().__init__(cell, constant_a(r_s, r1, tau1 / r1, r2, tau2 / r2))
+        self.start = textbook(cell)
+        self.start[1:] = learned
+
+    def _run(self, samples: SampleBlock, start_soc: float) -> tuple[Floats, Floats]:
+        return joint_ekf(*_columns(samples), start_soc, self.start, np.array(ocv_grid(self.cell)))
+
+    def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
+        """As ``Learned``."""
+        return self._run(samples, start_soc)[0]
+
+    def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
+        """As ``Learned``."""
+        return samples["time_s"].copy(), self._run(samples, initial_soc)[1][:, 0]
 
 
 class Observed(Elements):
@@ -241,36 +281,58 @@ def run_arx(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:
     return lambda: rls_arx(current_a, over_v, RLS_FORGETTING)
 
 
-def fit_offline(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned | None:
-    """PyBOP's fit of constant elements, where it is not too long."""
-    from tests.benchmarks.pybop_fit import fit  # noqa: PLC0415 - an optional, heavy package
-
-    _, r_s, r1, tau1, r2, tau2 = textbook(cell).tolist()
-    start = {"R0 [Ohm]": r_s, "R1 [Ohm]": r1, "C1 [F]": tau1 / r1, "R2 [Ohm]": r2, "C2 [F]": tau2 / r2}
-    found = fit(cell, samples, initial_soc, start)
-    return constant(cell, *found) if found else None
+def learn_thesis(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
+    """Steps 2 and 3 of the thesis with the bounds of its Table 10; step 1 is the OCV that every method is given."""
+    return learn_from_start(cell.model_copy(update={"adaptation": printed_bounds(cell)}), samples, initial_soc)
 
 
-def constant(cell: CellModel, r_s: float, r1: float, c1: float, r2: float, c2: float) -> Elements:
-    """Elements that are the same at any SOC."""
+def learn_from_start(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
+    """Steps 2 and 3 with bounds around the start."""
+    return Counted(cell, steps_2_and_3(cell, [Start(samples, initial_soc)], LOWEST_SOC).a)
+
+
+def run_joint_ekf(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:
+    """The filter over all samples."""
+    columns, model, grid = _columns(samples), textbook(cell), np.array(ocv_grid(cell))
+    return lambda: joint_ekf(*columns, 1.0, model, grid)
+
+
+def offline_fit(seed: int) -> Learn:
+    """PyBOP's fit of constant elements with the random numbers of ``seed``."""
+
+    def learn(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned | None:
+        from tests.benchmarks.pybop_fit import fit  # noqa: PLC0415 - an optional, heavy package
+
+        _, r_s, r1, tau1, r2, tau2 = textbook(cell).tolist()
+        start = {"R0 [Ohm]": r_s, "R1 [Ohm]": r1, "C1 [F]": tau1 / r1, "R2 [Ohm]": r2, "C2 [F]": tau2 / r2}
+        found = fit(cell, samples, initial_soc, start, seed)
+        return Elements(cell, constant_a(*found)) if found else None
+
+    return learn
+
+
+def constant_a(r_s: float, r1: float, c1: float, r2: float, c2: float) -> Floats:
+    """a1..a15 of elements that are the same at any SOC. Shape (16,)."""
     tiny = 1e-30
-    return Elements(
-        cell, np.array([np.nan, tiny, 1.0, r1, tiny, 1.0, r2, tiny, 1.0, c1, tiny, 1.0, c2, tiny, 1.0, r_s])
-    )
+    return np.array([np.nan, tiny, 1.0, r1, tiny, 1.0, r2, tiny, 1.0, c1, tiny, 1.0, c2, tiny, 1.0, r_s])
 
 
 PRINTED, LEARNING, ON = ObserverSettings(), ObserverSettings(law="learning"), IdentifierSettings()
 FILE = Method("the file, EKF", learn_nothing, run_ekf)
 """What the start was before it was made wrong, for comparison."""
+OFFLINE = tuple(map(offline_fit, SEEDS))
 METHODS = (
     observer("UAS printed", PRINTED, None, by_observer),
+    Method("thesis, steps 1-3", learn_thesis, None),
+    Method("steps 1-3, bounds of the start", learn_from_start, None),
     observer("UAS, bounds identified", PRINTED, ON, by_observer),
     observer("UAS learning", LEARNING, None, by_observer),
     observer("UAS learning + filter", LEARNING, ON, by_observer),
     observer("identifier", PRINTED, ON, by_identifier),
     Method("EKF, fixed", learn_nothing, run_ekf),
     Method("RLS", learn_arx, run_arx),
-    *((Method("PyBOP", fit_offline, None),) if find_spec("pybop") else ()),
+    Method("joint AEKF", JointEkf, run_joint_ekf),
+    *((Method("PyBOP", OFFLINE[0], None, OFFLINE[1:]),) if find_spec("pybop") else ()),
 )
 
 
