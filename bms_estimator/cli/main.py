@@ -32,6 +32,7 @@ COMMANDS = {
     "identify": Entry(
         "bms_estimator.cli.identify:identify_command", "A cell's elements from captures, into a cell file."
     ),
+    "adapt": Entry("bms_estimator.cli.adapt:adapt_command", "a1..a15 by the thesis's observer, into a cell file."),
     "capacity": Entry("bms_estimator.cli.capacity:capacity", "Capacity from rests and the charge between them."),
     "cell": Entry("bms_estimator.cli.cell:app", "What a pack's service has learned, as a cell file."),
     "history": Entry("bms_estimator.cli.history:history", "What the service kept of a pack, by the minute, as CSV."),

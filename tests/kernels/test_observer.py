@@ -131,6 +131,21 @@ def test_gain_is_rearmed_before_its_sign_turns() -> None:
     assert trace["lock"].all()
 
 
+def test_a_gain_of_the_wrong_sign_turns_and_the_error_comes_back() -> None:
+    """N(k0) < 0 is what a wrong sign of b amounts to: the error grows until k has carried N to the other sign."""
+    cell = load_cell("chen_mora")
+    samples = discharge(cell, 0.1, 1.0, 0.1)
+    samples["voltage_v"] += 0.2 * np.where(samples["time_s"] // 20 % 2 == 0, 1.0, -1.0)
+    settings = ObserverSettings(nussbaum="k2-cos", k0=2.0, dead_zone_v=0.0, rearm_gain=None)
+    estimator = Estimator(cell, settings, initial_soc=0.9, identifier=None)
+    trace = estimator.run(samples)
+    gain, error_v = trace["nussbaum_gain"], np.abs(trace["tracking_error_v"])
+    assert gain[0] < 0.0 < gain[-1]
+    assert error_v.max() > 10.0 * 0.4  # ten times the disturbance
+    assert error_v[-20:].max() < 0.41  # the disturbance alone
+    assert estimator.state["lock_losses"][0] == 0
+
+
 @pytest.mark.parametrize("nussbaum", ["k2-cos", "k-cos-sqrt", "ln-cos-sqrt-ln"])
 def test_a_gain_that_begins_at_zero_is_left_to_rise(nussbaum: str) -> None:
     cell = load_cell("chen_mora")

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from tests.benchmarks.recipes import DATA, cell_file
 from tests.benchmarks.side_by_side.measure import Bench, Figure, Reference, of_trial, step_costs
-from tests.benchmarks.side_by_side.tables import figure_tables, reference_table
+from tests.benchmarks.side_by_side.tables import figure_tables, reference_table, seed_table
 from tests.benchmarks.side_by_side.trials import TRIALS, chosen
 
 TIMED = (TRIALS[0], TRIALS[2])
@@ -48,6 +48,7 @@ def main() -> None:
     console.print(reference_table(references))
     for table in figure_tables(figures):
         console.print(table)
+    console.print(seed_table(figures))
 
 
 if __name__ == "__main__":

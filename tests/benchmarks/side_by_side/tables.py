@@ -37,6 +37,7 @@ TABLES = {
     STEP: ("a step [ns]", 0),
     FIT: ("a fit, processor time [s]", 1),
 }
+PYBOP = "PyBOP"
 FACTORS = (R_S, TAU_TS, TAU_TL)
 NOTHING = -np.inf
 """A method does not do that, or nothing shows it."""
@@ -92,10 +93,27 @@ def figure_table(name: str, figures: list[Figure], title: str, digits: int) -> T
         table.add_row(row, *(" / ".join(text(x, digits, name) for x in some) or "-" for some in each))
     if name != JUMP:
         table.add_row("geometric mean", *(over_rows(column, digits) for column in values.T))
+        common = np.isfinite(values[:, [j for j, method in enumerate(shown) if method == PYBOP]]).all(axis=1)
+        if PYBOP in shown and not common.all():
+            means = (over_rows(column, digits) for column in values[common].T)
+            table.add_row(f"geometric mean, the {common.sum()} rows of PyBOP", *means)
     compete = [j for j, method in enumerate(shown) if method != FILE.name]
     took_part = np.where(values == NOTHING, np.nan, np.nan_to_num(values, nan=np.inf, posinf=np.inf))[:, compete]
     ranks = rankdata(took_part.round(digits), axis=1, nan_policy="omit")
     table.add_row("mean rank", *(f"{x:.1f}" for x in np.nanmean(ranks, axis=0)))
+    return table
+
+
+def seed_table(figures: Iterable[Figure]) -> Table:
+    """Spread of PyBOP's voltage over its seeds: lowest, median and highest mean over both starts, for each row."""
+    table = Table(
+        "", "seeds", "lowest", "median", "highest", title="PyBOP: voltage RMS over its seeds [mV]", box=box.MARKDOWN
+    )
+    of_it = [f for f in figures if (f.table, f.method) == (VOLTAGE, PYBOP)]
+    for row in dict.fromkeys(f.row for f in of_it):
+        seeds = sorted({f.seed for f in of_it if f.row == row})
+        means = [np.mean([f.value for f in of_it if (f.row, f.seed) == (row, seed)]) for seed in seeds]
+        table.add_row(row, f"{len(seeds)}", *(f"{x:.1f}" for x in np.percentile(means, (0, 50, 100))))
     return table
 
 

@@ -1,0 +1,49 @@
+"""``adapt``: the thesis's steps 2 and 3 on captures."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration import adapt
+from bms_estimator.kernels.cell import r_s
+from bms_estimator.model.cell import load_cell
+from tests.calibration.simulated_load import TRUTH, capture, steps
+from tests.command_line import run
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    """A capture of steps as a file."""
+    samples = capture(steps(0), seed=0)
+    rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
+    path = tmp_path / "steps.csv"
+    np.savetxt(path, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
+    return path
+
+
+def test_adapt_writes_a_cell_with_the_series_resistance_of_the_capture(table, tmp_path, capsys):
+    out = tmp_path / "mine.toml"
+    code, text, err = run(capsys, "adapt", table, "--cell", "ncr18650", "--out", out, "--json")
+    assert (code, err) == (0, "")
+    found, cell = json.loads(text), load_cell(out)
+    assert set(found["a"]) == {f"a{i}" for i in range(1, 16)}
+    assert found["a"]["a1"]["std"] is None
+    assert found["a"]["a15"]["std"] > 0.0
+    assert found["score_after_percent"] <= 1.05 * found["score_before_percent"]
+    assert [cell.a[i] for i in range(1, 16)] == pytest.approx([found["a"][f"a{i}"]["value"] for i in range(1, 16)])
+    assert cell.ladder is not None
+    assert cell.ladder.error_v == pytest.approx(1e-3 * found["error_mv"])
+    dc_ohm = r_s(0.5, cell.a)
+    assert dc_ohm == pytest.approx(r_s(0.5, TRUTH.a), rel=0.3)
+
+
+def test_a_file_that_makes_replays_worse_is_not_written(table, tmp_path, capsys, monkeypatch):
+    scores = iter([1.0, 9.0])
+    monkeypatch.setattr(adapt, "interval_score", lambda *_: next(scores))
+    out = tmp_path / "worse.toml"
+    code, text, err = run(capsys, "adapt", table, "--cell", "ncr18650", "--out", out)
+    assert (code, text) == (2, "")
+    assert "from 1.00 to 9.00 % of SOC" in err
+    assert not out.exists()
