@@ -134,8 +134,10 @@ def test_gain_is_rearmed_before_its_sign_turns() -> None:
 def test_a_gain_of_the_wrong_sign_turns_and_the_error_comes_back() -> None:
     """N(k0) < 0 is what a wrong sign of b amounts to: the error grows until k has carried N to the other sign."""
     cell = load_cell("chen_mora")
-    samples = discharge(cell, 0.1, 1.0, 0.1)
-    samples["voltage_v"] += 0.2 * np.where(samples["time_s"] // 20 % 2 == 0, 1.0, -1.0)
+    time_s = np.arange(0.0, 4_000.0, 1.0)
+    current_a = np.full(time_s.size, 0.1)
+    voltage_v, _ = simulate_cell((0.9, 0.0, 0.0), time_s, current_a, 0.275 * 3600, cell.a)
+    samples = block(time_s, current_a, voltage_v + 0.2 * np.where(time_s // 20 % 2 == 0, 1.0, -1.0))
     settings = ObserverSettings(nussbaum="k2-cos", k0=2.0, dead_zone_v=0.0, rearm_gain=None)
     estimator = Estimator(cell, settings, initial_soc=0.9, identifier=None)
     trace = estimator.run(samples)
