@@ -92,7 +92,8 @@ class Elements:
             error_v = predict(self.cell, samples, initial_soc, a=self.a, lowest_soc=LOWEST_SOC).error_v
         except UserError:
             return None
-        return 1e3 * _rms(error_v) if error_v.size >= WHOLE * whole else None
+        rms_mv = 1e3 * _rms(error_v)
+        return rms_mv if error_v.size >= WHOLE * whole and rms_mv < MOST_MV else None
 
     def elements(self, soc: Floats) -> Floats:
         """As ``Learned``."""
