@@ -44,6 +44,19 @@ LOWEST, HIGHEST = -0.05, 1.05
 """Where the SOC of a filter may be."""
 MOST_STDS = 3.0
 """Resistances are within so many of their first std."""
+LEAST_LN_Q, MOST_LN_Q = math.log(0.5), math.log(1.3)
+"""Limits of the learned over the declared capacity: age takes up to half of it, no make holds much more than it declares."""
+NO_CAPACITY, ALL = STATES, STATES + 1
+"""An update that changes all states but the capacity, and one that changes all."""
+OWN_R_STD = 0.5
+"""Std of ln R that series resistance and branches have each of their own. What exceeds it is common: the size of the cell.
+A cell file with more is of no cell that was measured."""
+REST_C, SMALL_C, NEARLY_FULL = 0.02, 0.4, 0.9
+"""Currents below which the overpotential does not hide the capacity: above an SOC of ``NEARLY_FULL``, and elsewhere [C]."""
+CHARGE, CHARGE_C = TREND + 1, 0.04
+"""The branch of 500 s, and the current in it of a charge that is no regeneration [C]."""
+VARYING_C = 0.2
+"""Standard deviation over 10 min of a load that tells resistance from capacity [C]."""
 
 
 @njit(cache=True)
@@ -75,7 +88,7 @@ def predict(s: Record, p: Record, q: int) -> None:
     F is diagonal but for what offset and capacity do to the SOC, and the offset to the branches.
     """
     x, cov, f, w = s.mean[q], s.covariance[q], s.f, s.window
-    bias_v2 = bias_variance(s, p, x[SOC])
+    bias_v2 = bias_variance(s, p, q)
     capacity_as = p.capacity_as * math.exp(x[LN_Q])
     moved = (w.charge_as - x[OFFSET] * w.time_s) / capacity_as
     f[CURVE] = math.exp(-w.throughput_as / p.capacity_as / on_grid(x[SOC], p.curve_soc))
@@ -137,7 +150,8 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
             break
         soc, variance = to_soc, to_variance
         innovation_v, total_v2, straight_v2 = innovate(s, p, q, variance_v2, soc, variance)
-    correct(x, cov, ph, innovation_v, total_v2)
+    correct(x, cov, ph, innovation_v, total_v2, first_held(s, p, q))
+    x[LN_Q] = min(max(x[LN_Q], LEAST_LN_Q), MOST_LN_Q)
     most = MOST_STDS * resistance_std(s, p)
     for j in (LN_R0, LN_R):
         x[j] = min(max(x[j], -most), most)
@@ -216,20 +230,48 @@ def observe(s: Record, q: int, j: int, value: float, variance: float) -> None:
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     for k in range(STATES):
         ph[k] = cov[j, k]
-    correct(x, cov, ph, value - x[j], cov[j, j] + variance)
+    correct(x, cov, ph, value - x[j], cov[j, j] + variance, ALL)
 
 
 @njit(cache=True)
-def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: float) -> None:
-    """State and P by an innovation e of variance S: x + P H' e / S, P - P H' H P / S. ``ph`` is P H', and scratch afterwards."""
+def first_held(s: Record, p: Record, q: int) -> int:
+    """First state of the curve that a voltage must not change; ``NO_CAPACITY`` or ``ALL`` where it may change the curve.
+
+    A SOC outside 0..1 is limited, so the voltage error there is not one of the sensor, the capacity or the curve.
+    Where resistances are hardly known, resistance and capacity change the voltage alike under a large constant current, and
+    so does a charge at a constant voltage. The capacity is then learned at rest, at small currents and while a discharge varies.
+    """
+    soc, one_c = s.mean[q, SOC], p.capacity_as / 3600.0
+    trend_a = s.x_a[TREND]
+    if not 0.0 <= soc <= 1.0:
+        return CURVE if s.x_a[CHARGE] < -CHARGE_C * one_c else NODE
+    small_a = REST_C * one_c if soc > NEARLY_FULL else SMALL_C * one_c
+    varying = trend_a > 0.0 and s.rms_a2 - s.mean_a * s.mean_a > (VARYING_C * one_c) ** 2
+    return ALL if p.r_std <= OWN_R_STD or abs(trend_a) < small_a or varying else NO_CAPACITY
+
+
+@njit(cache=True)
+def is_held(j: int, first: int) -> bool:
+    """Whether state ``j`` keeps its mean and variance, by what ``first_held`` returns."""
+    return j >= first or (j == LN_Q and first <= NO_CAPACITY) or (j == OFFSET and first < NO_CAPACITY)
+
+
+@njit(cache=True)
+def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: float, first: int) -> None:
+    """State and P by an innovation e of variance S: x + P H' e / S, P - P H' H P / S. ``ph`` is P H', and scratch afterwards.
+
+    States that are held keep their mean and covariance: their gain is 0 (Schmidt-Kalman filter).
+    """
     scale = 1.0 / math.sqrt(variance)
     for j in range(STATES):
         ph[j] *= scale
     for j in range(STATES):
-        along, row = ph[j], cov[j]
-        x[j] += along * scale * innovation
+        along, row, held = ph[j], cov[j], is_held(j, first)
+        if not held:
+            x[j] += along * scale * innovation
         for k in range(STATES):
-            row[k] -= along * ph[k]  # the same at k, j to the last bit
+            if not (held and is_held(k, first)):
+                row[k] -= along * ph[k]  # the same at k, j to the last bit
     x[SOC] = min(max(x[SOC], LOWEST), HIGHEST)
 
 

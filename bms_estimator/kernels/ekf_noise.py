@@ -50,6 +50,8 @@ LOWER_HALF = 0.5
 """SOC below which a cell may be empty early."""
 STEEP_V = 1.0
 """Slope of the OCV of a cell that is its last fall [V]; where it is less, ``curve_error_v`` says how wrong the curve is."""
+USUAL_LN_R = 0.25
+"""Up to this ln of the resistances over those of the file, the error of the model does not grow with them."""
 OUTSIDE_K = 30.0
 """So far outside the temperatures of the cell file, errors are twice as large [K]."""
 
@@ -89,12 +91,15 @@ def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> flo
 
 
 @njit(cache=True)
-def bias_variance(s: Record, p: Record, soc: float) -> float:
-    """Variance of B_SLOW + B_FAST [V^2] at a steady state: resistances are wrong in proportion, and along SOC.
+def bias_variance(s: Record, p: Record, q: int) -> float:
+    """Variance of B_SLOW + B_FAST [V^2] of hypothesis ``q`` at a steady state: resistances are wrong in proportion, and along SOC.
+
+    Resistances that were found to be larger than those of the file leave a larger error.
 
     A cold cell is empty early, and no file says well by how much: in its lower half the shift along SOC grows in the cold as
     their weak part does, and moves the last fall of the OCV, too.
     """
+    soc, scale = s.mean[q, SOC], math.exp(max(s.mean[q, LN_R] - USUAL_LN_R, 0.0))
     ohm = total_resistance(s, p, soc)
     shift, early_v = p.bias_soc, 0.0
     if soc < LOWER_HALF:
@@ -105,7 +110,7 @@ def bias_variance(s: Record, p: Record, soc: float) -> float:
     grown = max(ohm - p.middle_ohm, 0.0)
     floor_a = FLOOR_C * p.capacity_as / 3600.0
     wrong_ohm2 = (p.bias_relative * ohm) ** 2 + (p.bias_grown * grown) ** 2 + (0.5 * steep) ** 2
-    wrong_v2 = wrong_ohm2 * max(s.rms_a2, floor_a * floor_a) + early_v * early_v
+    wrong_v2 = scale * scale * wrong_ohm2 * max(s.rms_a2, floor_a * floor_a) + early_v * early_v
     return outside(p, s.temperature_c) ** 2 * wrong_v2
 
 

@@ -13,7 +13,7 @@ import math
 from numba import njit
 
 from bms_estimator.kernels.charge import LONGEST_FLOW_S, along_line, held_current
-from bms_estimator.kernels.ekf import HIGHEST, LOWEST, decay, inflate, predict, update
+from bms_estimator.kernels.ekf import HIGHEST, LOWEST, OWN_R_STD, decay, inflate, predict, update
 from bms_estimator.kernels.ekf_noise import (
     bias_variance,
     measurement_variance,
@@ -74,6 +74,8 @@ COLDEST_C, HOTTEST_C = -60.0, 120.0
 """Where a cell's temperature may be [C]."""
 LEAST_STD = 0.005
 """What full and empty are of a cell is known no better, std of SOC."""
+UNKNOWN_FULL = 0.03
+"""Std of the SOC, over that of ln R, of a cell that was not measured: another make is full elsewhere on the curve."""
 HYST_STD = 0.7
 """Std of the first hysteresis."""
 KNOWN_S = 1800.0
@@ -108,6 +110,7 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     x[:] = 0.0
     cov[:, :] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
+    cov[LN_R0, LN_R] = cov[LN_R, LN_R0] = max(resistance_std(s, p) ** 2 - OWN_R_STD**2, 0.0)
     s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
@@ -155,7 +158,7 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
         s.mean[q, SOC] = min(max(soc + away, LOWEST), HIGHEST)
         s.covariance[q, SOC, SOC] = std * std
         s.ln_weight[q] = -0.5 * (away / soc_std) ** 2 - 0.5 * ((soc + away - s.mean[q, SOC]) / BEYOND_STD) ** 2
-        half_v2 = 0.5 * bias_variance(s, p, s.mean[q, SOC])
+        half_v2 = 0.5 * bias_variance(s, p, q)
         s.covariance[q, B_SLOW, B_SLOW] = s.covariance[q, B_FAST, B_FAST] = half_v2
         s.minute_u[q] = s.ten_minutes_u[q] = 0.0
         s.fast_inflation[q] = s.slow_inflation[q] = 1.0
@@ -308,7 +311,7 @@ def strain2(s: Record, p: Record, q: int) -> float:
     """
     bias_v, soc = s.mean[q, B_SLOW] + s.mean[q, B_FAST], s.mean[q, SOC]
     hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)
-    wrong_v2 = bias_variance(s, p, soc) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
+    wrong_v2 = bias_variance(s, p, q) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
     return bias_v * bias_v / wrong_v2
 
 
@@ -316,4 +319,4 @@ def strain2(s: Record, p: Record, q: int) -> float:
 def pack_std(s: Record, p: Record) -> float:
     """Std of the SOC as of the emptiest of cells in series: nobody sees how far below their mean it lies."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
-    return math.hypot(max(s.soc_std, LEAST_STD), spread)
+    return math.hypot(max(s.soc_std, LEAST_STD, UNKNOWN_FULL * p.r_std), spread)

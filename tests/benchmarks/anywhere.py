@@ -36,6 +36,7 @@ from bms_estimator.model.settings import IdentifierSettings
 from tests.benchmarks.baselines import FIVE_TAU_S, five_branches, fixed_ekf, ladder_ekf
 from tests.benchmarks.pulses import pulse_table
 from tests.benchmarks.recipes import GROUPS, Group, charge_ah, chosen, runs
+from tests.estimator.anywhere import cycles
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import Score, score
 
@@ -65,7 +66,27 @@ def main() -> None:
         for group in chosen(GROUPS, sys.argv[1:]):
             table.add_row(group.name, *cells_of(list(outcomes(group, Path(folder)))))
         console.print(table)
+        console.print(cycle_table(sys.argv[1:]))
         console.print(pulse_table(Path(folder), sys.argv[1:]))
+
+
+def cycle_table(names: list[str]) -> Table:
+    """Table of simulated full cycles and charges from empty, one row for each generic cell that matches ``names``."""
+    table = Table(title="full cycles and charges from empty, simulated: RMSE/worst, inside/worst, std, score in %")
+    for column in ("generic cell", "RMSE", "inside", "std", "score"):
+        table.add_column(column)
+    for chemistry in cycles.CHEMISTRIES:
+        if not names or any(name.lower() in f"cycles {chemistry}" for name in names):
+            scores = [row.score for row in cycles.rows(chemistry)]
+            rmse, cover = [s.rmse for s in scores], [s.cover for s in scores]
+            table.add_row(
+                chemistry,
+                f"{np.sqrt(np.mean(np.square(rmse))):.1f}/{max(rmse):.1f}",
+                f"{mean(cover):.0f}/{min(cover):.0f}",
+                f"{mean([s.std for s in scores]):.1f}",
+                f"{mean([s.score for s in scores]):.1f}",
+            )
+    return table
 
 
 def cells_of(found: list[Outcome]) -> Iterator[str]:

@@ -233,7 +233,7 @@ def test_above_the_temperatures_of_the_cell_file_nothing_is_surer() -> None:
     sizes = []
     for s["temperature_c"] in (30.0, 45.0, 60.0):
         hypotheses.follow_temperature(s)
-        sizes.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0.55)))
+        sizes.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0)))
     assert sizes[1] == pytest.approx(1.5**2 * np.array(sizes[0]), rel=0.01)
     assert sizes[2] == pytest.approx(2.0**2 * np.array(sizes[0]), rel=0.01)
 

@@ -1,8 +1,10 @@
-"""``python -m tests.estimator.anywhere`` writes the summary anew, after a change of the estimator that is meant."""
+"""``python -m tests.estimator.anywhere`` writes the summaries, after an intended change of the estimator."""
 
 import sys
 
+from tests.estimator.anywhere import cycles
 from tests.estimator.anywhere.summary import PATH, rows, write
 
 write(rows())
-sys.stdout.write(f"{PATH}\n")
+cycles.write(row for chemistry in cycles.CHEMISTRIES for row in cycles.rows(chemistry))
+sys.stdout.write(f"{PATH}\n{cycles.PATH}\n")

@@ -31,6 +31,8 @@ KINETIC_V = 0.051
 COOLS_S = 900.0
 """Time constant in which a cell gets warm [s]."""
 GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
+TAPER_C = 0.05
+"""Current at which a charger ends its charge [C]."""
 LOOPS_SOC, FAST_LOOP = (0.015, 0.15), 0.6
 """Charge that leads halfway from one branch of the hysteresis to the other, fast and slow, and the share of the fast one:
 stop operators (Prandtl), which regeneration takes no further from the branch than its own charge does."""
@@ -58,15 +60,35 @@ def along(soc, values):
 
 
 @njit
-def simulate(dt_s, current_a, room_c, soc, branch, capacity_ah, ocv_v, per_kelvin_v, hysteresis_v, ohm, warms_k=0.0):
+def simulate(
+    dt_s,
+    current_a,
+    room_c,
+    soc,
+    branch,
+    capacity_ah,
+    ocv_v,
+    per_kelvin_v,
+    hysteresis_v,
+    ohm,
+    warms_k=0.0,
+    low_v=-math.inf,
+    high_v=math.inf,
+):
     """Terminal voltage [V] and SOC at each sample, from rest; the current holds until the next sample.
 
-    A loss of 1 W warms the cell by ``warms_k`` above ``room_c``, in the end.
+    A loss of 1 W warms the cell by ``warms_k`` above ``room_c``, in the end. A charger holds ``high_v`` [V] and stops at C/20;
+    a protection ends the discharge below ``low_v`` [V]. ``current_a`` [A] is written: the current that flowed.
     """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
     x, fast, slow, rise_k = np.zeros(len(TAU_S)), branch, branch, 0.0
+    stopped = 0.0  # sign of the current that was stopped
     for n in range(len(current_a)):
         i, celsius = current_a[n], room_c[n] + rise_k
+        if i * stopped > 0.0:
+            i = 0.0
+        elif i != 0.0:
+            stopped = 0.0
         cold = (1.0 / (celsius + KELVIN) - 1.0 / REFERENCE_K) / GAS_J
         x[0] = i
         open_v = along(soc, ocv_v) + (celsius - 25.0) * along(soc, per_kelvin_v)
@@ -74,6 +96,16 @@ def simulate(dt_s, current_a, room_c, soc, branch, capacity_ah, ocv_v, per_kelvi
         for k in range(len(TAU_S)):
             drop_v = x[k] * along(soc, ohm[:, k]) * math.exp(ENERGY_J[k] * cold)
             v -= KINETIC_V * math.asinh(drop_v / KINETIC_V) if k == KINETIC else drop_v
+        if i < 0.0 and v > high_v:
+            series_ohm = along(soc, ohm[:, 0]) * math.exp(ENERGY_J[0] * cold)
+            held_a = min(i + (v - high_v) / series_ohm, 0.0)
+            v -= series_ohm * (held_a - i)
+            i = held_a
+            if i > -TAPER_C * capacity_ah:
+                stopped = -1.0
+        elif i > 0.0 and v < low_v:
+            stopped = 1.0
+        current_a[n] = i
         voltage_v[n], true_soc[n] = v, soc
         rise_k += (warms_k * i * (open_v - v) - rise_k) * dt_s / COOLS_S
         moved = i * dt_s / 3600.0 / capacity_ah

@@ -1,0 +1,170 @@
+"""Full cycles and charges from empty: the first day of a cell of which only chemistry and capacity are known.
+
+The estimator has the generic cell file and no initial SOC. The true cell has the OCV of another make, as far as a capture of
+one is at hand (LG M50, NCR18650, Leaf), that of the LFP test cell, or one up to 1.5 std off (LCO, LTO). Its resistances are 0.7
+to 3 times those of the generic cell.
+"""
+
+import csv
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.ekf_state import LN_Q
+from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, rising
+from tests.estimator.anywhere.score import Score, score
+from tests.estimator.anywhere.truth import GRID, Floats, curve_of, measured_curve, simulate, smooth
+from tests.estimator.anywhere.use import drive
+
+CAPACITY_AH = 3.0
+AFTER_S = 300.0
+"""Time after switch-on that is not judged [s]."""
+EMPTY_SOC = 0.02
+REST_S = 900
+"""Rest between two phases [s]."""
+TAIL_S = 4 * 3600
+"""Longest drive after the charge [s]."""
+LONGEST_CHARGE_S = 8 * 3600
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """One capture of a cell whose resistances are ``resistance`` times those of its generic cell."""
+
+    chemistry: Literal["nmc", "nca", "lfp", "lmo", "lco", "lto"]
+    begin: Literal["discharge", "charge"]
+    """A discharge at 1C to empty comes first; or the charge does, from empty."""
+    resistance: float
+    soc: float
+    """At the first sample, from rest."""
+    charge_c: float = 1.0
+    seed: int = 1
+
+    @property
+    def name(self) -> str:
+        """Name in the summary."""
+        return f"{self.chemistry} {self.begin} from {self.soc:.2f}, R x{self.resistance:g}"
+
+
+def cycles(chemistry: str) -> tuple[Cycle, ...]:
+    """Captures of one generic cell."""
+    down = [Cycle(chemistry, "discharge", r, s, seed=n) for n, (r, s) in enumerate(DISCHARGES)]
+    up = [Cycle(chemistry, "charge", r, s, c, seed=20 + n) for n, (r, s, c) in enumerate(CHARGES)]
+    return (*down, *up)
+
+
+DISCHARGES = ((0.7, 0.41), (1.0, 0.7), (1.5, 0.41), (2.0, 0.55), (3.0, 0.41), (3.0, 0.8))
+"""Resistance and initial SOC of the full cycles."""
+CHARGES = ((0.7, 0.03, 1.0), (1.0, 0.05, 0.3), (2.0, 0.02, 0.5), (3.0, 0.05, 1.0))
+"""Resistance, initial SOC and current [C] of the charges from empty."""
+WORST_STDS = 1.5
+"""Largest error of a true curve that is drawn, in std of the generic one."""
+CHEMISTRIES = ("nmc", "nca", "lfp", "lmo", "lco", "lto")
+
+
+def true_curve(cycle: Cycle) -> Floats:
+    """OCV of the true cell at ``GRID`` [V]."""
+    if cycle.chemistry == "nmc":
+        return measured_curve()
+    if cycle.chemistry == "lfp":
+        return PHOSPHATE.ocv_v
+    make = {"nca": "ncr18650", "lmo": "leaf"}.get(cycle.chemistry)
+    if make is not None:
+        ocv = load_cell(make).ocv
+        assert isinstance(ocv, TableOcv)
+        return PchipInterpolator(ocv.soc, ocv.ocv_v)(GRID)
+    ocv = load_cell(cycle.chemistry, 1.0).ocv
+    assert isinstance(ocv, TableOcv)
+    assert ocv.error_v is not None
+    shape = smooth(np.random.default_rng(cycle.seed), 0.6)
+    error_v = WORST_STDS * np.interp(GRID, ocv.soc, ocv.error_v) * shape / np.abs(shape).max()
+    return rising(curve_of(cycle.chemistry) + error_v) + 1e-5 * GRID
+
+
+def load(cycle: Cycle, rng: np.random.Generator, charge_s: int) -> Floats:
+    """Current that is asked for, at 1 Hz [A]: a discharge to empty or a rest, a charge, and a drive, with rests between."""
+    one_c = CAPACITY_AH
+    begin = np.r_[np.full(3600, one_c), np.zeros(REST_S)] if cycle.begin == "discharge" else np.zeros(REST_S)
+    return np.r_[begin, np.full(charge_s, -cycle.charge_c * one_c), np.zeros(REST_S), drive(rng, one_c, 0.5, TAIL_S)]
+
+
+def capture(cycle: Cycle) -> tuple[SampleBlock, Floats]:
+    """Samples at 1 Hz, and the true SOC at each, until the cell is empty again."""
+    truth = PHOSPHATE if cycle.chemistry in ("lfp", "lto") else OXIDE
+    ocv_v, generic = true_curve(cycle), load_cell(cycle.chemistry, CAPACITY_AH)
+    scale = cycle.resistance * total_ohm(generic) / truth.ohm[GRID.size // 2].sum()
+    curves = ocv_v, truth.per_kelvin_v, truth.hysteresis_v, scale * truth.ohm
+    limits = {"low_v": ocv_v[0], "high_v": ocv_v[-1]}
+
+    def run(charge_s: int) -> tuple[Floats, Floats, Floats]:
+        current_a = load(cycle, np.random.default_rng(3000 + cycle.seed), charge_s)
+        room_c = np.full(current_a.size, 25.0)
+        return current_a, *simulate(1.0, current_a, room_c, cycle.soc, -1.0, CAPACITY_AH, *curves, **limits)
+
+    current_a, _, _ = run(LONGEST_CHARGE_S)
+    current_a, voltage_v, soc = run(int(np.count_nonzero(current_a[: -REST_S - TAIL_S] < 0.0)))
+    empty = np.flatnonzero((soc < EMPTY_SOC) & (np.arange(soc.size) > soc.argmax()))
+    end = int(empty[0]) if empty.size else soc.size
+    rng = np.random.default_rng(4000 + cycle.seed)
+    samples = np.zeros(end, dtype=SAMPLE)
+    samples["time_s"] = np.arange(end)
+    samples["current_a"] = np.round(current_a[:end] + rng.normal(0.0, 2e-3, end), 3)
+    samples["voltage_v"] = np.round(voltage_v[:end] + rng.normal(0.0, 5e-4, end), 3)
+    samples["temperature_c"] = 25.0
+    return samples, soc[:end]
+
+
+def total_ohm(cell: CellModel) -> float:
+    """Sum of a cell's resistances at SOC 0.5 and 25 C [ohm]."""
+    ladder = cell.ladder
+    assert ladder is not None
+    return float(sum(np.interp(0.5, ladder.soc, row) for row in (*ladder.weak_ohm, *ladder.strong_ohm)))
+
+
+@dataclass(frozen=True)
+class CycleRow:
+    """The estimator on one capture."""
+
+    cycle: Cycle
+    score: Score
+    capacity: float
+    """Learned over true capacity, less 1 [%]."""
+
+    @property
+    def line(self) -> list[str]:
+        """Line of the checked-in summary."""
+        values = (self.score.rmse, self.score.cover, self.score.std, self.score.score, self.capacity)
+        return [self.cycle.name, *(f"{value:.1f}" for value in values)]
+
+
+HEAD = ["cycle", "rmse", "cover", "std", "score", "capacity"]
+PATH = Path(__file__).with_name("cycles.csv")
+
+
+def row(cycle: Cycle) -> CycleRow:
+    """Run the estimator with the generic cell file and the default start."""
+    samples, soc = capture(cycle)
+    estimator = Estimator(load_cell(cycle.chemistry, CAPACITY_AH))
+    trace = estimator.run(samples)
+    result = score(samples["time_s"], trace["soc"], trace["soc_std"], soc, AFTER_S)
+    assert result is not None
+    f = estimator.record[0]["filter"]
+    return CycleRow(cycle, result, 100.0 * float(np.expm1(f["mean"][f["best"], LN_Q])))
+
+
+def rows(chemistry: str) -> list[CycleRow]:
+    """All captures of one generic cell."""
+    return [row(cycle) for cycle in cycles(chemistry)]
+
+
+def write(table: Iterable[CycleRow]) -> None:
+    """Write the summary that is checked in."""
+    with PATH.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([HEAD, *(r.line for r in table)])

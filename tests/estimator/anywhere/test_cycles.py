@@ -1,0 +1,55 @@
+"""The SOC interval through the first full cycle of a cell of which only chemistry and capacity are known."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from tests.estimator.anywhere.cycles import CHEMISTRIES, HEAD, PATH, CycleRow, rows
+
+LIMITS = {
+    "nmc": (95, 80, 4.2),
+    "nca": (95, 80, 4.9),
+    "lfp": (95, 90, 4.1),
+    "lmo": (84, 72, 7.0),
+    "lco": (88, 65, 8.0),
+    "lto": (95, 85, 7.1),
+}
+"""Share of time inside two std: mean and worst capture [%], and RMSE [%]."""
+LAST_DIGIT = 0.15
+"""Allowed change of a summary value: it is rounded to 0.1, and exp and log of other processors differ in the last bit."""
+
+
+@pytest.fixture(scope="module")
+def table() -> dict[str, list[CycleRow]]:
+    return {chemistry: rows(chemistry) for chemistry in CHEMISTRIES}
+
+
+def test_the_summary_is_as_checked_in(table) -> None:
+    """After an intended change of the estimator, ``python -m tests.estimator.anywhere`` writes it."""
+    with PATH.open() as file:
+        expected = {line[0]: list(map(float, line[1:])) for line in list(csv.reader(file))[1:]}
+    lines = [r.line for some in table.values() for r in some]
+    assert {line[0] for line in lines} == set(expected)
+    changes = [
+        f"{line[0]} {name}: {now}, was {was}"
+        for line in lines
+        for name, now, was in zip(HEAD[1:], line[1:], expected[line[0]], strict=True)
+        if not abs(float(now) - was) <= LAST_DIGIT
+    ]
+    assert not changes, "\n".join(["python -m tests.estimator.anywhere writes the summary", *changes])
+
+
+@pytest.mark.parametrize("chemistry", CHEMISTRIES)
+def test_the_interval_holds_through_a_full_cycle(table, chemistry: str) -> None:
+    mean_cover, worst_cover, rmse = LIMITS[chemistry]
+    scores = [r.score for r in table[chemistry]]
+    assert np.mean([s.cover for s in scores]) >= mean_cover
+    assert min(s.cover for s in scores) >= worst_cover
+    assert np.sqrt(np.mean([s.rmse**2 for s in scores])) <= rmse
+
+
+@pytest.mark.parametrize("chemistry", CHEMISTRIES)
+def test_no_cycle_teaches_an_impossible_capacity(table, chemistry: str) -> None:
+    """The declared capacity is right. A charge once left 67 % too much."""
+    assert max(abs(r.capacity) for r in table[chemistry]) < 25.0
