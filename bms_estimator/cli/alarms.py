@@ -113,6 +113,8 @@ async def _found(settings: Settings, cell: PackModel, source: Replay) -> Found:
     now_s, changes = 0.0, list[Change]()
     with compiling_shown():
         estimator = new_estimator(settings, cell)
+    without_hooks = settings.alarms.model_copy(update={"hook": ()})
+    settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # only the capture's matters
     watch = AlarmWatch(settings, cell, estimator, source, clock, changes.append)
     async for block in source:
@@ -131,7 +133,9 @@ async def _found(settings: Settings, cell: PackModel, source: Replay) -> Found:
 def _paired(changes: list[Change]) -> list[Raised]:
     """Each alarm with its end."""
     found: list[Raised] = []
-    for at_s, alarm in changes:
+    for at_s, alarm, turn in changes:
+        if turn == "watched":
+            continue
         if alarm.active:
             told = alarm.value, alarm.limit, alarm.unit, alarm.text
             found.append(Raised(alarm.name, alarm.severity, at_s, None, False, *told))

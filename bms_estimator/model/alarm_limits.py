@@ -16,6 +16,26 @@ SILENT_PERIODS = 3
 """Nor before so many samples or publications are missing."""
 
 
+Quantity = Literal["voltage", "current", "temperature", "cells"]
+"""Measured quantity of a sample."""
+NEEDED: dict[AlarmName, tuple[Quantity, ...]] = {
+    "pack_over_voltage": ("voltage",),
+    "pack_under_voltage": ("voltage",),
+    "cell_over_voltage": ("cells",),
+    "cell_under_voltage": ("cells",),
+    "discharge_over_current": ("current",),
+    "charge_over_current": ("current",),
+    "over_temperature": ("temperature",),
+    "under_temperature": ("temperature",),
+    "charging_below_freezing": ("current", "temperature"),
+    "soc_low": ("voltage", "current"),
+    "stability_margin_low": ("voltage", "current"),
+    "cell_imbalance": ("cells",),
+    "model_mismatch": ("voltage", "current"),
+}
+"""Quantities without which an alarm cannot be watched. The alarms that are missing here judge the samples themselves."""
+
+
 class Watched(NamedTuple):
     """One alarm that is watched."""
 
@@ -82,6 +102,17 @@ def watched(settings: Settings, cell: PackModel) -> tuple[Watched, ...]:
     return tuple(each for each in found if each is not None)
 
 
+def silent_limit_s(settings: Settings) -> float:
+    """Time without a sample after which no alarm is watched any more [s]: the limit of ``link_lost``."""
+    rule = settings.alarms.link_lost
+    return (rule.limit_s or _silent_s(settings)) + rule.delay_s
+
+
+def _silent_s(settings: Settings) -> float:
+    """Default limit of ``link_lost`` [s]."""
+    return max(LEAST_SILENT_S, SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s))
+
+
 def charging_a(cell: PackModel) -> float:
     """From this current into the pack on it is charged [A]."""
     of = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
@@ -140,7 +171,6 @@ def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> Watched | N
 def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
     """By alarm; a fuel cell has no SOC, no chemistry, and stands no charge."""
     n = cell.cell.series_count
-    silent_s = SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s)
     common: dict[AlarmName, _Default] = {
         "over_temperature": _Default(60.0, 55.0, "°C"),
         "under_temperature": _Default(-20.0, -15.0, "°C", above=False),
@@ -150,7 +180,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "cell_imbalance": _Default(0.05, 0.03, "V"),
         "sensor_fault": _Default(0.1, 0.02, None),
         "model_mismatch": _Default(0.05 * n, 0.03 * n, "V"),
-        "link_lost": _Default(max(LEAST_SILENT_S, silent_s), None, "s"),
+        "link_lost": _Default(_silent_s(settings), None, "s"),
     }
     return common | (_of_battery(cell) if isinstance(cell, CellModel) else _of_stack(cell))
 

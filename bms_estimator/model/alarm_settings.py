@@ -88,6 +88,9 @@ class AlarmHook(Strict):
     timeout_s: Annotated[float, Field(gt=0, le=3600)] = Field(
         default=10.0, description="a program that takes longer is killed"
     )
+    pass_environment: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = Field(
+        default=(), description="further environment variables of the service that a program gets"
+    )
     topic: Annotated[str, Field(pattern=r"^[^+#\s]{1,200}$")] | None = Field(
         default=None, description="where a message is published at QoS 1, not retained"
     )
@@ -98,11 +101,18 @@ class AlarmHook(Strict):
         default=None,
         description="level of the board's relay pin while one of the alarms is active; else it is the other",
     )
-    when_silent: Literal["keep", "high", "low"] = Field(
-        default="keep", description="level of the pin once the board has not heard of the service for silent_s"
+    when_silent: Literal["keep", "high", "low"] | None = Field(
+        default=None,
+        description="level of the pin once the board has received nothing from the service for silent_s; "
+        "that of relay, the safe side, when left out",
     )
     silent_s: Annotated[int, Field(ge=15, le=3600)] = 30
     dry_run: bool = Field(default=False, description="log what would be done, and do nothing")
+
+    @property
+    def level_when_silent(self) -> Literal["keep", "high", "low"] | None:
+        """Level of the relay pin while the service is silent; None for a hook without a relay."""
+        return self.when_silent or self.relay
 
     @model_validator(mode="after")
     def _one_of_three(self) -> Self:
@@ -147,6 +157,11 @@ class AlarmSettings(Strict):
         description="limit_s: without a sample; 10 s, or 3 periods where that is longer",
     )
 
+    lost_s: NotNegative = Field(
+        default=10.0,
+        description="a quantity that was measured before counts as lost after this time without a value, "
+        "and as measured again after the same time with values",
+    )
     hook: tuple[AlarmHook, ...] = Field(
         default=(), description="what is done of it, as in [[alarms.hook]]; nothing when left out"
     )

@@ -233,6 +233,11 @@ class Alarm(Report):
     limit: float | None = Field(description="what it may reach, in unit; null where there is no number")
     unit: str | None = Field(description="of value and limit")
     text: str = Field(description="for people: what is wrong, and what to do; empty unless active")
+    watched: bool = Field(
+        default=True,
+        description="false: what the alarm needs was measured before and is missing, so it cannot be raised",
+    )
+    unwatched_reason: str | None = Field(default=None, description="why it is not watched; null while it is")
 
 
 class Snapshot(NamedTuple):

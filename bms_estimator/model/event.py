@@ -24,6 +24,8 @@ Name = Literal[
     "checkpoint_saved",
     "alarm_raised",
     "alarm_cleared",
+    "alarm_unwatched",
+    "alarm_watched",
 ]
 
 
@@ -76,6 +78,17 @@ def _alarms(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Found]:
             yield _Found("alarm_cleared", alarm.name)
         if alarm.since is not None and since != alarm.since and alarm.since >= snapshot.info.started:
             yield _Found("alarm_raised", f"{alarm.name}: {alarm.text}")
+    yield from _watched(before, snapshot)
+
+
+def _watched(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Found]:
+    """Alarms that can no longer be watched, and those that can again."""
+    was = {alarm.name: alarm.watched for alarm in before.alarms} if before else {}
+    for alarm in snapshot.alarms:
+        if was.get(alarm.name, True) and not alarm.watched:
+            yield _Found("alarm_unwatched", f"{alarm.name}: {alarm.unwatched_reason}")
+        elif alarm.watched and not was.get(alarm.name, True):
+            yield _Found("alarm_watched", alarm.name)
 
 
 def _unseen(unseen_s: float) -> Iterator[_Found]:

@@ -5,8 +5,10 @@ import contextlib
 import os
 import shutil
 import signal
+import uuid
 from collections import deque
 from collections.abc import Awaitable, Callable, Collection, Sequence
+from pathlib import Path
 from string import Template
 from typing import Any, Self
 
@@ -16,6 +18,7 @@ from bms_estimator.model.alarm_settings import AlarmHook
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Alarm
 from bms_estimator.model.settings import Settings
+from bms_estimator.sinks.pauses import Pauses
 from bms_estimator.snapshot.alarms import Change
 from bms_estimator.sources.protocol import Relay
 
@@ -25,8 +28,12 @@ RELAY_S, RETRY_S = 2.0, 0.5
 """So often the board is told its relay's level, at least [s]: it may have been reset, or replaced; and once it did not take it."""
 CLOSE_S = 2.0
 """At the end what is under way may take so long [s]."""
-OURS = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""Of the environment, what a program must not use: it is not the service."""
+FIRST_RETRY_S = 0.5
+"""First pause before a program that could not be started is tried again [s]; doubles each time, up to half a minute."""
+PASSED = ("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "LC_ALL", "TZ", "TMPDIR")
+"""Environment variables of the service that every program gets. Others may hold secrets of the service."""
+MARK = "BMS_HOOK_RUN"
+"""Environment variable with an identifier of one run, by which its descendants are found."""
 
 Say = Callable[[str, bytes], None]
 """Publishes a message on a topic."""
@@ -130,13 +137,40 @@ class _Hook:
 class _Program(_Hook):
     """Runs a program: the alarm as JSON on its standard input, its fields in the environment."""
 
+    def __init__(self, hook: AlarmHook, device: str) -> None:
+        super().__init__(hook, device)
+        self._states: dict[str, bool] = {}
+
     @property
     def _what(self) -> str:
         return f"run {' '.join(self._hook.run or ())}"
 
+    def tell(self, alarm: Alarm) -> None:
+        """Note the alarm's state, which ends the retries for another one, and have the program run."""
+        self._states[alarm.name] = alarm.active
+        self._wake.set()
+        super().tell(alarm)
+
     async def _do(self, alarm: Alarm) -> None:
-        values = _values(alarm, self._device)
-        environment = {name: value for name, value in os.environ.items() if name not in OURS}
+        """Run the program; one that cannot be started is tried again until it starts or the alarm's state changes."""
+        pauses = Pauses(FIRST_RETRY_S)
+        while not await self._run(alarm):
+            if not await self._retry(alarm, pauses.next_s()):
+                return
+
+    async def _retry(self, alarm: Alarm, pause_s: float) -> bool:
+        """Wait before another attempt. Return False once the alarm's state has changed or the hook is closed."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(pause_s):
+                while not self._closing and self._states[alarm.name] == alarm.active:
+                    self._wake.clear()
+                    await self._wake.wait()
+        return not self._closing and self._states[alarm.name] == alarm.active
+
+    async def _run(self, alarm: Alarm) -> bool:
+        """Run the program once. Return False if it could not be started."""
+        values, run = _values(alarm, self._device), uuid.uuid4().hex
+        environment = {name: os.environ[name] for name in (*PASSED, *self._hook.pass_environment) if name in os.environ}
         environment |= {f"BMS_{name.upper()}": value for name, value in values.items() if name != "json"}
         try:
             process = await asyncio.create_subprocess_exec(
@@ -144,12 +178,12 @@ class _Program(_Hook):
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=asyncio.subprocess.DEVNULL,
-                env=environment,
+                env=environment | {MARK: run},
                 start_new_session=True,
             )
         except (OSError, ValueError) as error:
             log.warning("alarm hook: the program cannot be started", hook=self._what, error=str(error))
-            return
+            return False
         try:
             async with asyncio.timeout(self._hook.timeout_s):
                 await process.communicate(values["json"].encode())
@@ -159,7 +193,8 @@ class _Program(_Hook):
             log.warning("alarm hook: the program takes too long and is killed", hook=self._what)
         finally:
             if process.returncode is None:
-                await _kill(process)
+                await _kill(process, run)
+        return True
 
 
 class _Publication(_Hook):
@@ -193,8 +228,9 @@ class _Switched(_Hook):
     @property
     def _wanted(self) -> Relay:
         high = (self._hook.relay == "high") == bool(self._active)
-        kept = self._hook.when_silent == "keep"
-        return Relay(high, None if kept else self._hook.when_silent == "high", 0 if kept else self._hook.silent_s)
+        silent = self._hook.level_when_silent
+        kept = silent == "keep"
+        return Relay(high, None if kept else silent == "high", 0 if kept else self._hook.silent_s)
 
     def tell(self, alarm: Alarm) -> None:
         """Whatever the hook is ``on``: the level follows whether one of the alarms is active."""
@@ -229,7 +265,7 @@ class _Switched(_Hook):
 
 
 def unusable(settings: Settings) -> list[str]:
-    """One line for each hook whose program is not there.
+    """One line for each hook whose program is not there, and for each relay without a stated level for a silent service.
 
     Raises:
         UserError: A hook needs a broker or a relay that is not there.
@@ -240,6 +276,11 @@ def unusable(settings: Settings) -> list[str]:
         f"alarms.hook.{i}.run = {hook.run[0]}: no such program here, or it may not be run"
         for i, hook in enumerate(hooks)
         if hook.run and shutil.which(hook.run[0]) is None
+    ] + [
+        f"alarms.hook.{i}.when_silent: not set, so the board switches its pin to {hook.relay}, as in an alarm, after "
+        f'{hook.silent_s} s without the service; write {hook.relay!r} to confirm, or "keep"'
+        for i, hook in enumerate(hooks)
+        if hook.relay and hook.when_silent is None
     ]
 
 
@@ -277,8 +318,17 @@ def _values(alarm: Alarm, device: str) -> dict[str, str]:
     return values | {"device": device, "state": _state(alarm), "json": alarm.model_dump_json()}
 
 
-async def _kill(process: asyncio.subprocess.Process) -> None:
-    """The program, and what it has started."""
+async def _kill(process: asyncio.subprocess.Process, run: str) -> None:
+    """Kill the program's process group, and descendants that left it."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
+    _kill_descendants(f"{MARK}={run}".encode())
     await process.wait()
+
+
+def _kill_descendants(mark: bytes) -> None:
+    """Kill each process that has ``mark`` in its environment."""
+    for environment in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):
+            if mark in environment.read_bytes().split(b"\0"):
+                os.kill(int(environment.parent.name), signal.SIGKILL)

@@ -64,9 +64,10 @@ class Pack:
 
     @cached_property
     def alarms(self) -> list[Fields]:
-        """Those that are raised."""
+        """Those that are raised, and while samples come those that cannot be watched."""
         told = [Fields(payload) for topic, payload in self.topics.items() if topic.startswith(ALARM)]
-        return [alarm for alarm in told if alarm.flag("active")]
+        online = Fields(self.topics.get("health")).flag("sensor_online")
+        return [alarm for alarm in told if alarm.flag("active") or (online and alarm.text("unwatched_reason"))]
 
     @cached_property
     def stale(self) -> str:

@@ -245,17 +245,22 @@ def _elements(elements: Fields) -> Table:
 
 
 def _alarms(alarms: Sequence[Fields]) -> Flow:
-    """Those that are raised, the critical first."""
+    """Raised and unwatched alarms, the critical first."""
     worst = sorted(alarms, key=lambda alarm: alarm.text("severity") != "critical")
     texts = [
         Text(
-            f"{alarm.text('severity')}: {alarm.text('text') or alarm.text('name')}",
+            f"{alarm.text('severity')}: {alarm.text('text') or _unwatched(alarm)}",
             style="bold red" if alarm.text("severity") == "critical" else "bold yellow",
         )
         for alarm in worst[:MOST_ALARMS]
     ]
     more = len(worst) - len(texts)
     return Flow(*texts, *([Text(f"and {more} more", style="bold red")] if more else []))
+
+
+def _unwatched(alarm: Fields) -> str:
+    """An alarm without a text: it cannot be watched."""
+    return f"{alarm.text('name')} cannot be raised: {alarm.text('unwatched_reason')}"
 
 
 def _health(health: Fields, parameters: Fields) -> Flow:

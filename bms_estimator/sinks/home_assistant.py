@@ -23,6 +23,8 @@ ALARM_CLASSES = {
     "charging_below_freezing": "cold",
 }
 """Where it is not "problem"."""
+_SEES = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
+"""An alarm that is raised stays on: what it needs may be lost after it was raised."""
 FORMER = {
     "soc_std": "sensor",
     "time_to_empty_s": "sensor",
@@ -168,7 +170,7 @@ def _sign(root: str, positive: str) -> dict[str, str]:
 
 
 def _alarm(name: str, root: str) -> dict[str, Any]:
-    """On while it is active; it matters when the sensor is silent, too."""
+    """On while it is active; unavailable, and never off, while it cannot be watched."""
     topic = f"{root}/alarm/{name}"
     return {
         "platform": "binary_sensor",
@@ -177,7 +179,8 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
         "value_template": "{{ 'ON' if value_json.active else 'OFF' }}",
         "json_attributes_topic": topic,
         "json_attributes_template": "{{ {'reason': value_json.text, 'severity': value_json.severity} | tojson }}",
-        "availability": [{"topic": f"{root}/availability"}],
+        "availability": [{"topic": f"{root}/availability"}, {"topic": topic, "value_template": _SEES}],
+        "availability_mode": "all",
         "device_class": ALARM_CLASSES.get(name, "problem"),
     }
 

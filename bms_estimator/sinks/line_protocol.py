@@ -30,7 +30,7 @@ def _state(device: str, estimate: Estimate) -> str:
 
 
 def _alarm(device: str, alarm: Alarm, time: str) -> str:
-    fields = {"active": alarm.active, "value": alarm.value, "limit": alarm.limit}
+    fields = {"active": alarm.active, "watched": alarm.watched, "value": alarm.value, "limit": alarm.limit}
     told = [*_fields(fields), f"text={_quoted(alarm.text)}"]
     return f"{ALARM},device={device},name={alarm.name},severity={alarm.severity} {','.join(told)} {_ms(time)}"
 

@@ -71,6 +71,7 @@ def metrics(snapshot: Snapshot) -> Iterator[Metric]:
         yield _by_kind(device, name, meaning, getattr(health, name))
     yield _elements(device, snapshot)
     yield _alarms(device, snapshot)
+    yield _watched(device, snapshot)
     info = GaugeMetricFamily("bms_info", "what this is; always 1", labels=["device", "cell", "version"])
     info.add_metric([device, snapshot.info.cell, snapshot.info.version], 1.0)
     yield info
@@ -122,6 +123,14 @@ def _alarms(device: str, snapshot: Snapshot) -> Metric:
     metric = GaugeMetricFamily("bms_alarm", "1 while it is raised", labels=["device", "name", "severity"])
     for alarm in snapshot.alarms:
         metric.add_metric([device, alarm.name, alarm.severity], float(alarm.active))
+    return metric
+
+
+def _watched(device: str, snapshot: Snapshot) -> Metric:
+    meaning = "0 while what the alarm needs is missing, so that it cannot be raised"
+    metric = GaugeMetricFamily("bms_alarm_watched", meaning, labels=["device", "name", "severity"])
+    for alarm in snapshot.alarms:
+        metric.add_metric([device, alarm.name, alarm.severity], float(alarm.watched))
     return metric
 
 

@@ -7,13 +7,14 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.model.alarm_limits import charging_a, watched
+from bms_estimator.model.alarm_limits import charging_a, silent_limit_s, watched
 from bms_estimator.model.alarm_settings import AlarmName
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
 from bms_estimator.model.suspect import Suspect
+from bms_estimator.snapshot.alarm_inputs import Inputs
 from bms_estimator.snapshot.alarms import Alarms, Change, Counts
 from bms_estimator.snapshot.health import sample_counters, suspicions
 from bms_estimator.sources import Source
@@ -55,7 +56,8 @@ class AlarmWatch:
     ) -> None:
         self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
         gap_s = float(estimator.settings["gap_s"][0])
-        self.alarms = Alarms(watched(settings, cell), charging_a(cell), gap_s)
+        inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
+        self.alarms = Alarms(watched(settings, cell), charging_a(cell), gap_s, inputs, silent_limit_s(settings))
         self._heard_s, self._arrival_s = clock.monotonic(), clock.wall()  # of the last sample, accepted or not
         self._judged_s = -math.inf
 
@@ -91,7 +93,10 @@ class AlarmWatch:
     def _tell(self) -> None:
         for change in self.alarms.changes():
             alarm = change.alarm
-            if alarm.active:
+            if change.turn == "watched":
+                say = log.info if alarm.watched else log.warning
+                say("alarm watched", alarm=alarm.name, watched=alarm.watched, reason=alarm.unwatched_reason)
+            elif alarm.active:
                 log.warning("alarm raised", alarm=alarm.name, severity=alarm.severity, reason=alarm.text)
             else:
                 log.info("alarm cleared", alarm=alarm.name)

@@ -8,19 +8,20 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.sample_step import GAP_RATIO
 from bms_estimator.kernels.state import TRACE
-from bms_estimator.model.alarm_limits import Watched
+from bms_estimator.model.alarm_limits import NEEDED, Quantity, Watched
 from bms_estimator.model.alarm_settings import AlarmName
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Alarm
 from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock, SampleStatus
 from bms_estimator.model.suspect import Suspect
+from bms_estimator.snapshot.alarm_inputs import LOST, Inputs, counted
 from bms_estimator.snapshot.alarm_state import AlarmState, Floats, Raising, Turn
 from bms_estimator.snapshot.alarm_text import alarm_text
 
@@ -28,8 +29,12 @@ SENSOR_SUSPECTS = Suspect.SIGN_OF_CURRENT | Suspect.OFFSET | Suspect.OUTLIERS | 
 MODEL_SUSPECTS = Suspect.CAPACITY | Suspect.OCV
 ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """These are watched before anything was measured."""
+INPUTS = "inputs"
+"""Key of the saved state of measured quantities, beside the alarms' names."""
 WAITING_ROWS = 256
 """Room for so many samples to begin with."""
+RECENT_STEPS = 4.0
+"""A long step is usual until this multiple of it has passed without another one of about its length."""
 SHARE_S = 1.0
 """Lost and unusable samples are set against the good ones of so long at least [s]."""
 
@@ -43,11 +48,13 @@ class Counts(NamedTuple):
 
 
 class Change(NamedTuple):
-    """That an alarm was raised or ended."""
+    """An alarm was raised or ended, or can no longer or again be watched."""
 
     at_s: float
     """On the samples' clock [s]."""
     alarm: Alarm
+    turn: Literal["active", "watched"] = "active"
+    """Field of the alarm that has changed."""
 
 
 class Reasons(NamedTuple):
@@ -63,22 +70,35 @@ class Told(NamedTuple):
     raising: Raising | None
     gone: bool
     reasons: tuple[str, ...]
+    unwatched: str | None
+    """Why it is not watched; None while it is."""
 
 
+_COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
+"""Columns of a sample by quantity."""
+_NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
+"""``_extremes`` of a sample without cell voltages."""
 _NO_REASONS = Reasons(Suspect(0), ())
 
 
 @dataclass
 class _Steps:
-    """Times between samples: what is between is taken to be as at both ends, unless it is a gap.
+    """Times between samples: between two samples a value is taken to be as at both, unless there is a gap.
+
+    A gap is much longer than the longest step shortly before. Samples that come in bursts have one long step for each
+    burst: from the second on these are no gaps.
 
     Attributes:
-        gap_s: What is shorter is none [s].
+        gap_s: Shorter steps are no gaps [s].
     """
 
     gap_s: float
     _last_s: float = math.nan
     _step_s: float = math.inf
+    _longest_s: float = 0.0
+    """Longest step of late [s]."""
+    _longest_at_s: float = -math.inf
+    """When a step of about this length was last seen [s]."""
 
     def of(self, times_s: Floats) -> tuple[Floats, Floats]:
         """Shape (n,) each: the time before each sample [s], 0 where the clock was set back; and 0 in gaps, too."""
@@ -86,8 +106,21 @@ class _Steps:
         passed_s = np.where(passed_s > 0.0, passed_s, 0.0)
         before_s = np.concatenate(([self._step_s], passed_s[:-1]))
         seen_s = np.where(passed_s > np.maximum(self.gap_s, GAP_RATIO * before_s), 0.0, passed_s)
+        for i in np.flatnonzero(passed_s > self.gap_s).tolist():
+            if self._is_usual(float(times_s[i]), float(passed_s[i])):
+                seen_s[i] = passed_s[i]
         self._last_s, self._step_s = float(times_s[-1]), float(passed_s[-1]) or self._step_s
         return passed_s, seen_s
+
+    def _is_usual(self, at_s: float, step_s: float) -> bool:
+        """Whether a step of about this length was seen shortly before; takes note of it."""
+        is_recent = abs(at_s - self._longest_at_s) <= RECENT_STEPS * self._longest_s
+        is_usual = is_recent and step_s <= GAP_RATIO * self._longest_s
+        if not is_recent or step_s >= self._longest_s:
+            self._longest_s, self._longest_at_s = step_s, at_s
+        elif GAP_RATIO * step_s >= self._longest_s:
+            self._longest_at_s = at_s
+        return is_usual
 
 
 class _Rows:
@@ -119,17 +152,24 @@ class Alarms:
         watched: What is watched.
         charging_a: From this current into the pack on it is charged [A].
         gap_s: A time between samples that is shorter is no gap [s].
+        inputs: Measured quantities.
+        silent_s: Without a sample for this time no alarm is watched [s].
 
     Attributes:
         rows: Samples that wait to be judged.
         kept: What outlives a restart, as ``restore`` takes it.
     """
 
-    def __init__(self, watched: Sequence[Watched], charging_a: float, gap_s: float) -> None:
+    def __init__(
+        self, watched: Sequence[Watched], charging_a: float, gap_s: float, inputs: Inputs, silent_s: float
+    ) -> None:
         self._states = {each.name: AlarmState(each) for each in watched}
         self._charging_a = charging_a
+        self._inputs, self._silent_s = inputs, silent_s
+        self._silence = ""  # why no samples come; empty while they do
+        self._unwatched: dict[AlarmName, str] = {}  # reasons
         self._sampled, self._traced, self._shared = _Steps(gap_s), _Steps(gap_s), _Steps(math.inf)
-        self._samples, self._traces, self._extremes = _Rows(SAMPLE), _Rows(TRACE), _Rows(np.float64, (2,))
+        self._samples, self._traces, self._extremes = _Rows(SAMPLE), _Rows(TRACE), _Rows(np.float64, (3,))
         self._counts: Counts | None = None
         self._counted_s = -math.inf
         self._at_s = 0.0  # of the last sample
@@ -148,7 +188,7 @@ class Alarms:
         """Take a block, what the estimator made of it, and the cells beside it; ``judge`` looks at them."""
         self._samples.add(block, block.size)
         self._traces.add(trace, trace.size)
-        self._extremes.add(_extremes(cells) if len(cells) == block.size else math.nan, block.size)
+        self._extremes.add(_extremes(cells) if len(cells) == block.size else _NO_EXTREMES, block.size)
 
     def judge(self, arrival_s: float, counts: Counts, suspects: Suspect, suspicions: Sequence[str]) -> None:
         """Judge all that waits.
@@ -169,7 +209,7 @@ class Alarms:
         self._suspect("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
         if samples.size:
             wall_s = arrival_s - float(samples["time_s"][-1])
-            self._judge_samples(samples, extremes_v[:, 0], extremes_v[:, 1], wall_s)
+            self._judge_samples(samples, extremes_v, wall_s)
             self._judge_share(float(samples["time_s"][-1]), counts, suspects, wall_s)
         if trace.size:
             self._judge_estimates(trace, suspects, arrival_s - float(trace["time_s"][-1]))
@@ -183,6 +223,10 @@ class Alarms:
             now_s: Wall clock [s since 1970].
             reason: Why, as far as that is known.
         """
+        if (silent_s >= self._silent_s) != bool(self._silence):
+            self._silence = "" if self._silence else reason or "no samples come"
+            self._see(self._at_s)
+            self._keep()
         state = self._states.get("link_lost")
         if state is None or silent_s < state.watched.limit:
             return
@@ -216,8 +260,13 @@ class Alarms:
         """Of those that are raised."""
         return tuple(name for name, state in self._states.items() if state.raising is not None)
 
+    @property
+    def unwatched(self) -> tuple[AlarmName, ...]:
+        """Critical alarms that cannot be watched though what they need was measured before."""
+        return tuple(name for name in self._unwatched if self._states[name].watched.severity == "critical")
+
     def changes(self) -> list[Change]:
-        """What was raised and ended since the last call."""
+        """Changes since the last call, oldest first."""
         changes, self._changes = self._changes, []
         return changes
 
@@ -227,7 +276,7 @@ class Alarms:
         return tuple(
             _alarm(state.watched, unshown[name]) if state.raising is None and name in unshown else self._alarm(state)
             for name, state in self._states.items()
-            if state.known or state.raising is not None or name in ALWAYS
+            if state.known or state.raising is not None or name in self._unwatched or name in ALWAYS
         )
 
     def restore(self, kept: str) -> None:
@@ -236,7 +285,10 @@ class Alarms:
         Raises:
             ValueError, TypeError, LookupError: It is damaged.
         """
-        for name, told in json.loads(kept or "{}").items():
+        entries = json.loads(kept or "{}")
+        self._inputs.restore(entries.pop(INPUTS, {}))
+        self._unwatched = self._reasons_unwatched()
+        for name, told in entries.items():
             state = self._states.get(name)
             if state is None or (told["gone"] and not state.watched.latch):
                 continue
@@ -248,8 +300,8 @@ class Alarms:
             state.restore(raising, gone=bool(told["gone"]), acknowledged=bool(told["acknowledged"]))
         self._keep()
 
-    def _judge_samples(self, samples: SampleBlock, lowest_v: Floats, highest_v: Floats, wall_s: float) -> None:
-        times_s = samples["time_s"]
+    def _judge_samples(self, samples: SampleBlock, extremes_v: Floats, wall_s: float) -> None:
+        times_s, lowest_v, highest_v = samples["time_s"], extremes_v[:, 0], extremes_v[:, 1]
         self._at_s = float(times_s[-1])
         passed_s, seen_s = self._sampled.of(times_s)
         voltage_v, temperature_c = samples["voltage_v"], samples["temperature_c"]
@@ -272,6 +324,42 @@ class Alarms:
         for name, of in values.items():
             self._take(name, times_s, seen_s, of, wall_s)
         self._take("link_lost", times_s, passed_s, np.where(seen_s < passed_s, passed_s, 0.0), wall_s)
+        counts = {name: counted(samples[column]) for name, column in _COLUMNS.items()}
+        cells = extremes_v[:, 2].astype(np.int64)
+        for at_s in self._inputs.take(times_s, seen_s, counts | {"cells": cells}):
+            self._see(at_s)
+            if self._is_blinded():
+                self._raise_sensor_fault(at_s, wall_s)
+
+    def _see(self, at_s: float) -> None:
+        """Note which alarms can no longer or again be watched since ``at_s`` of the samples' clock [s]."""
+        before, self._unwatched = self._unwatched, self._reasons_unwatched()
+        for name in sorted(before.keys() ^ self._unwatched.keys()):
+            self._changes.append(Change(at_s, self._alarm(self._states[name]), "watched"))
+
+    def _reasons_unwatched(self) -> dict[AlarmName, str]:
+        """Reasons by alarm: no sample comes, or a quantity that it needs is lost."""
+        lost = self._inputs.lost
+        found: dict[AlarmName, str] = {}
+        for name in self._states:
+            needed = NEEDED.get(name, ())
+            missing = [LOST[each] for each in needed if each in lost]
+            if missing:
+                found[name] = "; ".join(missing)
+            elif self._silence and needed and self._inputs.measured(needed):
+                found[name] = self._silence
+        return found
+
+    def _is_blinded(self) -> bool:
+        """Whether a quantity is lost that a critical alarm needs."""
+        lost = set(self._inputs.lost)
+        return any(not lost.isdisjoint(NEEDED.get(name, ())) for name in self.unwatched)
+
+    def _raise_sensor_fault(self, at_s: float, wall_s: float) -> None:
+        """Raise it without its own delay: the quantity has been missing for ``lost_s`` already."""
+        state = self._states.get("sensor_fault")
+        if state is not None:
+            self._note(state, state.raise_at(at_s, Raising(at_s + wall_s, None)))
 
     def _judge_share(self, at_s: float, counts: Counts, suspects: Suspect, wall_s: float) -> None:
         """Of samples that are lost or unusable among all."""
@@ -281,7 +369,7 @@ class Alarms:
         _, seen_s = self._shared.of(np.array([at_s]))
         good, bad = (counts.good - before.good, counts.bad - before.bad) if before else (0, 0)
         share = bad / (good + bad) if good + bad > 0 else math.nan
-        if suspects & SENSOR_SUSPECTS:
+        if suspects & SENSOR_SUSPECTS or self._is_blinded():
             share = math.inf
         self._take("sensor_fault", np.array([at_s]), seen_s, np.array([share]), wall_s)
 
@@ -308,7 +396,7 @@ class Alarms:
     def _note(self, state: AlarmState, turns: Iterable[Turn]) -> None:
         name = state.watched.name
         for turn in turns:
-            told = Told(turn.raising, gone=False, reasons=self._reasons.get(name, _NO_REASONS).texts)
+            told = Told(turn.raising, gone=False, reasons=self._texts(name), unwatched=self._unwatched.get(name))
             if turn.raising is not None:
                 self._unshown[name] = told
             self._changes.append(Change(turn.at_s, _alarm(state.watched, told)))
@@ -321,16 +409,29 @@ class Alarms:
             self._reasons[name] = Reasons(suspects, texts)
 
     def _alarm(self, state: AlarmState) -> Alarm:
-        reasons = self._reasons.get(state.watched.name, _NO_REASONS).texts
-        return _alarm(state.watched, Told(state.raising, gone=state.gone, reasons=reasons))
+        name = state.watched.name
+        told = Told(state.raising, gone=state.gone, reasons=self._texts(name), unwatched=self._unwatched.get(name))
+        return _alarm(state.watched, told)
+
+    def _texts(self, name: AlarmName) -> tuple[str, ...]:
+        """Known causes of an alarm, one sentence each."""
+        lost = tuple(self._lost_text(each) for each in self._inputs.lost) if name == "sensor_fault" else ()
+        return lost + self._reasons.get(name, _NO_REASONS).texts
+
+    def _lost_text(self, quantity: Quantity) -> str:
+        """A lost quantity with the alarms that need it."""
+        names = ", ".join(name for name in self._unwatched if quantity in NEEDED.get(name, ()))
+        return f"{LOST[quantity]}: {names} cannot be raised" if names else LOST[quantity]
 
     def _keep(self) -> None:
-        """What is raised outlives a restart: a relay that has cut the load must not let it on again for that."""
-        kept = {
+        """Save the raised alarms and the lost quantities: a relay that has cut the load stays so over a restart."""
+        kept: dict[str, Any] = {
             name: {**state.raising._asdict(), "gone": state.gone, "acknowledged": state.acknowledged}
             for name, state in self._states.items()
             if state.raising is not None
         }
+        if inputs := self._inputs.kept:
+            kept[INPUTS] = inputs
         self.kept = json.dumps(kept) if kept else ""
 
 
@@ -346,9 +447,14 @@ def _alarm(watched: Watched, told: Told) -> Alarm:
         limit=watched.limit,
         unit=watched.unit,
         text=alarm_text(watched, value, told.reasons, gone=told.gone) if raising else "",
+        watched=told.unwatched is None,
+        unwatched_reason=told.unwatched,
     )
 
 
 def _extremes(cells: CellBlock) -> Floats:
-    """Lowest and highest cell voltage of each sample [V], NaN where none was told. Shape (n, 2)."""
-    return np.stack((np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1)), axis=1)
+    """Lowest and highest cell voltage of each sample [V], NaN where there is none, and their number. Shape (n, 3)."""
+    if not cells.shape[1]:
+        return np.tile(_NO_EXTREMES, (len(cells), 1))
+    measured = np.count_nonzero(np.isfinite(cells), axis=1)
+    return np.stack((np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1), measured), axis=1)

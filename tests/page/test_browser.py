@@ -276,10 +276,15 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
             "latched",
         ):
             assert said in text
-        await publish(
-            house.live, "alarm/cell_under_voltage", alarm.model_copy(update={"active": False}).model_dump_json()
-        )
+        quiet = alarm.model_copy(update={"active": False, "latched": False, "since": None, "value": None, "text": ""})
+        await publish(house.live, "alarm/cell_under_voltage", quiet.model_dump_json())
         await shown.wait_for(state="detached")
+        unwatched = quiet.model_copy(update={"watched": False, "unwatched_reason": "cell voltages are missing"})
+        await publish(house.live, "alarm/cell_under_voltage", unwatched.model_dump_json())
+        await shown.wait_for()
+        text = await shown.inner_text()
+        assert "cell voltages are missing" in text
+        assert "cannot be watched" in text
         await publish(house.live, "alarm/cell_under_voltage", b"")
         assert opened.errors == []
 

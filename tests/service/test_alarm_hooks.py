@@ -15,11 +15,12 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.estimate import Alarm
 from bms_estimator.model.settings import Settings
-from bms_estimator.service.alarm_hooks import Hooks
+from bms_estimator.service.alarm_hooks import Hooks, unusable
 from bms_estimator.service.serve import serve
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.snapshot.alarms import Change
+from bms_estimator.sources.protocol import Relay
 from tests.collector import Collector
 from tests.mosquitto import Broker, Listener, broker
 from tests.patience import LONG_S
@@ -116,6 +117,68 @@ async def test_a_program_that_hangs_is_killed_with_what_it_started_and_the_next_
     async with asyncio.timeout(LONG_S):
         while _runs(int(child.read_text())):  # noqa: ASYNC110 - nor has one that is not ours
             await asyncio.sleep(0.01)
+
+
+async def test_a_descendant_in_a_session_of_its_own_is_killed_too(tmp_path: Path) -> None:
+    child = tmp_path / "child"
+    hang = program(tmp_path / "hang", f"setsid sh -c 'echo $$ > {child}; exec sleep 1000' & wait")
+    async with hooks({"run": [hang], "timeout_s": 2.0}) as made:
+        made.tell(Change(0.0, RAISED))
+        await until(child, 1)
+        async with asyncio.timeout(LONG_S):
+            while _runs(int(child.read_text())):  # noqa: ASYNC110 - it is not a child of this process
+                await asyncio.sleep(0.01)
+
+
+async def test_a_program_that_cannot_be_started_is_tried_again(tmp_path: Path) -> None:
+    out, tell = tmp_path / "out", tmp_path / "tell"
+    async with hooks({"run": [str(tell)]}) as made:
+        with capture_logs() as lines:
+            made.tell(Change(0.0, RAISED))
+            async with asyncio.timeout(LONG_S):
+                while not lines:  # noqa: ASYNC110 - a log line has no event
+                    await asyncio.sleep(0.01)
+        program(tell, f"echo $BMS_STATE > {out}")
+        assert await until(out, 1) == ["raised"]
+
+
+async def test_the_end_of_an_alarm_ends_the_retries(tmp_path: Path) -> None:
+    out, tell = tmp_path / "out", tmp_path / "tell"
+    async with hooks({"run": [str(tell)], "on": ["raised"]}) as made:
+        with capture_logs() as lines:
+            made.tell(Change(0.0, RAISED))
+            async with asyncio.timeout(LONG_S):
+                while not lines:  # noqa: ASYNC110 - a log line has no event
+                    await asyncio.sleep(0.01)
+        program(tell, f"echo $BMS_NAME >> {out}")
+        made.tell(Change(0.0, CLEARED))
+        made.tell(Change(0.0, RAISED.model_copy(update={"name": "link_lost"})))
+        assert await until(out, 1) == ["link_lost"]
+
+
+async def test_a_program_gets_only_named_variables_of_the_service(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("SECRET_OF_THE_SERVICE", "a")
+    monkeypatch.setenv("WANTED", "b")
+    out = tmp_path / "out"
+    tell = program(tmp_path / "tell", f'echo "$SECRET_OF_THE_SERVICE-$WANTED" > {out}')
+    async with hooks({"run": [tell], "pass_environment": ["WANTED"]}) as made:
+        made.tell(Change(0.0, RAISED))
+        assert await until(out, 1) == ["-b"]
+
+
+def test_a_relay_is_safe_when_the_service_is_silent() -> None:
+    """Without ``when_silent`` the pin takes the level of an alarm, and `config check` says so."""
+    settings = Settings.model_validate({"sensor": {"port": "/dev/none"}, "alarms": {"hook": [{"relay": "low"}]}})
+    (line,) = unusable(settings)
+    assert line.startswith(
+        "alarms.hook.0.when_silent: not set, so the board switches its pin to low, as in an alarm, after 30 s"
+    )
+
+
+async def test_a_silent_service_leaves_the_relay_at_the_level_of_an_alarm() -> None:
+    switched: asyncio.Queue[Relay] = asyncio.Queue()
+    async with hooks({"relay": "low"}, switch=switched.put):
+        assert await asyncio.wait_for(switched.get(), LONG_S) == Relay(high=True, high_when_silent=False, silent_s=30)
 
 
 async def test_a_program_that_is_not_there_or_fails_is_logged_and_ends_nothing(tmp_path: Path) -> None:

@@ -292,7 +292,10 @@ def test_alarms_are_there_that_are_watched_and_hold_though_the_sensor_is_silent(
     component = found["components"]["alarm_soc_low"]
     assert (component["platform"], component["device_class"]) == ("binary_sensor", "battery")
     assert component["state_topic"] == "bms/pack/alarm/soc_low"
-    assert component["availability"] == [{"topic": "bms/pack/availability"}]
+    of_service, of_alarm = component["availability"]
+    assert of_service == {"topic": "bms/pack/availability"}
+    assert (of_alarm["topic"], component["availability_mode"]) == ("bms/pack/alarm/soc_low", "all")
+    assert of_alarm["value_template"] == ("{{ 'online' if value_json.watched or value_json.active else 'offline' }}")
 
 
 def test_the_names_are_home_assistants_or_the_users_and_the_ids_the_same_in_any_language() -> None:

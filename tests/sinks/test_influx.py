@@ -228,5 +228,7 @@ def test_a_window_without_samples_and_alarms_that_stay_are_no_lines() -> None:
     assert lines(None, NOTHING_YET) == []
     raised = NOTHING_YET._replace(alarms=(LOW,))
     [line] = lines(NOTHING_YET, raised)
-    assert line.startswith("bms_alarm,device=pack,name=soc_low,severity=warning active=true,value=9.5,limit=10.0,text=")
+    assert line.startswith(
+        "bms_alarm,device=pack,name=soc_low,severity=warning active=true,watched=true,value=9.5,limit=10.0,text="
+    )
     assert lines(raised, raised) == []

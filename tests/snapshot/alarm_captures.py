@@ -50,7 +50,13 @@ class Told:
 
     def turns(self, name: str) -> list[tuple[float, bool]]:
         """When an alarm was raised and when it ended, in seconds of the capture."""
-        return [(round(change.at_s, 3), change.alarm.active) for change in self.changes if change.alarm.name == name]
+        turns = [change for change in self.changes if change.alarm.name == name and change.turn == "active"]
+        return [(round(change.at_s, 3), change.alarm.active) for change in turns]
+
+    def watched(self, name: str) -> list[tuple[float, bool]]:
+        """When an alarm could no longer be watched and when it could again, in seconds of the capture."""
+        turns = [change for change in self.changes if change.alarm.name == name and change.turn == "watched"]
+        return [(round(change.at_s, 3), change.alarm.watched) for change in turns]
 
 
 def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:

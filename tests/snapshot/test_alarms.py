@@ -19,6 +19,7 @@ from bms_estimator.model.event import events
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.model.suspect import Suspect
+from bms_estimator.snapshot.alarm_inputs import Inputs
 from bms_estimator.snapshot.alarm_state import AlarmState
 from bms_estimator.snapshot.alarms import Alarms, Counts
 from tests.snapshot.alarm_captures import PACK, WALL_S, Line, Told, record, replayed, settings
@@ -227,7 +228,13 @@ async def test_what_is_raised_outlives_a_restart_and_ends_where_it_would_have_en
 
 
 async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
-    alarms = Alarms(watched(settings({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}}), PACK), 0.2, 5.0)
+    alarms = Alarms(
+        watched(settings({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}}), PACK),
+        0.2,
+        5.0,
+        Inputs(10.0, 2),
+        10.0,
+    )
     block = np.zeros(2, dtype=SAMPLE)
     block["time_s"], block["current_a"], block["voltage_v"] = [0.0, 0.1], 25.0, 7.4
     block["status"] = [0, int(SampleStatus.CURRENT_SATURATED)]
@@ -239,7 +246,7 @@ async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
 
 
 def test_silence_that_is_back_is_the_cause_of_a_latched_link_lost_again() -> None:
-    alarms = Alarms(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0)
+    alarms = Alarms(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     kept = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
     alarms.restore(json.dumps({"link_lost": kept}))
     alarms.silent(1.0, WALL_S, "")
@@ -251,7 +258,7 @@ def test_silence_that_is_back_is_the_cause_of_a_latched_link_lost_again() -> Non
 
 
 def test_an_alarm_that_was_kept_with_a_value_that_is_none_is_refused() -> None:
-    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0)
+    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     kept = {"since_s": WALL_S, "value": math.inf, "gone": False, "acknowledged": False}
     with pytest.raises(ValueError, match="pack_over_voltage: value = inf"):
         alarms.restore(json.dumps({"pack_over_voltage": kept}))
@@ -286,3 +293,113 @@ def test_limits_follow_chemistry_size_and_what_is_set() -> None:
     assert "cell_imbalance" not in told_of
     stack = {each.name for each in watched(settings(), load_fuel_cell("pem_30w"))}
     assert not stack & {"cell_over_voltage", "cell_under_voltage", "charge_over_current", "charging_below_freezing"}
+
+
+CHARGED = Line(30, voltage_v=7.6, current_a=-5.0, cells_v=(3.8, 3.8))
+LOSSES = [
+    (CHARGED._replace(temperature_c=None), "temperature", ("charging_below_freezing", "over_temperature")),
+    (CHARGED._replace(cells_v=()), "cell voltages", ("cell_over_voltage", "cell_under_voltage")),
+    (CHARGED._replace(cells_v=(3.8,)), "cell voltages", ("cell_over_voltage", "cell_under_voltage")),
+]
+"""What is lost while the pack is charged, the word for it, and the critical alarms that need it."""
+
+
+@pytest.mark.parametrize(("lost", "word", "blind"), LOSSES)
+async def test_a_quantity_that_is_lost_raises_sensor_fault_after_ten_seconds_and_its_alarms_say_so(
+    lost: Line, word: str, blind: tuple[str, ...], tmp_path: Path
+) -> None:
+    lines = [CHARGED, lost, CHARGED._replace(seconds=60)]
+    told = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert told.turns("sensor_fault") == [(40.0, True), (100.0, False)]  # measured again for 10 s, then its own 30 s
+    for name in blind:
+        assert told.watched(name) == [(40.0, False), (70.0, True)]
+    assert told.watched("pack_over_voltage") == []
+    shown = [{a.name: a for a in s.alarms} for s in told.snapshots]
+    unwatched = [alarms[name] for alarms in shown for name in blind if not alarms[name].watched]
+    assert {alarm.active for alarm in unwatched} == {False}
+    assert all(word in (alarm.unwatched_reason or "") for alarm in unwatched)
+    fault = next(alarms["sensor_fault"] for alarms in shown if alarms["sensor_fault"].active)
+    assert all(name in fault.text for name in (word, *blind))
+    named = [e.name for before, after in itertools.pairwise(told.snapshots) for e in events(before, after)]
+    assert {"alarm_raised", "alarm_unwatched", "alarm_watched", "alarm_cleared"} <= set(named)
+
+
+async def test_a_loss_shorter_than_the_delay_and_one_that_no_critical_alarm_needs_raise_nothing(tmp_path: Path) -> None:
+    short = [CHARGED, CHARGED._replace(seconds=10, temperature_c=None), CHARGED]
+    path = record(tmp_path / "short.bms", short)
+    assert (await replayed(path, settings())).changes == []
+    told = await replayed(path, settings({"lost_s": 5.0}))
+    assert told.turns("sensor_fault")[:1] == [(35.0, True)]
+    warnings = {name: {"severity": "warning"} for name in ("over_temperature", "charging_below_freezing")}
+    lines = [CHARGED, CHARGED._replace(temperature_c=None)]
+    told = await replayed(record(tmp_path / "warning.bms", lines), settings(warnings))
+    assert told.turns("sensor_fault") == []
+    assert told.watched("over_temperature") == [(40.0, False)]
+
+
+async def test_a_quantity_that_comes_beside_few_samples_is_measured_again_after_a_loss(tmp_path: Path) -> None:
+    rare = [CHARGED._replace(seconds=1), CHARGED._replace(seconds=4, temperature_c=None)]
+    lines = [*rare * 6, CHARGED._replace(temperature_c=None), *rare * 8]
+    told = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert told.watched("over_temperature") == [(36.0, False), (70.0, True)]
+
+
+async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None:
+    lines = [CHARGED, CHARGED._replace(temperature_c=None)]
+    before = await replayed(record(tmp_path / "one.bms", lines), settings())
+    without = record(tmp_path / "two.bms", [CHARGED._replace(temperature_c=None)])
+    after = await replayed(without, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    first = {alarm.name: alarm for alarm in after.snapshots[0].alarms}
+    assert (first["sensor_fault"].active, first["over_temperature"].watched) == (True, False)
+    assert (after.turns("sensor_fault"), after.watched("over_temperature")) == ([], [])
+    lost_meanwhile = await replayed(record(tmp_path / "three.bms", [CHARGED]), settings())
+    after = await replayed(without, settings(), kept=lost_meanwhile.kept, begin_s=WALL_S + 1000.0)
+    assert after.turns("sensor_fault") == [(10.0, True)]
+
+
+def test_without_samples_alarms_are_unwatched_until_some_come() -> None:
+    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    block = np.zeros(1, dtype=SAMPLE)
+    block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
+    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    seen = [(9.9, True, None), (10.0, False, "no cable"), (0.1, True, None)]
+    for silent_s, is_watched, reason in seen:
+        alarms.silent(silent_s, WALL_S, "no cable")
+        shown = {alarm.name: alarm for alarm in alarms.report()}
+        assert (shown["pack_over_voltage"].watched, shown["pack_over_voltage"].unwatched_reason) == (is_watched, reason)
+        assert shown["link_lost"].watched
+        assert "over_temperature" not in shown, "it was never measured"
+
+
+def test_saved_quantities_that_are_damaged_are_refused() -> None:
+    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    with pytest.raises(ValueError, match="temperature: measured = 77"):
+        alarms.restore(json.dumps({"inputs": {"temperature": [77, True]}}))
+
+
+@pytest.mark.parametrize("spacing_s", [0.0, 0.1, 1.0])
+def test_a_delay_counts_the_time_between_bursts_of_samples(spacing_s: float) -> None:
+    """Two samples at a time, twice a minute: over the limit from the fifth burst on."""
+    rule = {"pack_over_voltage": {"delay_s": 10.0}}
+    alarms = Alarms(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    for burst in range(12):
+        block = np.zeros(2, dtype=SAMPLE)
+        block["time_s"], block["voltage_v"] = 30.0 * burst + np.array([0.0, spacing_s]), 8.6 if burst >= 4 else 7.4
+        alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+        alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
+    assert turns == [150.0], "the first burst after which it has been over the limit for 10 s"
+
+
+def test_a_gap_that_does_not_come_again_soon_counts_for_no_delay() -> None:
+    rule = {"pack_over_voltage": {"delay_s": 25.0}}
+    alarms = Alarms(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    times_s = [*range(5), *range(25, 200), *range(220, 300)]
+    block = np.zeros(len(times_s), dtype=SAMPLE)
+    block["time_s"] = times_s
+    block["voltage_v"] = np.where((block["time_s"] < 180.0) & (block["time_s"] > 10.0), 7.4, 8.6)
+    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
+    assert turns == [226.0]  # 180 to 199 s, nothing for 20 s, then 6 s

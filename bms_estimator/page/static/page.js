@@ -1,4 +1,4 @@
-// The live page: what comes is kept by pack, and drawn four times a second at most, curves twice.
+// The live page: drawn four times a second at most, curves twice.
 import * as f from "./format.js";
 import { attribute, changed, hide, listen, node, text } from "./live.js";
 import { Curve, OverSoc, Ring, gaps, scaled } from "./charts.js";
@@ -155,8 +155,9 @@ function drawHead(pack) {
 }
 
 function drawAlarms({ topics }) {
-	const active = Object.keys(topics).filter((t) => t.startsWith("alarm/")).map((t) => topics[t]).filter((a) => a?.active);
-	active.sort((a, b) => (a.severity < b.severity ? -1 : 1)); // critical, then warning
+	const active = Object.keys(topics).filter((t) => t.startsWith("alarm/")).map((t) => topics[t])
+		.filter((a) => a?.active || (a?.watched === false && topics.health?.sensor_online !== false));
+	active.sort((a, b) => (a.severity < b.severity ? -1 : 1));
 	if (changed($("alarms"), JSON.stringify(active))) $("alarms").replaceChildren(...active.map(alarmRow));
 }
 
@@ -164,7 +165,7 @@ function alarmRow(a) {
 	const of = (x, label) => (number(x) ? `${label}${f.digits(x)} ${a.unit ?? ""}`.trim() : "");
 	const facts = [a.severity, of(a.value, ""), of(a.limit, "limit "), a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched"];
 	return node("div", { class: `alarm ${a.severity}`, "data-alarm": a.name },
-		node("b", {}, words(a.name)), node("span", {}, a.text), node("small", {}, facts.filter(Boolean).join(" · ")));
+		node("b", {}, words(a.name)), node("span", {}, a.text || a.unwatched_reason), node("small", {}, facts.filter(Boolean).join(" · ")));
 }
 
 const SHOWN = {
@@ -448,5 +449,5 @@ onresize = redrawAll;
 matchMedia("(prefers-color-scheme: dark)").onchange = () => {
 	for (const chart of [...Object.values(curves ?? {}), overSoc]) chart?.plot.redraw(false, true);
 };
-setInterval(drawSoon, 1000); // a state that ends, too, is to be seen
+setInterval(drawSoon, 1000);
 stream = listen(take, drawSoon);
