@@ -5,7 +5,7 @@ import { Curve, OverSoc, Ring, gaps, scaled } from "./charts.js";
 
 const DRAW_MS = 250, CURVES_MS = 500, DESCRIBE_MS = 10_000, HISTORY_MS = 60_000;
 const SPANS = { live: 300, hour: 3600, day: 86400, month: 30 * 86400 }; // [s]
-const ROWS = 3600; // five minutes at 10 Hz, and some
+const ROWS = 3600;
 const COLUMNS = ["voltage_v", "voltage_estimate_v", "current_a", "soc", "soc_std", "innovation_v"];
 const MOST_EVENTS = 50;
 
@@ -17,7 +17,6 @@ const packs = new Map();
 const ui = { pack: null, span: "live", element: null, drawn: 0, curves: -Infinity, described: -Infinity, due: false };
 let stream, link = null, linkSince = 0;
 
-// what came last
 
 class Pack {
 	topics = {};
@@ -26,7 +25,7 @@ class Pack {
 	events = [];
 	history = {}; // span -> { at, data } or { at, reason }
 	stateAt = 0; // of its last state, by our clock
-	since = null; // stale since
+	since = null;
 	constructor(name) { this.name = name; }
 	take(topic, value) {
 		if (topic === "recent") {
@@ -163,7 +162,7 @@ function drawAlarms({ topics }) {
 
 function alarmRow(a) {
 	const of = (x, label) => (number(x) ? `${label}${f.digits(x)} ${a.unit ?? ""}`.trim() : "");
-	const facts = [a.severity, of(a.value, ""), of(a.limit, "limit "), a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched"];
+	const facts = [a.severity, of(a.value, ""), of(a.limit, "limit "), a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched", a.watched === false && "cannot be watched"];
 	return node("div", { class: `alarm ${a.severity}`, "data-alarm": a.name },
 		node("b", {}, words(a.name)), node("span", {}, a.text || a.unwatched_reason), node("small", {}, facts.filter(Boolean).join(" · ")));
 }
