@@ -46,8 +46,8 @@ MOST_STDS = 3.0
 """Resistances are within so many of their first std."""
 LEAST_LN_Q, MOST_LN_Q = math.log(0.5), math.log(1.3)
 """Limits of the learned over the declared capacity: age takes up to half of it, no make holds much more than it declares."""
-NO_CAPACITY, ALL = STATES, STATES + 1
-"""An update that changes all states but the capacity, and one that changes all."""
+HOLD_NOTHING, HOLD_CAPACITY, HOLD_CELL, HOLD_CELL_AND_CURVE = range(4)
+"""States that an update keeps: none; LN_Q; LN_Q, OFFSET and the learned nodes; these and CURVE."""
 OWN_R_STD = 0.5
 """Std of ln R that series resistance and branches have each of their own. What exceeds it is common: the size of the cell.
 A cell file with more is of no cell that was measured."""
@@ -150,7 +150,7 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
             break
         soc, variance = to_soc, to_variance
         innovation_v, total_v2, straight_v2 = innovate(s, p, q, variance_v2, soc, variance)
-    correct(x, cov, ph, innovation_v, total_v2, first_held(s, p, q))
+    correct(x, cov, ph, innovation_v, total_v2, states_to_hold(s, p, q))
     x[LN_Q] = min(max(x[LN_Q], LEAST_LN_Q), MOST_LN_Q)
     most = MOST_STDS * resistance_std(s, p)
     for j in (LN_R0, LN_R):
@@ -230,34 +230,39 @@ def observe(s: Record, q: int, j: int, value: float, variance: float) -> None:
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     for k in range(STATES):
         ph[k] = cov[j, k]
-    correct(x, cov, ph, value - x[j], cov[j, j] + variance, ALL)
+    correct(x, cov, ph, value - x[j], cov[j, j] + variance, HOLD_NOTHING)
 
 
 @njit(cache=True)
-def first_held(s: Record, p: Record, q: int) -> int:
-    """First state of the curve that a voltage must not change; ``NO_CAPACITY`` or ``ALL`` where it may change the curve.
+def states_to_hold(s: Record, p: Record, q: int) -> int:
+    """Return what a voltage must not change, ``HOLD_NOTHING`` to ``HOLD_CELL_AND_CURVE``.
 
     A SOC outside 0..1 is limited, so the voltage error there is not one of the sensor, the capacity or the curve.
     Where resistances are hardly known, resistance and capacity change the voltage alike under a large constant current, and
     so does a charge at a constant voltage. The capacity is then learned at rest, at small currents and while a discharge varies.
     """
     soc, one_c = s.mean[q, SOC], p.capacity_as / 3600.0
-    trend_a = s.x_a[TREND]
     if not 0.0 <= soc <= 1.0:
-        return CURVE if s.x_a[CHARGE] < -CHARGE_C * one_c else NODE
+        return HOLD_CELL_AND_CURVE if s.x_a[CHARGE] < -CHARGE_C * one_c else HOLD_CELL
+    if p.r_std <= OWN_R_STD:
+        return HOLD_NOTHING
     small_a = REST_C * one_c if soc > NEARLY_FULL else SMALL_C * one_c
-    varying = trend_a > 0.0 and s.rms_a2 - s.mean_a * s.mean_a > (VARYING_C * one_c) ** 2
-    return ALL if p.r_std <= OWN_R_STD or abs(trend_a) < small_a or varying else NO_CAPACITY
+    varying = s.x_a[TREND] > 0.0 and s.rms_a2 - s.mean_a * s.mean_a > (VARYING_C * one_c) ** 2
+    return HOLD_NOTHING if abs(s.x_a[TREND]) < small_a or varying else HOLD_CAPACITY
 
 
 @njit(cache=True)
-def is_held(j: int, first: int) -> bool:
-    """Whether state ``j`` keeps its mean and variance, by what ``first_held`` returns."""
-    return j >= first or (j == LN_Q and first <= NO_CAPACITY) or (j == OFFSET and first < NO_CAPACITY)
+def is_held(j: int, hold: int) -> bool:
+    """Return true where state ``j`` keeps its mean and variance."""
+    if j == LN_Q:
+        return hold >= HOLD_CAPACITY
+    if j == CURVE:
+        return hold >= HOLD_CELL_AND_CURVE
+    return (j == OFFSET or j >= NODE) and hold >= HOLD_CELL
 
 
 @njit(cache=True)
-def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: float, first: int) -> None:
+def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: float, hold: int) -> None:
     """State and P by an innovation e of variance S: x + P H' e / S, P - P H' H P / S. ``ph`` is P H', and scratch afterwards.
 
     States that are held keep their mean and covariance: their gain is 0 (Schmidt-Kalman filter).
@@ -266,11 +271,11 @@ def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: flo
     for j in range(STATES):
         ph[j] *= scale
     for j in range(STATES):
-        along, row, held = ph[j], cov[j], is_held(j, first)
+        along, row, held = ph[j], cov[j], is_held(j, hold)
         if not held:
             x[j] += along * scale * innovation
         for k in range(STATES):
-            if not (held and is_held(k, first)):
+            if not (held and is_held(k, hold)):
                 row[k] -= along * ph[k]  # the same at k, j to the last bit
     x[SOC] = min(max(x[SOC], LOWEST), HIGHEST)
 

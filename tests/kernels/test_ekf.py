@@ -567,3 +567,32 @@ def test_what_is_not_finite_is_forgotten_and_counted(drive, field: str) -> None:
     assert np.isfinite(trace["soc_std"][2:]).all()
     assert trace["soc"][5] == pytest.approx(before, abs=0.05)
     assert estimator.record[0]["filter"]["mean"][0, LN_R] != 0.0
+
+
+@pytest.mark.parametrize(("soc", "held"), [(1.02, True), (-0.02, True), (0.6, False)])
+def test_a_limited_soc_teaches_neither_sensor_nor_capacity_nor_curve(soc: float, held: bool) -> None:
+    p = settings()
+    s = somewhere(p)
+    s["mean"][0, SOC] = soc
+    before, std = s["mean"][0].copy(), np.sqrt(np.diag(s["covariance"][0]))
+    ekf.update(s, p, 0, 1e-4)
+    taught = [OFFSET, LN_Q, *range(NODE, STATES)]
+    assert not held or np.array_equal(s["mean"][0, taught], before[taught])
+    assert not held or np.array_equal(np.sqrt(np.diag(s["covariance"][0]))[taught], std[taught])
+    assert held or np.all(s["mean"][0, taught] != before[taught])
+    assert s["mean"][0, LN_R] != before[LN_R]
+
+
+@pytest.mark.parametrize(
+    ("trend_c", "r_std", "held"), [(0.9, 0.7, True), (-0.9, 0.7, True), (0.1, 0.7, False), (0.9, 0.1, False)]
+)
+def test_a_constant_current_teaches_no_capacity_where_resistances_are_hardly_known(
+    trend_c: float, r_std: float, held: bool
+) -> None:
+    p = settings(r_std=r_std)
+    s = somewhere(p)
+    s["x_a"][:] = s["mean_a"] = 3.0 * trend_c
+    s["rms_a2"] = s["mean_a"] ** 2
+    before = s["mean"][0, LN_Q]
+    ekf.update(s, p, 0, 1e-4)
+    assert (s["mean"][0, LN_Q] == before) == held

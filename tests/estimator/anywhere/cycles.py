@@ -64,6 +64,8 @@ DISCHARGES = ((0.7, 0.41), (1.0, 0.7), (1.5, 0.41), (2.0, 0.55), (3.0, 0.41), (3
 """Resistance and initial SOC of the full cycles."""
 CHARGES = ((0.7, 0.03, 1.0), (1.0, 0.05, 0.3), (2.0, 0.02, 0.5), (3.0, 0.05, 1.0))
 """Resistance, initial SOC and current [C] of the charges from empty."""
+THREE_TIMES_PHOSPHATE = Cycle("lfp", "discharge", 1.815, 0.41)
+"""A cell with three times the resistances of ``PHOSPHATE``, for its capacity."""
 WORST_STDS = 1.5
 """Largest error of a true curve that is drawn, in std of the generic one."""
 CHEMISTRIES = ("nmc", "nca", "lfp", "lmo", "lco", "lto")
@@ -136,6 +138,8 @@ class CycleRow:
     score: Score
     capacity: float
     """Learned over true capacity, less 1 [%]."""
+    initializations: int
+    """How often the filter initialized itself again."""
 
     @property
     def line(self) -> list[str]:
@@ -156,7 +160,7 @@ def row(cycle: Cycle) -> CycleRow:
     result = score(samples["time_s"], trace["soc"], trace["soc_std"], soc, AFTER_S)
     assert result is not None
     f = estimator.record[0]["filter"]
-    return CycleRow(cycle, result, 100.0 * float(np.expm1(f["mean"][f["best"], LN_Q])))
+    return CycleRow(cycle, result, 100.0 * float(np.expm1(f["mean"][f["best"], LN_Q])), int(f["reopened"]))
 
 
 def rows(chemistry: str) -> list[CycleRow]:

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from tests.estimator.anywhere.cycles import CHEMISTRIES, HEAD, PATH, CycleRow, rows
+from tests.estimator.anywhere.cycles import CHEMISTRIES, HEAD, PATH, THREE_TIMES_PHOSPHATE, CycleRow, row, rows
 
 LIMITS = {
     "nmc": (95, 80, 4.2),
@@ -53,3 +53,18 @@ def test_the_interval_holds_through_a_full_cycle(table, chemistry: str) -> None:
 def test_no_cycle_teaches_an_impossible_capacity(table, chemistry: str) -> None:
     """The declared capacity is right. A charge once left 67 % too much."""
     assert max(abs(r.capacity) for r in table[chemistry]) < 25.0
+
+
+def test_a_charge_from_empty_neither_teaches_a_capacity_nor_initializes_the_filter_again() -> None:
+    """The filter once began again as the charge did, was limited at full too early, and learned 36 % too much capacity there."""
+    cycle = row(THREE_TIMES_PHOSPHATE)
+    assert cycle.initializations == 0
+    assert abs(cycle.capacity) < 5.0
+    assert cycle.score.rmse < 4.0
+    assert cycle.score.cover > 95.0
+
+
+@pytest.mark.parametrize("chemistry", ["nmc", "nca", "lfp", "lmo"])
+def test_no_capture_of_these_initializes_the_filter_again(table, chemistry: str) -> None:
+    """Of lco and lto some do, in the middle of a charge or at rest after the discharge."""
+    assert [r.cycle.name for r in table[chemistry] if r.initializations] == []
