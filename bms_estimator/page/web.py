@@ -4,7 +4,7 @@ import asyncio
 import hashlib
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, cast
 
 import structlog
 from aiohttp import web
@@ -12,6 +12,7 @@ from aiohttp import web
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.page_settings import Listen, PageSettings
 from bms_estimator.page.guard import HEADERS, Guard, guard_of
+from bms_estimator.page.listener import CONNECTIONS, Listener
 from bms_estimator.page.newest import Newest
 
 PING_S = 5.0
@@ -79,6 +80,7 @@ class WebServer:
         self._files = {path: _read(file) for path, file in files.items()}
         self._handlers = {**dict.fromkeys(files, self._file), "/events": self._events, **handlers}
         self._runner: web.AppRunner | None = None
+        self._listener: Listener | None = None
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -116,6 +118,8 @@ class WebServer:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
         self._newest.close()
+        if self._listener:
+            await self._listener.close()
         if self._runner:
             await self._runner.cleanup()
 
@@ -125,9 +129,9 @@ class WebServer:
         Raises:
             OSError: It cannot be had.
         """
-        site = web.TCPSite(runner, self._wanted.host, self._wanted.port)
-        await site.start()
-        port = runner.addresses[0][1]
+        listener = Listener(cast("web.Server", runner.server))
+        port = await listener.open(self._wanted.host, self._wanted.port)
+        self._listener = listener
         self._listening = self._wanted._replace(port=port)
         log.info("live page", url=self.url)
         self._opened(self.url)
@@ -142,7 +146,11 @@ class WebServer:
 
     @web.middleware
     async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Whose name is asked for, and whether the token was shown."""
+        """Handle a request under a name of ours, with the token."""
+        with CONNECTIONS.serving(request.transport):
+            return await self._checked(request, handler)
+
+    async def _checked(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         if not self._guard.knows_host(request.headers.get("Host", "")):
             raise web.HTTPForbidden(text="not under this name: add it to page.hosts, or --host\n")
         shown = request.query.get("token")
