@@ -4,8 +4,7 @@ import asyncio
 import contextlib
 import resource
 import socket
-import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import aiohttp
@@ -18,69 +17,30 @@ from bms_estimator.page.hub import Hub
 from bms_estimator.page.listener import CONNECTIONS, Connections, Listener
 from bms_estimator.page.past import Past
 from bms_estimator.page.server import PageServer
+from tests.idle_connections import DESCRIPTORS, attacked, few_descriptors
 from tests.patience import LONG_S
 
-IDLE = 1000
-DESCRIPTORS = 1024
-"""Soft limit that most systems give to a process."""
-ATTACK = """
-import resource, socket, sys
-hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-idle = []
-for number in range(int(sys.argv[2])):
-    idle.append(socket.create_connection(("127.0.0.1", int(sys.argv[1]))))
-print("open", flush=True)
-sys.stdin.read()
-"""
-"""A process of its own, so that its descriptors are not those of the server: port, number of connections."""
 
-
-@pytest.fixture
-def few_descriptors() -> Iterator[None]:
-    before = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_NOFILE, before)
-
-
-@contextlib.asynccontextmanager
-async def attacked(port: int) -> AsyncIterator[None]:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-c",
-        ATTACK,
-        str(port),
-        str(IDLE),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-    )
-    try:
-        async with asyncio.timeout(LONG_S):
-            assert process.stdout
-            assert await process.stdout.readline() == b"open\n"
-        yield
-    finally:
-        process.kill()
-        await process.wait()
-
-
-@pytest.mark.usefixtures("few_descriptors")
 async def test_a_thousand_idle_connections_leave_descriptors_and_an_authorized_client_is_answered(
     tmp_path: Path,
 ) -> None:
     token = tmp_path / "token"
     token.write_text("0123456789abcdef")
     settings = PageSettings(listen="127.0.0.1:0", token_file=token)
-    async with PageServer(settings, Hub(), Past(), patient=False) as server:  # noqa: SIM117 - needs its port
-        async with attacked(int(server.url.rsplit(":", 1)[1].strip("/"))):
-            assert len(CONNECTIONS) <= CONNECTIONS.limit
-            with contextlib.ExitStack() as files:  # as many as the cap reserves for all else
-                for number in range(DESCRIPTORS // 2):
-                    files.enter_context((tmp_path / f"{number}").open("w"))
-            given = {"Authorization": "Bearer 0123456789abcdef"}
-            async with aiohttp.ClientSession(server.url, headers=given) as session, session.get("/") as response:
-                assert response.status == 200
+    with few_descriptors():
+        async with PageServer(settings, Hub(), Past(), patient=False) as server:
+            await _answered_under_attack(server, tmp_path)
+
+
+async def _answered_under_attack(server: PageServer, tmp_path: Path) -> None:
+    async with attacked(int(server.url.rsplit(":", 1)[1].strip("/"))):
+        assert len(CONNECTIONS) <= CONNECTIONS.limit
+        with contextlib.ExitStack() as files:  # as many as the cap reserves for all else
+            for number in range(DESCRIPTORS // 2):
+                files.enter_context((tmp_path / f"{number}").open("w"))
+        given = {"Authorization": "Bearer 0123456789abcdef"}
+        async with aiohttp.ClientSession(server.url, headers=given) as session, session.get("/") as response:
+            assert response.status == 200
 
 
 async def test_a_client_without_a_complete_header_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
