@@ -18,9 +18,10 @@ from tests.mosquitto import Broker, Listener
 from tests.page.house import Service, starting
 from tests.patience import LONG_S
 
-IDLE = 1000
 DESCRIPTORS = 1024
 """Soft limit that most systems give to a process."""
+IDLE = DESCRIPTORS
+"""Idle connections to each listener: as many as the process may have descriptors."""
 ATTACK = """
 import resource, socket, sys
 hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
