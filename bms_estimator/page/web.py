@@ -154,11 +154,12 @@ class WebServer:
 
     @web.middleware
     async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Handle a request under a name of ours, with the token."""
+        """Keep the connection of a request open while the request is handled."""
         with CONNECTIONS.serving(request.transport):
             return await self._checked(request, handler)
 
     async def _checked(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Require a permitted host name and the token."""
         if not self._guard.knows_host(request.headers.get("Host", "")):
             raise web.HTTPForbidden(text="not under this name: add it to page.hosts, or --host\n")
         shown = request.query.get("token")

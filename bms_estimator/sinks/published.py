@@ -25,7 +25,7 @@ SILENT_S = 30.0
 ASKED = ("request", "response")
 """First part of topics that do not say how a device is."""
 ALARM = "alarm/"
-"""Begin of the topics of alarms."""
+"""Prefix of alarm topics."""
 
 
 class Heard(NamedTuple):
