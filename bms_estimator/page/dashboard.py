@@ -35,12 +35,18 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
         if message.device not in hub.packs:
             past.add(message.device, folder / f"{message.device}.sqlite")
         hub.put(*message)
+        hub.hide(subscriber.hidden)
+
+    def left_out(device: str) -> None:
+        hub.drop(device)
+        past.drop(device)
+        hub.hide(subscriber.hidden)
 
     def linked() -> None:
         lost = subscriber.lost_since is not None
         hub.say_link(subscriber.trouble or "the broker is lost" if lost else None)
 
     async with PageServer(settings, hub, past, patient=False) as server:
-        subscriber = Subscriber(broker, heard, linked)
+        subscriber = Subscriber(broker, heard, linked, left_out=left_out)
         async with subscriber:
             yield server.url

@@ -1,14 +1,17 @@
 """The newest payload of each topic of each pack. No connection, no clock of its own."""
 
 import json
+import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from bms_estimator.page.newest import Newest
 from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.store.minute import epoch_s
 
+PACKS = "packs"
+"""Key of the names of all packs and of the number of packs that are not shown."""
 STATE, PARAMETERS, RECENT, ELEMENTS = "state", "parameters", "recent", "elements"
 """Topics of the estimate and of the parameters, and what there is here beside the topics of MQTT."""
 SHOWN = frozenset({STATE, PARAMETERS, "health", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY})
@@ -17,6 +20,8 @@ ELEMENTS_OVER_SOC = frozenset({"r_s_ohm", "r_ts_ohm", "c_ts_farad", "r_tl_ohm", 
 RECENT_STATES = 600
 RECENT_STEP_S = 1.0
 """Between the states that are kept for the curves of whoever opens the page later [s]."""
+MAX_AHEAD_S = 86_400.0
+"""Maximum time of a state ahead of the wall clock [s]."""
 RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
 
 _Row = tuple[float, tuple[float | None, ...]]
@@ -27,10 +32,14 @@ class Hub(Newest):
     """What is known of all packs.
 
     Keys are ``<pack>/<topic>``, values JSON as text in one line.
+
+    Args:
+        wall: Wall clock, seconds since 1970.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wall: Callable[[], float] = time.time) -> None:
         super().__init__()
+        self._wall, self._hidden = wall, 0
         self._topics: dict[str, dict[str, str]] = {}
         self._recent: dict[str, deque[_Row]] = {}
         self._learned: dict[str, dict[str, dict[int, tuple[float, float]]]] = {}
@@ -54,39 +63,74 @@ class Hub(Newest):
             text = _json(value)
         except RecursionError:  # somebody else's: deeper than it could be written
             return
-        topics = self._topics.setdefault(pack, {})
         if value is None:
             self._forget(pack, topic)
         else:
-            topics[topic] = text
+            self._add(pack)[topic] = text
         if topic == STATE and isinstance(value, dict):
             self._remember(pack, value)
         if topic == PARAMETERS and isinstance(value, dict):
             self._learn(pack, value)
-        self.hand_on(f"{pack}/{topic}", text)
+        self.hand_on(f"{pack}/{topic}")
 
-    def known(self) -> dict[str, str]:
-        """What a new reader finds."""
-        known = super().known()
+    def drop(self, pack: str) -> None:
+        """Remove a pack."""
+        if self._topics.pop(pack, None) is None:
+            return
+        self._recent.pop(pack, None)
+        self._learned.pop(pack, None)
+        self._publish_packs()
+
+    def hide(self, count: int) -> None:
+        """Report the number of packs that are not shown."""
+        if count != self._hidden:
+            self._hidden = count
+            self._publish_packs()
+
+    def keys(self) -> list[str]:
+        """Return the keys that a new reader is sent."""
+        keys = super().keys()
         for pack, topics in self._topics.items():
-            known |= {f"{pack}/{topic}": text for topic, text in topics.items()}
-            known[f"{pack}/{RECENT}"] = _json(_columns(self._recent.get(pack, ())))
-            known[f"{pack}/{ELEMENTS}"] = _json(self._learned.get(pack, {}))
-        return known
+            keys += [f"{pack}/{topic}" for topic in (*topics, RECENT, ELEMENTS)]
+        return keys
+
+    def text(self, key: str) -> str | None:
+        """Return the newest text of a key; None: its pack is gone."""
+        pack, slash, topic = key.partition("/")
+        if not slash:
+            return super().text(key)
+        if pack not in self._topics:
+            return None
+        if topic == RECENT:
+            return _json(_columns(self._recent.get(pack, ())))
+        if topic == ELEMENTS:
+            return _json(self._learned.get(pack, {}))
+        return self._topics[pack].get(topic, "null")
+
+    def _add(self, pack: str) -> dict[str, str]:
+        """Return the topics of a pack, which is added if it is new."""
+        if pack not in self._topics:
+            self._topics[pack] = {}
+            self._publish_packs()
+        return self._topics[pack]
 
     def _forget(self, pack: str, topic: str) -> None:
-        """A topic was emptied; with its last one a pack is gone."""
-        topics = self._topics[pack]
+        """Remove a topic, and the pack with its last one."""
+        topics = self._topics.get(pack, {})
         topics.pop(topic, None)
         if not topics:
-            for of_packs in (self._topics, self._recent, self._learned):
-                of_packs.pop(pack, None)
+            self.drop(pack)
+
+    def _publish_packs(self) -> None:
+        self.say(PACKS, _json({"names": self.packs, "hidden": self._hidden}))
 
     def _remember(self, pack: str, state: Mapping[str, Any]) -> None:
-        """Keep what the curves show, once a second; a state that comes late is left out."""
+        """Keep what the curves show, once a second; a state that comes late or is dated far in the future is left out."""
         try:
             row = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
         except (TypeError, ValueError, KeyError):  # somebody else's
+            return
+        if row[0] > self._wall() + MAX_AHEAD_S:  # would keep all later states out
             return
         rows = self._recent.setdefault(pack, deque(maxlen=RECENT_STATES))
         if not rows or row[0] >= rows[-1][0] + RECENT_STEP_S:

@@ -1,13 +1,15 @@
 """The newest text of each key, and who reads it. No connection, no clock of its own.
 
-A reader who is slow finds only the newest of what came meanwhile: what waits for one is at most a text for each key.
+A slow reader is sent only the newest text of each key.
 """
 
 import asyncio
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 
+MESSAGE_BYTES = 256 * 1024
+"""Size of a message to a reader. A reader that never reads keeps one message in memory."""
 LINK = "link"
 """Whether what fills it is connected."""
 
@@ -24,29 +26,33 @@ class Newest:
         """How many read now."""
         return len(self._readers)
 
-    def known(self) -> dict[str, str]:
-        """What a new reader finds."""
-        return dict(self._texts)
+    def keys(self) -> list[str]:
+        """Return the keys that a new reader is sent."""
+        return list(self._texts)
+
+    def text(self, key: str) -> str | None:
+        """Return the newest text of a key; None: there is nothing to send."""
+        return self._texts.get(key)
 
     def say(self, key: str, text: str) -> None:
         """Keep a text, and hand it on where it is another one."""
         if text != self._texts.get(key):
             self._texts[key] = text
-            self.hand_on(key, text)
+            self.hand_on(key)
 
     def say_link(self, trouble: str | None) -> None:
         """Whether what fills this is connected: why not, or None when it is."""
         self.say(LINK, json.dumps({"up": trouble is None, "reason": trouble}))
 
-    def hand_on(self, key: str, text: str) -> None:
-        """To all who read now, kept or not."""
+    def hand_on(self, key: str) -> None:
+        """Have the newest text of a key sent to all readers."""
         for reader in self._readers:
-            reader.put(key, text)
+            reader.put(key)
 
     @contextmanager
     def reading(self) -> Iterator["Reader"]:
         """A reader, who finds all that is known first."""
-        reader = Reader(self.known())
+        reader = Reader(self)
         self._readers.add(reader)
         try:
             yield reader
@@ -60,36 +66,53 @@ class Newest:
 
 
 class Reader:
-    """What waits for one who reads.
+    """Keys whose newest text one reader has not been sent yet. Texts are shared, so that readers cost no memory.
 
     Args:
-        known: What is there at first.
+        newest: Source of the keys and texts.
     """
 
-    def __init__(self, known: Mapping[str, str]) -> None:
-        self._waiting = dict(known)
+    def __init__(self, newest: Newest) -> None:
+        self._newest = newest
+        self._waiting = dict.fromkeys(newest.keys())
         self._due = asyncio.Event()
         self._due.set()
         self.closed = False
 
-    def put(self, key: str, text: str) -> None:
-        """Have the newest wait."""
-        self._waiting[key] = text
+    def put(self, key: str) -> None:
+        """Add a key whose text has changed."""
+        self._waiting[key] = None
         self._due.set()
 
     def close(self) -> None:
-        """Nothing more will come."""
+        """End the stream."""
         self.closed = True
         self._due.set()
 
     async def next(self, longest_s: float) -> str:
-        """All that waits as one JSON object; empty when nothing came in ``longest_s``, or when it is closed."""
+        """Return what waits as one JSON object of at most ``MESSAGE_BYTES``, or one text if that is longer.
+
+        The rest waits for the next call. The result is empty when nothing came in ``longest_s``, or at the end.
+        """
         try:
             async with asyncio.timeout(longest_s):
                 await self._due.wait()
         except TimeoutError:
             return ""
-        self._due.clear()
-        waiting, self._waiting = self._waiting, {}
-        parts = ",".join(f"{json.dumps(key)}:{text}" for key, text in waiting.items())
-        return f"{{{parts}}}" if parts else ""
+        parts = self._take()
+        if not self._waiting:
+            self._due.clear()
+        return f"{{{','.join(parts)}}}" if parts else ""
+
+    def _take(self) -> list[str]:
+        parts, size = list[str](), 0
+        while self._waiting:
+            key = next(iter(self._waiting))
+            text = self._newest.text(key)
+            if text is not None:
+                size += len(key) + len(text)
+                if parts and size > MESSAGE_BYTES:
+                    break
+                parts.append(f"{json.dumps(key)}:{text}")
+            del self._waiting[key]
+        return parts

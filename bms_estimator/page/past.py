@@ -56,6 +56,12 @@ class Past:
         """Say where a pack's history is kept."""
         self._files[pack] = path
 
+    def drop(self, pack: str) -> None:
+        """Remove a pack."""
+        self._files.pop(pack, None)
+        for name in SPANS:
+            self._read.pop((pack, name), None)
+
     def read(self, pack: str, name: str) -> bytes:
         """A span of a pack's history as JSON, by columns; to be called in ``thread``.
 

@@ -1,10 +1,12 @@
 """An HTTP server of pages: their files, the stream of what is new, what is asked for; nothing can be changed through it."""
 
 import asyncio
+import contextlib
 import hashlib
-from collections.abc import Awaitable, Callable, Mapping
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, cast
 
 import structlog
 from aiohttp import web
@@ -12,14 +14,15 @@ from aiohttp import web
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.page_settings import Listen, PageSettings
 from bms_estimator.page.guard import HEADERS, Guard, guard_of
-from bms_estimator.page.newest import Newest
+from bms_estimator.page.listener import CONNECTIONS, Listener
+from bms_estimator.page.newest import Newest, Reader
 
 PING_S = 5.0
 """A reader who hears nothing for so long hears that all is well: the page takes three times that for a lost line [s]."""
 WRITE_S = 30.0
 """One who takes nothing for so long is gone [s]."""
-MOST_READERS = 32
-"""At a time, of all packs together."""
+MAX_STREAMS = 32
+"""Streams at a time, of all packs together."""
 AGAIN_S = 10.0
 """Before an address that is taken is tried again [s]."""
 CLOSING_S = 1.0
@@ -46,6 +49,11 @@ class _Read(NamedTuple):
     body: bytes
     kind: str
     tag: str
+
+
+class _Stream(NamedTuple):
+    address: str | None
+    transport: asyncio.Transport | None
 
 
 class WebServer:
@@ -78,7 +86,9 @@ class WebServer:
         self._wanted, self._listening = settings.address, settings.address
         self._files = {path: _read(file) for path, file in files.items()}
         self._handlers = {**dict.fromkeys(files, self._file), "/events": self._events, **handlers}
+        self._streams: dict[Reader, _Stream] = {}
         self._runner: web.AppRunner | None = None
+        self._listener: Listener | None = None
         self._task: asyncio.Task[None] | None = None
 
     @property
@@ -116,6 +126,8 @@ class WebServer:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
         self._newest.close()
+        if self._listener:
+            await self._listener.close()
         if self._runner:
             await self._runner.cleanup()
 
@@ -125,9 +137,9 @@ class WebServer:
         Raises:
             OSError: It cannot be had.
         """
-        site = web.TCPSite(runner, self._wanted.host, self._wanted.port)
-        await site.start()
-        port = runner.addresses[0][1]
+        listener = Listener(cast("web.Server", runner.server))
+        port = await listener.open(self._wanted.host, self._wanted.port)
+        self._listener = listener
         self._listening = self._wanted._replace(port=port)
         log.info("live page", url=self.url)
         self._opened(self.url)
@@ -142,7 +154,12 @@ class WebServer:
 
     @web.middleware
     async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Whose name is asked for, and whether the token was shown."""
+        """Keep the connection of a request open while the request is handled."""
+        with CONNECTIONS.serving(request.transport):
+            return await self._checked(request, handler)
+
+    async def _checked(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Require a permitted host name and the token."""
         if not self._guard.knows_host(request.headers.get("Host", "")):
             raise web.HTTPForbidden(text="not under this name: add it to page.hosts, or --host\n")
         shown = request.query.get("token")
@@ -174,13 +191,11 @@ class WebServer:
         return web.Response(body=file.body, content_type=file.kind, charset="utf-8", headers=headers)
 
     async def _events(self, request: web.Request) -> web.StreamResponse:
-        """What is known, then what is new, until either side goes."""
-        if self._newest.readers >= MOST_READERS:
-            raise web.HTTPServiceUnavailable(text=f"{MOST_READERS} browsers read already\n")
+        """Stream what is known, then what is new, until either side closes."""
         response = web.StreamResponse(
             headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         )
-        with self._newest.reading() as reader:
+        with self._newest.reading() as reader, self._streaming(reader, request):
             await response.prepare(request)
             await response.write(b"retry: 1000\n\n")
             while not reader.closed:
@@ -191,6 +206,27 @@ class WebServer:
                 except (TimeoutError, ConnectionError):
                     break
         return response
+
+    @contextlib.contextmanager
+    def _streaming(self, reader: Reader, request: web.Request) -> Iterator[None]:
+        """Count a stream, which replaces another one when there are too many."""
+        if len(self._streams) >= MAX_STREAMS:
+            self._close_one(request.remote)
+        self._streams[reader] = _Stream(request.remote, request.transport)
+        try:
+            yield
+        finally:
+            self._streams.pop(reader, None)
+
+    def _close_one(self, newcomer: str | None) -> None:
+        """Close the oldest stream of the address that has the most; of the newcomer's own where several have as many."""
+        counts = Counter(stream.address for stream in self._streams.values())
+        most = max(counts, key=lambda address: (counts[address], address == newcomer))
+        reader = next(reader for reader, stream in self._streams.items() if stream.address == most)
+        transport = self._streams.pop(reader).transport
+        reader.close()
+        if transport:
+            transport.abort()  # its reader may be waiting for a client that reads nothing
 
 
 async def _protect(_: web.Request, response: web.StreamResponse) -> None:

@@ -121,6 +121,8 @@ class LiveView:
         self.show()
 
     def _remember(self, heard: Heard) -> None:
+        if len(self._curves) > len(self._devices):  # some devices were replaced
+            self._curves = {name: curves for name, curves in self._curves.items() if name in self._devices}
         curves = self._curves.setdefault(heard.device, Curves())
         state = Fields(heard.payload)
         voltage_v, current_a = state.number("voltage_v"), state.number("current_a")

@@ -6,19 +6,26 @@ Whoever may publish may put anything there, so all that is kept is bounded, and 
 import json
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from bms_estimator.model.settings import DEVICE_NAME
 
-MOST_DEVICES = 64
-"""More are not looked at."""
-MOST_TOPICS = 64
-"""Of one device; more are not looked at."""
-MOST_KEPT_BYTES = 16 * 1024 * 1024
-"""Of all payloads together; what would go beyond is not looked at."""
+MAX_DEVICES = 64
+"""Devices that are stored at a time."""
+MAX_TOPICS = 64
+"""Topics of one device; messages on further topics are ignored."""
+MAX_DEVICE_BYTES = 128 * 1024
+"""Payloads of one device together; a message that would exceed this is ignored."""
+MAX_HIDDEN = 10_000
+"""Names of devices without room that are counted."""
+SILENT_S = 30.0
+"""A new device replaces the one that has been silent longest, if that is at least this [s]. A raised alarm does not wait."""
 ASKED = ("request", "response")
 """First part of topics that do not say how a device is."""
+ALARM = "alarm/"
+"""Prefix of alarm topics."""
 
 
 class Heard(NamedTuple):
@@ -41,6 +48,15 @@ class Device:
     """By topic when that came, seconds since 1970."""
     sizes: dict[str, int] = field(default_factory=dict)
     """Of the payloads [bytes]."""
+    alarms: set[str] = field(default_factory=set)
+    """Topics of the alarms that are raised."""
+    last_s: float = 0.0
+    """Time of the last message, seconds since 1970."""
+
+    @property
+    def priority(self) -> tuple[bool, float]:
+        """Rank by which devices are stored: raised alarms first, then the last message."""
+        return bool(self.alarms), self.last_s
 
 
 class Published:
@@ -48,13 +64,19 @@ class Published:
 
     Args:
         base_topic: First part of all topics.
+        left_out: Called with the name of a device that has no room: a new one, or one that was replaced.
     """
 
-    def __init__(self, base_topic: str) -> None:
-        self._root = f"{base_topic}/"
+    def __init__(self, base_topic: str, left_out: Callable[[str], object] = str) -> None:
+        self._root, self._left_out = f"{base_topic}/", left_out
         self.devices: dict[str, Device] = {}
         """By name, in the order in which they were heard first."""
-        self._bytes = 0
+        self._hidden: set[str] = set()
+
+    @property
+    def hidden(self) -> int:
+        """Number of devices that publish but have no room, ``MAX_HIDDEN`` at most."""
+        return len(self._hidden)
 
     def take(self, topic: str, payload: bytes, now_s: float) -> Heard | None:
         """Keep a message.
@@ -77,26 +99,46 @@ class Published:
         return self._keep(name, rest, payload, now_s)
 
     def _keep(self, name: str, topic: str, payload: bytes, now_s: float) -> Heard | None:
-        device = self.devices.get(name) or Device()
-        grown = len(payload) - device.sizes.get(topic, 0)
-        if name not in self.devices and len(self.devices) >= MOST_DEVICES:
-            return None
-        if topic not in device.topics and len(device.topics) >= MOST_TOPICS:
-            return None
-        if self._bytes + grown > MOST_KEPT_BYTES:
-            return None
-        self._bytes += grown
         value = parsed(payload)
+        raised = topic.startswith(ALARM) and isinstance(value, dict) and value.get("active") is True
+        device = self.devices.get(name) or Device()
+        if topic not in device.topics and len(device.topics) >= MAX_TOPICS:
+            return None
+        if sum(device.sizes.values()) + len(payload) - device.sizes.get(topic, 0) > MAX_DEVICE_BYTES:
+            return None
+        if name not in self.devices and not self._make_room(now_s, urgent=raised):
+            self._hide(name)
+            return None
         device.topics[topic], device.heard_s[topic], device.sizes[topic] = value, now_s, len(payload)
+        device.last_s = now_s
+        (device.alarms.add if raised else device.alarms.discard)(topic)
         self.devices[name] = device
+        self._hidden.discard(name)
         return Heard(name, topic, value)
 
+    def _make_room(self, now_s: float, *, urgent: bool) -> bool:
+        """Return whether one more device may be stored, dropping the least important one if necessary."""
+        if len(self.devices) < MAX_DEVICES:
+            return True
+        name = min(self.devices, key=lambda each: self.devices[each].priority)
+        if not urgent and now_s - self.devices[name].last_s < SILENT_S:
+            return False
+        del self.devices[name]
+        self._hide(name)
+        return True
+
+    def _hide(self, name: str) -> None:
+        if len(self._hidden) < MAX_HIDDEN:
+            self._hidden.add(name)
+        self._left_out(name)
+
     def _forget(self, name: str, topic: str) -> Heard | None:
+        self._hidden.discard(name)
         device = self.devices.get(name)
         if device is None or topic not in device.topics:
             return None
-        del device.topics[topic], device.heard_s[topic]
-        self._bytes -= device.sizes.pop(topic)
+        del device.topics[topic], device.heard_s[topic], device.sizes[topic]
+        device.alarms.discard(topic)
         if not device.topics:
             del self.devices[name]
         return Heard(name, topic, None)

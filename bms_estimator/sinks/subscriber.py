@@ -6,6 +6,8 @@ import secrets
 from collections.abc import Callable, Mapping
 from typing import Self
 
+import structlog
+
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks import Delivery
@@ -20,8 +22,14 @@ MOST_WAITING = 2000
 """Messages that wait to be read: a broker sends all that is retained at once, some twenty of each device."""
 MOST_BYTES = 65_536
 """Nothing of ours is longer: ``schema`` is a quarter of it."""
+REASONS = {"too_long": f"longer than {MOST_BYTES} bytes", "overflow": "faster than they are read"}
+LOG_S = 60.0
+"""Minimum time between two log lines on dropped messages [s]."""
 CLOSING_S = 3.0
 """How long parting from the broker may take [s]."""
+
+
+log = structlog.get_logger(__name__)
 
 
 class Subscriber:
@@ -32,6 +40,7 @@ class Subscriber:
         heard: Called with each message of a device, once it is kept.
         linked: Called when the broker was reached, and when it is lost; ``lost_since`` says which.
         connect: Makes a connection; over TCP when left out.
+        left_out: Called with the name of a device that is not stored, because there are too many.
         clock: The clocks.
         first_delay_s: Before a lost broker is tried once more; then longer, as ``Pauses`` has it [s].
 
@@ -46,19 +55,21 @@ class Subscriber:
         linked: Callable[[], None] = lambda: None,
         *,
         connect: Connect | None = None,
+        left_out: Callable[[str], object] = str,
         clock: Clock | None = None,
         first_delay_s: float = FIRST_DELAY_S,
     ) -> None:
         check(settings)
         self._heard, self._linked, self._clock = heard, linked, clock or Clock()
         self._topic = f"{settings.base_topic}/#"
-        self._published = Published(settings.base_topic)
+        self._published = Published(settings.base_topic, left_out)
         self._delivery = Delivery()
         self._lost_since: float | None = self._clock.wall()
         hello = Hello(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
         connect = connect or Dial(settings)
         self._link = Link(brokers(settings), hello, connect, self._serve, self._delivery, first_delay_s)
         self._task: asyncio.Task[None] | None = None
+        self._loss_logged_s: float | None = None
         self.lost_messages = 0
         """That were too long, or came faster than they were read."""
 
@@ -66,6 +77,11 @@ class Subscriber:
     def devices(self) -> Mapping[str, Device]:
         """What each published last, by name, in the order in which they were heard first."""
         return self._published.devices
+
+    @property
+    def hidden(self) -> int:
+        """Number of devices that publish but are not stored, because there are too many."""
+        return self._published.hidden
 
     @property
     def lost_since(self) -> float | None:
@@ -127,5 +143,9 @@ class Subscriber:
         self._lost_since = lost_since
         self._linked()
 
-    def _lose(self, _kind: str, _topic: str) -> None:
+    def _lose(self, kind: str, topic: str) -> None:
         self.lost_messages += 1
+        now_s = self._clock.monotonic()
+        if self._loss_logged_s is None or now_s >= self._loss_logged_s + LOG_S:
+            self._loss_logged_s = now_s
+            log.warning("messages are dropped", reason=REASONS[kind], topic=topic, dropped=self.lost_messages)

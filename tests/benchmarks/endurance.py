@@ -1,6 +1,8 @@
 """Load: thousands of frames a second through the service over a PTY, and a day of serial bytes through decoder and estimator.
 
-make load ARGS="--rate 5000 --minutes 10 --hours 24"
+Idle connections to the HTTP listeners of service, dashboard and fleet page, while their broker or server is restarted.
+
+make load ARGS="--rate 5000 --minutes 10 --hours 24 --no-idle"
 """
 
 import argparse
@@ -13,7 +15,7 @@ import sys
 import tempfile
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +30,16 @@ from bms_estimator.sources.dialects.board import BoardDialect
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
 from tests.benchmarks.table import Row, show
 from tests.benchmarks.wire import hello, sample_frames
+from tests.fleet.engine import running
+from tests.idle_connections import (
+    DESCRIPTORS,
+    IDLE,
+    Outcome,
+    attack_dashboard,
+    attack_fleet_page,
+    attack_service,
+    few_descriptors,
+)
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
@@ -196,6 +208,8 @@ def fed(rate_hz: int, seconds: float) -> tuple[BoardDialect, Estimator, float, l
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
     """Measure."""
+    if options.idle:
+        yield from idle_rows()
     if options.minutes:
         with tempfile.TemporaryDirectory() as folder:
             broker = Broker(Path(folder)).start()
@@ -227,12 +241,40 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         yield Row("  resident memory", "flat", growth, rss[-1] - rss[begun - 1] < MOST_GROWTH_MIB)
 
 
+def idle_rows() -> Iterator[Row]:
+    """Attack the listeners with idle connections."""
+    with tempfile.TemporaryDirectory() as name, few_descriptors():
+        folder = Path(name)
+        broker = Broker(folder).start()
+        try:
+            yield _idle_row("service: page and [prometheus]", attack_service(folder, broker))
+            yield _idle_row("dashboard", attack_dashboard(folder, broker))
+        finally:
+            broker.stop()
+        with running(folder, partitions=1) as engine:
+            yield _idle_row("fleet page", attack_fleet_page(folder, engine))
+
+
+def _idle_row(program: str, attack: Coroutine[None, None, Outcome]) -> Row:
+    what = f"{IDLE:,} idle connections each, {DESCRIPTORS:,} descriptors: {program}"
+    target = "reconnects, answers, no traceback"
+    try:
+        outcome = asyncio.run(attack)
+    except (TimeoutError, AssertionError) as error:
+        return Row(what, target, f"not recovered: {error}", met=False)
+    measured = f"HTTP {outcome.answers}, {outcome.tracebacks} tracebacks, {outcome.log_lines} log lines"
+    return Row(what, target, measured, met=set(outcome.answers) == {200} and outcome.tracebacks == 0)
+
+
 def main() -> None:
     """Measure what is asked for; 1 where a target was not met."""
     parser = argparse.ArgumentParser(prog="make load", description=__doc__)
     parser.add_argument("--rate", type=int, default=5000, help="frames per second over the PTY")
     parser.add_argument("--minutes", type=float, default=10.0, help="for so long; 0: not at all")
     parser.add_argument("--hours", type=float, default=24.0, help="of serial bytes at 100 Hz, at once; 0: not at all")
+    parser.add_argument(
+        "--idle", action=argparse.BooleanOptionalAction, default=True, help="attack by idle connections"
+    )
     sys.exit(not show(rows(parser.parse_args())))
 
 

@@ -72,6 +72,7 @@ class Service:
         board: What the board prints, by the time since it began [s].
         pack: What it is, as its file has it.
         name: Of the pack.
+        more: Further settings, TOML; the first ones belong to ``[state]``.
         rate_hz: How often the board prints and the service publishes.
     """
 
@@ -84,6 +85,7 @@ class Service:
         *,
         pack: str = PACK,
         name: str = "attic",
+        more: str = "",
         rate_hz: float = 10.0,
     ) -> None:
         self.url = f"http://127.0.0.1:{port}/"
@@ -105,7 +107,7 @@ url = "{broker.url}"
 listen = "127.0.0.1:{port}"
 [state]
 folder = "{folder}"
-"""
+{more}"""
 
     async def __aenter__(self) -> Self:
         self._line.plug()

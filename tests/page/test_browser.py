@@ -21,6 +21,7 @@ from bms_estimator.model.estimate import Alarm
 from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.page.dashboard import dashboard
+from bms_estimator.sinks.published import MAX_DEVICES
 from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
@@ -286,6 +287,70 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
         assert "cell voltages are missing" in text
         assert "cannot be watched" in text
         await publish(house.live, "alarm/cell_under_voltage", b"")
+        assert opened.errors == []
+
+
+async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(browser: Browser, house: House) -> None:
+    assert ONE.estimate
+    states = (
+        (50.0, "2026-11-22T17:00:00.000Z"),
+        (99.0, "9999-01-01T00:00:00.000Z"),
+        (52.0, "2026-11-22T17:00:05.000Z"),
+    )
+
+    async def put(voltage_v: float, time: str) -> None:
+        state = ONE.estimate.model_dump() | {"voltage_v": voltage_v, "time": time}
+        await house.live.publish("bms/shed/state", json.dumps(state), qos=1)
+
+    await put(*states[0])
+    async with dashboard_of(browser, house, "shed") as opened:
+        for voltage_v, time in states:
+            await put(voltage_v, time)
+            await opened.until_text("voltage_v", f"{voltage_v:.2f} V")
+        await opened.until(
+            "() => [...document.querySelectorAll('.curve [role=img]')].some((e) => e.ariaLabel?.endsWith('last 52.000 V'))"
+        )
+        await house.live.publish("bms/shed/state", b"", qos=1)
+        await opened.until(
+            "() => ![...document.querySelectorAll('#packs button')].some((t) => t.textContent === 'shed')"
+        )
+        assert opened.errors == []
+
+
+async def test_a_pack_with_an_alarm_appears_among_foreign_names_and_stands_first(
+    browser: Browser, broker: Broker, folder: Path
+) -> None:
+    """On a dashboard of its own, as foreign names would stay on the other one."""
+    settings = MqttSettings(url=broker.url, base_topic="crowd")
+    alarm = Alarm(
+        name="over_temperature",
+        severity="critical",
+        active=True,
+        latched=False,
+        since=None,
+        value=70.0,
+        limit=60.0,
+        unit="°C",
+        text="70 °C",
+    )
+    async with (
+        Listener(broker) as live,
+        dashboard(settings, PageSettings(listen="127.0.0.1:0"), folder) as url,
+        tab(browser, url) as opened,
+    ):
+        for number in range(100):
+            await live.publish(f"crowd/a{number:03}/availability", b"online", qos=1, retain=True)
+        await opened.until("() => document.getElementById('hidden').textContent === '36 more devices not shown'")
+        await live.publish("crowd/zz/alarm/over_temperature", alarm.model_dump_json(), qos=1, retain=True)
+        await opened.until("() => document.querySelector('#packs button').textContent === 'zz'")
+        await opened.until("() => document.getElementById('hidden').textContent === '37 more devices not shown'")
+        assert await opened.page.get_by_role("tab").count() == MAX_DEVICES
+        first = opened.page.get_by_role("tab").first
+        await first.click()
+        await opened.until("() => document.getElementById('alarms').textContent.includes('70 °C')")
+        assert "raised" in str(await first.get_attribute("class"))
+        await live.publish("crowd/zz/alarm/over_temperature", b"", qos=1, retain=True)
+        await opened.until("() => ![...document.querySelectorAll('#packs button')].some((t) => t.textContent === 'zz')")
         assert opened.errors == []
 
 

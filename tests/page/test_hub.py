@@ -2,10 +2,13 @@
 
 import json
 import sys
+from typing import Any
 
 import pytest
 
 from bms_estimator.page.hub import RECENT_STATES, Hub
+from bms_estimator.page.newest import MESSAGE_BYTES, Reader
+from bms_estimator.store.minute import epoch_s
 
 TIME = "2026-11-22T16:00:{:06.3f}Z"
 
@@ -14,7 +17,7 @@ def state(second: float, **fields: object) -> dict[str, object]:
     return {"time": TIME.format(second), "voltage_v": 13.0 + second} | fields
 
 
-async def read(reader) -> dict[str, object]:
+async def read(reader: Reader) -> dict[str, Any]:
     return json.loads(await reader.next(1.0))
 
 
@@ -37,10 +40,11 @@ async def test_a_slow_reader_finds_the_newest_alone_however_much_came():
         for number in range(10_000):
             hub.put("attic", "state", state(number % 60, frames_received=number))
             hub.put("attic", "health", {"uptime_s": number})
-        assert len(reader._waiting) == 2
+        assert len(reader._waiting) == 3
         assert await read(reader) == {
             "attic/state": state(39, frames_received=9999),
             "attic/health": {"uptime_s": 9999},
+            "packs": {"names": ["attic"], "hidden": 0},
         }
         assert await reader.next(0.0) == ""
     assert hub.readers == 0
@@ -132,6 +136,42 @@ async def test_elements_are_kept_by_percent_of_soc_where_they_are_valid():
     with hub.reading() as reader:
         learned = (await read(reader))["attic/elements"]
     assert learned == {"r_s_ohm": {"50": [0.02, 0.001], "70": [0.03, 0.001]}}
+
+
+async def test_a_state_dated_far_in_the_future_does_not_stop_the_curves() -> None:
+    hub = Hub(lambda: epoch_s(TIME.format(0.0)))
+    hub.put("attic", "state", state(0.0))
+    hub.put("attic", "state", state(1.0) | {"time": "9999-01-01T00:00:00.000Z"})
+    hub.put("attic", "state", state(2.0))
+    with hub.reading() as reader:
+        found = await read(reader)
+    assert found["attic/recent"]["voltage_v"] == [13.0, 15.0]
+
+
+async def test_a_message_to_a_reader_is_bounded_and_the_rest_comes_next() -> None:
+    hub = Hub()
+    for number in range(100):
+        hub.put("attic", f"alarm/{number}", "x" * 10_000)
+    found, sizes = dict[str, object](), list[int]()
+    with hub.reading() as reader:
+        while text := await reader.next(0.0):
+            sizes.append(len(text))
+            found |= json.loads(text)
+    assert max(sizes) < 1.1 * MESSAGE_BYTES
+    assert len(sizes) > 1
+    assert sum(key.startswith("attic/alarm/") for key in found) == 100
+
+
+async def test_a_pack_that_is_dropped_is_named_no_more() -> None:
+    hub = Hub()
+    for pack in ("attic", "cellar"):
+        hub.put(pack, "availability", "online")
+    with hub.reading() as reader:
+        assert (await read(reader))["packs"] == {"names": ["attic", "cellar"], "hidden": 0}
+        hub.put("attic", "state", state(0.0))
+        hub.drop("attic")
+        hub.hide(7)
+        assert await read(reader) == {"packs": {"names": ["cellar"], "hidden": 7}}
 
 
 async def test_the_link_is_said_once_for_each_change():

@@ -7,7 +7,9 @@ import socket
 from collections.abc import AsyncIterator
 
 import aiohttp
+import psutil
 import pytest
+from yarl import URL
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.page_settings import PageSettings
@@ -110,12 +112,52 @@ async def test_one_who_reads_nothing_holds_a_bounded_amount_and_is_parted_from(h
         writer.close()
 
 
-async def test_there_is_room_for_so_many_readers(hub, past, monkeypatch):
-    monkeypatch.setattr(of_server, "MOST_READERS", 1)
-    async with browsing(hub, past) as session, session.get("/events") as first:
-        await anext(messages(first))
-        async with session.get("/events") as second:
-            assert second.status == 503
+async def test_a_stream_too_many_replaces_the_oldest_one_of_the_address_that_has_most(
+    hub: Hub, past: Past, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(of_server, "MAX_STREAMS", 3)
+    hub.say_link(None)
+    async with browsing(hub, past) as session, contextlib.AsyncExitStack() as streams:
+        url = session._base_url.join(URL("/events"))
+
+        async def opened(address: str) -> AsyncIterator[dict[str, object]]:
+            connector = aiohttp.TCPConnector(local_addr=(address, 0))
+            client = await streams.enter_async_context(aiohttp.ClientSession(connector=connector))
+            stream = messages(await streams.enter_async_context(client.get(url)))
+            assert "link" in await anext(stream)
+            return stream
+
+        first, second, third = [await opened("127.0.0.2") for _ in range(3)]
+        other = await opened("127.0.0.3")
+        with pytest.raises(aiohttp.ClientError):
+            await anext(first)
+        fourth = await opened("127.0.0.2")
+        with pytest.raises(aiohttp.ClientError):
+            await anext(second)
+        hub.put("attic", "availability", "online")
+        for stream in (third, other, fourth):
+            assert "attic/availability" in await anext(stream)
+
+
+async def test_readers_that_never_read_share_what_waits_for_them(hub: Hub, past: Past) -> None:
+    for number in range(256):
+        hub.put("attic", f"alarm/{number}", f"{number}".zfill(65_000))
+    process = psutil.Process()
+    async with browsing(hub, past) as session:
+        before = process.memory_info().rss
+        address = session._base_url.host, session._base_url.port
+        clients = [await asyncio.open_connection(*address, limit=1024) for _ in range(of_server.MAX_STREAMS)]
+        async with asyncio.timeout(LONG_S):
+            for reader, writer in clients:
+                writer.write(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                await reader.readuntil(b"data: ")
+            for number in range(256):  # other texts, which readers must not store either
+                hub.put("attic", f"alarm/{number}", f"{number}".zfill(65_001))
+                await asyncio.sleep(0)
+        grown = process.memory_info().rss - before
+        for _, writer in clients:
+            writer.close()
+    assert grown < 100e6, f"{grown / 1e6:.0f} MB"
 
 
 async def test_a_name_that_is_not_ours_is_not_answered(hub, past):

@@ -122,14 +122,14 @@ def test_addresses_of_both_kinds() -> None:
 
 
 async def test_a_slow_name_service_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, answer = threading.Event(), threading.Event()
+    asked, answer, found = threading.Event(), threading.Event(), socket.getaddrinfo
 
-    def slow(_name: str = "") -> str:
+    def slow(*arguments: Any, **options: Any) -> Any:
         asked.set()
         assert answer.wait(LONG_S)
-        return "pi"
+        return found(*arguments, **options)
 
-    monkeypatch.setattr(socket, "getfqdn", slow)
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
 
     async def turn() -> None:
         await asyncio.to_thread(asked.wait, LONG_S)

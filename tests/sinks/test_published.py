@@ -7,7 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.sinks.messages import Messages, Sent
-from bms_estimator.sinks.published import MOST_DEVICES, MOST_KEPT_BYTES, MOST_TOPICS, Heard, Published, parsed
+from bms_estimator.sinks.published import (
+    MAX_DEVICE_BYTES,
+    MAX_DEVICES,
+    MAX_TOPICS,
+    SILENT_S,
+    Heard,
+    Published,
+    parsed,
+)
 from tests.sinks.snapshots import NOW, ONE
 
 
@@ -55,20 +63,49 @@ def test_what_is_of_no_device_is_not_looked_at():
     assert published.devices == {}
 
 
-def test_devices_topics_and_bytes_are_bounded_and_what_is_known_goes_on():
+def test_devices_topics_and_bytes_are_bounded_and_known_devices_are_updated() -> None:
     published = Published("bms")
-    for number in range(2 * MOST_DEVICES):
+    for number in range(2 * MAX_DEVICES):
         published.take(f"bms/d{number}/state", b"1", NOW)
-    assert len(published.devices) == MOST_DEVICES
-    for number in range(2 * MOST_TOPICS):
+    assert (len(published.devices), published.hidden) == (MAX_DEVICES, MAX_DEVICES)
+    for number in range(2 * MAX_TOPICS):
         published.take(f"bms/d0/t{number}", b"1", NOW)
-    assert len(published.devices["d0"].topics) == MOST_TOPICS
-    many = json.dumps("x" * (MOST_KEPT_BYTES // 4)).encode()
-    taken = [published.take(f"bms/d{number}/state", many, NOW) for number in range(1, 10)]
+    assert len(published.devices["d0"].topics) == MAX_TOPICS
+    quarter = json.dumps("x" * (MAX_DEVICE_BYTES // 4)).encode()
+    taken = [published.take(f"bms/d1/t{number}", quarter, NOW) for number in range(10)]
     assert sum(heard is not None for heard in taken) == 3
-    assert published.take("bms/d0/state", b"2", NOW + 1.0) == Heard("d0", "state", 2)
-    published.take("bms/d1/state", b"", NOW)
-    assert published.take("bms/d9/state", many, NOW) is not None
+    assert published.take("bms/d1/state", b"2", NOW + 1.0) == Heard("d1", "state", 2)
+    published.take("bms/d1/t0", b"", NOW)
+    assert published.take("bms/d1/t9", quarter, NOW) is not None
+
+
+def test_a_new_device_replaces_the_one_that_has_been_silent_longest() -> None:
+    left_out = list[str]()
+    published = Published("bms", left_out.append)
+    for number in range(MAX_DEVICES):
+        published.take(f"bms/d{number}/state", b"1", NOW + number)
+    published.take("bms/d0/state", b"1", NOW + MAX_DEVICES)
+    assert published.take("bms/new/state", b"1", NOW + SILENT_S) is None
+    assert left_out == ["new"]
+    assert published.take("bms/new/state", b"1", NOW + SILENT_S + MAX_DEVICES) == Heard("new", "state", 1)
+    assert left_out == ["new", "d1"]
+    assert published.hidden == 1
+    assert {"new", "d0"} <= published.devices.keys()
+
+
+def test_a_raised_alarm_finds_room_at_once_and_its_device_is_kept() -> None:
+    published = Published("bms")
+    for number in range(2 * MAX_DEVICES):
+        published.take(f"bms/d{number}/state", b"1", NOW)
+    alarm = "bms/new/alarm/over_temperature"
+    assert published.take(alarm, b'{"active": false}', NOW) is None
+    assert published.take(alarm, b'{"active": true}', NOW) is not None
+    for number in range(2 * MAX_DEVICES):
+        published.take(f"bms/later{number}/state", b"1", NOW + 10.0 * SILENT_S)
+    assert "new" in published.devices
+    published.take(alarm, b'{"active": false}', NOW)
+    published.take("bms/last/state", b"1", NOW + 20.0 * SILENT_S)
+    assert "new" not in published.devices
 
 
 @given(st.text(string.printable), st.binary(max_size=200))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import structlog
 
 from bms_estimator.model.settings import MqttSettings
 from bms_estimator.sinks.published import Heard
@@ -143,3 +144,29 @@ async def test_a_broker_that_refuses_is_named_with_the_reason(broker_with_passwo
         await until(lambda: watch.subscriber.trouble)
         assert "mqtt.password_file" in str(watch.subscriber.trouble)
         assert watch.subscriber.lost_since is not None
+
+
+async def test_long_messages_are_dropped_with_one_log_line(broker: Broker) -> None:
+    """A broker of MQTT 5 holds them back; one of MQTT 3.1.1 cannot."""
+    with structlog.testing.capture_logs() as lines:
+        async with Proxy(broker.port, knows_5=False) as proxy, Listener(broker) as live:
+            watch = Watch(proxy.url)
+            async with watch.subscriber:
+                await watch.until(lambda: watch.subscriber.lost_since is None)
+                for number in range(5):
+                    await live.publish(f"bms/pack/t{number}", b"x" * (MOST_BYTES + 1), qos=1)
+                await live.publish("bms/pack/state", b"1", qos=1)
+                await watch.until(lambda: watch.kept("pack", "state"))
+                assert watch.subscriber.lost_messages == 5
+    assert [line["reason"] for line in lines if line["event"] == "messages are dropped"] == ["longer than 65536 bytes"]
+
+
+async def test_a_retained_payload_of_16_mib_does_not_arrive(broker: Broker) -> None:
+    async with Listener(broker, "other/#") as live:
+        await live.publish("bms/pack/info", bytes(16 * 2**20), qos=1, retain=True)
+        await live.publish("bms/pack/state", b"1", qos=1, retain=True)
+        watch = Watch(broker.url)
+        async with watch.subscriber:
+            await watch.until(lambda: watch.kept("pack", "state"))
+            assert watch.kept("pack", "info") is None
+            assert watch.subscriber.lost_since is None

@@ -3,7 +3,7 @@ import * as f from "./format.js";
 import { attribute, changed, hide, listen, node, text } from "./live.js";
 import { Curve, OverSoc, Ring, gaps, scaled } from "./charts.js";
 
-const DRAW_MS = 250, CURVES_MS = 500, DESCRIBE_MS = 10_000, HISTORY_MS = 60_000;
+const DRAW_MS = 250, CURVES_MS = 500, DESCRIBE_MS = 10_000, HISTORY_MS = 60_000, AHEAD_MS = 86_400_000;
 const SPANS = { live: 300, hour: 3600, day: 86400, month: 30 * 86400 }; // [s]
 const ROWS = 3600;
 const COLUMNS = ["voltage_v", "voltage_estimate_v", "current_a", "soc", "soc_std", "innovation_v"];
@@ -38,7 +38,8 @@ class Pack {
 		this.topics[topic] = value;
 		if (topic === "state" && value) {
 			this.stateAt = Date.now();
-			this.recent.push([Date.parse(value.time) / 1e3, ...COLUMNS.map((c) => value[c])]);
+			const time = Date.parse(value.time);
+			if (time < this.stateAt + AHEAD_MS) this.recent.push([time / 1e3, ...COLUMNS.map((c) => value[c])]);
 		}
 		if (topic === "parameters" && value?.soc != null) {
 			for (const [name, p] of Object.entries(value.elements)) {
@@ -52,6 +53,8 @@ class Pack {
 		this.events.sort((a, b) => Date.parse(b.time) - Date.parse(a.time));
 		this.events.length = Math.min(this.events.length, MOST_EVENTS);
 	}
+	get alarms() { return Object.entries(this.topics).filter(([t, a]) => t.startsWith("alarm/") && a).map(([, a]) => a); }
+	get raised() { return this.alarms.some((a) => a.active); }
 	/** Why the values are not what is now; "" when they are. */
 	get trouble() {
 		const { availability, "sensor/availability": sensor, health, state } = this.topics;
@@ -69,8 +72,11 @@ function take(message) {
 		if (key === "link") {
 			if (value.up && link?.up === false && packs.size) linkSince = Date.now();
 			link = value;
+		} else if (key === "packs") {
+			for (const gone of packs.keys()) if (!value.names.includes(gone)) packs.delete(gone);
+			text($("hidden"), value.hidden ? `${value.hidden} more devices not shown` : "");
 		} else {
-			if (!packs.has(name)) { packs.set(name, new Pack(name)); listPacks(); }
+			if (!packs.has(name)) packs.set(name, new Pack(name));
 			packs.get(name).take(key.slice(slash + 1), value);
 		}
 	}
@@ -91,6 +97,7 @@ const put = (name, value) => text(slots[name], value);
 
 function draw() {
 	ui.due = false;
+	listPacks();
 	const now = performance.now(), pack = packs.get(ui.pack);
 	ui.drawn = now;
 	drawStatus(pack);
@@ -149,13 +156,14 @@ function drawHead(pack) {
 		const here = tab.dataset.pack === pack.name;
 		attribute(tab, "aria-selected", String(here));
 		tab.tabIndex = here ? 0 : -1;
-		attribute(tab, "data-state", packs.get(tab.dataset.pack).trouble ? "stale" : "live");
+		const { raised, trouble } = packs.get(tab.dataset.pack);
+		attribute(tab, "data-state", trouble ? "stale" : "live");
+		attribute(tab, "class", raised ? "raised" : "");
 	}
 }
 
-function drawAlarms({ topics }) {
-	const active = Object.keys(topics).filter((t) => t.startsWith("alarm/")).map((t) => topics[t])
-		.filter((a) => a?.active || (a?.watched === false && topics.health?.sensor_online !== false));
+function drawAlarms({ alarms, topics }) {
+	const active = alarms.filter((a) => a.active || (a.watched === false && topics.health?.sensor_online !== false));
 	active.sort((a, b) => (a.severity < b.severity ? -1 : 1));
 	if (changed($("alarms"), JSON.stringify(active))) $("alarms").replaceChildren(...active.map(alarmRow));
 }
@@ -415,13 +423,17 @@ function curveOf(a, name, factor) {
 
 function redrawAll() { ui.curves = ui.described = -Infinity; drawSoon(); }
 
+/** Packs with a raised alarm first. */
 function listPacks() {
-	const names = [...packs.keys()].sort(), wanted = decodeURIComponent(location.hash.slice(1));
+	const names = [...packs.keys()].sort((a, b) => packs.get(b).raised - packs.get(a).raised || (a < b ? -1 : 1));
+	if (!changed($("packs"), names.join())) return;
+	const wanted = decodeURIComponent(location.hash.slice(1)), focused = document.activeElement.dataset.pack;
 	$("packs").replaceChildren(...names.map((name) => {
 		const tab = node("button", { type: "button", role: "tab", "data-pack": name, "aria-controls": "pack" }, name);
 		tab.onclick = () => choose(name);
 		return tab;
 	}));
+	[...$("packs").children].find((tab) => tab.dataset.pack === focused)?.focus();
 	hide($("packs"), names.length < 2);
 	$("name").classList.toggle("hide", names.length > 1);
 	if (!packs.has(ui.pack) || names.includes(wanted)) ui.pack = names.includes(wanted) ? wanted : names[0];

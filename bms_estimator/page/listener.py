@@ -1,0 +1,230 @@
+"""A bounded TCP listener for HTTP servers: idle clients must not use up the descriptors that checkpoints and MQTT need."""
+
+import asyncio
+import contextlib
+import resource
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import structlog
+
+HEADER_S = 10.0
+"""Deadline from the connection to a complete request header [s]."""
+IDLE_S = 30.0
+"""Deadline from the end of a response to the next complete request header [s]."""
+MAX_CONNECTIONS = 256
+"""Connections of all listeners of the process together."""
+DESCRIPTOR_FRACTION = 0.25
+"""Fraction of RLIMIT_NOFILE that connections may use; the rest is reserved for checkpoints, databases and MQTT."""
+ADDRESS_FRACTION = 0.5
+"""Fraction of the connections that one client address may hold."""
+BACKLOG = 128
+LOG_S = 60.0
+"""Minimum time between two log lines on failed accepts [s]."""
+RETRY_S = 1.0
+"""Delay after a failed accept [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+def _limit() -> int:
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY:
+        return MAX_CONNECTIONS
+    return max(2, min(MAX_CONNECTIONS, int(DESCRIPTOR_FRACTION * soft)))
+
+
+@dataclass(eq=False)
+class _Connection:
+    connected: socket.socket
+    transport: asyncio.Transport
+    address: str
+    deadline: asyncio.TimerHandle
+    serving: bool = False
+
+
+class Connections:
+    """Open connections, limited in total and for each address.
+
+    A new connection beyond a limit displaces the oldest one that has no request in progress. It is refused if there is none.
+
+    Args:
+        limit: Maximum number of connections; None derives it from RLIMIT_NOFILE.
+    """
+
+    def __init__(self, limit: int | None = None) -> None:
+        self.limit = limit or _limit()
+        self._address_limit = max(1, int(ADDRESS_FRACTION * self.limit))
+        self._open: dict[asyncio.BaseTransport, _Connection] = {}
+
+    def __len__(self) -> int:
+        """Return the number of open connections."""
+        self._prune()
+        return len(self._open)
+
+    def add(self, connected: socket.socket, transport: asyncio.Transport, address: str) -> None:
+        """Add a connection and start the deadline of its first request; close it if there is no room."""
+        if not self._make_room(address):
+            transport.abort()
+            return
+        deadline = asyncio.get_running_loop().call_later(HEADER_S, transport.abort)
+        self._open[transport] = _Connection(connected, transport, address, deadline)
+
+    @contextlib.contextmanager
+    def serving(self, transport: asyncio.BaseTransport | None) -> Iterator[None]:
+        """Exempt a connection from deadline and displacement while its request is handled."""
+        connection = self._open.get(transport) if transport else None
+        if connection is None:
+            yield
+            return
+        connection.deadline.cancel()
+        connection.serving = True
+        try:
+            yield
+        finally:
+            connection.serving = False
+            loop = asyncio.get_running_loop()
+            connection.deadline = loop.call_later(IDLE_S, connection.transport.abort)
+
+    def _make_room(self, address: str) -> bool:
+        """Return whether an address may have one more connection, displacing another if necessary."""
+        self._prune()
+        own = [each for each in self._open.values() if each.address == address]
+        if len(own) >= self._address_limit:
+            return self._displace(own)
+        return len(self._open) < self.limit or self._displace(list(self._open.values()))
+
+    def _displace(self, candidates: list[_Connection]) -> bool:
+        idle = next((each for each in candidates if not each.serving), None)
+        if idle is None:
+            return False
+        self._drop(idle)
+        idle.transport.abort()
+        return True
+
+    def _prune(self) -> None:
+        """Remove the connections whose descriptor is closed."""
+        for each in list(self._open.values()):
+            if each.connected.fileno() < 0:
+                self._drop(each)
+
+    def _drop(self, connection: _Connection) -> None:
+        connection.deadline.cancel()
+        del self._open[connection.transport]
+
+
+CONNECTIONS = Connections()
+"""Connections of this process: all its listeners share the descriptors."""
+
+
+class Listener:
+    """Accepts connections on one address.
+
+    Args:
+        protocol: Protocol factory, such as aiohttp's ``web.Server``.
+        connections: Limits.
+    """
+
+    def __init__(
+        self, protocol: Callable[[], asyncio.BaseProtocol | None], connections: Connections = CONNECTIONS
+    ) -> None:
+        self._protocol, self._connections = protocol, connections
+        self._sockets: list[socket.socket] = []
+        self._connecting: set[asyncio.Task[None]] = set()
+        self._resuming: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._logged_s = -LOG_S
+
+    async def open(self, host: str, port: int) -> int:
+        """Listen and return the port.
+
+        Raises:
+            OSError: The address cannot be listened on.
+        """
+        loop = asyncio.get_running_loop()
+        found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        try:
+            for family, (address, *_) in dict.fromkeys((family, sockaddr) for family, *_, sockaddr in found):
+                listening = _bound(family, str(address), port)
+                self._sockets.append(listening)
+                port = listening.getsockname()[1]
+        except OSError:
+            self._close_sockets()
+            raise
+        for each in self._sockets:
+            self._resume(each)
+        return port
+
+    async def close(self) -> None:
+        """Stop accepting; open connections are the server's to close."""
+        for timer in self._resuming.values():
+            timer.cancel()
+        self._resuming.clear()
+        self._close_sockets()
+        await asyncio.gather(*self._connecting, return_exceptions=True)
+
+    def _close_sockets(self) -> None:
+        for each in self._sockets:
+            asyncio.get_running_loop().remove_reader(each)
+            each.close()
+        self._sockets = []
+
+    def _accept(self, listening: socket.socket) -> None:
+        """Accept one connection; the loop calls again while others wait."""
+        try:
+            connected, address = listening.accept()
+        except (BlockingIOError, InterruptedError, ConnectionError):  # the client has gone meanwhile
+            return
+        except OSError as error:
+            self._log(error)
+            self._pause(listening)
+            return
+        task = asyncio.create_task(self._serve(connected, str(address[0])), name="connection")
+        self._connecting.add(task)
+        task.add_done_callback(self._connecting.discard)
+
+    def _pause(self, listening: socket.socket) -> None:
+        """Accept no connection for ``RETRY_S``: the loop would otherwise report the waiting one without end."""
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(listening)
+        self._resuming[listening] = loop.call_later(RETRY_S, self._resume, listening)
+
+    def _resume(self, listening: socket.socket) -> None:
+        self._resuming.pop(listening, None)
+        asyncio.get_running_loop().add_reader(listening, self._accept, listening)
+
+    async def _serve(self, connected: socket.socket, address: str) -> None:
+        try:
+            transport, _ = await asyncio.get_running_loop().connect_accepted_socket(self._make_protocol, connected)
+        except OSError:
+            connected.close()
+            return
+        self._connections.add(connected, transport, address)
+
+    def _make_protocol(self) -> asyncio.BaseProtocol:
+        protocol = self._protocol()
+        if protocol is None:  # the server is shutting down
+            raise ConnectionAbortedError
+        return protocol
+
+    def _log(self, error: OSError) -> None:
+        now_s = time.monotonic()
+        if now_s >= self._logged_s + LOG_S:
+            self._logged_s = now_s
+            log.warning("connections cannot be accepted", reason=error.strerror)
+
+
+def _bound(family: int, address: str, port: int) -> socket.socket:
+    listening = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listening.setblocking(False)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            listening.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        listening.bind((address, port))
+        listening.listen(BACKLOG)
+    except OSError:
+        listening.close()
+        raise
+    return listening

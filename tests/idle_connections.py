@@ -1,0 +1,160 @@
+"""Attack with idle connections on the HTTP listeners of programs that may open 1,024 files, as most systems have it."""
+
+import asyncio
+import contextlib
+import json
+import resource
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import aiohttp
+
+from tests.fleet.engine import Engine
+from tests.free_port import free_port
+from tests.mosquitto import Broker, Listener
+from tests.page.house import Service, starting
+from tests.patience import LONG_S
+
+DESCRIPTORS = 1024
+"""Soft limit that most systems give to a process."""
+IDLE = DESCRIPTORS
+"""Idle connections to each listener: as many as the process may have descriptors."""
+ATTACK = """
+import resource, socket, sys
+hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+idle = [socket.create_connection(("127.0.0.1", int(port))) for port in sys.argv[2:] for _ in range(int(sys.argv[1]))]
+print("open", flush=True)
+sys.stdin.read()
+"""
+"""A process of its own, so that its descriptors are not those of the server. Arguments: connections, ports."""
+BOARD = {"voltage": 13.276, "current": 2.5, "temperature": 21.5, "cells": [3.311, 3.325, 3.318, 3.322]}
+PACK = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
+
+
+class Outcome(NamedTuple):
+    """Behavior of a program while idle connections are open."""
+
+    answers: list[int]
+    """HTTP status of each listener."""
+    tracebacks: int
+    log_lines: int
+
+
+@contextlib.contextmanager
+def few_descriptors() -> Iterator[None]:
+    """Limit the descriptors of this process and of those that it starts."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+@contextlib.asynccontextmanager
+async def attacked(*ports: int) -> AsyncIterator[None]:
+    """Hold ``IDLE`` connections to each port."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-c",
+        ATTACK,
+        str(IDLE),
+        *map(str, ports),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    try:
+        assert process.stdout
+        async with asyncio.timeout(LONG_S):
+            assert await process.stdout.readline() == b"open\n"
+        yield
+    finally:
+        process.kill()
+        await process.wait()
+
+
+async def attack_service(folder: Path, broker: Broker) -> Outcome:
+    """Attack page and Prometheus exporter of the real service; return once it has saved checkpoints and found the broker again."""
+    port, exporter = free_port(), free_port()
+    more = f'checkpoint_s = 1\n[prometheus]\nlisten = "127.0.0.1:{exporter}"\n'
+    service = Service(folder, broker, port, lambda _: BOARD, pack=PACK, more=more)
+    async with service:
+        async with Listener(broker) as live:
+            await live.wait_json("bms/attic/state")
+        async with attacked(port, exporter):
+            await _checkpoint_saved(folder)
+            broker.stop()
+            broker.start()
+            async with Listener(broker) as live:
+                await live.wait_json("bms/attic/state")
+            await _checkpoint_saved(folder)
+            return await _outcome(folder, port, f"http://127.0.0.1:{port}/", f"http://127.0.0.1:{exporter}/metrics")
+
+
+async def attack_dashboard(folder: Path, broker: Broker) -> Outcome:
+    """Attack the real ``dashboard``; return once its page shows that it has found the broker again."""
+    port = free_port()
+    arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
+    return await _attack_page(folder, port, ("dashboard", *arguments), broker.stop, broker.start)
+
+
+async def attack_fleet_page(folder: Path, engine: Engine) -> Outcome:
+    """Attack the real ``fleet page``; return once it has found the NATS server again."""
+    port = free_port()
+    arguments = ("--server", engine.url, "--listen", f"127.0.0.1:{port}", "--no-browser")
+    return await _attack_page(
+        folder, port, ("fleet", "page", *arguments), partial(engine.kill, 0), partial(engine.start, 0)
+    )
+
+
+async def _attack_page(
+    folder: Path, port: int, program: tuple[object, ...], stop: Callable[[], object], start: Callable[[], object]
+) -> Outcome:
+    process = await starting(folder, *program, port=port)
+    url = f"http://127.0.0.1:{port}/"
+    try:
+        await _link_is(url, up=True)
+        async with attacked(port):
+            stop()
+            await _link_is(url, up=False)
+            start()
+            await _link_is(url, up=True)
+            return await _outcome(folder, port, url)
+    finally:
+        process.terminate()
+        await process.wait()
+
+
+async def _link_is(url: str, *, up: bool) -> None:
+    """Read the page's stream until it reports the link to be up or down."""
+    async with asyncio.timeout(LONG_S), aiohttp.ClientSession() as session, session.get(f"{url}events") as response:
+        async for line in response.content:
+            found = json.loads(line[6:]) if line.startswith(b"data: ") else {}
+            if found.get("link", {}).get("up") is up:
+                return
+
+
+async def _checkpoint_saved(folder: Path) -> None:
+    """Wait for a checkpoint that is newer than the present one."""
+    async with asyncio.timeout(LONG_S):
+        before = _saved(folder)
+        while _saved(folder) <= before:  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.05)
+
+
+def _saved(folder: Path) -> float:
+    return max((path.stat().st_mtime for path in folder.glob("attic-*.npz")), default=0.0)
+
+
+async def _outcome(folder: Path, port: int, *urls: str) -> Outcome:
+    answers = list[int]()
+    async with aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(LONG_S)) as session:
+        for url in urls:
+            async with session.get(url) as response:
+                answers.append(response.status)
+    log = (folder / f"{port}.log").read_text()
+    return Outcome(answers, log.count("Traceback"), log.count("\n"))

@@ -1,0 +1,111 @@
+"""The listener under attack: idle connections without a token, while checkpoints are saved and clients are answered."""
+
+import asyncio
+import contextlib
+import resource
+import socket
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import aiohttp
+import pytest
+import structlog
+
+from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.page import listener as of_listener
+from bms_estimator.page.hub import Hub
+from bms_estimator.page.listener import CONNECTIONS, Connections, Listener
+from bms_estimator.page.past import Past
+from bms_estimator.page.server import PageServer
+from tests.idle_connections import DESCRIPTORS, attacked, few_descriptors
+from tests.patience import LONG_S
+
+
+async def test_a_thousand_idle_connections_leave_descriptors_and_an_authorized_client_is_answered(
+    tmp_path: Path,
+) -> None:
+    token = tmp_path / "token"
+    token.write_text("0123456789abcdef")
+    settings = PageSettings(listen="127.0.0.1:0", token_file=token)
+    with few_descriptors():
+        async with PageServer(settings, Hub(), Past(), patient=False) as server:
+            await _answered_under_attack(server, tmp_path)
+
+
+async def _answered_under_attack(server: PageServer, tmp_path: Path) -> None:
+    async with attacked(int(server.url.rsplit(":", 1)[1].strip("/"))):
+        assert len(CONNECTIONS) <= CONNECTIONS.limit
+        with contextlib.ExitStack() as files:  # as many as the cap reserves for all else
+            for number in range(DESCRIPTORS // 2):
+                files.enter_context((tmp_path / f"{number}").open("w"))
+        given = {"Authorization": "Bearer 0123456789abcdef"}
+        async with aiohttp.ClientSession(server.url, headers=given) as session, session.get("/") as response:
+            assert response.status == 200
+
+
+async def test_a_client_without_a_complete_header_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(of_listener, "HEADER_S", 0.05)
+    async with PageServer(PageSettings(listen="127.0.0.1:0"), Hub(), Past(), patient=False) as server:
+        port = int(server.url.rsplit(":", 1)[1].strip("/"))
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET / HTTP/1.1\r\nHost: loc")
+        async with asyncio.timeout(LONG_S):
+            with contextlib.suppress(ConnectionError):
+                assert await reader.read() == b""
+        writer.close()
+
+
+async def test_connections_with_a_request_in_progress_are_not_displaced() -> None:
+    connections = Connections(4)
+    async with contextlib.AsyncExitStack() as open_pairs:
+        first, second, third, other = [await open_pairs.enter_async_context(connection()) for _ in range(4)]
+        connections.add(*first, "192.0.2.1")
+        connections.add(*second, "192.0.2.1")
+        with connections.serving(first[1]):
+            connections.add(*other, "192.0.2.2")
+            connections.add(*third, "192.0.2.1")
+            assert [transport.is_closing() for _, transport in (first, second, third, other)] == [
+                False,
+                True,
+                False,
+                False,
+            ]
+
+
+@contextlib.asynccontextmanager
+async def connection() -> AsyncIterator[tuple[socket.socket, asyncio.Transport]]:
+    own, peer = socket.socketpair()
+    transport, _ = await asyncio.get_running_loop().connect_accepted_socket(asyncio.Protocol, own)
+    try:
+        yield own, transport
+    finally:
+        transport.abort()
+        peer.close()
+        await asyncio.sleep(0)  # the loop closes the socket in its next cycle
+
+
+async def test_failed_accepts_are_logged_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Descriptors are exhausted, as they are where other parts of the process leak them."""
+    monkeypatch.setattr(of_listener, "RETRY_S", 0.01)
+    attempts, paused = 0, Listener._pause
+
+    def pause(listener: Listener, listening: socket.socket) -> None:
+        nonlocal attempts
+        attempts += 1
+        paused(listener, listening)
+
+    monkeypatch.setattr(Listener, "_pause", pause)
+    listener, soft = Listener(asyncio.Protocol), resource.getrlimit(resource.RLIMIT_NOFILE)
+    port = await listener.open("127.0.0.1", 0)
+    with structlog.testing.capture_logs() as lines, socket.socket() as client:
+        client.setblocking(False)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, soft[1]))
+        try:
+            await asyncio.get_running_loop().sock_connect(client, ("127.0.0.1", port))
+            async with asyncio.timeout(LONG_S):
+                while attempts < 10:  # noqa: ASYNC110 - a counter has no event
+                    await asyncio.sleep(0.01)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, soft)
+    await listener.close()
+    assert [line["reason"] for line in lines] == ["Too many open files"]
