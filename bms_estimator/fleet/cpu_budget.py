@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 SHARE = 0.1
 """Fraction of a core that a pack may use for long: a source at 1,000 Hz needs 0.005."""
-BURST_S = 0.5
-"""Processor time that a pack may use at once after a pause [s]: a thousand minute blocks at 1 Hz."""
-MAX_CHARGE_S = 0.25
-"""Maximum charge for one block [s]: the first one may load or compile kernels, which is no fault of its pack."""
+BURST_S = 0.2
+"""Processor time that a pack may use at once after a pause [s]: five hundred minute blocks at 1 Hz."""
+MAX_CHARGE_S = 0.1
+"""Maximum charge for one block [s], which 20,000 samples need: the first one may load or compile kernels, which is no fault of its pack."""
 MAX_PACKS = 10_000
 """Maximum number of levels that are stored before those of idle packs are removed."""
 

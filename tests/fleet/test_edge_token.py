@@ -3,25 +3,20 @@
 import asyncio
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-import aiomqtt
 import nats
-import numpy as np
 import pytest
 from nats.aio.client import Client
 from structlog.testing import capture_logs
 
-from bms_estimator.fleet import credentials, subjects
-from bms_estimator.fleet.block import Block, encode
+from bms_estimator.fleet import subjects
 from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.pack_bucket import write_bucket
 from bms_estimator.fleet.streams import MAX_BLOCK_BYTES, make_streams, pack_blocks
 from bms_estimator.fleet.worker import Options, work
-from bms_estimator.model.fleet_settings import TenantSettings
-from bms_estimator.model.sample import SAMPLE
-from tests.fleet.engine import Engine, running
+from tests.fleet.engine import running
+from tests.fleet.tenant import Tenant, heavy_block, numbered, one_tenant
 from tests.fleet.workers import KIND, Heartbeats, block, until
 from tests.patience import LONG_S
 
@@ -33,41 +28,11 @@ OLD = "p.*.raw.*"
 """Subject of ``RAW`` in the version before, where the server mapped what edges published."""
 
 
-class Fleet:
-    """A server with one tenant."""
-
-    def __init__(self, engine: Engine, keys: Path) -> None:
-        self.engine, self._keys = engine, keys
-
-    def options(self) -> Options:
-        """Of a worker."""
-        return Options(self.engine.url, "w", credentials.credentials_file(self._keys, "acme", Role.WORKER))
-
-    async def program(self, role: Role) -> Client:
-        file = credentials.credentials_file(self._keys, "acme", role)
-        return await nats.connect(self.engine.url, user_credentials=file, connect_timeout=LONG_S)
-
-    def edge(self, pack: str) -> aiomqtt.Client:
-        made = datetime.now(UTC) - timedelta(minutes=1)
-        token = credentials.edge_token(self._keys, "acme", pack, made)
-        return aiomqtt.Client("127.0.0.1", self.engine.mqtt_port, username="any", password=token, timeout=LONG_S)
-
-
 @pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[Fleet]:
-    keys = tmp_path / "keys"
-    accounts = credentials.make_accounts(keys, {"acme": TenantSettings()}, datetime.now(UTC))
-    with running(tmp_path, accounts=accounts) as engine:
-        made = Fleet(engine, keys)
-        asyncio.run(keep_raw(made, 1 << 30))
-        yield made
-
-
-async def keep_raw(fleet: Fleet, raw_bytes: int) -> None:
-    """Make the streams, or change the size of ``RAW``."""
-    nc = await fleet.program(Role.ADMIN)
-    await make_streams(nc, partitions=PARTITIONS, raw_bytes=raw_bytes)
-    await nc.close()
+def fleet(tmp_path: Path) -> Iterator[Tenant]:
+    with one_tenant(tmp_path) as tenant:
+        asyncio.run(tenant.make_streams(PARTITIONS, 1 << 30))
+        yield tenant
 
 
 async def stored(nc: Client) -> dict[str, int]:
@@ -80,7 +45,7 @@ def subject(pack: str) -> str:
     return subjects.kept(subjects.partition_of(pack, PARTITIONS), pack)
 
 
-async def test_invented_subjects_and_foreign_partitions_are_refused(fleet: Fleet) -> None:
+async def test_invented_subjects_and_foreign_partitions_are_refused(fleet: Tenant) -> None:
     reader = await fleet.program(Role.READER)
     async with fleet.edge("attacker") as edge:
         for partition in (*range(PARTITIONS), "x", "invented", "64"):
@@ -95,8 +60,8 @@ async def test_invented_subjects_and_foreign_partitions_are_refused(fleet: Fleet
     await reader.close()
 
 
-async def test_junk_evicts_no_block_of_another_pack(fleet: Fleet) -> None:
-    await keep_raw(fleet, RAW_BYTES)
+async def test_junk_evicts_no_block_of_another_pack(fleet: Tenant) -> None:
+    await fleet.make_streams(PARTITIONS, RAW_BYTES)
     reader = await fleet.program(Role.READER)
     async with fleet.edge("honest") as edge:
         for _ in range(5):
@@ -110,7 +75,7 @@ async def test_junk_evicts_no_block_of_another_pack(fleet: Fleet) -> None:
     await reader.close()
 
 
-async def test_a_message_larger_than_a_block_is_not_stored(fleet: Fleet) -> None:
+async def test_a_message_larger_than_a_block_is_not_stored(fleet: Tenant) -> None:
     reader = await fleet.program(Role.READER)
     async with fleet.edge("attacker") as edge:
         await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES + 1), qos=1)
@@ -131,24 +96,15 @@ async def test_a_stream_of_the_version_before_takes_the_limits_and_keeps_its_blo
 
 
 @asynccontextmanager
-async def worker(fleet: Fleet) -> AsyncIterator[None]:
+async def worker(fleet: Tenant) -> AsyncIterator[None]:
     """A worker that runs meanwhile."""
     stop = asyncio.Event()
-    working = asyncio.create_task(work(fleet.options(), stop))
+    working = asyncio.create_task(work(Options(fleet.engine.url, "w", fleet.file(Role.WORKER)), stop))
     try:
         yield
     finally:
         stop.set()
         await working
-
-
-def blocks_of(count: int, samples: int, period_s: float) -> list[bytes]:
-    """Blocks of a few kilobytes that hold many samples."""
-    made = np.zeros(samples, SAMPLE)
-    made["time_s"] = period_s * np.arange(samples)
-    made["voltage_v"], made["temperature_c"] = 3.7, 25.0
-    data = encode(Block(1, 1, 1, 1.79e9, made))
-    return [data[:16] + number.to_bytes(8, "little") + data[24:] for number in range(1, count + 1)]
 
 
 @pytest.mark.parametrize(
@@ -159,37 +115,38 @@ def blocks_of(count: int, samples: int, period_s: float) -> list[bytes]:
     ],
 )
 async def test_715_kb_of_dense_blocks_are_refused_and_honest_packs_go_on(
-    fleet: Fleet, samples: int, seconds: float, reason: str
+    fleet: Tenant, samples: int, seconds: float, reason: str
 ) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
     await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND, "attacker": KIND})
     states = await reader.subscribe(subjects.published("*", "state"))
     await reader.flush()
-    dense = blocks_of(1, samples, seconds / samples)
-    dense = blocks_of(715_000 // len(dense[0]), samples, seconds / samples)
+    dense = heavy_block(samples, seconds / samples)
+    count = 715_000 // len(dense)
     async with fleet.edge("attacker") as attacker, fleet.edge("p1") as honest:
-        for data in dense:
-            await attacker.publish("raw/attacker", data, qos=1)
+        for number in range(1, count + 1):
+            await attacker.publish("raw/attacker", numbered(dense, number), qos=1)
         await honest.publish("raw/p1", block("p1", 1), qos=1)
     with capture_logs() as logs:
         async with Heartbeats(reader) as heard, worker(fleet):
             assert (await states.next_msg(LONG_S)).subject == subjects.published("p1", "state")
-            await heard.until(lambda last: last["w"].counters.get("too_dense", 0) == len(dense))
+            await heard.until(lambda last: last["w"].counters.get("too_dense", 0) == count)
     refused = [line for line in logs if line["event"] == "a block is refused"]
     assert [(line["pack"], line["reason"]) for line in refused] == [("attacker", reason)]
     await admin.close()
     await reader.close()
 
 
-async def test_a_flood_of_blocks_delays_its_own_pack_alone_and_loses_nothing(fleet: Fleet) -> None:
+async def test_a_flood_of_blocks_delays_its_own_pack_alone_and_loses_nothing(fleet: Tenant) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
     await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND, "attacker": KIND})
     assert subject("p1").split(".")[1] == subject("attacker").split(".")[1]
     states = await reader.subscribe(subjects.published("*", "state"))
     await reader.flush()
     async with fleet.edge("attacker") as attacker, fleet.edge("p1") as honest:
-        for data in blocks_of(FLOOD, 20_000, 1.0):
-            await attacker.publish("raw/attacker", data, qos=1)
+        heavy = heavy_block(20_000, 1.0)
+        for number in range(1, FLOOD + 1):
+            await attacker.publish("raw/attacker", numbered(heavy, number), qos=1)
         await honest.publish("raw/p1", block("p1", 1), qos=1)
     async with Heartbeats(reader) as heard, worker(fleet):
         before = 0
@@ -202,7 +159,7 @@ async def test_a_flood_of_blocks_delays_its_own_pack_alone_and_loses_nothing(fle
     await reader.close()
 
 
-async def test_a_worker_refuses_a_block_in_the_wrong_partition(fleet: Fleet) -> None:
+async def test_a_worker_refuses_a_block_in_the_wrong_partition(fleet: Tenant) -> None:
     admin = await fleet.program(Role.ADMIN)
     await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND})
     wrong = (subjects.partition_of("p1", PARTITIONS) + 1) % PARTITIONS
