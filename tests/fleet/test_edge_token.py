@@ -12,6 +12,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.claims import Role
+from bms_estimator.fleet.delivery import MAX_PASSED
 from bms_estimator.fleet.pack_bucket import write_bucket
 from bms_estimator.fleet.streams import MAX_BLOCK_BYTES, make_streams, pack_blocks
 from bms_estimator.fleet.worker import Options, work
@@ -81,6 +82,23 @@ async def test_a_message_larger_than_a_block_is_not_stored(fleet: Tenant) -> Non
         await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES + 1), qos=1)
         await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES - 1024), qos=1)
     assert await stored(reader) == {subject("attacker"): 1}
+    await reader.close()
+
+
+async def test_a_block_that_the_server_refuses_is_not_sent_for_ever(fleet: Tenant) -> None:
+    admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
+    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND})
+    answers = await reader.subscribe(subjects.published("p1", "state"))
+    await reader.flush()
+    async with Heartbeats(reader) as heard, worker(fleet), fleet.edge("p1") as edge:
+        await edge.publish("raw/p1", block("p1", 1), qos=1)
+        await answers.next_msg(LONG_S)
+        for _ in range(MAX_PASSED):  # as an edge that is asked for block 2 each time
+            await edge.publish("raw/p1", bytes(MAX_BLOCK_BYTES + 1), qos=1)
+            await edge.publish("raw/p1", block("p1", 3), qos=1)
+        await answers.next_msg(LONG_S)
+        await heard.until(lambda last: last["w"].counters.get("lost_blocks") == 1)
+    await admin.close()
     await reader.close()
 
 

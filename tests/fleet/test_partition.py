@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.fleet import partition as partition_module
 from bms_estimator.fleet.block import Block, encode
-from bms_estimator.fleet.delivery import ASKED_EACH, TOLD_EACH
+from bms_estimator.fleet.delivery import ASKED_EACH, MAX_PASSED, TOLD_EACH
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.partition import Partition
 from bms_estimator.fleet.stepping import AT_ONCE, Stepping
@@ -89,7 +89,7 @@ async def test_the_end_state_is_that_of_a_replay(stream, samples) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.integers(-6, 6), max_size=30), st.data())
+@given(st.lists(st.integers(-6, 6), max_size=MAX_PASSED - 2), st.data())
 def test_any_order_of_delivery_leaves_the_same(steps, data) -> None:
     """An edge that jumps back and ahead at will, and workers that go on from any earlier snapshot."""
     rows = pulses(soc=0.6, hours=0.1)[0]
@@ -201,6 +201,26 @@ def test_what_never_comes_is_counted_and_the_rest_goes_on(stream, samples) -> No
     assert_same(stream, "a", estimator.record)
     assert stream.partition.counters["lost_blocks"] == 5
     assert json.loads(stream.send("a", one_block(samples[400:420], 21)).state)["frames_lost"] == 5
+
+
+@pytest.mark.parametrize("refused", [None, b"damaged"])
+def test_a_block_that_the_edge_sends_in_vain_is_lost_and_the_rest_goes_on(stream, samples, refused) -> None:
+    blocks = blocks_of(samples[:400])
+    deliver(stream, "a", blocks[:5])
+    awaits = stream.send("a", blocks[6]).awaits
+    assert (awaits.number, awaits.resend) == (6, True)
+    for _ in range(MAX_PASSED - 2):
+        if refused:
+            stream.send("a", refused)
+        assert stream.send("a", blocks[6]).state is None
+        stream.take_over()
+    assert stream.send("a", blocks[6]).state
+    deliver(stream, "a", blocks[7:], first=8)
+    estimator = estimator_of(SETTINGS, CELL)
+    estimator.run(samples[:100])
+    estimator.run(samples[120:400])
+    assert_same(stream, "a", estimator.record)
+    assert stream.partition.counters["lost_blocks"] == 1
 
 
 class TestWhatIsPublished:
