@@ -36,8 +36,8 @@ ATTACKER = "attacker"
 PACKS = [f"p{i}" for i in range(20)]
 PARTITIONS = 4
 PERIOD_OF_BLOCKS_S = 0.5
-MAX_MORE_S = 1.0
-"""Target: how much longer than without an attack the longest wait may be [s]."""
+MAX_RATIO = 15.0
+"""Target for the longest wait in an attack divided by the longest one without: above 300 before each pack had a budget."""
 IN_FLIGHT = 64
 """Messages of the attacker that wait for an acknowledgement."""
 ATTACKS = {
@@ -162,9 +162,10 @@ async def measure(folder: Path, seconds: float) -> list[Row]:
                 for name in ATTACKS:
                     with attacked(tenant, name):
                         found = await packs.send(seconds)
-                    more = f"{found[0] / alone[0]:.1f} and {found[1] / alone[1]:.1f} times as long"
-                    target, is_met = f"longest at most {MAX_MORE_S:g} s more", found[1] < alone[1] + MAX_MORE_S
-                    rows.append(Row(f"  one edge sends {name}", target, f"{_text(found)}: {more}", is_met))
+                    ratio = found[1] / alone[1]
+                    measured = f"{_text(found)}: {found[0] / alone[0]:.1f} and {ratio:.1f} times as long"
+                    target = f"longest at most {MAX_RATIO:g} times as long"
+                    rows.append(Row(f"  one edge sends {name}", target, measured, ratio < MAX_RATIO))
                 rows.append(await _kept(reader, packs.number))
         finally:
             worker.kill()
