@@ -37,7 +37,7 @@ PACKS = [f"p{i}" for i in range(20)]
 PARTITIONS = 4
 PERIOD_OF_BLOCKS_S = 0.5
 MAX_RATIO = 15.0
-"""Target for the longest wait in an attack divided by the longest one without: above 300 before each pack had a budget."""
+"""Target for the longest wait in an attack divided by the longest one without."""
 IN_FLIGHT = 64
 """Messages of the attacker that wait for an acknowledgement."""
 ATTACKS = {
