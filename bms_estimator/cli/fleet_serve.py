@@ -137,5 +137,5 @@ def _accounts(settings: FleetSettings, place: Place) -> Accounts | None:
     if not settings.tenants:
         return None
     if place.number == 1 or credentials.has_keys(place.keys):
-        return credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC), settings.server.partitions)
+        return credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC))
     return credentials.read_accounts(place.keys)

@@ -6,12 +6,13 @@ Layout, little-endian::
     8  format   u2   1
     10 length   u4   of the header
     14 crc      u4   CRC-32 of the header
-    18 header        JSON: partition, sequence, counters, layouts of records, entries
+    18 header        JSON: partition, sequence, counters, spans of packs that wait, layouts of records, entries
     .. chunks        length u4, CRC-32 u4, entries; the last has length 0
 
-    entry:  layout u1 (255: a held block), length of the name u2, of the data u4, name, data
+    entry:  layout u1, length of the name u2, of the data u4, name, data
 
-A layout names each field of a record, so that a version with other fields can take the state over.
+A layout names each field of a record, so that a version with other fields can take the state over. Layout 255 is a block that
+an earlier version kept here for a pack which it did not know: the messages of this pack are read from the stream again.
 """
 
 import json
@@ -23,13 +24,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bms_estimator.fleet.deferred import Span
 from bms_estimator.fleet.pack_state import PACK_STATE
 from bms_estimator.kernels.sparse import mirror_of
 
 FORMAT = 1
 CHUNK_BYTES = 1 << 20
 _HEAD, _CHUNK, _ENTRY = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
-_MAGIC, _HELD, _MOST_LAYOUTS = b"BMSFLEET", 255, 255
+_MAGIC, _FORMER_BLOCK, _MOST_LAYOUTS = b"BMSFLEET", 255, 255
 _LONGEST_RECORD = 1 << 24
 
 
@@ -89,7 +91,7 @@ class Snapshot:
         counters: By what they count.
         packs: Packed records by pack, of this version's layout.
         former: The same of packs that were not heard since another version.
-        held: Blocks of packs that the table does not know, in the order in which they came.
+        deferred: Messages of packs that wait, in the order of their turns.
     """
 
     number: int
@@ -97,7 +99,7 @@ class Snapshot:
     counters: Mapping[str, int] = field(default_factory=dict)
     packs: Mapping[str, bytes] = field(default_factory=dict)
     former: Mapping[str, Former] = field(default_factory=dict)
-    held: Mapping[str, tuple[bytes, ...]] = field(default_factory=dict)
+    deferred: Mapping[str, Span] = field(default_factory=dict)
 
     def chunks(self) -> Iterator[bytes]:
         """The bytes, about ``CHUNK_BYTES`` at a time."""
@@ -106,8 +108,9 @@ class Snapshot:
             "partition": self.number,
             "sequence": self.sequence,
             "counters": dict(self.counters),
+            "deferred": dict(self.deferred),
             "layouts": [json.loads(layout) for layout in layouts],
-            "entries": len(self.packs) + len(self.former) + sum(map(len, self.held.values())),
+            "entries": len(self.packs) + len(self.former),
         }
         text = json.dumps(header, separators=(",", ":")).encode()
         chunk = [_HEAD.pack(_MAGIC, FORMAT, len(text), zlib.crc32(text)), text]
@@ -127,9 +130,6 @@ class Snapshot:
             yield _entry(places[PRESENT], pack, packed)
         for pack, former in self.former.items():
             yield _entry(places[former.layout], pack, former.packed)
-        for pack, blocks in self.held.items():
-            for block in blocks:
-                yield _entry(_HELD, pack, block)
 
 
 def _entry(layout: int, pack: str, data: bytes) -> bytes:
@@ -173,12 +173,13 @@ def _read(data: memoryview) -> Snapshot:
             dtype_of(layout)
     packs: dict[str, bytes] = {}
     former: dict[str, Former] = {}
-    held: dict[str, list[bytes]] = {}
+    sequence = int(header["sequence"])
+    deferred = {str(pack): Span(int(first), int(last)) for pack, (first, last) in header.get("deferred", {}).items()}
     entries = 0
     for place, pack, content in _entries_of(data, at):
         entries += 1
-        if place == _HELD:
-            held.setdefault(pack, []).append(content)
+        if place == _FORMER_BLOCK:
+            deferred[pack] = Span(1, sequence)
         elif layouts[place] == PRESENT:
             packs[pack] = content
         else:
@@ -186,8 +187,7 @@ def _read(data: memoryview) -> Snapshot:
     if entries != header["entries"]:
         raise CheckpointError(f"the checkpoint is damaged: {entries} of {header['entries']} entries")
     counters = {str(name): int(count) for name, count in header["counters"].items()}
-    blocks = {pack: tuple(each) for pack, each in held.items()}
-    return Snapshot(int(header["partition"]), int(header["sequence"]), counters, packs, former, blocks)
+    return Snapshot(int(header["partition"]), sequence, counters, packs, former, deferred)
 
 
 def _entries_of(data: memoryview, at: int) -> Iterator[tuple[int, str, bytes]]:

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from bms_estimator.fleet import claims, subjects
+from bms_estimator.fleet import claims
 from bms_estimator.fleet.claims import ACCOUNT, BEARERS, OPERATOR, Key, Role, Tenant
 from bms_estimator.fleet.server_config import Accounts
 from bms_estimator.model.errors import UserError
@@ -35,16 +35,13 @@ def has_keys(folder: Path) -> bool:
     return (folder / "operator.nk").exists()
 
 
-def make_accounts(
-    folder: Path, tenants: Mapping[str, TenantSettings], now: datetime, partitions: int = subjects.PARTITIONS
-) -> Accounts:
+def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: datetime) -> Accounts:
     """Claims of the operator and of all tenants, with what keys are missing for them made.
 
     Args:
         folder: Of the keys; made where it is missing.
         tenants: By name.
         now: When credentials that are made are made.
-        partitions: Of each tenant's stream ``RAW``.
 
     Raises:
         UserError: The folder cannot be read or written, or holds what is no key.
@@ -52,7 +49,7 @@ def make_accounts(
     operator, system = _key(folder / "operator.nk", OPERATOR), _key(folder / "system.nk", ACCOUNT)
     accounts = {system.public: claims.system_account(operator, system.public)}
     for name, settings in sorted(tenants.items()):
-        tenant = _tenant(folder / name, name, settings, partitions)
+        tenant = _tenant(folder / name, name, settings)
         accounts[tenant.public] = claims.account(operator, tenant)
         _write_users(folder / name, tenant.public, now)
     made = Accounts(claims.operator(operator, system.public), system.public, accounts)
@@ -100,7 +97,7 @@ def credentials_file(folder: Path, tenant: str, role: Role) -> Path:
     return folder / tenant / f"{role.value}.{'token' if role in BEARERS else 'creds'}"
 
 
-def _tenant(folder: Path, name: str, settings: TenantSettings, partitions: int) -> Tenant:
+def _tenant(folder: Path, name: str, settings: TenantSettings) -> Tenant:
     signers = {role: _key(folder / f"{role.value}.nk", ACCOUNT) for role in Role}
     revoked = {
         claims.user_key(signers[Role.EDGE], Role.EDGE, pack).public: int(before.timestamp())
@@ -110,7 +107,6 @@ def _tenant(folder: Path, name: str, settings: TenantSettings, partitions: int) 
         name=name,
         public=_key(folder / "account.nk", ACCOUNT).public,
         signers={role: key.public for role, key in signers.items()},
-        partitions=partitions,
         disk_bytes=None if settings.disk_gb is None else round(GB * settings.disk_gb),
         revoked=revoked,
     )

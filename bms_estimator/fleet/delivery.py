@@ -17,6 +17,10 @@ TOLD_EACH = 10
 ASKED_EACH = 5
 """Blocks that came too early: so often it hears again from where to send."""
 
+MAX_PASSED = 20
+"""A missing block is lost when the one after it has come this often: the edge has sent both again at least 30 s apart each time, so
+the server refuses the missing one, or it is damaged on the edge's disk."""
+
 
 class Order(Enum):
     """What a block is to the order of its pack."""
@@ -41,23 +45,36 @@ def judge(d: np.void, block: Block) -> Order:
     if block.store < store:
         return Order.FORMER_STORE
     if block.store > store:
-        d["store"], d["awaited"], d["ahead"], number = block.store, 1, 0, 1
+        d["store"], number = block.store, _await(d, 1)
     if block.oldest > number:
-        d["lost_blocks"] = min(int(d["lost_blocks"]) + block.oldest - number, MOST_LOST)
-        d["awaited"], d["ahead"], number = block.oldest, 0, block.oldest
+        number = _lose(d, block.oldest)
     if block.number < number:
         return Order.RESENT
     if block.number > number:
         d["ahead"] += 1
-        return Order.AHEAD
+        d["passed"] += block.number == number + 1
+        if d["passed"] < MAX_PASSED:
+            return Order.AHEAD
+        _lose(d, block.number)
     return Order.NEXT
 
 
 def taken(d: np.void) -> None:
     """The block that was awaited is taken; ``d`` as in ``judge``."""
-    d["awaited"] += 1
+    _await(d, int(d["awaited"]) + 1)
     d["blocks"] += 1
-    d["ahead"] = 0
+
+
+def _lose(d: np.void, number: int) -> int:
+    """Count the blocks before a number as lost; returns the number."""
+    d["lost_blocks"] = min(int(d["lost_blocks"]) + number - int(d["awaited"]), MOST_LOST)
+    return _await(d, number)
+
+
+def _await(d: np.void, number: int) -> int:
+    """Await a block, of which none was missed yet; returns its number."""
+    d["awaited"], d["ahead"], d["passed"] = number, 0, 0
+    return number
 
 
 def answer(order: Order, d: np.void, block: Block, *, first: bool) -> Awaits | None:

@@ -6,8 +6,8 @@ import numpy as np
 
 from bms_estimator.model.sample import SampleBlock
 
-MOST_SAMPLES = 20_000
-"""Of a block: however little they can be packed, it is below the 1 MiB that a NATS server takes."""
+MOST_SAMPLES = 7_000
+"""Maximum number of samples in a block: even samples that do not compress stay below ``streams.MAX_BLOCK_BYTES``."""
 
 
 class Gathered(NamedTuple):

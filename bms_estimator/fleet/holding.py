@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from contextlib import aclosing
+from functools import partial
 from itertools import islice
 
 import structlog
@@ -21,11 +22,14 @@ from nats.js.errors import NotFoundError
 from bms_estimator.fleet import subjects
 from bms_estimator.fleet.block import glance
 from bms_estimator.fleet.consumer import Given, PinnedConsumer
+from bms_estimator.fleet.cpu_budget import CpuBudget
+from bms_estimator.fleet.deferred import Span
 from bms_estimator.fleet.keeping import Claim, FencedError, Keeping, Kept
 from bms_estimator.fleet.partition import Partition, Table, Taken
 from bms_estimator.fleet.reasons import reason
 from bms_estimator.fleet.stored import stored
 from bms_estimator.fleet.stream_reader import StreamError
+from bms_estimator.fleet.tasks import until_first_ends
 
 RETRY_S = 0.5
 """Between two attempts at what the server does not do now [s]."""
@@ -52,6 +56,8 @@ class Holding:
         inbox: As ``PinnedConsumer`` has it.
         turn: Held while a block is stepped: of all partitions one at a time, so that the loop sees to requests and heartbeats
             between any two.
+        partitions: Number of partitions of the stream.
+        is_busy: Whether any partition of the worker has messages that were given and not taken.
 
     Attributes:
         consumer: What asks for messages.
@@ -65,7 +71,19 @@ class Holding:
         trouble: What does not work now; empty: nothing.
     """
 
-    def __init__(self, nc: Client, number: int, table: Table, keeping: Keeping, inbox: str, turn: asyncio.Lock) -> None:
+    def __init__(
+        self,
+        nc: Client,
+        number: int,
+        table: Table,
+        keeping: Keeping,
+        inbox: str,
+        turn: asyncio.Lock,
+        *,
+        partitions: int,
+        is_busy: Callable[[], bool],
+    ) -> None:
+        self._partitions, self._is_busy, self._budget = partitions, is_busy, CpuBudget()
         self._nc, self.number, self._table, self._keeping = nc, number, table, keeping
         self._turn = turn
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
@@ -79,7 +97,7 @@ class Holding:
         self._whole = False  # nothing is missing between the state and the last message given
         self._lost = self._silent = False
         self._ask_s = time.monotonic() + SILENCE_S  # when silence is to be looked into
-        self._news = asyncio.Event()
+        self._news, self._turns = asyncio.Event(), asyncio.Event()
         self._changing = asyncio.Lock()  # of state and claim
         self._sending = asyncio.Lock()
 
@@ -104,9 +122,13 @@ class Holding:
         if time.monotonic() >= self._ask_s:
             self._silent = True
             self._news.set()
+        self._turns.set()
 
     async def run(self) -> None:
         """Take messages for ever."""
+        await until_first_ends(self._run(), self._run_deferred())
+
+    async def _run(self) -> None:
         while True:
             self._news.clear()
             if self._lost:
@@ -131,14 +153,17 @@ class Holding:
             partition, claim = self.partition, self.claim
             if partition is None or claim is None:
                 return
-            if self.kept and self.kept.sequence == partition.sequence:
+            if self.kept and self.kept.sequence == partition.sequence and partition.deferred.is_saved:
                 return
-            snapshot = partition.snapshot()
+            snapshot, partition.deferred.is_saved = partition.snapshot(), True
             await self.send_hours()  # those of what is in the checkpoint: nobody would make them again
             try:
                 self.claim = await self._keeping.write(claim, snapshot.sequence, snapshot.chunks())
             except FencedError as error:
                 self._fenced(error)
+            except BaseException:
+                partition.deferred.is_saved = False
+                raise
 
     async def send_hours(self) -> None:
         """Have the stream of summaries keep those that wait.
@@ -174,11 +199,41 @@ class Holding:
         except TROUBLES as error:
             log.warning("not given back: that takes its time", partition=self.number, reason=reason(error))
 
-    async def settings_changed(self, pack: str) -> None:
+    def settings_changed(self, pack: str) -> None:
         """A pack has other settings, or is known now."""
-        for taken in self.partition.settings_changed(pack) if self.partition else ():
-            self._note(taken)
-            await self._publish(taken)
+        if self.partition:
+            self.partition.settings_changed(pack)
+            self._turns.set()
+
+    async def _run_deferred(self) -> None:
+        """Take messages that wait for ever: one of each pack at a time."""
+        while True:
+            self._turns.clear()
+            while self.partition and (found := self.partition.deferred.next(self._is_due)):
+                if not await self._try(partial(self._take_deferred, self.partition, *found)):
+                    await asyncio.sleep(RETRY_S)
+            await self._turns.wait()
+
+    def _is_due(self, pack: str) -> bool:
+        """Return whether a pack that waits may go on: within its budget, or while no other pack needs the processor."""
+        is_known = self.partition is not None and self.partition.is_known(pack)
+        return is_known and not (self._budget.is_exhausted(pack) and self._is_busy())
+
+    async def _take_deferred(self, partition: Partition, pack: str, span: Span) -> None:
+        """Take the next message of a pack that waits."""
+        js, subject = self._nc.jetstream(), subjects.kept(self.number, pack)
+        try:
+            message = await js.get_msg(subjects.RAW_STREAM, span.first, subject, next=True)
+        except NotFoundError:  # the stream has dropped them; the edge is asked for them with its next block
+            partition.deferred.advance(pack, span.last)
+            return
+        data, sequence = message.data or b"", message.seq or 0
+        if sequence > span.last:
+            partition.deferred.advance(pack, span.last)
+            return
+        take = partial(partition.take_deferred, pack, data, sequence)
+        self._count(data)
+        await self._publish(await self._step(pack, sequence, take))
 
     async def _take(self, given: Given) -> None:
         """Take a message, after those before it; until that is done, or the partition somebody else's."""
@@ -190,7 +245,7 @@ class Holding:
         partition = self.partition
         if partition is None or given.sequence <= partition.sequence:
             return
-        await self._publish(await self._step(partition, given.pack, given.data, given.sequence))
+        await self._publish(await self._take_or_defer(partition, given.pack, given.data, given.sequence))
 
     async def _go_on_to(self, given: Given) -> None:
         """Have the state of all messages before one that was given."""
@@ -228,9 +283,7 @@ class Holding:
             claim = await self._keeping.claim(self.number)
             partition = await self._restored(claim)
             self.partition, self.claim = partition, claim
-            for pack in partition.unknown:  # the table may know it by now
-                await self.settings_changed(pack)
-                await asyncio.sleep(0)
+            self._turns.set()
         last = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
         if partition.sequence > last:
             log.warning(
@@ -240,6 +293,7 @@ class Holding:
                 checkpoint=partition.sequence,
             )
             partition.sequence = 0
+            partition.deferred.clear()
         return partition
 
     async def _restored(self, claim: Claim) -> Partition:
@@ -270,20 +324,36 @@ class Holding:
         async with aclosing(messages):
             async for message in messages:
                 pack = message.subject.rpartition(".")[2]
-                taken = await self._step(partition, pack, message.data, message.sequence)
+                taken = await self._take_or_defer(partition, pack, message.data, message.sequence)
                 latest[pack] = _later(latest.get(pack), taken)
         for taken in latest.values():
             await self._publish(taken)
 
-    async def _step(self, partition: Partition, pack: str, data: bytes, sequence: int) -> Taken:
+    async def _take_or_defer(self, partition: Partition, pack: str, data: bytes, sequence: int) -> Taken:
+        """Take a message, or let it wait where its pack has to."""
+        if subjects.partition_of(pack, self._partitions) != self.number:
+            return partition.refuse(pack, sequence)
+        if pack in partition.deferred or self._budget.is_exhausted(pack):
+            await asyncio.sleep(0)
+            partition.defer(pack, sequence)
+            self._turns.set()
+            return Taken(pack)
+        taken = await self._step(pack, sequence, partial(partition.take, pack, data, sequence))
+        if pack not in partition.deferred:
+            self._count(data)
+        return taken
+
+    async def _step(self, pack: str, sequence: int, take: Callable[[], Taken]) -> Taken:
+        """Take a message when no other block is stepped; the time that it needs is charged to its pack."""
         async with self._turn:
             await asyncio.sleep(0)
+            begin_s = time.thread_time()
             try:
-                taken = partition.take(pack, data, sequence)
+                taken = take()
             except Exception:  # a fault of ours with one pack, which would end one worker after the other
                 log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
                 taken = Taken(pack, failed=1)
-        self._count(data)
+            self._budget.charge(pack, time.thread_time() - begin_s)
         self._note(taken)
         return taken
 

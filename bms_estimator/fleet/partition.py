@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from bms_estimator.fleet.block import Block, BlockError, decode
 from bms_estimator.fleet.checkpoint import CheckpointError, Former, Snapshot, dtype_of, read_checkpoint
+from bms_estimator.fleet.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.delivery import Order, answer, judge, taken
-from bms_estimator.fleet.held import Held
+from bms_estimator.fleet.density import density_fault
 from bms_estimator.fleet.pack_state import Bench, Fields
 from bms_estimator.fleet.pack_type import PackType, PackTypes
 from bms_estimator.fleet.stepping import Stepping
@@ -60,7 +61,8 @@ class Partition:
 
     Attributes:
         number: The same.
-        sequence: Of the last message that was taken; 0: none was.
+        sequence: Of the last message that was taken or deferred; 0: none was.
+        deferred: Packs whose messages wait in the stream.
     """
 
     def __init__(self, number: int, table: Table, *, wall: Callable[[], float] = time.time) -> None:
@@ -69,9 +71,10 @@ class Partition:
         self._counters: Counter[str] = Counter()
         self._packs: dict[str, bytes] = {}
         self._former: dict[str, Former] = {}
-        self._held = Held()
+        self.deferred = Deferred()
         self._known: dict[str, PackType] = {}
         self._greeted: set[str] = set()
+        self._refused: set[str] = set()
         self._bench = Bench()
         self._types = PackTypes(self._bench.record)
         self._stepping = Stepping(self._bench.record, self._counters, wall)
@@ -91,25 +94,23 @@ class Partition:
         made._counters.update(found.counters)
         made._packs.update(found.packs)
         made._former.update(found.former)
-        for pack, blocks in found.held.items():
-            for held in blocks:
-                made._held.add(pack, held)
+        made.deferred = Deferred(found.deferred)
         return made
 
     def snapshot(self) -> Snapshot:
         """The partition as it is now, whatever comes later; costs no more than a list of its packs."""
-        held = self._held.blocks()
-        return Snapshot(self.number, self.sequence, dict(self._counters), dict(self._packs), dict(self._former), held)
+        spans = self.deferred.spans()
+        return Snapshot(self.number, self.sequence, dict(self._counters), dict(self._packs), dict(self._former), spans)
 
     @property
     def counters(self) -> Mapping[str, int]:
         """What came, and what became of it, since the partition began."""
-        return {**self._counters, "packs": len(self._packs) + len(self._former), "unknown": len(self._held)}
+        return {**self._counters, "packs": len(self._packs) + len(self._former), "unknown": len(self.unknown)}
 
     @property
     def unknown(self) -> tuple[str, ...]:
         """Packs that sent something and that the table does not know."""
-        return tuple(self._held.blocks())
+        return tuple(pack for pack in self.deferred if not self.is_known(pack))
 
     def state(self, pack: str) -> NDArray[np.void] | None:
         """A copy of the record of a pack, shape (1,), dtype PACK_STATE; None where there is none of this version."""
@@ -120,7 +121,7 @@ class Partition:
         return self._bench.record.copy()
 
     def take(self, pack: str, data: bytes, sequence: int) -> Taken:
-        """Take a message of the stream.
+        """Take a message of the stream, or defer it where its pack is not known or has others that wait.
 
         Args:
             pack: From which.
@@ -130,25 +131,59 @@ class Partition:
         if sequence <= self.sequence:
             self._counters["repeated"] += 1
             return Taken(pack)
+        if pack in self.deferred:
+            return self.defer(pack, sequence)
         self.sequence = sequence
-        try:
-            block = decode(data)
-        except BlockError:
-            self._counters["damaged"] += 1
+        block = self._decoded(data)
+        if block is None:
             return Taken(pack)
         known = self._look_up(pack)
         if known is None:
-            self._counters["held" if self._held.add(pack, data) else "not_held"] += 1
-            return Taken(pack)
-        if pack in self._held:
-            return _together(pack, [*self._release(pack, known), self._take(pack, block, known)])
+            return self.defer(pack, sequence)
         return self._take(pack, block, known)
 
-    def settings_changed(self, pack: str) -> list[Taken]:
-        """Take the settings of a pack from the table anew, and what was held of it if it is known now."""
-        self._known.pop(pack, None)
+    def defer(self, pack: str, sequence: int) -> Taken:
+        """Let a message wait in the stream."""
+        self.sequence = max(self.sequence, sequence)
+        if pack in self.deferred or len(self.deferred) < MAX_UNKNOWN or self.is_known(pack):
+            self.deferred.add(pack, sequence)
+            self._counters["deferred"] += 1
+        else:
+            self._counters["not_deferred"] += 1
+        return Taken(pack)
+
+    def take_deferred(self, pack: str, data: bytes, sequence: int) -> Taken:
+        """Take the next message of a known pack that waits; arguments as in ``take``."""
         known = self._look_up(pack)
-        return [] if known is None else self._release(pack, known)
+        if known is None or pack not in self.deferred:
+            return Taken(pack)
+        self.deferred.advance(pack, sequence)
+        block = self._decoded(data)
+        return self._take(pack, block, known) if block else Taken(pack)
+
+    def is_known(self, pack: str) -> bool:
+        """Return whether the table has the pack."""
+        return self._table(pack) is not None
+
+    def refuse(self, pack: str, sequence: int) -> Taken:
+        """Leave out a message that is not in its pack's partition, whoever put it there."""
+        if sequence > self.sequence:
+            self.sequence = sequence
+            self._counters["misplaced"] += 1
+            self._log_refusal(pack, "the pack belongs to another partition")
+        return Taken(pack)
+
+    def settings_changed(self, pack: str) -> None:
+        """Read the settings of a pack from the table again with its next block."""
+        self._known.pop(pack, None)
+
+    def _decoded(self, data: bytes) -> Block | None:
+        """Return the block in a message; None: it is damaged."""
+        try:
+            return decode(data)
+        except BlockError:
+            self._counters["damaged"] += 1
+            return None
 
     def _look_up(self, pack: str) -> PackType | None:
         known = self._known.get(pack)
@@ -159,9 +194,6 @@ class Partition:
             known = self._known[pack] = self._types.of(*found)
         return known
 
-    def _release(self, pack: str, known: PackType) -> list[Taken]:
-        return [self._take(pack, decode(data), known) for data in self._held.release(pack)]
-
     def _take(self, pack: str, block: Block, of_type: PackType) -> Taken:
         former = self._open(pack)
         d = self._bench.delivery
@@ -171,13 +203,17 @@ class Partition:
         self._bench.count_lost(lost)
         made = Taken(pack)
         if order is Order.NEXT:
-            stepped = self._step(pack, block, of_type, former)
+            stepped, fault = None, density_fault(block.samples)
+            if fault:
+                self._log_refusal(pack, fault)
+            else:
+                stepped = self._step(pack, block, of_type, former)
             if stepped is None:  # as if it had brought nothing
                 self._open(pack)
                 judge(d, block)
                 self._bench.count_lost(lost)
-                self._counters["failed"] += 1
-            made = stepped or Taken(pack, failed=1)
+                self._counters["too_dense" if fault else "failed"] += 1
+            made = stepped or Taken(pack, failed=int(not fault))
             taken(d)
             self._former.pop(pack, None)
         else:
@@ -188,6 +224,12 @@ class Partition:
         first = pack not in self._greeted
         self._greeted.add(pack)
         return made._replace(awaits=answer(order, d, block, first=first))
+
+    def _log_refusal(self, pack: str, why: str) -> None:
+        """Log the first refused block of a pack; ``counters`` has the others."""
+        if pack not in self._refused:
+            self._refused.add(pack)
+            log.warning("a block is refused", partition=self.number, pack=pack, reason=why)
 
     def _step(self, pack: str, block: Block, of_type: PackType, former: Fields | None) -> Taken | None:
         """What comes of the next block; None: of this one nothing can."""
@@ -211,15 +253,3 @@ class Partition:
             self._counters["damaged_states"] += 1
         self._bench.clear()
         return None
-
-
-def _together(pack: str, made: list[Taken]) -> Taken:
-    """What came of several blocks, as of one."""
-    return Taken(
-        pack,
-        awaits=next((each.awaits for each in reversed(made) if each.awaits), None),
-        state=next((each.state for each in reversed(made) if each.state), None),
-        parameters=next((each.parameters for each in reversed(made) if each.parameters), None),
-        hours=tuple(row for each in made for row in each.hours),
-        failed=sum(each.failed for each in made),
-    )

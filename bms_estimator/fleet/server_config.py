@@ -131,10 +131,9 @@ def _cluster(node: Node) -> list[str]:
 
 
 def _accounts(node: Node) -> list[str]:
-    """Claims bring their own mapping; without any, the mapping is that of the one account there is."""
+    """Return the lines that say who may connect; without accounts, anybody."""
     if node.accounts is None:
-        source, target = subjects.mapping(node.partitions)
-        return [f"mappings {{ {_text(source)}: {_text(target)} }}"]
+        return []
     preload = [f"  {key}: {claims}" for key, claims in node.accounts.claims.items()]
     return [
         f"operator: {node.accounts.operator}",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator import Estimator
 from bms_estimator.fleet import hour
 from bms_estimator.fleet.block import Block
+from bms_estimator.fleet.density import LONGEST_STORE_S
 from bms_estimator.fleet.pack_state import PACK_STATE, Fields
 from bms_estimator.fleet.pack_type import Digest, PackType
 from bms_estimator.model.clock import iso_utc
@@ -24,9 +25,6 @@ from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.topics import estimate_report
 from bms_estimator.snapshot.window import Window
 
-LONGEST_STORE_S = 2.0**33
-"""A store may be made before its machine knows the time, in 1970: it is no longer in use than the time since then. A sample that is
-told to be later has no time [s]."""
 LAST_WALL_S = 2.0**34
 """No wall clock shows a later time: the year 2514 [s since 1970]."""
 AT_ONCE = 4096

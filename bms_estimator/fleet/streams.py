@@ -25,6 +25,13 @@ RAW_BYTES, RAW_AGE_S = 8 << 30, 7 * 86_400.0
 """What ``RAW`` keeps at most."""
 HOURS_PART, HOURS_AGE_S = 1 / 16, 30 * 86_400.0
 """What ``HOURS`` may take, of what ``RAW`` may; and so long summaries wait for who collects them."""
+MAX_BLOCK_BYTES = 256 << 10
+"""Maximum size of a block in ``RAW`` [bytes]: 7,000 samples that do not compress fit."""
+PACK_FRACTION = 1 / 3
+"""Fraction of ``RAW`` that one pack can fill with blocks of the maximum size: by default seven days of minute blocks. Beyond it its own
+oldest block goes."""
+MIN_PACK_BLOCKS = 60
+"""Blocks of a pack that even a small ``RAW`` keeps: an hour of minute blocks."""
 DUPLICATES_S = 3600.0
 """A summary that comes again within it, under its number, is dropped."""
 GROUP = "w"
@@ -94,10 +101,28 @@ def consumer(partition: int) -> str:
     return f"p{partition}"
 
 
+def pack_blocks(raw_bytes: int) -> int:
+    """Return the number of blocks of one pack that ``RAW`` keeps."""
+    return max(round(PACK_FRACTION * raw_bytes / MAX_BLOCK_BYTES), MIN_PACK_BLOCKS)
+
+
 def _raw(partitions: int, most_bytes: int, age_s: float) -> dict[str, Any]:
-    limits = {"max_bytes": most_bytes, "max_age": _ns(age_s), "discard": "old", "allow_direct": True}
-    subject = "p.*.raw.*"
-    return _stream(subjects.RAW_STREAM, subject, metadata={PARTITIONS_KEY: str(partitions)}, **limits)
+    source, destination = subjects.mapping(partitions)
+    limits = {
+        "max_bytes": most_bytes,
+        "max_age": _ns(age_s),
+        "max_msg_size": MAX_BLOCK_BYTES,
+        "max_msgs_per_subject": pack_blocks(most_bytes),
+        "discard": "old",
+        "allow_direct": True,
+    }
+    return _stream(
+        subjects.RAW_STREAM,
+        source,
+        subject_transform={"src": source, "dest": destination},
+        metadata={PARTITIONS_KEY: str(partitions)},
+        **limits,
+    )
 
 
 def _hours(raw_bytes: int) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Names on the server, within the account of one tenant. An MQTT topic is the subject with / for the dots.
 
 ===========================  ================================================================================
-``raw.<pack>``               an edge's blocks, ``block``; mapped by the server to ...
-``p.<partition>.raw.<pack>`` ... this, which the stream ``RAW`` keeps
+``raw.<pack>``               an edge's blocks, ``block``; the stream ``RAW`` takes them and stores them as ...
+``p.<partition>.raw.<pack>`` ... this; published to it, a message reaches no stream
 ``edge.<pack>.awaits``       to the edge: which block a worker awaits next, ``Awaits``
 ``bms.<pack>.<topic>``       estimates, as ``run`` publishes them
 ``hours.<pack>``             what a worker sums up each hour, kept by the stream ``HOURS``
@@ -33,7 +33,7 @@ def kept(partition: int, pack: str = "*") -> str:
 
 
 def mapping(partitions: int) -> tuple[str, str]:
-    """What the server maps, and to what."""
+    """Source and destination of the transform by which ``RAW`` puts each pack into its partition."""
     return "raw.*", f"p.{{{{partition({partitions},1)}}}}.raw.{{{{wildcard(1)}}}}"
 
 

@@ -249,7 +249,16 @@ class Worker:
                 await holding.consumer.renew()
 
     def _try_for(self, number: int, now_s: float) -> None:
-        holding = Holding(self._nc, number, self._bucket.packs, self._keeping, self._inbox, self._turn)
+        holding = Holding(
+            self._nc,
+            number,
+            self._bucket.packs,
+            self._keeping,
+            self._inbox,
+            self._turn,
+            partitions=self._partitions,
+            is_busy=lambda: any(each.consumer.waiting for each in self._holdings),
+        )
         holding.due_s = now_s + self._options.checkpoint_s * (number + 1) / self._partitions
         self._held[number] = holding, asyncio.create_task(holding.run())
 
@@ -291,8 +300,7 @@ class Worker:
             for pack in await self._changed.get():
                 held = self._held.get(subjects.partition_of(pack, self._partitions))
                 if held:
-                    await held[0].settings_changed(pack)
-                    await asyncio.sleep(0)
+                    held[0].settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
         holdings = [holding for holding in self._holdings if holding.held]

@@ -1,8 +1,9 @@
-"""Load: thousands of frames a second through the service over a PTY, and a day of serial bytes through decoder and estimator.
+"""Load: thousands of frames a second through the service over a PTY, and a day of serial bytes through decoder and estimator,
+and an attack with the token of one edge of a fleet.
 
 Idle connections to the HTTP listeners of service, dashboard and fleet page, while their broker or server is restarted.
 
-make load ARGS="--rate 5000 --minutes 10 --hours 24 --no-idle"
+make load ARGS="--rate 5000 --minutes 10 --hours 24 --no-idle --attack-s 20"
 """
 
 import argparse
@@ -27,6 +28,7 @@ from bms_estimator.kernels.cell import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.dialects.board import BoardDialect
+from tests.benchmarks import edge_token
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
 from tests.benchmarks.table import Row, show
 from tests.benchmarks.wire import hello, sample_frames
@@ -239,6 +241,8 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         begun = math.ceil(len(rss) / 6)  # what grows at first: the allocator's pools
         growth = f"{rss[begun - 1]:.1f} MiB after {begun} h, {rss[-1]:.1f} at the end"
         yield Row("  resident memory", "flat", growth, rss[-1] - rss[begun - 1] < MOST_GROWTH_MIB)
+    if options.attack_s:
+        yield from edge_token.rows(options.attack_s)
 
 
 def idle_rows() -> Iterator[Row]:
@@ -271,6 +275,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="make load", description=__doc__)
     parser.add_argument("--rate", type=int, default=5000, help="frames per second over the PTY")
     parser.add_argument("--minutes", type=float, default=10.0, help="for so long; 0: not at all")
+    parser.add_argument("--attack-s", type=float, default=20.0, help="each attack on a fleet; 0: none")
     parser.add_argument("--hours", type=float, default=24.0, help="of serial bytes at 100 Hz, at once; 0: not at all")
     parser.add_argument(
         "--idle", action=argparse.BooleanOptionalAction, default=True, help="attack by idle connections"

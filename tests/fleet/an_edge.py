@@ -38,9 +38,21 @@ class Stream:
         self.partition = partition
         self.messages: list[tuple[str, bytes]] = []
 
-    def send(self, pack: str, data: bytes) -> Taken:
+    def send(self, pack: str, data: bytes, *, waits: bool = False) -> Taken:
         self.messages.append((pack, data))
+        if waits:
+            return self.partition.defer(pack, len(self.messages))
         return self.partition.take(pack, data, len(self.messages))
+
+    def take_deferred(self, most: int = 10_000) -> list[Taken]:
+        """Take what waits of known packs, one message of each at a time."""
+        made: list[Taken] = []
+        while len(made) < most and (found := self.partition.deferred.next(self.partition.is_known)):
+            pack, span = found
+            messages = enumerate(self.messages, 1)
+            data, sequence = next((data, n) for n, (of, data) in messages if of == pack and n >= span.first)
+            made.append(self.partition.take_deferred(pack, data, sequence))
+        return made
 
     def take_over(self) -> None:
         """Another worker goes on from a snapshot."""

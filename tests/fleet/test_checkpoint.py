@@ -19,6 +19,7 @@ from bms_estimator.fleet.checkpoint import (
     layout_of,
     read_checkpoint,
 )
+from bms_estimator.fleet.deferred import Span
 from bms_estimator.fleet.pack_state import PACK_STATE, Bench
 from bms_estimator.fleet.partition import Partition
 from bms_estimator.model.estimate import Estimate
@@ -35,7 +36,7 @@ snapshots = st.builds(
     st.dictionaries(
         names, st.builds(Former, st.just(layout_of(np.dtype([("x", "<f8", (2,))]))), st.binary(max_size=9))
     ),
-    st.dictionaries(names, st.lists(st.binary(max_size=9), min_size=1).map(tuple)),
+    st.dictionaries(names, st.builds(Span, st.integers(0, 2**63), st.integers(0, 2**63))),
 )
 
 
@@ -77,10 +78,17 @@ def test_whatever_is_damaged_is_said_and_no_other_exception(snapshot: Snapshot, 
 
 
 def test_no_byte_can_be_another_unseen() -> None:
-    good = whole(Snapshot(3, 7, {"blocks": 1}, {"a": b"12345678"}, held={"b": (b"x",)}))
+    good = whole(Snapshot(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
     for at in range(len(good)):
         with pytest.raises(CheckpointError):
             read_checkpoint(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
+
+
+def test_blocks_that_an_earlier_version_kept_are_read_from_the_stream_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = [checkpoint._entry(0, "known", b"12345678"), checkpoint._entry(255, "unknown", b"block")]
+    monkeypatch.setattr(Snapshot, "_entries", lambda *_: iter(entries))
+    read = read_checkpoint(whole(Snapshot(3, 7, packs={"known": b"", "unknown": b""})))
+    assert (read.packs, read.deferred) == ({"known": b"12345678"}, {"unknown": Span(1, 7)})
 
 
 @pytest.mark.parametrize("data", [b"", b"BMSFLEET", b"x" * 100])

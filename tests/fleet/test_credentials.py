@@ -84,7 +84,7 @@ class Fleet:
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     folder = tmp_path_factory.mktemp("fleet")
     keys = folder / "keys"
-    accounts = credentials.make_accounts(keys, TENANTS, NOW, partitions=4)
+    accounts = credentials.make_accounts(keys, TENANTS, NOW)
     with running(folder, accounts=accounts) as engine:
         made = Fleet(engine, keys)
         asyncio.run(_make_streams(made))
@@ -149,6 +149,7 @@ FOREIGN = (
     "raw/p2",
     "raw/p1/x",
     "p/1/raw/p2",
+    *(f"p/{partition}/raw/p1" for partition in range(4)),
     "edge/p1/awaits",
     "edge/p2/awaits",
     "bms/p1/state",
@@ -321,7 +322,7 @@ async def test_who_is_revoked_is_put_out_and_comes_back_with_a_new_token(fleet: 
         "acme": TenantSettings(revoked={"stolen": NOW + timedelta(seconds=1)}),
         "new": TenantSettings(),
     }
-    accounts = credentials.make_accounts(fleet.keys, revoked, NOW, partitions=4)
+    accounts = credentials.make_accounts(fleet.keys, revoked, NOW)
     assert await is_put_out(fleet.edge(stolen), lambda: fleet.reload(accounts))
     assert not await is_let_in(fleet.edge(stolen))
     assert await is_let_in(fleet.edge(fleet.token("stolen", made=NOW + timedelta(seconds=2))))

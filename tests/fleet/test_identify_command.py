@@ -12,7 +12,7 @@ from bms_estimator.fleet.block import Block, encode
 from bms_estimator.fleet.pack_bucket import put
 from bms_estimator.fleet.pack_row import stored
 from bms_estimator.fleet.streams import make_streams
-from bms_estimator.fleet.subjects import CELLS_BUCKET, PACKS_BUCKET, kept
+from bms_estimator.fleet.subjects import CELLS_BUCKET, PACKS_BUCKET, raw
 from tests.command_line import run
 from tests.fleet.engine import running
 from tests.fleet.test_reidentify import KIND, WRONG, pack_samples
@@ -29,9 +29,9 @@ async def fill(url):
         await put(nc, PACKS_BUCKET, rows | {"wrong": b"{"})
         for number, rows in enumerate(np.array_split(samples, 100), 1):
             data = encode(Block(STORE, number, 1, STORE * 1e-9 + rows["time_s"][-1], rows))
-            await nc.publish(kept(0, "house"), data)
+            await nc.publish(raw("house"), data)
             if number < 10:
-                await nc.publish(kept(0, "young"), data)
+                await nc.publish(raw("young"), data)
         await nc.flush()
 
 

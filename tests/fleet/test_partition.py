@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.fleet import partition as partition_module
 from bms_estimator.fleet.block import Block, encode
-from bms_estimator.fleet.delivery import ASKED_EACH, TOLD_EACH
-from bms_estimator.fleet.held import MOST_BLOCKS, MOST_BYTES, Held
+from bms_estimator.fleet.delivery import ASKED_EACH, MAX_PASSED, TOLD_EACH
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.partition import Partition
 from bms_estimator.fleet.stepping import AT_ONCE, Stepping
@@ -89,7 +89,7 @@ async def test_the_end_state_is_that_of_a_replay(stream, samples) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.integers(-6, 6), max_size=30), st.data())
+@given(st.lists(st.integers(-6, 6), max_size=MAX_PASSED - 2), st.data())
 def test_any_order_of_delivery_leaves_the_same(steps, data) -> None:
     """An edge that jumps back and ahead at will, and workers that go on from any earlier snapshot."""
     rows = pulses(soc=0.6, hours=0.1)[0]
@@ -203,6 +203,26 @@ def test_what_never_comes_is_counted_and_the_rest_goes_on(stream, samples) -> No
     assert json.loads(stream.send("a", one_block(samples[400:420], 21)).state)["frames_lost"] == 5
 
 
+@pytest.mark.parametrize("refused", [None, b"damaged"])
+def test_a_block_that_the_edge_sends_in_vain_is_lost_and_the_rest_goes_on(stream, samples, refused) -> None:
+    blocks = blocks_of(samples[:400])
+    deliver(stream, "a", blocks[:5])
+    awaits = stream.send("a", blocks[6]).awaits
+    assert (awaits.number, awaits.resend) == (6, True)
+    for _ in range(MAX_PASSED - 2):
+        if refused:
+            stream.send("a", refused)
+        assert stream.send("a", blocks[6]).state is None
+        stream.take_over()
+    assert stream.send("a", blocks[6]).state
+    deliver(stream, "a", blocks[7:], first=8)
+    estimator = estimator_of(SETTINGS, CELL)
+    estimator.run(samples[:100])
+    estimator.run(samples[120:400])
+    assert_same(stream, "a", estimator.record)
+    assert stream.partition.counters["lost_blocks"] == 1
+
+
 class TestWhatIsPublished:
     def test_the_state_is_that_of_run_for_the_block(self, samples) -> None:
         stream = Stream(Partition(5, table, wall=lambda: 2e9))
@@ -257,7 +277,7 @@ class TestWhatIsPublished:
 
 
 class TestAPackThatTheTableDoesNotKnow:
-    def test_is_held_and_taken_once_it_is_known(self, samples) -> None:
+    def test_waits_and_is_taken_once_it_is_known(self, samples) -> None:
         packs = {}
         stream = Stream(Partition(5, packs.get))
         blocks = blocks_of(samples[:400])
@@ -266,42 +286,70 @@ class TestAPackThatTheTableDoesNotKnow:
             assert (taken.state, taken.awaits) == (None, None)
             stream.take_over()
         assert stream.partition.unknown == ("a",)
-        assert stream.partition.settings_changed("a") == []
+        assert stream.take_deferred() == []
         packs["a"] = SETTINGS, CELL
-        assert [bool(each.state) for each in stream.partition.settings_changed("a")] == 10 * [True]
+        assert [bool(each.state) for each in stream.take_deferred()] == 10 * [True]
         assert stream.partition.unknown == ()
         deliver(stream, "a", blocks)
         assert_same(stream, "a", estimated(samples[:400]))
 
-    def test_is_taken_with_its_next_block_where_nobody_said_that_it_is_known(self, samples) -> None:
+    def test_is_taken_in_order_where_it_became_known_between_two_blocks(self, samples) -> None:
         packs = {}
         stream = Stream(Partition(5, packs.get))
         blocks = blocks_of(samples[:200])
         for data in blocks[:-1]:
             stream.send("a", data)
         packs["a"] = SETTINGS, CELL
-        assert stream.send("a", blocks[-1]).awaits.number == len(blocks) + 1
+        stream.send("a", blocks[-1])
+        assert stream.take_deferred()[-1].awaits.number == len(blocks) + 1
         assert_same(stream, "a", estimated(samples[:200]))
 
-    def test_is_asked_for_what_was_too_much_to_be_held(self, samples) -> None:
+    def test_no_more_names_wait_than_can_be_stored(self, monkeypatch: pytest.MonkeyPatch, samples) -> None:
+        monkeypatch.setattr(partition_module, "MAX_UNKNOWN", 3)
         packs = {}
         stream = Stream(Partition(5, packs.get))
-        blocks = blocks_of(samples[: 20 * (MOST_BLOCKS + 20)])
-        for data in blocks:
-            stream.send("a", data)
-        assert stream.partition.counters["not_held"] == 20
-        packs["a"] = SETTINGS, CELL
-        stream.partition.settings_changed("a")
-        deliver(stream, "a", blocks)
-        assert_same(stream, "a", estimated(samples[: 20 * len(blocks)]))
+        data = one_block(samples[:20], 1)
+        for number in range(5):
+            stream.send(f"pack{number}", data)
+        assert stream.partition.unknown == ("pack0", "pack1", "pack2")
+        assert stream.partition.counters["not_deferred"] == 2
+        packs["pack4"] = SETTINGS, CELL
+        assert stream.send("pack4", data).awaits.number == 2
 
-    def test_whatever_edges_send_no_more_is_held(self) -> None:
-        held = Held()
-        count = sum(held.add(f"pack{n}", b"x") for n in range(20_000))
-        assert count == len(held) == MOST_BYTES // 1024
-        assert held.release("pack0") == (b"x",)
-        assert held.add("another", b"x")
-        assert not held.add("another", b"x")
+
+class TestAPackThatHasToWait:
+    @settings(max_examples=25, deadline=None)
+    @given(st.lists(st.sampled_from(["send", "defer", "take", "restart"]), max_size=40))
+    def test_leaves_the_same_whenever_it_waits_and_whoever_goes_on(self, steps) -> None:
+        rows = pulses(soc=0.6, hours=0.1)[0]
+        blocks, stream, number = blocks_of(rows, size=30), Stream(Partition(5, table)), 0
+        for step in steps:
+            if step == "take":
+                stream.take_deferred(most=1)
+            elif step == "restart":
+                stream.take_over()
+            elif number < len(blocks):
+                stream.send("a", blocks[number], waits=step == "defer")
+                number += 1
+        stream.take_deferred()
+        for data in blocks[number:]:
+            stream.send("a", data)
+        assert_same(stream, "a", estimated(rows))
+        assert stream.partition.counters["samples"] == rows.size
+        assert not stream.partition.deferred
+
+    def test_is_taken_in_order_and_turn_about_whoever_goes_on(self, stream, samples) -> None:
+        blocks, others = blocks_of(samples[:400]), blocks_of(pulses(soc=0.7, hours=0.2, seed=2)[0][:400])
+        for pack, data in [("a", data) for data in blocks[:10]] + [("b", data) for data in others[:10]]:
+            stream.send(pack, data, waits=True)
+        stream.take_over()
+        assert [taken.pack for taken in stream.take_deferred()] == 10 * ["a", "b"]
+        stream.take_over()
+        deliver(stream, "a", blocks[10:], first=11)
+        deliver(stream, "b", others[10:], first=11)
+        assert_same(stream, "a", estimated(samples[:400]))
+        assert_same(stream, "b", estimated(pulses(soc=0.7, hours=0.2, seed=2)[0][:400]))
+        assert "gaps" not in stream.partition.counters
 
 
 class TestOtherSettings:
@@ -352,7 +400,8 @@ class TestOtherSettings:
         stream.partition.settings_changed("a")
         assert self.take(stream, samples, 10, 20).state is None
         packs["a"] = of_pack
-        assert len(stream.partition.settings_changed("a")) == 10
+        stream.partition.settings_changed("a")
+        assert len(stream.take_deferred()) == 10
         assert_same(stream, "a", estimated(samples[:400]))
 
 

@@ -237,7 +237,7 @@ async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authorit
         (place.folder / "fleet.toml").write_text(settings_text(authority))
         settings = settings_of(place.folder)
         if place.number == 1:
-            credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC), 4)
+            credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC))
         else:
             shutil.copy(places[0].keys / "claims.json", place.keys)
         told = Told(settings, credentials.read_accounts(place.keys))

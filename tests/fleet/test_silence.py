@@ -108,7 +108,7 @@ def _packs_of(partition: int) -> int:
 async def _holding_first_blocks(nc: Client, table: Table) -> tuple[Holding, asyncio.Task[None]]:
     """A worker's only partition, once it has stepped the first block of each pack; and what goes on with it."""
     inbox = nc.new_inbox()
-    holding = Holding(nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock())
+    holding = Holding(nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock(), partitions=1, is_busy=lambda: False)
     await _subscribe(nc, f"{inbox}.0.*", holding.receive)
     taking = asyncio.create_task(holding.run())
     for pack in PACKS:

@@ -13,7 +13,7 @@ from bms_estimator.fleet.simulate import Report, run_edges
 from bms_estimator.fleet.simulated_edges import RESEND_S, SimulatedEdges
 from bms_estimator.fleet.simulated_fleet import SimulatedFleet
 from bms_estimator.fleet.streams import make_streams
-from bms_estimator.fleet.subjects import RAW_STREAM, Awaits, awaits
+from bms_estimator.fleet.subjects import RAW_STREAM, Awaits, awaits, raw
 from bms_estimator.model.settings import MqttSettings
 from tests.command_line import run
 from tests.fleet.engine import running
@@ -33,7 +33,7 @@ async def sent(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]], i
     seen: Counter[tuple[str, int]] = Counter()
     nc = await nats.connect(url)
     await make_streams(nc, partitions=4)
-    coming = await nc.subscribe("p.*.raw.*")
+    coming = await nc.subscribe(raw("*"))
     await nc.flush()
     stop = asyncio.Event()
     sending = asyncio.create_task(
@@ -43,7 +43,7 @@ async def sent(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]], i
 
     async def see(timeout_s: float) -> None:
         message = await coming.next_msg(timeout=timeout_s)
-        seen[message.subject.split(".")[3], decode(message.data).number] += 1
+        seen[message.subject.split(".")[1], decode(message.data).number] += 1
 
     while len(seen) < PACKS * BLOCKS:
         await see(LONG_S)

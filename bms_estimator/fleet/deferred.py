@@ -1,0 +1,71 @@
+"""Messages of packs that have to wait. They stay in the stream, and are read from there when it is the pack's turn."""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
+
+MAX_UNKNOWN = 8192
+"""Maximum number of unknown packs of a partition that wait: a server without tenants accepts any name."""
+
+
+class Span(NamedTuple):
+    """Messages of one pack that wait."""
+
+    first: int
+    """Sequence in the stream from which on they are read."""
+    last: int
+    """Sequence of the last of them."""
+
+
+class Deferred:
+    """The packs that wait, in the order of their turns.
+
+    Args:
+        spans: Of each pack that waits.
+
+    Attributes:
+        is_saved: Whether a checkpoint has all that was taken from here.
+    """
+
+    def __init__(self, spans: Mapping[str, Span] | None = None) -> None:
+        self._spans = dict(spans or {})
+        self.is_saved = True
+
+    def __contains__(self, pack: str) -> bool:
+        return pack in self._spans
+
+    def __len__(self) -> int:
+        return len(self._spans)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._spans)
+
+    def spans(self) -> dict[str, Span]:
+        """Return a copy of all spans."""
+        return dict(self._spans)
+
+    def add(self, pack: str, sequence: int) -> None:
+        """Let a message of a pack wait."""
+        before = self._spans.get(pack)
+        self._spans[pack] = Span(before.first if before else sequence, sequence)
+
+    def next(self, is_due: Callable[[str], bool]) -> tuple[str, Span] | None:
+        """Return a pack whose turn it is and its span; the pack goes to the end of the queue. None: no pack is due."""
+        pack = next(filter(is_due, self._spans), None)
+        if pack is None:
+            return None
+        span = self._spans[pack] = self._spans.pop(pack)
+        return pack, span
+
+    def advance(self, pack: str, sequence: int) -> None:
+        """Note that the messages of a pack up to a sequence were taken or are not in the stream any more."""
+        span = self._spans[pack]
+        if sequence < span.last:
+            self._spans[pack] = span._replace(first=max(span.first, sequence + 1))
+        else:
+            del self._spans[pack]
+        self.is_saved = False
+
+    def clear(self) -> None:
+        """Forget all packs, as of a stream that was made anew."""
+        self._spans.clear()
+        self.is_saved = False

@@ -1,0 +1,195 @@
+"""An attack with the token of one edge: how long other packs of the tenant wait for their estimates meanwhile.
+
+make load ARGS="--minutes 0 --hours 0 --attack-s 30"
+
+Real server, one worker as a process, honest edges that send a block each half second, and the attacker as a process that
+sends as fast as the server takes it. The wait of a block is from before it is published until its state arrives.
+"""
+
+import asyncio
+import contextlib
+import json
+import multiprocessing as mp
+import tempfile
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from aiomqtt import Client as Edge
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+
+from bms_estimator.fleet import subjects
+from bms_estimator.fleet.claims import Role
+from bms_estimator.fleet.pack_bucket import write_bucket
+from bms_estimator.fleet.streams import MAX_BLOCK_BYTES, RAW_BYTES
+from bms_estimator.service.warm_up import load_kernels
+from tests.benchmarks.table import Row
+from tests.fleet.tenant import Tenant, heavy_block, mqtt_client, numbered, one_tenant
+from tests.fleet.workers import KIND, PERIOD_S, SAMPLES, Heartbeats, Process, block
+from tests.patience import LONG_S
+
+ATTACKER = "attacker"
+PACKS = [f"p{i}" for i in range(20)]
+PARTITIONS = 4
+PERIOD_OF_BLOCKS_S = 0.5
+MAX_RATIO = 15.0
+"""Target for the longest wait in an attack divided by the longest one without."""
+IN_FLIGHT = 64
+"""Messages of the attacker that wait for an acknowledgement."""
+ATTACKS = {
+    "blocks of 65,535 samples": lambda: heavy_block(65_535, 1.0),
+    "blocks of 20,000 samples, 1 Hz": lambda: heavy_block(20_000, 1.0, store=2),
+    "junk of 256 KiB": lambda: bytes(MAX_BLOCK_BYTES - 1024),
+}
+
+
+def attack(port: int, token: str, name: str) -> None:
+    """Send one kind of message until the process is ended."""
+    asyncio.run(_attack(port, token, ATTACKS[name]()))
+
+
+async def _attack(port: int, token: str, data: bytes) -> None:
+    number = 0
+    async with mqtt_client(port, token) as edge:
+        edge.pending_calls_threshold = IN_FLIGHT
+        while True:
+            numbers = range(number + 1, number + IN_FLIGHT + 1)
+            number += IN_FLIGHT
+            await asyncio.gather(*(edge.publish(f"raw/{ATTACKER}", numbered(data, n), qos=1) for n in numbers))
+
+
+@contextlib.contextmanager
+def attacked(tenant: Tenant, name: str) -> Iterator[None]:
+    """Run an attack meanwhile."""
+    arguments = tenant.engine.mqtt_port, tenant.token(ATTACKER), name
+    process = mp.get_context("spawn").Process(target=attack, args=arguments, daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.kill()
+        process.join()
+
+
+@dataclass
+class Waits:
+    """Waits of the honest packs' blocks.
+
+    Attributes:
+        published_s: When a block was published [monotonic s], by pack and time of its last sample.
+        waits_s: Of the blocks whose state has arrived [s].
+    """
+
+    published_s: dict[tuple[str, float], float] = field(default_factory=dict)
+    waits_s: list[float] = field(default_factory=list)
+
+    async def hear(self, message: Msg) -> None:
+        """Take a state."""
+        key = message.subject.split(".")[1], json.loads(message.data)["board_time_s"]
+        if key in self.published_s:
+            self.waits_s.append(time.monotonic() - self.published_s.pop(key))
+
+    async def all_arrived(self) -> None:
+        """Wait until no block is left."""
+        async with asyncio.timeout(LONG_S):
+            while self.published_s:  # noqa: ASYNC110 - states arrive in a callback
+                await asyncio.sleep(0.01)
+
+    def take(self) -> tuple[float, float, int]:
+        """Return median, maximum [s] and number of the waits, and begin again."""
+        waits_s, self.waits_s = self.waits_s, []
+        return float(np.median(waits_s)), max(waits_s), len(waits_s)
+
+
+@dataclass
+class Honest:
+    """The honest packs' edges.
+
+    Attributes:
+        edges: Connections by pack.
+        waits: Of their blocks.
+        number: Of the last block of each.
+    """
+
+    edges: dict[str, Edge]
+    waits: Waits
+    number: int = 0
+
+    async def send(self, seconds: float) -> tuple[float, float, int]:
+        """Send blocks for so long; return what ``Waits.take`` does."""
+        end_s = time.monotonic() + seconds
+        while True:
+            self.number += 1
+            await asyncio.gather(*(self._send(pack, edge) for pack, edge in self.edges.items()))
+            if time.monotonic() >= end_s:
+                break
+        await self.waits.all_arrived()
+        return self.waits.take()
+
+    async def _send(self, pack: str, edge: Edge) -> None:
+        last_s = PERIOD_S * (SAMPLES * self.number - 1)
+        self.waits.published_s[pack, last_s] = time.monotonic()
+        await edge.publish(f"raw/{pack}", block(pack, self.number), qos=1)
+        await asyncio.sleep(PERIOD_OF_BLOCKS_S)
+
+
+@contextlib.asynccontextmanager
+async def honest(tenant: Tenant, reader: Client) -> AsyncIterator[Honest]:
+    """Connect the honest packs."""
+    waits = Waits()
+    await reader.subscribe(subjects.published("*", "state"), cb=waits.hear)
+    async with AsyncExitStack() as stack:
+        yield Honest({pack: await stack.enter_async_context(tenant.edge(pack)) for pack in PACKS}, waits)
+
+
+async def measure(folder: Path, seconds: float) -> list[Row]:
+    """Measure without an attack and with each."""
+    with one_tenant(folder) as tenant:
+        await tenant.make_streams(PARTITIONS, RAW_BYTES)
+        admin, reader = await tenant.program(Role.ADMIN), await tenant.program(Role.READER)
+        await write_bucket(admin, subjects.PACKS_BUCKET, dict.fromkeys([*PACKS, ATTACKER], KIND))
+        worker = Process(folder, tenant.engine.url, "w", "--creds", tenant.file(Role.WORKER))
+        try:
+            async with Heartbeats(reader) as heard, honest(tenant, reader) as packs:
+                await heard.until_held(PARTITIONS, "w")
+                await packs.send(2.0)  # kernels are loaded
+                alone = await packs.send(seconds)
+                rows = [Row(f"{len(PACKS)} packs of a fleet, without an attack", "", _text(alone), None)]
+                for name in ATTACKS:
+                    with attacked(tenant, name):
+                        found = await packs.send(seconds)
+                    ratio = found[1] / alone[1]
+                    measured = f"{_text(found)}: {found[0] / alone[0]:.1f} and {ratio:.1f} times as long"
+                    target = f"longest at most {MAX_RATIO:g} times as long"
+                    rows.append(Row(f"  one edge sends {name}", target, measured, ratio < MAX_RATIO))
+                rows.append(await _kept(reader, packs.number))
+        finally:
+            worker.kill()
+            await admin.close()
+            await reader.close()
+        return rows
+
+
+def _text(found: tuple[float, float, int]) -> str:
+    median_s, longest_s, count = found
+    return f"{1e3 * median_s:.0f} ms, longest {1e3 * longest_s:.0f} ms, {count} blocks"
+
+
+async def _kept(reader: Client, number: int) -> Row:
+    """Return the row of the blocks that the stream has."""
+    info = await reader.jetstream().stream_info(subjects.RAW_STREAM, subjects_filter=">")
+    counts = dict(info.state.subjects or {})
+    kept = sum(count for subject, count in counts.items() if not subject.endswith(f".{ATTACKER}"))
+    sent, own = number * len(PACKS), sum(counts.values()) - kept
+    return Row("  their blocks in the stream", "all", f"{kept:,} of {sent:,}, {own:,} of the attacker", kept == sent)
+
+
+def rows(seconds: float) -> Iterator[Row]:
+    """Measure for so long each [s]."""
+    load_kernels()  # compiled once, not by the worker
+    with tempfile.TemporaryDirectory() as folder:
+        yield from asyncio.run(measure(Path(folder), seconds))
