@@ -26,6 +26,7 @@ _WHAT: dict[AlarmName, tuple[str, str]] = {
     ),
     "model_mismatch": ("measured and estimated voltage disagree", "check that the cell file belongs to this pack"),
     "link_lost": ("no samples come", "check board, cable and power"),
+    "hook_failed": ("an alarm hook could not do its work", "check its program; do by hand what it is for"),
 }
 
 

@@ -238,6 +238,20 @@ class Alarms:
             self._note(state, state.raise_at(self._at_s, Raising(now_s, silent_s)))
             self._keep()
 
+    def judge_hooks(self, failing: Sequence[str], passed_s: float, now_s: float) -> None:
+        """Judge whether alarm hooks do their work.
+
+        Args:
+            failing: Hooks whose last attempt failed, each with its reason.
+            passed_s: Time since the last call [s].
+            now_s: Wall clock [s since 1970].
+        """
+        if failing:
+            self._reasons["hook_failed"] = Reasons(Suspect(0), tuple(failing))
+        value = np.array([math.inf if failing else 0.0])  # no number stands for it
+        self._take("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
+        self._keep()
+
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Somebody knows of an alarm, or of all. Returns which ones: those whose cause is gone have ended by that.
 

@@ -74,10 +74,10 @@ CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]]
 
 
 def test_there_is_a_capture_of_each_alarm() -> None:
-    assert set(CAPTURES) == set(ALARMS)
+    assert set(CAPTURES) == set(ALARMS) - {"hook_failed"}, "no capture has hooks"
 
 
-@pytest.mark.parametrize("name", ALARMS)
+@pytest.mark.parametrize("name", CAPTURES)
 async def test_each_alarm_is_raised_and_ends_on_a_capture(name: str, tmp_path: Path) -> None:
     lines, sections, expected = CAPTURES[name]
     latched = len(expected) == 1
@@ -103,6 +103,7 @@ async def test_no_alarm_is_raised_by_a_pack_that_is_well_and_none_is_shown_of_wh
     assert told.changes == []
     shown = {alarm.name for alarm in told.snapshots[-1].alarms}
     assert set(ALARMS) - shown == {
+        "hook_failed",
         "cell_over_voltage",
         "cell_under_voltage",
         "cell_imbalance",
