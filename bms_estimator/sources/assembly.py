@@ -117,11 +117,11 @@ class Assembly:
             return
         conflict = False
         for way, match in ways:
+            cell = int(match[1]) if match.re.groups else None
             try:
-                self._put(way, payload, int(match[1]) if match.re.groups else None, now_s)
-            except NoNumberError as error:  # nor is it as it was
-                self._told.pop(way.quantity, None)
-                self._new.pop(way.quantity, None)
+                self._put(way, payload, cell, now_s)
+            except NoNumberError as error:
+                self._drop(way.quantity, cell)
                 self._counters[error.kind] += 1
                 self._faults[way.quantity] = f"{way.quantity}: {topic}: {error}"
             else:
@@ -160,6 +160,15 @@ class Assembly:
             self._cells |= {number: _Told(v, now_s) for number, v in many(payload, way.place, way.path).items()}
         elif 1 <= cell <= MOST_CELLS:
             self._cells[cell] = _Told(one(payload, way.place, way.path), now_s)
+
+    def _drop(self, quantity: str, cell: int | None) -> None:
+        """Forget a quantity that is no longer measured; ``cell`` None: all cells."""
+        self._told.pop(quantity, None)
+        self._new.pop(quantity, None)
+        if quantity == "cells":
+            gone = tuple(self._cells) if cell is None else (cell,)
+            for each in gone:
+                self._cells.pop(each, None)
 
     def _has_rivals(self, way: _Way, now_s: float) -> bool:
         """Return whether two publishers write the value that has just come on this topic."""

@@ -392,3 +392,16 @@ def test_a_publisher_with_a_current_of_its_own_at_random_times_is_a_second_one()
         rival.append((at_s, -80.0))
     _, found = _errors(sorted(_merged((1.0, 0.0, 160.0, 5.0)) + rival))
     assert 100.0 < found[0] < 115.0
+
+
+def test_cells_that_are_no_longer_measured_do_not_stay_as_they_were() -> None:
+    together = Assembly(own(cells="cells"))
+    payloads = ('{"u": 52.0, "i": 1.0, "cells": [3.3, 3.4]}', '{"u": 52.0, "i": 1.0, "cells": null}')
+    first, lost = told(together, [("home/pack", payload) for payload in payloads])
+    assert (first["cells_v"], "cells_v" in lost) == ([3.3, 3.4], False)
+    each = Assembly(own(cells={"topic": "home/cell/{cell}"}))
+    pack = ("home/pack", '{"u": 52.0, "i": 1.0}')
+    before, after = told(
+        each, [("home/cell/1", "3.3"), ("home/cell/2", "3.4"), pack, ("home/cell/1", "unavailable"), pack]
+    )
+    assert (before["cells_v"], after["cells_v"]) == ([3.3, 3.4], [None, 3.4])
