@@ -103,7 +103,7 @@ learning: venv ## what the learning law and each of its parts are worth, simulat
 fuzz: venv ## mutated inputs to all that reads foreign bytes, e.g. make fuzz ARGS="--decoders 100000 --parsers 10000 --only text"
 	@$(BIN)/python -m tests.benchmarks.fuzz $(ARGS)
 
-load: venv ## 5,000 frames/s for 10 min over a PTY, and a day of serial bytes, e.g. make load ARGS="--minutes 1 --hours 2"
+load: venv ## a lost sensor, 5,000 frames/s for 10 min over a PTY, a day of serial bytes, e.g. make load ARGS="--minutes 1 --hours 2"
 	@$(BIN)/python -m tests.benchmarks.endurance $(ARGS)
 
 audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 3 where the data cannot be reached

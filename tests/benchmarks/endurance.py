@@ -1,6 +1,6 @@
-"""Load: thousands of frames a second through the service over a PTY, and a day of serial bytes through decoder and estimator.
+"""Load: thousands of frames a second through the service over a PTY, a day of serial bytes, and a lost sensor.
 
-make load ARGS="--rate 5000 --minutes 10 --hours 24"
+make load ARGS="--rate 5000 --minutes 10 --hours 24 --lost 10"
 """
 
 import argparse
@@ -25,6 +25,7 @@ from bms_estimator.kernels.cell import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.dialects.board import BoardDialect
+from tests.benchmarks import lost_sensor
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
 from tests.benchmarks.table import Row, show
 from tests.benchmarks.wire import hello, sample_frames
@@ -196,6 +197,8 @@ def fed(rate_hz: int, seconds: float) -> tuple[BoardDialect, Estimator, float, l
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
     """Measure."""
+    if options.lost:
+        yield from lost_sensor_rows(options.lost)
     if options.minutes:
         with tempfile.TemporaryDirectory() as folder:
             broker = Broker(Path(folder)).start()
@@ -227,12 +230,23 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         yield Row("  resident memory", "flat", growth, rss[-1] - rss[begun - 1] < MOST_GROWTH_MIB)
 
 
+def lost_sensor_rows(lost_s: float) -> Iterator[Row]:
+    """Attack by a lost sensor."""
+    with tempfile.TemporaryDirectory() as folder:
+        broker = Broker(Path(folder)).start()
+        try:
+            yield from lost_sensor.rows(broker, Path(folder), lost_s)
+        finally:
+            broker.stop()
+
+
 def main() -> None:
     """Measure what is asked for; 1 where a target was not met."""
     parser = argparse.ArgumentParser(prog="make load", description=__doc__)
     parser.add_argument("--rate", type=int, default=5000, help="frames per second over the PTY")
     parser.add_argument("--minutes", type=float, default=10.0, help="for so long; 0: not at all")
     parser.add_argument("--hours", type=float, default=24.0, help="of serial bytes at 100 Hz, at once; 0: not at all")
+    parser.add_argument("--lost", type=float, default=10.0, help="delay of a lost sensor [s]; 0: none is lost")
     sys.exit(not show(rows(parser.parse_args())))
 
 
