@@ -91,7 +91,7 @@ class Alarms:
     def __init__(
         self, watched: Sequence[Watched], charging_a: float, gap_s: float, inputs: Inputs, silent_s: float
     ) -> None:
-        self._states = {each.name: AlarmState(each) for each in watched}
+        self._states = {each.name: AlarmState(each, lost_s=inputs.lost_s) for each in watched}
         self._charging_a = charging_a
         self._inputs, self._silent_s = inputs, silent_s
         self._silence = ""  # why no samples come; empty while they do

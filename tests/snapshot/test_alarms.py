@@ -404,3 +404,11 @@ def test_a_gap_that_does_not_come_again_soon_counts_for_no_delay() -> None:
     alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
     turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
     assert turns == [226.0]  # 180 to 199 s, nothing for 20 s, then 6 s
+
+
+async def test_a_sensor_that_comes_and_goes_delays_its_alarm_no_longer_than_one_that_stays(tmp_path: Path) -> None:
+    """A loose wire: one value in five seconds, which is not yet a lost sensor."""
+    hot = [Line(1, temperature_c=61.0), Line(4, temperature_c=None)] * 4
+    told = await replayed(record(tmp_path / "capture.bms", [Line(30), *hot]), settings())
+    assert told.turns("over_temperature") == [(40.0, True)]
+    assert told.turns("sensor_fault") == []
