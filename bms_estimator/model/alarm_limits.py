@@ -181,6 +181,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "sensor_fault": _Default(0.1, 0.02, None),
         "model_mismatch": _Default(0.05 * n, 0.03 * n, "V"),
         "link_lost": _Default(_silent_s(settings), None, "s"),
+        "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0, None),
     }
     return common | (_of_battery(cell) if isinstance(cell, CellModel) else _of_stack(cell))
 

@@ -26,6 +26,7 @@ AlarmName = Literal[
     "sensor_fault",
     "model_mismatch",
     "link_lost",
+    "hook_failed",
 ]
 ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
 """All alarms that there are, in the order in which they are shown."""
@@ -78,7 +79,7 @@ class LinkRule(AlarmRule):
 class AlarmHook(Strict):
     """What is done when alarms are raised and end: run a program, publish a message, or switch the board's relay."""
 
-    alarms: tuple[AlarmName, ...] = Field(default=(), description="which ones; all when left out")
+    alarms: tuple[AlarmName, ...] = Field(default=(), description="which ones; all but hook_failed when left out")
     on: tuple[Literal["raised", "cleared"], ...] = Field(
         default=("raised", "cleared"), description="when a program is run or a message published"
     )
@@ -86,7 +87,7 @@ class AlarmHook(Strict):
         default=None, description="program and its arguments; no shell"
     )
     timeout_s: Annotated[float, Field(gt=0, le=3600)] = Field(
-        default=10.0, description="a program that takes longer is killed"
+        default=10.0, description="a program that takes longer, with all it started, is killed"
     )
     pass_environment: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = Field(
         default=(), description="further environment variables of the service that a program gets"
@@ -155,6 +156,11 @@ class AlarmSettings(Strict):
     link_lost: LinkRule = Field(
         default=LinkRule(delay_s=0.0, clear_delay_s=5.0),
         description="limit_s: without a sample; 10 s, or 3 periods where that is longer",
+    )
+
+    hook_failed: AlarmRule = Field(
+        default=AlarmRule(clear_delay_s=10.0),
+        description="a hook could not be started or has failed, until it works",
     )
 
     lost_s: NotNegative = Field(

@@ -140,6 +140,17 @@ class EdgeHealth(Report):
     trouble: str | None = Field(description="why the server was lost or could not be reached last; null: never")
 
 
+class HookHealth(Report):
+    """Alarm hooks, since start."""
+
+    done: int = Field(description="programs that ended with exit code 0, messages that were published")
+    failures: int = Field(
+        description="failed attempts: a program not started, killed or with another exit code, a level that the board did "
+        "not take"
+    )
+    failing: list[str] = Field(description="hooks whose last attempt failed, each with its reason")
+
+
 class Totals(Report):
     """What is counted over restarts; what came after the last checkpoint before a kill is missing."""
 
@@ -191,6 +202,7 @@ class Health(Report):
     loop: LoopHealth
     recording: RecordingHealth | None = Field(description="null: nothing is recorded")
     edge: EdgeHealth | None = Field(default=None, description="null: no raw samples are sent")
+    hooks: HookHealth | None = Field(default=None, description="null: there is no alarm hook")
     unseen_s: float | None = Field(
         description="how long nobody measured in the last gap of the samples or before the start [s]; "
         "null: never since the start, or nobody knows"

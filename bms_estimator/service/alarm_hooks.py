@@ -1,23 +1,20 @@
-"""What is done when an alarm is raised or ends: each hook has a task of its own, and nothing waits for it."""
+"""Actions taken when an alarm is raised, ends or can no longer be watched. Each hook has its own task; nothing waits for it."""
 
 import asyncio
 import contextlib
-import os
 import shutil
-import signal
-import uuid
 from collections import deque
 from collections.abc import Awaitable, Callable, Collection, Sequence
-from pathlib import Path
 from string import Template
-from typing import Any, Self
+from typing import Literal, NamedTuple, Self
 
 import structlog
 
 from bms_estimator.model.alarm_settings import AlarmHook
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Alarm
+from bms_estimator.model.estimate import Alarm, HookHealth
 from bms_estimator.model.settings import Settings
+from bms_estimator.service.hook_process import StartError, environment, run
 from bms_estimator.sinks.pauses import Pauses
 from bms_estimator.snapshot.alarms import Change
 from bms_estimator.sources.protocol import Relay
@@ -30,10 +27,6 @@ CLOSE_S = 2.0
 """At the end what is under way may take so long [s]."""
 FIRST_RETRY_S = 0.5
 """First pause before a program that could not be started is tried again [s]; doubles each time, up to half a minute."""
-PASSED = ("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "LC_ALL", "TZ", "TMPDIR")
-"""Environment variables of the service that every program gets. Others may hold secrets of the service."""
-MARK = "BMS_HOOK_RUN"
-"""Environment variable with an identifier of one run, by which its descendants are found."""
 
 Say = Callable[[str, bytes], None]
 """Publishes a message on a topic."""
@@ -41,6 +34,13 @@ Switch = Callable[[Relay], Awaitable[None]]
 """Tells the board its relay's level. Raises UserError when it does not take it."""
 
 log = structlog.get_logger(__name__)
+
+
+class Job(NamedTuple):
+    """One thing to be done by a hook."""
+
+    alarm: Alarm
+    state: Literal["raised", "cleared"]
 
 
 class Hooks:
@@ -60,19 +60,35 @@ class Hooks:
         self._hooks = [_made(i, hook, device, say, switch) for i, hook in enumerate(hooks)]
         self._tasks: list[asyncio.Task[None]] = []
 
-    def tell(self, change: Change) -> None:
-        """An alarm was raised or has ended; returns at once."""
-        for hook in self._hooks:
-            hook.tell(change.alarm)
+    @property
+    def health(self) -> HookHealth | None:
+        """Successes and failures since start; None without hooks."""
+        if not self._hooks:
+            return None
+        return HookHealth(
+            done=sum(hook.done for hook in self._hooks),
+            failures=sum(hook.failures for hook in self._hooks),
+            failing=[f"{hook.what}: {hook.trouble}" for hook in self._hooks if hook.trouble],
+        )
 
-    def begin(self, active: Collection[str]) -> None:
-        """These alarms are active from a run before: what they are for has been done, but the relay must be as it was."""
+    def tell(self, change: Change) -> None:
+        """Pass on that an alarm has changed; returns at once."""
         for hook in self._hooks:
-            hook.begin(active)
+            if hook.covers(change.alarm.name):
+                hook.tell(change)
+
+    def begin(self, raised: Collection[str]) -> None:
+        """Take over alarms of an earlier run: their jobs have been done, but the relay must be as it was.
+
+        Args:
+            raised: Alarms that are active, and critical ones that cannot be watched.
+        """
+        for hook in self._hooks:
+            hook.begin(raised)
 
     async def __aenter__(self) -> Self:
         """Start."""
-        self._tasks = [asyncio.create_task(hook.work(), name="alarm hook") for hook in self._hooks]
+        self._tasks = [asyncio.create_task(hook.supervise(), name="alarm hook") for hook in self._hooks]
         return self
 
     async def __aexit__(self, *_error: object) -> None:
@@ -80,120 +96,154 @@ class Hooks:
         for hook in self._hooks:
             hook.close()
         if self._tasks:
-            done, late = await asyncio.wait(self._tasks, timeout=CLOSE_S)
+            _, late = await asyncio.wait(self._tasks, timeout=CLOSE_S)
             for task in late:
                 task.cancel()
             await asyncio.gather(*late, return_exceptions=True)
-            for task in done:
-                task.result()  # only a fault of ours ends one: let it be seen
 
 
 class _Hook:
-    """What one does with alarms, one after the other."""
+    """One hook, which does its jobs one after the other.
+
+    Attributes:
+        done: Jobs done since start.
+        failures: Failed attempts since start.
+        trouble: Reason why the last attempt failed; empty if it did not.
+    """
 
     def __init__(self, hook: AlarmHook, device: str) -> None:
         self._hook, self._device = hook, device
-        self._waiting: deque[Alarm] = deque(maxlen=WAITING)
+        self.done, self.failures, self.trouble = 0, 0, ""
+        self._raised: set[str] = set()
+        self._waiting: deque[Job] = deque(maxlen=WAITING)
         self._wake = asyncio.Event()
         self._closing = False
 
-    def tell(self, alarm: Alarm) -> None:
-        """Have it done."""
-        if (not self._hook.alarms or alarm.name in self._hook.alarms) and _state(alarm) in self._hook.on:
-            if len(self._waiting) == WAITING:
-                log.warning("an alarm hook is behind: its oldest alarm is left out", hook=self._what)
-            self._waiting.append(alarm)
-            self._wake.set()
+    @property
+    def what(self) -> str:
+        """Short description. A program's arguments are left out, since they may hold secrets."""
+        raise NotImplementedError
 
-    def begin(self, active: Collection[str]) -> None:
-        """These were active before the start."""
+    def covers(self, name: str) -> bool:
+        """Return whether an alarm is one of this hook's. ``hook_failed`` must be listed."""
+        return name in self._hook.alarms if self._hook.alarms else name != "hook_failed"
+
+    def tell(self, change: Change) -> None:
+        """Queue the job that follows from a change."""
+        job = self._job(change)
+        if job is None or job.state not in self._hook.on:
+            return
+        if len(self._waiting) == WAITING:
+            log.warning("an alarm hook is behind: its oldest alarm is left out", hook=self.what)
+        self._waiting.append(job)
+
+    def begin(self, raised: Collection[str]) -> None:
+        """Take over alarms of an earlier run."""
+        self._raised = {name for name in raised if self.covers(name)}
 
     def close(self) -> None:
         """No more will come."""
         self._closing = True
         self._wake.set()
 
+    async def supervise(self) -> None:
+        """Do all jobs until it is closed. An internal error must not end the hook; it is logged and counted."""
+        while True:
+            try:
+                return await self.work()
+            except Exception as error:
+                self.failures, self.trouble = self.failures + 1, f"internal error: {error!r}"
+                log.exception("alarm hook: internal error", hook=self.what)
+                await asyncio.sleep(FIRST_RETRY_S)
+
     async def work(self) -> None:
-        """Until it is closed, and nothing waits any more."""
+        """Do all jobs until it is closed."""
         while not self._closing or self._waiting:
             await self._wake.wait()
             if not self._closing:
                 self._wake.clear()
             while self._waiting:
-                alarm = self._waiting.popleft()
+                job = self._waiting.popleft()
                 if self._hook.dry_run:
-                    log.warning("alarm hook, dry run", would=self._what, alarm=alarm.name, state=_state(alarm))
+                    log.warning("alarm hook, dry run", would=self.what, alarm=job.alarm.name, state=job.state)
                 else:
-                    await self._do(alarm)
+                    await self._do(job)
 
-    async def _do(self, alarm: Alarm) -> None:
+    async def _do(self, job: Job) -> None:
         raise NotImplementedError
 
-    @property
-    def _what(self) -> str:
-        raise NotImplementedError
+    def _job(self, change: Change) -> Job | None:
+        """Note a change. Return the job that follows, if one does.
+
+        A critical alarm that cannot be watched counts as raised: that is the safe side.
+        """
+        alarm = change.alarm
+        is_raised = alarm.active or (alarm.severity == "critical" and not alarm.watched)
+        if is_raised == (alarm.name in self._raised):
+            return None
+        self._raised ^= {alarm.name}
+        self._wake.set()
+        return Job(alarm, "raised" if is_raised else "cleared")
+
+    def _is_due(self, job: Job) -> bool:
+        """Return whether a job must still be done: the hook is open and the alarm's state has not changed."""
+        return not self._closing and (job.alarm.name in self._raised) == (job.state == "raised")
+
+    def _succeed(self) -> None:
+        self.done += 1
+        self.trouble = ""
+
+    def _fail(self, job: Job, trouble: str) -> None:
+        """Count a failure. A failed job for ``hook_failed`` does not raise ``hook_failed`` again: that would never end."""
+        self.failures += 1
+        if job.alarm.name != "hook_failed":
+            self.trouble = trouble
 
 
 class _Program(_Hook):
     """Runs a program: the alarm as JSON on its standard input, its fields in the environment."""
 
-    def __init__(self, hook: AlarmHook, device: str) -> None:
-        super().__init__(hook, device)
-        self._states: dict[str, bool] = {}
-
     @property
-    def _what(self) -> str:
-        return f"run {' '.join(self._hook.run or ())}"
+    def what(self) -> str:
+        """The program."""
+        return f"run {(self._hook.run or ('',))[0]}"
 
-    def tell(self, alarm: Alarm) -> None:
-        """Note the alarm's state, which ends the retries for another one, and have the program run."""
-        self._states[alarm.name] = alarm.active
-        self._wake.set()
-        super().tell(alarm)
-
-    async def _do(self, alarm: Alarm) -> None:
+    async def _do(self, job: Job) -> None:
         """Run the program; one that cannot be started is tried again until it starts or the alarm's state changes."""
         pauses = Pauses(FIRST_RETRY_S)
-        while not await self._run(alarm):
-            if not await self._retry(alarm, pauses.next_s()):
+        while not await self._run(job):
+            await self._pause(job, pauses.next_s())
+            if not self._is_due(job):
+                log.warning("alarm hook: the program was never started", hook=self.what, alarm=job.alarm.name)
                 return
 
-    async def _retry(self, alarm: Alarm, pause_s: float) -> bool:
-        """Wait before another attempt. Return False once the alarm's state has changed or the hook is closed."""
+    async def _pause(self, job: Job, pause_s: float) -> None:
+        """Wait before another attempt, at most until the job is no longer due."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause_s):
-                while not self._closing and self._states[alarm.name] == alarm.active:
+                while self._is_due(job):
                     self._wake.clear()
                     await self._wake.wait()
-        return not self._closing and self._states[alarm.name] == alarm.active
 
-    async def _run(self, alarm: Alarm) -> bool:
+    async def _run(self, job: Job) -> bool:
         """Run the program once. Return False if it could not be started."""
-        values, run = _values(alarm, self._device), uuid.uuid4().hex
-        environment = {name: os.environ[name] for name in (*PASSED, *self._hook.pass_environment) if name in os.environ}
-        environment |= {f"BMS_{name.upper()}": value for name, value in values.items() if name != "json"}
+        values = _values(job, self._device)
+        text, timeout_s = values.pop("json").encode(), self._hook.timeout_s
+        variables = environment(self._hook.pass_environment, values)
         try:
-            process = await asyncio.create_subprocess_exec(
-                *(self._hook.run or ()),
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.DEVNULL,
-                stderr=asyncio.subprocess.DEVNULL,
-                env=environment | {MARK: run},
-                start_new_session=True,
-            )
-        except (OSError, ValueError) as error:
-            log.warning("alarm hook: the program cannot be started", hook=self._what, error=str(error))
+            code = await run(self._hook.run or (), text, variables, timeout_s)
+        except StartError as error:
+            self._fail(job, f"cannot be started: {error}")
+            log.warning("alarm hook: the program cannot be started", hook=self.what, error=str(error))
             return False
-        try:
-            async with asyncio.timeout(self._hook.timeout_s):
-                await process.communicate(values["json"].encode())
-            if process.returncode:
-                log.warning("alarm hook: the program has failed", hook=self._what, exit_code=process.returncode)
-        except TimeoutError:
-            log.warning("alarm hook: the program takes too long and is killed", hook=self._what)
-        finally:
-            if process.returncode is None:
-                await _kill(process, run)
+        if code is None:
+            self._fail(job, f"took longer than {timeout_s:g} s")
+            log.warning("alarm hook: the program takes too long and is killed", hook=self.what)
+        elif code:
+            self._fail(job, f"exit code {code}")
+            log.warning("alarm hook: the program has failed", hook=self.what, exit_code=code)
+        else:
+            self._succeed()
         return True
 
 
@@ -205,11 +255,13 @@ class _Publication(_Hook):
         self._topic, self._say = topic, say
 
     @property
-    def _what(self) -> str:
+    def what(self) -> str:
+        """The topic."""
         return f"publish on {self._topic}"
 
-    async def _do(self, alarm: Alarm) -> None:
-        self._say(self._topic, Template(self._hook.payload).substitute(_values(alarm, self._device)).encode())
+    async def _do(self, job: Job) -> None:
+        self._say(self._topic, Template(self._hook.payload).substitute(_values(job, self._device)).encode())
+        self._succeed()
 
 
 class _Switched(_Hook):
@@ -218,49 +270,41 @@ class _Switched(_Hook):
     def __init__(self, hook: AlarmHook, device: str, switch: Switch) -> None:
         super().__init__(hook, device)
         self._switch = switch
-        self._active: set[str] = set()
-        self._trouble = ""
 
     @property
-    def _what(self) -> str:
+    def what(self) -> str:
+        """The level."""
         return f"relay pin {'high' if self._wanted.high else 'low'}"
 
     @property
     def _wanted(self) -> Relay:
-        high = (self._hook.relay == "high") == bool(self._active)
+        high = (self._hook.relay == "high") == bool(self._raised)
         silent = self._hook.level_when_silent
         kept = silent == "keep"
         return Relay(high, None if kept else silent == "high", 0 if kept else self._hook.silent_s)
 
-    def tell(self, alarm: Alarm) -> None:
-        """Whatever the hook is ``on``: the level follows whether one of the alarms is active."""
-        if self._hook.alarms and alarm.name not in self._hook.alarms:
-            return
-        before = bool(self._active)
-        (self._active.add if alarm.active else self._active.discard)(alarm.name)
-        if bool(self._active) != before:
-            log.warning("relay", dry_run=self._hook.dry_run, hook=self._what, alarm=alarm.name, state=_state(alarm))
-            self._wake.set()
-
-    def begin(self, active: Collection[str]) -> None:
-        """The relay is to be as it was."""
-        self._active = {name for name in active if not self._hook.alarms or name in self._hook.alarms}
+    def tell(self, change: Change) -> None:
+        """Follow the alarms, whatever the hook is ``on``: the level depends on whether one of them counts as raised."""
+        before = self._wanted
+        job = self._job(change)
+        if job is not None and self._wanted != before:
+            log.warning("relay", dry_run=self._hook.dry_run, hook=self.what, alarm=job.alarm.name, state=job.state)
 
     async def work(self) -> None:
-        """Until it is closed."""
+        """Set the level again and again until it is closed."""
         while not self._hook.dry_run and not self._closing:
             self._wake.clear()
             try:
                 await self._switch(self._wanted)
-                if self._trouble:
-                    log.info("the board takes its relay's level again", hook=self._what)
-                self._trouble = ""
+                if self.trouble:
+                    log.info("the board takes its relay's level again", hook=self.what)
+                self.trouble = ""
             except UserError as error:
-                if str(error) != self._trouble:
-                    log.warning("the board does not take its relay's level", hook=self._what, reason=str(error))
-                self._trouble = str(error)
+                if str(error) != self.trouble:
+                    log.warning("the board does not take its relay's level", hook=self.what, reason=str(error))
+                self.failures, self.trouble = self.failures + 1, str(error)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(RETRY_S if self._trouble else RELAY_S):
+                async with asyncio.timeout(RETRY_S if self.trouble else RELAY_S):
                     await self._wake.wait()
 
 
@@ -307,28 +351,10 @@ def _made(i: int, hook: AlarmHook, device: str, say: Say | None, switch: Switch 
     return _Program(hook, device)
 
 
-def _state(alarm: Alarm) -> Any:
-    return "raised" if alarm.active else "cleared"
-
-
-def _values(alarm: Alarm, device: str) -> dict[str, str]:
-    """What a program or a payload is told; empty where there is nothing."""
-    told = {name: getattr(alarm, name) for name in ("name", "severity", "since", "value", "limit", "unit", "text")}
-    values = {name: "" if value is None else str(value) for name, value in told.items()}
-    return values | {"device": device, "state": _state(alarm), "json": alarm.model_dump_json()}
-
-
-async def _kill(process: asyncio.subprocess.Process, run: str) -> None:
-    """Kill the program's process group, and descendants that left it."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    _kill_descendants(f"{MARK}={run}".encode())
-    await process.wait()
-
-
-def _kill_descendants(mark: bytes) -> None:
-    """Kill each process that has ``mark`` in its environment."""
-    for environment in Path("/proc").glob("[0-9]*/environ"):
-        with contextlib.suppress(OSError):
-            if mark in environment.read_bytes().split(b"\0"):
-                os.kill(int(environment.parent.name), signal.SIGKILL)
+def _values(job: Job, device: str) -> dict[str, str]:
+    """Fields for a program or a payload; empty where there is no value."""
+    alarm = job.alarm
+    fields = {name: getattr(alarm, name) for name in ("name", "severity", "since", "value", "limit", "unit")}
+    values = {name: "" if value is None else str(value) for name, value in fields.items()}
+    text = alarm.text or alarm.unwatched_reason or ""
+    return values | {"text": text, "device": device, "state": job.state, "json": alarm.model_dump_json()}

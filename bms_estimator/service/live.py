@@ -105,10 +105,11 @@ async def run_live(
         pulse=pulse,
         recording=recording,
         edge=edge.health if edge else lambda: None,
+        hooks=lambda: hooks.health,
         on_alarm=hooks.tell,
     )
     _restore_alarms(publisher, ledger.alarms)
-    hooks.begin(publisher.watch.alarms.active)
+    hooks.begin({*publisher.watch.alarms.active, *publisher.watch.alarms.unwatched})
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
     every_s = settings.state.checkpoint_s

@@ -39,6 +39,7 @@ class AlarmState:
         gone: The cause is gone, but it is latched.
         acknowledged: Somebody knows: it ends once the cause is gone.
         known: A value has come.
+        lost_s: A time without values that is shorter than this counts for a delay [s].
     """
 
     watched: Watched
@@ -46,6 +47,9 @@ class AlarmState:
     gone: bool = False
     acknowledged: bool = False
     known: bool = False
+    lost_s: float = 0.0
+    _missing_s: float = 0.0
+    """Time without values since the last value [s]."""
     _held_s: float | None = None
     """For how long what leads to the next state has held [s]; None: it does not."""
 
@@ -69,9 +73,11 @@ class AlarmState:
         turns = []
         for at_s, step_s, value in zip(times_s.tolist(), steps_s.tolist(), signed.tolist(), strict=True):
             if math.isnan(value):
+                self._missing_s += step_s
                 continue
             self.known = True
-            if self._due(value, step_s, sign):
+            missing_s, self._missing_s = self._missing_s, 0.0
+            if self._due(value, step_s + (missing_s if missing_s < self.lost_s else 0.0), sign):
                 turns += self._turn(at_s, sign * value, wall_s)
         return turns
 

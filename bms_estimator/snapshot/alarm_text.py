@@ -21,11 +21,12 @@ _WHAT: dict[AlarmName, tuple[str, str]] = {
     "stability_margin_low": ("the SOC is close to where the model ends", "charge"),
     "cell_imbalance": ("the cells' voltages differ", "let them be balanced, look for a weak one"),
     "sensor_fault": (
-        "samples are lost or cannot be used",
+        "samples are lost, cannot be used or come from two publishers",
         "check sensors and wiring; topic health counts what is wrong",
     ),
     "model_mismatch": ("measured and estimated voltage disagree", "check that the cell file belongs to this pack"),
     "link_lost": ("no samples come", "check board, cable and power"),
+    "hook_failed": ("an alarm hook could not do its work", "check its program; do by hand what it is for"),
 }
 
 

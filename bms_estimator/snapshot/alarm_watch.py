@@ -10,6 +10,7 @@ from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.alarm_limits import charging_a, silent_limit_s, watched
 from bms_estimator.model.alarm_settings import AlarmName
 from bms_estimator.model.clock import Clock
+from bms_estimator.model.estimate import HookHealth
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
@@ -36,7 +37,8 @@ class AlarmWatch:
         estimator: Read only.
         source: Its counters, cells and message are read.
         clock: The clocks.
-        on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
+        on_alarm: Called with each change of an alarm, as soon as it occurs.
+        hooks: Successes and failures of alarm hooks; None where there are none.
 
     Attributes:
         alarms: What is watched, and what is raised.
@@ -53,7 +55,9 @@ class AlarmWatch:
         source: Source,
         clock: Clock,
         on_alarm: Callable[[Change], object],
+        hooks: Callable[[], HookHealth | None] = lambda: None,
     ) -> None:
+        self._hooks = hooks
         self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
@@ -70,12 +74,14 @@ class AlarmWatch:
 
     def judge(self, now_s: float) -> None:
         """Look at what has come since the last time, and at that nothing came, at ``now_s`` of the monotonic clock [s]."""
-        self._judged_s = now_s
+        passed_s, self._judged_s = now_s - self._judged_s, now_s
         record = self._estimator.record[0]
         suspects = Suspect(int(record["checks"]["suspects"]))
         said = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.judge(self._arrival_s, self._counts(), suspects, said)
         self.alarms.silent(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
+        if (hooks := self._hooks()) is not None:
+            self.alarms.judge_hooks(hooks.failing, passed_s, self._clock.wall())
         self._tell()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:

@@ -7,21 +7,19 @@ sensors say counts as it came, also what the estimator takes for a glitch; the d
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.sample_step import GAP_RATIO
-from bms_estimator.kernels.state import TRACE
 from bms_estimator.model.alarm_limits import NEEDED, Quantity, Watched
 from bms_estimator.model.alarm_settings import AlarmName
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.estimate import Alarm
-from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock, SampleStatus
+from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
 from bms_estimator.model.suspect import Suspect
 from bms_estimator.snapshot.alarm_inputs import LOST, Inputs, counted
+from bms_estimator.snapshot.alarm_samples import Steps, Waiting
 from bms_estimator.snapshot.alarm_state import AlarmState, Floats, Raising, Turn
 from bms_estimator.snapshot.alarm_text import alarm_text
 
@@ -31,10 +29,6 @@ ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """These are watched before anything was measured."""
 INPUTS = "inputs"
 """Key of the saved state of measured quantities, beside the alarms' names."""
-WAITING_ROWS = 256
-"""Room for so many samples to begin with."""
-RECENT_STEPS = 4.0
-"""A long step is usual until this multiple of it has passed without another one of about its length."""
 SHARE_S = 1.0
 """Lost and unusable samples are set against the good ones of so long at least [s]."""
 
@@ -76,73 +70,7 @@ class Told(NamedTuple):
 
 _COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
 """Columns of a sample by quantity."""
-_NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
-"""``_extremes`` of a sample without cell voltages."""
 _NO_REASONS = Reasons(Suspect(0), ())
-
-
-@dataclass
-class _Steps:
-    """Times between samples: between two samples a value is taken to be as at both, unless there is a gap.
-
-    A gap is much longer than the longest step shortly before. Samples that come in bursts have one long step for each
-    burst: from the second on these are no gaps.
-
-    Attributes:
-        gap_s: Shorter steps are no gaps [s].
-    """
-
-    gap_s: float
-    _last_s: float = math.nan
-    _step_s: float = math.inf
-    _longest_s: float = 0.0
-    """Longest step of late [s]."""
-    _longest_at_s: float = -math.inf
-    """When a step of about this length was last seen [s]."""
-
-    def of(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """Shape (n,) each: the time before each sample [s], 0 where the clock was set back; and 0 in gaps, too."""
-        passed_s = np.diff(times_s, prepend=self._last_s)
-        passed_s = np.where(passed_s > 0.0, passed_s, 0.0)
-        before_s = np.concatenate(([self._step_s], passed_s[:-1]))
-        seen_s = np.where(passed_s > np.maximum(self.gap_s, GAP_RATIO * before_s), 0.0, passed_s)
-        for i in np.flatnonzero(passed_s > self.gap_s).tolist():
-            if self._is_usual(float(times_s[i]), float(passed_s[i])):
-                seen_s[i] = passed_s[i]
-        self._last_s, self._step_s = float(times_s[-1]), float(passed_s[-1]) or self._step_s
-        return passed_s, seen_s
-
-    def _is_usual(self, at_s: float, step_s: float) -> bool:
-        """Whether a step of about this length was seen shortly before; takes note of it."""
-        is_recent = abs(at_s - self._longest_at_s) <= RECENT_STEPS * self._longest_s
-        is_usual = is_recent and step_s <= GAP_RATIO * self._longest_s
-        if not is_recent or step_s >= self._longest_s:
-            self._longest_s, self._longest_at_s = step_s, at_s
-        elif GAP_RATIO * step_s >= self._longest_s:
-            self._longest_at_s = at_s
-        return is_usual
-
-
-class _Rows:
-    """Rows of one dtype that wait: written in place, since to join hundreds of short structured arrays takes milliseconds."""
-
-    def __init__(self, dtype: Any, columns: tuple[int, ...] = ()) -> None:
-        self._rows = np.zeros((WAITING_ROWS, *columns), dtype=dtype)
-        self.size = 0
-
-    def add(self, values: Any, count: int) -> None:
-        """Append ``count`` rows."""
-        end = self.size + count
-        if end > len(self._rows):
-            more = np.zeros((end, *self._rows.shape[1:]), dtype=self._rows.dtype)
-            self._rows = np.concatenate((self._rows, more))
-        self._rows[self.size : end] = values
-        self.size = end
-
-    def take(self) -> Any:
-        """All of them; valid until the next call of ``add``."""
-        rows, self.size = self._rows[: self.size], 0
-        return rows
 
 
 class Alarms:
@@ -163,13 +91,13 @@ class Alarms:
     def __init__(
         self, watched: Sequence[Watched], charging_a: float, gap_s: float, inputs: Inputs, silent_s: float
     ) -> None:
-        self._states = {each.name: AlarmState(each) for each in watched}
+        self._states = {each.name: AlarmState(each, lost_s=inputs.lost_s) for each in watched}
         self._charging_a = charging_a
         self._inputs, self._silent_s = inputs, silent_s
         self._silence = ""  # why no samples come; empty while they do
         self._unwatched: dict[AlarmName, str] = {}  # reasons
-        self._sampled, self._traced, self._shared = _Steps(gap_s), _Steps(gap_s), _Steps(math.inf)
-        self._samples, self._traces, self._extremes = _Rows(SAMPLE), _Rows(TRACE), _Rows(np.float64, (3,))
+        self._sampled, self._traced, self._shared = Steps(gap_s), Steps(gap_s), Steps(math.inf)
+        self._waiting = Waiting()
         self._counts: Counts | None = None
         self._counted_s = -math.inf
         self._at_s = 0.0  # of the last sample
@@ -182,13 +110,11 @@ class Alarms:
     @property
     def rows(self) -> int:
         """Samples that wait to be judged."""
-        return self._samples.size
+        return self._waiting.size
 
     def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock) -> None:
         """Take a block, what the estimator made of it, and the cells beside it; ``judge`` looks at them."""
-        self._samples.add(block, block.size)
-        self._traces.add(trace, trace.size)
-        self._extremes.add(_extremes(cells) if len(cells) == block.size else _NO_EXTREMES, block.size)
+        self._waiting.add(block, trace, cells)
 
     def judge(self, arrival_s: float, counts: Counts, suspects: Suspect, suspicions: Sequence[str]) -> None:
         """Judge all that waits.
@@ -201,10 +127,7 @@ class Alarms:
         """
         if not self.rows:
             return
-        samples, trace, extremes_v = self._samples.take(), self._traces.take(), self._extremes.take()
-        known = np.isfinite(samples["time_s"])
-        if not known.all():
-            samples, extremes_v = samples[known], extremes_v[known]
+        samples, trace, extremes_v = self._waiting.take()
         self._suspect("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._suspect("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
         if samples.size:
@@ -237,6 +160,20 @@ class Alarms:
             self._reasons["link_lost"] = Reasons(Suspect(0), (reason,) if reason else ())
             self._note(state, state.raise_at(self._at_s, Raising(now_s, silent_s)))
             self._keep()
+
+    def judge_hooks(self, failing: Sequence[str], passed_s: float, now_s: float) -> None:
+        """Judge whether alarm hooks do their work.
+
+        Args:
+            failing: Hooks whose last attempt failed, each with its reason.
+            passed_s: Time since the last call [s].
+            now_s: Wall clock [s since 1970].
+        """
+        if failing:
+            self._reasons["hook_failed"] = Reasons(Suspect(0), tuple(failing))
+        value = np.array([math.inf if failing else 0.0])  # no number stands for it
+        self._take("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
+        self._keep()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Somebody knows of an alarm, or of all. Returns which ones: those whose cause is gone have ended by that.
@@ -450,11 +387,3 @@ def _alarm(watched: Watched, told: Told) -> Alarm:
         watched=told.unwatched is None,
         unwatched_reason=told.unwatched,
     )
-
-
-def _extremes(cells: CellBlock) -> Floats:
-    """Lowest and highest cell voltage of each sample [V], NaN where there is none, and their number. Shape (n, 3)."""
-    if not cells.shape[1]:
-        return np.tile(_NO_EXTREMES, (len(cells), 1))
-    measured = np.count_nonzero(np.isfinite(cells), axis=1)
-    return np.stack((np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1), measured), axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 from bms_estimator.kernels.input_checks import COUNTERS
 from bms_estimator.kernels.state import OBSERVER_STATE
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import EdgeHealth, Health, LoopHealth, RecordingHealth, Totals
+from bms_estimator.model.estimate import EdgeHealth, Health, HookHealth, LoopHealth, RecordingHealth, Totals
 from bms_estimator.model.suspect import Suspect
 from bms_estimator.sinks import Delivery
 
@@ -81,6 +81,7 @@ def health_report(
     loop: LoopHealth,
     recording: RecordingHealth | None,
     edge: EdgeHealth | None = None,
+    hooks: HookHealth | None = None,
 ) -> Health:
     """Topic ``health``.
 
@@ -101,6 +102,7 @@ def health_report(
         loop: How long what comes in waits.
         recording: The state of one; None: nothing is recorded.
         edge: Of raw samples on their way; None: none are sent.
+        hooks: Successes and failures of alarm hooks; None: there are none.
     """
     state = record["observer"]
     return Health(
@@ -131,6 +133,7 @@ def health_report(
         loop=loop,
         recording=recording,
         edge=edge,
+        hooks=hooks,
         unseen_s=unseen_s,
         total=total,
     )

@@ -9,7 +9,16 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.estimate import EdgeHealth, Estimate, Health, Info, LoopHealth, RecordingHealth, Snapshot
+from bms_estimator.model.estimate import (
+    EdgeHealth,
+    Estimate,
+    Health,
+    HookHealth,
+    Info,
+    LoopHealth,
+    RecordingHealth,
+    Snapshot,
+)
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import Settings
@@ -53,6 +62,7 @@ class Publisher:
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
         edge: Of raw samples on their way to a fleet; None where none are sent.
+        hooks: Successes and failures of alarm hooks; None where there are none.
         on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
 
     Attributes:
@@ -81,6 +91,7 @@ class Publisher:
         pulse: Callable[[], Pulse] | None = None,
         recording: Callable[[], RecordingHealth | None] = lambda: None,
         edge: Callable[[], EdgeHealth | None] = lambda: None,
+        hooks: Callable[[], HookHealth | None] = lambda: None,
         on_alarm: Callable[[Change], object] = lambda _: None,
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
@@ -90,13 +101,14 @@ class Publisher:
         self._rest = Rest(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
         self._pulse, self._recording, self._edge, self._latency = pulse, recording, edge, Latency()
+        self._hooks = hooks
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
         self.kept: Flow | None = None
         self._flow = Flow()  # as it was told last
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
-        self.watch = AlarmWatch(settings, cell, estimator, source, clock, on_alarm)
+        self.watch = AlarmWatch(settings, cell, estimator, source, clock, on_alarm, hooks)
         self._suspects = 0  # bits of ``Suspect``, as logged
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
@@ -227,6 +239,7 @@ class Publisher:
             loop=self._loop(),
             recording=self._recording(),
             edge=self._edge(),
+            hooks=self._hooks(),
         )
 
     def _log_suspicions(self, health: Health) -> None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from bms_estimator.model.mqtt_source_settings import MqttSource, Place
 from bms_estimator.sources.payload import MOST_CELLS, NoNumberError, cell_pattern, many, one
 from bms_estimator.sources.report_line import report_line
+from bms_estimator.sources.rivals import MIN_JUMPS, Rivals
 
 NEEDED = ("voltage", "current")
 
@@ -51,7 +52,13 @@ class Assembly:
         self._cells: dict[int, _Told] = {}
         self._faults: dict[str, str] = {}  # of each quantity what was wrong last
         self._new: dict[str, float] = {}  # of voltage and current those that have come since the last sample, and when
-        self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale"), 0)
+        self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
+        self._rivals = {
+            (way.quantity, way.topic): Rivals(MIN_JUMPS[way.quantity], settings.interval_s)
+            for way in self._ways
+            if way.quantity in NEEDED
+        }
+        self._conflicts: dict[tuple[str, str], str] = {}  # by quantity and topic
 
     @property
     def topics(self) -> list[str]:
@@ -62,8 +69,16 @@ class Assembly:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Messages that the broker had kept, payloads without the quantity or no number; samples that lacked one of two."""
+        """Messages that the broker had kept, payloads without the quantity or no number; samples that lacked one of two.
+
+        ``publisher_errors`` counts messages on a topic while two publishers write there.
+        """
         return self._counters
+
+    @property
+    def conflict(self) -> str:
+        """Topics on which two publishers write, with their values, for people; empty where there is none."""
+        return "; ".join(self._conflicts.values())
 
     @property
     def fault(self) -> str | None:
@@ -100,16 +115,19 @@ class Assembly:
         if retained:
             self._counters["retained"] += bool(ways)
             return
+        conflict = False
         for way, match in ways:
+            cell = int(match[1]) if match.re.groups else None
             try:
-                self._put(way, payload, int(match[1]) if match.re.groups else None, now_s)
-            except NoNumberError as error:  # nor is it as it was
-                self._told.pop(way.quantity, None)
-                self._new.pop(way.quantity, None)
+                self._put(way, payload, cell, now_s)
+            except NoNumberError as error:
+                self._drop(way.quantity, cell)
                 self._counters[error.kind] += 1
                 self._faults[way.quantity] = f"{way.quantity}: {topic}: {error}"
             else:
                 self._faults.pop(way.quantity, None)
+                conflict |= self._has_rivals(way, now_s)
+        self._counters["publisher_errors"] += conflict
 
     def line(self, now_s: float) -> bytes:
         """The sample that is complete now; nothing where none is."""
@@ -142,6 +160,25 @@ class Assembly:
             self._cells |= {number: _Told(v, now_s) for number, v in many(payload, way.place, way.path).items()}
         elif 1 <= cell <= MOST_CELLS:
             self._cells[cell] = _Told(one(payload, way.place, way.path), now_s)
+
+    def _drop(self, quantity: str, cell: int | None) -> None:
+        """Forget a quantity that is no longer measured; ``cell`` None: all cells."""
+        self._told.pop(quantity, None)
+        self._new.pop(quantity, None)
+        if quantity == "cells":
+            gone = tuple(self._cells) if cell is None else (cell,)
+            for each in gone:
+                self._cells.pop(each, None)
+
+    def _has_rivals(self, way: _Way, now_s: float) -> bool:
+        """Return whether two publishers write the value that has just come on this topic."""
+        key = way.quantity, way.topic
+        rivals = self._rivals.get(key)
+        if rivals is None or not rivals.take(self._told[way.quantity].value, now_s):
+            self._conflicts.pop(key, None)
+            return False
+        self._conflicts[key] = f"{way.topic}: {way.quantity} {rivals.text}"
+        return True
 
     def _miss(self, name: str) -> None:
         """A sample lacks one of the two."""

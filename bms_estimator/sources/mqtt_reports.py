@@ -6,6 +6,8 @@ import secrets
 from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Mapping
 
+import structlog
+
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.mqtt_source_settings import MqttSource
@@ -22,6 +24,8 @@ MOST_WAITING = 2000
 """Messages that wait to be read: a broker hands out at once all that it has kept of a wildcard."""
 MOST_BYTES = 65_536
 """Nobody tells more of a battery at once."""
+
+log = structlog.get_logger(__name__)
 
 
 class MqttReports(Bringer):
@@ -51,6 +55,7 @@ class MqttReports(Bringer):
         found = brokers(mqtt)
         self._broker, self._brokers = found[0], itertools.cycle(found)
         self._connect = connect or Dial(mqtt)
+        self._conflicting = False
         self._lost: Counter[str] = Counter({"too_long": 0, "overflow": 0})
         self._hello = Hello(f"bms-source-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
 
@@ -101,6 +106,7 @@ class MqttReports(Bringer):
                 if receiving.done():
                     message, receiving = receiving.result(), None
                     self._assembly.take(message.topic, message.payload, self._monotonic(), retained=message.retain)
+                    self._log_conflict()
                 if line := self._assembly.line(self._monotonic()):
                     yield line
         finally:
@@ -120,6 +126,17 @@ class MqttReports(Bringer):
             refusal = await connection.publish(message)
             if refusal is not None:
                 raise NothingComesError(f"not allowed to write {message.topic}: {refusal.why}")
+
+    def _log_conflict(self) -> None:
+        """Log the first message of a second publisher, and its end."""
+        conflict = self._assembly.conflict
+        if bool(conflict) == self._conflicting:
+            return
+        self._conflicting = bool(conflict)
+        if conflict:
+            log.warning("two publishers write the same topic; stop one of them", values=conflict)
+        else:
+            log.info("one publisher writes the topic again")
 
     def _lose(self, kind: str, _topic: str) -> None:
         self._lost[kind] += 1

@@ -1,9 +1,9 @@
-"""Load: thousands of frames a second through the service over a PTY, and a day of serial bytes through decoder and estimator,
-and an attack with the token of one edge of a fleet.
+"""Load: thousands of frames a second over a PTY, a day of serial bytes, and attacks.
 
-Idle connections to the HTTP listeners of service, dashboard and fleet page, while their broker or server is restarted.
+The attacks are idle connections to the HTTP listeners of service, dashboard and fleet page while their broker or server is
+restarted, a lost sensor, and the token of one edge of a fleet.
 
-make load ARGS="--rate 5000 --minutes 10 --hours 24 --no-idle --attack-s 20"
+make load ARGS="--rate 5000 --minutes 10 --hours 24 --no-idle --lost 10 --attack-s 20"
 """
 
 import argparse
@@ -28,7 +28,7 @@ from bms_estimator.kernels.cell import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.dialects.board import BoardDialect
-from tests.benchmarks import edge_token
+from tests.benchmarks import edge_token, lost_sensor
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
 from tests.benchmarks.table import Row, show
 from tests.benchmarks.wire import hello, sample_frames
@@ -212,6 +212,8 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
     """Measure."""
     if options.idle:
         yield from idle_rows()
+    if options.lost:
+        yield from lost_sensor_rows(options.lost)
     if options.minutes:
         with tempfile.TemporaryDirectory() as folder:
             broker = Broker(Path(folder)).start()
@@ -270,6 +272,16 @@ def _idle_row(program: str, attack: Coroutine[None, None, Outcome]) -> Row:
     return Row(what, target, measured, met=set(outcome.answers) == {200} and outcome.tracebacks == 0)
 
 
+def lost_sensor_rows(lost_s: float) -> Iterator[Row]:
+    """Attack by a lost sensor."""
+    with tempfile.TemporaryDirectory() as folder:
+        broker = Broker(Path(folder)).start()
+        try:
+            yield from lost_sensor.rows(broker, Path(folder), lost_s)
+        finally:
+            broker.stop()
+
+
 def main() -> None:
     """Measure what is asked for; 1 where a target was not met."""
     parser = argparse.ArgumentParser(prog="make load", description=__doc__)
@@ -280,6 +292,7 @@ def main() -> None:
     parser.add_argument(
         "--idle", action=argparse.BooleanOptionalAction, default=True, help="attack by idle connections"
     )
+    parser.add_argument("--lost", type=float, default=10.0, help="delay of a lost sensor [s]; 0: none is lost")
     sys.exit(not show(rows(parser.parse_args())))
 
 

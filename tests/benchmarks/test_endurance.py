@@ -1,9 +1,22 @@
 """A little of ``make load``: the line itself has tests of its own."""
 
+from pathlib import Path
+
 from tests.benchmarks.endurance import fed
+from tests.benchmarks.lost_sensor import LOSSES, attack
+from tests.mosquitto import Broker, broker
+
+__all__ = ["broker"]
 
 
 def test_ten_minutes_of_serial_bytes_are_all_estimated() -> None:
     dialect, estimator, _, _ = fed(100, 600.0)
     assert dialect.counters["frames_received"] == estimator.state["samples"][0] == 60_000
     assert dialect.counters["frames_lost"] == dialect.counters["clock_jumps"] == 0
+
+
+async def test_a_lost_sensor_raises_sensor_fault_and_runs_the_hook_of_an_alarm_that_needs_it(
+    broker: Broker, tmp_path: Path
+) -> None:
+    losses = await attack(broker, tmp_path, lost_s=0.5)
+    assert [loss.ran for loss in losses] == [(f"{alarm} raised", f"{alarm} cleared") for alarm in LOSSES.values()]

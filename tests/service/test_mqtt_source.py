@@ -2,12 +2,14 @@
 
 import asyncio
 import contextlib
+import json
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import aiomqtt
 from structlog.testing import capture_logs
 
+from bms_estimator.model.alarm_settings import AlarmSettings
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.settings import Settings
 from bms_estimator.service.serve import serve
@@ -155,3 +157,29 @@ async def test_the_next_broker_is_tried_and_the_one_that_is_not_there_is_named(b
     assert len(reasons) == 1
     assert reasons[0].startswith(f"esphome-jk jk-bms by MQTT, {dead}: ")
     assert reasons[0].endswith("; trying again")
+
+
+async def test_a_second_publisher_raises_sensor_fault(broker: Broker) -> None:
+    """The true node says 5 A; then another one, which answers each of its messages at once, says -80 A."""
+    told = settings(broker, profile=None, prefix=None, topic="home/pack", voltage="u", current="i", interval_s=2.0)
+    told = told.model_copy(update={"alarms": AlarmSettings.model_validate({"sensor_fault": {"delay_s": 0.5}})})
+    attacked = asyncio.Event()
+
+    async def nodes() -> None:
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            while True:
+                await client.publish("home/pack", b'{"u": 53.0, "i": 5.0}')
+                if attacked.is_set():
+                    await client.publish("home/pack", b'{"u": 53.0, "i": -80.0}')
+                await asyncio.sleep(0.05)
+
+    async with Listener(broker, "bms/#") as listener, serving(told):
+        publishers = asyncio.create_task(nodes())
+        try:
+            await listener.wait_json(STATE, lambda s: s["frames_received"] > 20)
+            assert not json.loads(await listener.wait("bms/pack/alarm/sensor_fault"))["active"]
+            attacked.set()
+            await listener.wait_json("bms/pack/alarm/sensor_fault", lambda alarm: alarm["active"])
+            await listener.wait_json(HEALTH, lambda h: h["line"]["publisher_errors"] > 0)
+        finally:
+            await end(publishers)

@@ -4,6 +4,7 @@ The payloads are those of the projects named in ``model/mqtt_profiles.py``, with
 """
 
 import json
+import random
 from typing import Any
 
 import pytest
@@ -329,3 +330,78 @@ def test_what_is_told_goes_before_the_profile() -> None:
     assert (told_too.current.path, told_too.current.scale) == ("battery_current", -1.0)
     assert told_too.temperature.path == "temperature_min"
     assert (told_too.prefix, told_too.period_s) == ("BE", 2.0)
+
+
+def _merged(*publishers: tuple[float, float, float, float]) -> list[tuple[float, float]]:
+    """Times and currents of publishers, each given by period, first and last time, and current."""
+    messages = [
+        (first_s + period_s * i, current_a)
+        for period_s, first_s, last_s, current_a in publishers
+        for i in range(round((last_s - first_s) / period_s))
+    ]
+    return sorted(messages)
+
+
+def _errors(messages: list[tuple[float, float]]) -> tuple[Assembly, list[float]]:
+    """Times at which a message was counted as one of two publishers [s]."""
+    assembly, found = Assembly(own()), list[float]()
+    for at_s, current_a in messages:
+        before = assembly.counters["publisher_errors"]
+        assembly.take("home/pack", json.dumps({"u": 52.0, "i": current_a}).encode(), at_s, retained=False)
+        found += [at_s] * (assembly.counters["publisher_errors"] - before)
+    return assembly, found
+
+
+@pytest.mark.parametrize("period_s", [0.2, 1.0, 2.7])
+def test_a_second_publisher_of_a_topic_is_counted_and_named_until_it_is_gone(period_s: float) -> None:
+    rival = (period_s, 100.3, 160.0, -80.0)
+    assembly, found = _errors(_merged((1.0, 0.0, 160.0, 5.0), rival))
+    assert 100.3 < found[0] < 115.0
+    assert found[-1] > 158.0
+    assert set(assembly.conflict.removeprefix("home/pack: current ").split(" and ")) == {"5", "-80"}
+    assembly, found = _errors(_merged((1.0, 0.0, 400.0, 5.0), rival))
+    assert assembly.conflict == ""
+    assert found[-1] < 160.0 + 64.0
+
+
+@pytest.mark.parametrize("on_s", [1, 2, 3, 10])
+def test_a_load_that_switches_on_and_off_is_no_second_publisher(on_s: int) -> None:
+    messages = [(float(second), 80.0 if second // on_s % 2 else -5.0) for second in range(1000)]
+    assembly, found = _errors(messages)
+    assert (assembly.conflict, found) == ("", [])
+
+
+@pytest.mark.parametrize(("on_s", "off_s", "spread"), [(3, 60, 0.0), (600, 1800, 0.1), (5, 15, 0.9)])
+def test_a_load_of_which_only_the_changes_are_published_is_no_second_publisher(
+    on_s: int, off_s: int, spread: float
+) -> None:
+    """A short pulse in each minute, a refrigerator, a load that somebody switches."""
+    chance, messages, at_s = random.Random(1), list[tuple[float, float]](), 0.0
+    for _ in range(200):
+        for pause_s, current_a in ((off_s, 80.0), (on_s, 5.0)):
+            at_s += pause_s * chance.uniform(1.0 - spread, 1.0 + spread)
+            messages.append((at_s, current_a))
+    assembly, found = _errors(messages)
+    assert (assembly.conflict, found) == ("", [])
+
+
+def test_a_publisher_with_a_current_of_its_own_at_random_times_is_a_second_one() -> None:
+    chance, rival, at_s = random.Random(1), list[tuple[float, float]](), 100.0
+    while at_s < 160.0:
+        at_s += chance.expovariate(1.0)
+        rival.append((at_s, -80.0))
+    _, found = _errors(sorted(_merged((1.0, 0.0, 160.0, 5.0)) + rival))
+    assert 100.0 < found[0] < 115.0
+
+
+def test_cells_that_are_no_longer_measured_do_not_stay_as_they_were() -> None:
+    together = Assembly(own(cells="cells"))
+    payloads = ('{"u": 52.0, "i": 1.0, "cells": [3.3, 3.4]}', '{"u": 52.0, "i": 1.0, "cells": null}')
+    first, lost = told(together, [("home/pack", payload) for payload in payloads])
+    assert (first["cells_v"], "cells_v" in lost) == ([3.3, 3.4], False)
+    each = Assembly(own(cells={"topic": "home/cell/{cell}"}))
+    pack = ("home/pack", '{"u": 52.0, "i": 1.0}')
+    before, after = told(
+        each, [("home/cell/1", "3.3"), ("home/cell/2", "3.4"), pack, ("home/cell/1", "unavailable"), pack]
+    )
+    assert (before["cells_v"], after["cells_v"]) == ([3.3, 3.4], [None, 3.4])

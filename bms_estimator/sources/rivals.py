@@ -1,0 +1,115 @@
+"""Detection of two publishers on one topic. MQTT does not name the publisher, so values and times must show it."""
+
+import itertools
+from collections import deque
+from collections.abc import Sequence
+from statistics import quantiles
+from typing import NamedTuple
+
+HISTORY = 64
+"""Number of remembered messages of a topic."""
+MIN_INTERVALS = 8
+"""Number of intervals from which on the usual interval is known."""
+QUICK_FRACTION = 0.5
+"""A message is out of turn if it follows the previous one within this fraction of the usual interval."""
+MIN_RETURNS = 4
+"""Number of quick returns to an earlier value, among the remembered messages, that show two publishers."""
+BACK_FRACTION = 0.75
+"""Fraction of the jumps that must go back: a load that varies at random has fewer."""
+MIN_REPEATS = 0.25
+"""Fraction of messages without a jump that shows a publisher that does not only publish changes."""
+MAX_SPREAD = 0.5
+"""Largest interquartile range of a publisher's intervals, as a fraction of their median."""
+MIN_JUMPS = {"voltage": 0.01, "current": 0.2}
+"""Smallest difference between two publishers, as a fraction of the larger value."""
+SAME_FRACTION = 0.2
+"""Two values belong to one publisher if they differ by less than this fraction of the jump between the two publishers."""
+
+
+class _Message(NamedTuple):
+    """A message.
+
+    Attributes:
+        is_back: It went back to the value before the last jump.
+        is_quick: It came out of turn.
+    """
+
+    value: float
+    at_s: float
+    is_jump: bool = False
+    is_back: bool = False
+    is_quick: bool = False
+
+
+class Rivals:
+    """Detects a second publisher of one quantity on one topic.
+
+    Two publishers with different values make the value jump back and forth, and one of the two jumps comes sooner than one
+    publisher would publish. A load that switches on and off jumps, too, but in step with its publisher. If a publisher
+    sends changes only, such a load can look like two publishers; therefore values must also be repeated or come regularly.
+
+    Args:
+        min_jump: Smallest difference between two publishers, as a fraction of the larger value.
+        interval_s: Expected interval between messages [s].
+    """
+
+    def __init__(self, min_jump: float, interval_s: float) -> None:
+        self._min_jump, self._interval_s = min_jump, interval_s
+        self._messages: deque[_Message] = deque(maxlen=HISTORY)
+        self._levels: tuple[float, float] | None = None  # before and after the last jump
+
+    def take(self, value: float, now_s: float) -> bool:
+        """Take a value that came at ``now_s`` of the monotonic clock [s]. Return whether there are two publishers."""
+        message = _Message(value, now_s)
+        if self._messages and self._is_jump(self._messages[-1].value, value):
+            before, levels = self._messages[-1], self._levels
+            self._levels = before.value, value
+            is_back = levels is not None and _is_back(levels, value)
+            message = _Message(value, now_s, True, is_back, self._is_quick(now_s - before.at_s))
+        self._messages.append(message)
+        return self._are_two
+
+    @property
+    def text(self) -> str:
+        """The two values, for people."""
+        return " and ".join(f"{level:g}" for level in self._levels or ())
+
+    @property
+    def _are_two(self) -> bool:
+        jumps = [message for message in self._messages if message.is_jump]
+        backs = [message for message in jumps if message.is_back]
+        if sum(message.is_quick for message in backs) < MIN_RETURNS or len(backs) < BACK_FRACTION * len(jumps):
+            return False
+        repeats = len(self._messages) - len(jumps)
+        return repeats >= MIN_REPEATS * len(self._messages) or self._are_regular(jumps)
+
+    def _are_regular(self, jumps: Sequence[_Message]) -> bool:
+        """Return whether every second jump comes at the expected interval or faster, with little spread."""
+        intervals_s = _intervals_s(jumps[::2])
+        if len(intervals_s) < MIN_RETURNS:
+            return False
+        low_s, median_s, high_s = quantiles(intervals_s, n=4)
+        return median_s <= self._interval_s and high_s - low_s <= MAX_SPREAD * median_s
+
+    def _is_jump(self, before: float, value: float) -> bool:
+        return abs(value - before) > self._min_jump * max(abs(value), abs(before))
+
+    def _is_quick(self, interval_s: float) -> bool:
+        """Return whether a message came sooner than one publisher would publish.
+
+        The upper quartile of the intervals is that of one publisher also while there are two.
+        """
+        intervals_s = _intervals_s(self._messages)
+        if len(intervals_s) < MIN_INTERVALS:
+            return False
+        return interval_s < QUICK_FRACTION * quantiles(intervals_s, n=4)[2]
+
+
+def _intervals_s(messages: Sequence[_Message]) -> list[float]:
+    return [after.at_s - before.at_s for before, after in itertools.pairwise(messages)]
+
+
+def _is_back(levels: tuple[float, float], value: float) -> bool:
+    """Return whether a value is that before the last jump."""
+    before, after = levels
+    return abs(value - before) < SAME_FRACTION * abs(after - before)

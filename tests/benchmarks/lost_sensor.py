@@ -1,0 +1,155 @@
+"""Attack by a lost sensor: while a pack is charged, its temperature and then its cell voltages become null.
+
+Service and Mosquitto are processes of their own. A hook that lists one critical alarm, and not ``sensor_fault``, must be run.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import aiomqtt
+
+from tests.benchmarks.table import Row
+from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
+
+CHARGE_A = -30.0
+PERIOD_S = 0.1
+LATE_S = 3.0
+"""From the end of the delay to the hook's program at most [s]."""
+LOSSES = {"t": "over_temperature", "cells": "cell_over_voltage"}
+"""By quantity of the publisher: an alarm that needs it."""
+PACK = """
+[pack]
+name = "attack"
+cell = "lfp"
+series = 4
+capacity_ah = 100.0
+[source]
+kind = "mqtt"
+topic = "home/pack"
+voltage = "u"
+current = "i"
+temperature = "t"
+cells = "cells"
+interval_s = 1.0
+[mqtt]
+url = "{url}"
+[state]
+folder = "{folder}"
+[alarms]
+lost_s = {lost_s}
+sensor_fault = {{clear_delay_s = 1.0}}
+"""
+HOOK = """
+[[alarms.hook]]
+alarms = ["{alarm}"]
+run = ["{program}"]
+"""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What followed when a quantity became null.
+
+    Attributes:
+        alarm: Alarm that needs the quantity.
+        fault_s: Time until ``sensor_fault`` [s].
+        hook_s: Time until the hook's program ran [s].
+        ran: What the program was run for, until the quantity was back.
+    """
+
+    alarm: str
+    fault_s: float
+    hook_s: float
+    ran: tuple[str, ...]
+
+
+async def attack(broker: Broker, folder: Path, lost_s: float) -> list[Loss]:
+    """Run the service, take one quantity after the other from it, and give each back."""
+    out, program = folder / "ran", folder / "hook"
+    out.touch()
+    program.write_text(f'#!/bin/sh\necho "$BMS_NAME $BMS_STATE" >> {out}\n')
+    program.chmod(0o700)
+    text = PACK.format(url=broker.url, folder=folder, lost_s=lost_s)
+    pack = folder / "attack.toml"
+    pack.write_text(text + "".join(HOOK.format(alarm=alarm, program=program) for alarm in LOSSES.values()))
+    values: dict[str, object] = {"u": 13.4, "i": CHARGE_A, "t": 25.0, "cells": [3.35] * 4}
+    async with Listener(broker, "bms/attack/alarm/#") as live, _service(pack, folder), _publisher(broker, values):
+        return [await _lose(live, out, values, quantity, alarm) for quantity, alarm in LOSSES.items()]
+
+
+async def _lose(live: Listener, out: Path, values: dict[str, object], quantity: str, alarm: str) -> Loss:
+    """Let a quantity become null until its alarm's hook has run, and give it back."""
+    fault, topic, ran = "bms/attack/alarm/sensor_fault", f"bms/attack/alarm/{alarm}", len(_lines(out))
+    await live.wait_json(topic, lambda told: told["watched"] and not told["active"])
+    before, lost_at_s, begin = values[quantity], time.monotonic(), len(live.messages)
+    values[quantity] = None
+    await live.wait_json(fault, lambda told: told["active"] and alarm in told["text"], begin)
+    fault_s = time.monotonic() - lost_at_s
+    await _until(out, ran + 1)
+    hook_s = time.monotonic() - lost_at_s
+    values[quantity], back = before, len(live.messages)
+    await _until(out, ran + 2)
+    await live.wait_json(fault, lambda told: not told["active"], back)
+    return Loss(alarm, fault_s, hook_s, tuple(_lines(out)[ran:]))
+
+
+@contextlib.asynccontextmanager
+async def _service(pack: Path, folder: Path) -> AsyncIterator[None]:
+    program = Path(sys.executable).with_name("bms-estimator")
+    with (folder / "log").open("w") as log:
+        service = await asyncio.create_subprocess_exec(program, "run", "--no-view", pack, stdout=log, stderr=log)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(service.pid, signal.SIGINT)
+        await service.wait()
+
+
+@contextlib.asynccontextmanager
+async def _publisher(broker: Broker, values: dict[str, object]) -> AsyncIterator[None]:
+    async def publish() -> None:
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            while True:
+                await client.publish("home/pack", json.dumps(values))
+                await asyncio.sleep(PERIOD_S)
+
+    task = asyncio.create_task(publish())
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def _until(out: Path, lines: int) -> None:
+    async with asyncio.timeout(LONG_S):
+        while len(_lines(out)) < lines:  # noqa: ASYNC110 - a program has no event
+            await asyncio.sleep(0.01)
+
+
+def _lines(out: Path) -> list[str]:
+    return out.read_text().splitlines()
+
+
+def rows(broker: Broker, folder: Path, lost_s: float) -> Iterator[Row]:
+    """Measure."""
+    latest_s = lost_s + LATE_S
+    for loss in asyncio.run(attack(broker, folder, lost_s)):
+        in_time = lost_s <= loss.fault_s <= latest_s and lost_s <= loss.hook_s <= latest_s
+        as_told = loss.ran == (f"{loss.alarm} raised", f"{loss.alarm} cleared")
+        yield Row(
+            f"a charged pack loses what {loss.alarm} needs",
+            f"alarm and hook after {lost_s:g} to {latest_s:g} s",
+            f"sensor_fault after {loss.fault_s:.1f} s, hook after {loss.hook_s:.1f} s",
+            in_time and as_told,
+        )
