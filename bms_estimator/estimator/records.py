@@ -76,6 +76,7 @@ def estimator_settings(
     p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
     p["hand_over"] = observer.law in ("improved", "scheme-3")  # (3.16) and (3.17) have no limit to set
+    p["series_resistance"] = observer.law == "improved" and not identifier.enabled
     p["map_memory_s"] = identifier.map_memory_h * 3600.0
     p["configured"][1:] = cell.a[1:PARAMETERS]
     for i in range(1, PARAMETERS):

@@ -14,6 +14,7 @@ from bms_estimator.kernels.identification import UNSEEN_MOST, identify, restart_
 from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.kernels.learning import begin_learning, learning_step, take_as_rest
 from bms_estimator.kernels.observer import count_charge, observer_step, start
+from bms_estimator.kernels.series_resistance import begin_series_resistance, series_resistance, series_resistance_step
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
 
@@ -100,7 +101,8 @@ def step(
     new_clock = dt_s == -math.inf
     if new_clock:
         dt_s = state[0].unseen_s
-        state[0].learning.settle_s = settings[0].learning.settle_s  # the load meanwhile is not known
+        settle_s = settings[0].learning.settle_s  # the load meanwhile is not known
+        state[0].learning.settle_s = state[0].series_resistance.settle_s = settle_s
     if not 0.0 <= dt_s < math.inf:  # the clock was set back, or nobody knows how long nobody measured: go on from here
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
@@ -110,7 +112,7 @@ def step(
             s.time_steps_back += 1
         return verdict
     gap = new_clock or is_gap(s, p, dt_s)
-    before_a = s.current_a
+    before_a, before_soc = s.current_a, s.soc
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
         identify(state[0], settings[0], dt_s, gap, current_a, voltage_v, temperature_c)
@@ -120,6 +122,8 @@ def step(
         learning_step(state[0], settings[0], dt_s, before_a, voltage_v)
     else:
         observer_step(s, p, dt_s, voltage_v)
+    if settings[0].series_resistance:
+        series_resistance_step(state[0], settings[0], dt_s, before_a, before_soc, voltage_v)
     return verdict
 
 
@@ -142,6 +146,8 @@ def begin(s: Record, p: Record, current_a: float, voltage_v: float, temperature_
         start_filter(s, p, current_a, voltage_v, temperature_c)
     if p.learning.enabled:
         begin_learning(s, p, voltage_v)
+    if p.series_resistance:
+        begin_series_resistance(s, p)
 
 
 @njit(cache=True)
@@ -209,14 +215,15 @@ def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
 
 @njit(cache=True)
 def write_filter(row: Record, s: Record, p: Record) -> None:
-    """What the filter says; records as in ``step``. Without it: the observer's e, and NaN.
+    """What the filter says; records as in ``step``. Without it: the observer's e, R_s by (4.2) where that is on, and NaN.
 
     The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.
     """
     if not p.identify:
         row.innovation_v = s.observer.innovation_v
         row.soc_ocv = row.soc_std = math.nan
-        row.r_s_ohm = row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
+        row.r_s_ohm = series_resistance(s) if p.series_resistance else math.nan
+        row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
         row.r_s_std_ohm = row.r_ts_std_ohm = row.tau_ts_std_s = row.r_tl_std_ohm = row.tau_tl_std_s = math.nan
         return
     f, e = s.filter, s.elements

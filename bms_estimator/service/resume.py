@@ -45,7 +45,11 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     was_on = bool(saved.get("filter.started", np.zeros(1))[0])
     fill(
         estimator.record,
-        {name: v for name, v in saved.items() if was_on or name.startswith(("observer.", "learning."))},
+        {
+            name: v
+            for name, v in saved.items()
+            if was_on or name.startswith(("observer.", "learning.", "series_resistance."))
+        },
     )
     wrong = _insane(estimator, begun)
     if wrong:
@@ -109,7 +113,10 @@ def _insane(estimator: Estimator, begun: NDArray[np.void]) -> str:
     for (name, field), (_, first) in zip(fields(record), fields(begun), strict=True):
         part, _, what = name.partition(".")
         known = np.isfinite(first)
-        if part in ("observer", "learning", "filter", "checks", "map") and not np.isfinite(field[known]).all():
+        if (
+            part in ("observer", "learning", "series_resistance", "filter", "checks", "map")
+            and not np.isfinite(field[known]).all()
+        ):
             return f"{what} of the {part} is not finite"
     s = record[0]["observer"]
     if not s["started"]:

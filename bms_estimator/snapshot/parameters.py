@@ -24,6 +24,7 @@ from bms_estimator.model.estimate import OcvCurve, Parameter, ParameterReport
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.snapshot.fuel_cell import VALID_STD, fuel_cell_parameters
 from bms_estimator.snapshot.ocv_formula import formula
+from bms_estimator.snapshot.series_resistance import series_resistance_parameters
 from bms_estimator.snapshot.topics import finite
 
 OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
@@ -80,6 +81,10 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
         for name, one in present_elements(record).items():
             elements[name] = _identified(one, elements[name], VALID_STD, now_s)
         health = _state_of_health(estimator, now_s)
+    if estimator.settings_record["series_resistance"][0]:
+        found = series_resistance_parameters(estimator)
+        elements["r_s_ohm"] = found.pop("r_s_ohm")
+        parameters |= found
     return ParameterReport(
         publish_time=iso_utc(now_s),
         soc=finite(state["soc"]),
