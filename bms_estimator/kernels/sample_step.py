@@ -187,7 +187,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
     for j in range(samples.shape[0]):
         x = samples[j]
         if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
-            write_observer(trace[rows], state[0].observer, settings[0].observer, x)
+            write_observer(trace[rows], state[0].observer, settings[0], x)
             write_filter(trace[rows], state[0], settings[0])
             rows += 1
     return rows
@@ -195,7 +195,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
 
 @njit(cache=True)
 def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
-    """What the observer says of an accepted sample ``x``; records as in ``judge``."""
+    """Columns of the observer for an accepted sample ``x``; records of OBSERVER_STATE and ESTIMATOR_SETTINGS."""
     row.time_s = x.time_s
     row.voltage_v = x.voltage_v
     row.current_a = x.current_a
@@ -203,13 +203,14 @@ def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
     row.soc = s.soc
     row.voltage_estimate_v = s.voltage_estimate_v
     row.tracking_error_v = s.innovation_v
-    row.nussbaum_gain = s.gain
+    row.nussbaum_gain = math.nan if p.learning.enabled else s.gain
+    row.adaptation_gain_hz = s.gain if p.learning.enabled else math.nan
     row.k = s.k
     row.delta_1 = s.delta_1
     row.delta_2 = s.delta_2
     row.stability_margin = s.soc - max(s.delta_1, s.delta_2)
     row.lock = s.lock
-    row.converged = 1 if abs(s.innovation_v) < p.epsilon_v else 0
+    row.converged = 1 if abs(s.innovation_v) < p.observer.epsilon_v else 0
     row.soc_coulomb = s.soc_coulomb
 
 

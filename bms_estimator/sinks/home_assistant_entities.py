@@ -69,7 +69,7 @@ ESTIMATE = {
     "voltage_estimate_v": _raw("Estimated voltage", "V", 2, "voltage"),
     "innovation_v": _raw("Innovation", "V", 3, "voltage"),
     "adaptive_gain_k": _raw("Adaptive gain k", "V²s", 6),
-    "nussbaum_gain": _raw("Nussbaum gain", None, 3),
+    "adaptation_gain_hz": _raw("Adaptation gain", "1/s", 4),
     "sample_rate_hz": _raw("Sample rate", "Hz", 1, "frequency"),
 }
 OF_CHARGE = {
@@ -86,6 +86,7 @@ OF_CHARGE = {
     "stability_margin": _raw("Stability margin", None, 3),
     "delta_1": _raw("delta 1", None, 4),
     "delta_2": _raw("delta 2", None, 4),
+    "nussbaum_gain": _raw("Nussbaum gain", None, 3),
 }
 """What a fuel cell has not."""
 OF_CELLS = {
