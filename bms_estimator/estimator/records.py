@@ -113,7 +113,7 @@ def observer_settings(
 
 
 def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage_resolution_v: float) -> None:
-    """What the observer of every pack has: the gain, its dead zone, the lock, what a sample may hold.
+    """Settings of the observer for every pack: the gain, its dead zone, the lock, limits of a sample.
 
     Args:
         p: Of dtype ``OBSERVER_SETTINGS``; written.
@@ -142,7 +142,7 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
 
 
 def _pace(p: np.void, sampling: Sampling) -> None:
-    """How long a step is usual; ``p`` is of dtype ``OBSERVER_SETTINGS``, written."""
+    """Usual length of a step; ``p`` is of dtype ``OBSERVER_SETTINGS``, written."""
     p["gap_s"] = max(GAP_S, PERIODS * sampling.period_s)
     p["unmeasured_s"] = unmeasured_s(sampling)
 

@@ -22,7 +22,7 @@ Records = NDArray[np.void]
 
 
 class Verdict(IntEnum):
-    """What became of a sample."""
+    """Outcome of a sample: accepted, or why it was dropped."""
 
     ACCEPTED = 0
     NOT_FINITE = 1
@@ -43,7 +43,7 @@ _SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SAT
 
 @njit(cache=True)
 def judge(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
-    """Whether a sample can be used; counts those that cannot by their kind.
+    """Verdict on a sample; dropped samples are counted by kind.
 
     ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
     """
@@ -129,7 +129,7 @@ def step(
 
 @njit(cache=True)
 def is_gap(s: Record, p: Record, dt_s: float) -> bool:
-    """Whether samples are missing in a step of ``dt_s``; counts them. Records as in ``judge``."""
+    """True when samples are missing in a step of ``dt_s``; such gaps are counted. Records as in ``judge``."""
     gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
     s.step_s = dt_s
     if gap:
@@ -216,7 +216,7 @@ def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
 
 @njit(cache=True)
 def write_filter(row: Record, s: Record, p: Record) -> None:
-    """What the filter says; records as in ``step``. Without it: the observer's e, R_s by (4.2) where that is on, and NaN.
+    """Columns of the filter; records as in ``step``. Without it: the observer's e, R_s by (4.2) where that is on, and NaN.
 
     The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.
     """

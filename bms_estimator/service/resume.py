@@ -22,7 +22,7 @@ OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_
 GROWING = {"filter.mean": 1, "filter.covariance": 2}
 """Fields whose last axes, so many, are along the states of the filter; states that a version adds come last."""
 SAME_SOC = 0.03
-"""Where the SOC of the filter is further from the observer's, it was switched off."""
+"""Largest difference between the SOC of filter and observer; beyond it the filter was switched off."""
 
 
 def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
@@ -84,7 +84,7 @@ def fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _is_shorter(known: tuple[int, ...], field: tuple[int, ...], axes: int) -> bool:
-    """Whether the shapes are the same but for the last ``axes``, along which less is known."""
+    """True when the shapes are the same but for the last ``axes``, along which less is known."""
     return known[:-axes] == field[:-axes] and max(known[-axes:]) <= field[-1]
 
 

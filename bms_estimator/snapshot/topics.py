@@ -89,7 +89,7 @@ def estimate_report(
 
 
 def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
-    """What is told of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
+    """Fields of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
     if not (cells_v.size and np.isfinite(cells_v).any()):
         return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))
     lowest, highest = int(np.nanargmin(cells_v)), int(np.nanargmax(cells_v))

@@ -287,6 +287,7 @@ def test_gamma_k_has_its_own_name_and_delta_is_said_to_be_configured(ten_hours: 
         k = float(estimator.state["k"][0])
         assert states[law].adaptive_gain_k == k
     learning, improved = states["learning"], states["improved"]
+    assert learning.adaptive_gain_k is not None
     assert learning.adaptation_gain_hz == pytest.approx(learning.adaptive_gain_k / 60.0)
     assert (learning.nussbaum_gain, learning.delta_configured) == (None, True)
     assert (improved.adaptation_gain_hz, improved.delta_configured) == (None, False)
