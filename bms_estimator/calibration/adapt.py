@@ -14,6 +14,7 @@ from bms_estimator.calibration.prediction import predict
 from bms_estimator.calibration.printed_bounds import printed_bounds
 from bms_estimator.calibration.relaxation import without_glitches
 from bms_estimator.calibration.replays import interval_score
+from bms_estimator.calibration.series_resistance import LOWEST_SOC
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, ROOM_C, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.ladder import weak_share
 from bms_estimator.model.cell import CellModel, Ladder, Resistance
@@ -22,8 +23,6 @@ from bms_estimator.model.errors import UserError
 
 Floats = NDArray[np.float64]
 
-LOWEST_SOC = 0.1
-"""Neither (4.2) nor the error of the voltage is evaluated below: the elements leave their form there."""
 SMALLEST_ERROR_V = 1e-5
 """Lower limit of the error that is written [V]."""
 

@@ -14,27 +14,27 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from bms_estimator.calibration.prediction import Prediction, open_circuit
+from bms_estimator.kernels.series_resistance import BINS, SMALLEST_CURRENT_C
 from bms_estimator.model.cell import CellModel, Resistance
 from bms_estimator.model.errors import UserError
 
 Floats = NDArray[np.float64]
 
-LEAST_CURRENT_C = 0.02
-"""Below this C-rate a current is none: the sensor's noise [1/h]."""
-BIN = 0.01
-"""R_s is averaged over such steps of SOC."""
+LOWEST_SOC = 0.1
+"""(4.2) is not fitted below this SOC: the elements leave their form there."""
 EXPONENTS = np.geomspace(2.0, 200.0, 200)
 """Exponents a14 tried."""
+TINY = 1e-300
+"""Smallest determinant of the normal equations: an amplitude that no bin shows is none."""
 LEAST_BINS = 5
 """As many bins as a fit of three parameters should have."""
 
 
 @dataclass(frozen=True)
 class SeriesResistance:
-    """R_s over SOC, one value for each bin of ``BIN`` that holds data. All arrays have shape (n,).
+    """R_s over SOC, one value for each of ``BINS`` that holds data. All arrays have shape (n,).
 
     Attributes:
         soc: Mean SOC of the bin's samples, 0..1.
@@ -82,10 +82,10 @@ def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
     Raises:
         UserError: No current flows.
     """
-    flowing = np.abs(run.current_a) > LEAST_CURRENT_C * cell.cell.capacity_ah
+    flowing = np.abs(run.current_a) > SMALLEST_CURRENT_C * cell.cell.capacity_ah
     if not flowing.any():
         raise UserError(
-            f"R_s by (4.2) needs a current: none above {LEAST_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
+            f"R_s by (4.2) needs a current: none above {SMALLEST_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
             f"{np.abs(run.current_a).max():.3f} A"
         )
     missing_v = (open_circuit(cell, run.soc) - run.overpotential_v - run.voltage_v)[flowing]
@@ -115,11 +115,23 @@ def mean_of(curves: Sequence[SeriesResistance]) -> SeriesResistance:
 
 
 def _bins(soc: Floats) -> NDArray[np.int64]:
-    return np.clip((soc / BIN).astype(np.int64), 0, round(1.0 / BIN) - 1)
+    return np.clip((soc * BINS).astype(np.int64), 0, BINS - 1)
+
+
+def summed(record: np.void) -> SeriesResistance:
+    """The curve that an estimator has summed up sample by sample; SOC is the middle of each bin.
+
+    Args:
+        record: Of dtype ESTIMATOR_STATE.
+    """
+    sums = record["series_resistance"]
+    used = np.flatnonzero(sums["square_a2"] > 0.0)
+    squares = sums["square_a2"][used]
+    return SeriesResistance((used + 0.5) / BINS, sums["product_va"][used] / squares, squares / sums["samples"][used])
 
 
 def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> SeriesResistanceFit:
-    """Fit (2.9): for each exponent a14 non-negative weighted linear least squares, the best of them taken.
+    """Fit (2.9): for each of ``EXPONENTS`` non-negative weighted linear least squares, the best of them taken.
 
     Raises:
         UserError: Too few bins of SOC with data.
@@ -128,14 +140,10 @@ def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> S
     soc, r_s = curve.soc[used], curve.r_s_ohm[used]
     if soc.size < LEAST_BINS:
         raise UserError(f"R_s is known in {soc.size} steps of SOC, at least {LEAST_BINS} are needed for a13..a15")
-    root = np.sqrt(curve.weight[used] / curve.weight[used].mean())
-    fits = []
-    for exponent in EXPONENTS:
-        basis = np.column_stack([np.exp(-exponent * soc), np.ones_like(soc)])
-        values, norm = nnls(root[:, None] * basis, root * r_s)
-        fits.append((float(norm), exponent, values))
-    norm, exponent, (a13, a15) = min(fits, key=lambda fit: fit[0])
-    a = np.array([a13, exponent, a15])
+    weight = curve.weight[used] / curve.weight[used].mean()
+    a13, exponent, a15 = _best(soc, r_s, weight)
+    a, root = np.array([a13, exponent, a15]), np.sqrt(weight)
+    norm = float(np.linalg.norm(root * (r_s - a13 * np.exp(-exponent * soc) - a15)))
     decay = np.exp(-exponent * soc)
     jacobian = root[:, None] * np.column_stack([decay, -a13 * soc * decay, np.ones_like(soc)])
     free = np.array([a13 > 0.0, a13 > 0.0 and EXPONENTS[0] < exponent < EXPONENTS[-1], a15 > 0.0])
@@ -143,3 +151,19 @@ def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> S
     variance = norm**2 / max(soc.size - int(free.sum()), 1)
     std[free] = np.sqrt(np.diag(np.linalg.pinv(jacobian[:, free].T @ jacobian[:, free])) * variance)
     return SeriesResistanceFit(a=a, std=std, rms_ohm=norm / float(np.sqrt(soc.size)))
+
+
+def _best(soc: Floats, r_s: Floats, weight: Floats) -> tuple[float, float, float]:
+    """a13 >= 0, a14 and a15 >= 0 of the smallest weighted sum of squares, by the normal equations of each exponent."""
+    decay = np.exp(-EXPONENTS[:, None] * soc)
+    dd, d1, dr = decay**2 @ weight, decay @ weight, decay @ (weight * r_s)
+    one, r1 = weight.sum(), (weight * r_s).sum()
+    determinant = np.maximum(dd * one - d1**2, TINY)
+    inside = (dr * one - d1 * r1) / determinant, (dd * r1 - d1 * dr) / determinant
+    flat = np.zeros_like(dd), np.full_like(dd, max(r1 / one, 0.0))
+    falling = np.maximum(dr / dd, 0.0), np.zeros_like(dd)
+    a13, a15 = (np.stack(parts) for parts in zip(inside, flat, falling, strict=True))
+    cost = a13**2 * dd + 2.0 * a13 * a15 * d1 + a15**2 * one - 2.0 * (a13 * dr + a15 * r1)
+    cost[(a13 < 0.0) | (a15 < 0.0)] = np.inf
+    edge, j = np.unravel_index(np.argmin(cost), cost.shape)
+    return float(a13[edge, j]), float(EXPONENTS[j]), float(a15[edge, j])

@@ -4,9 +4,8 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -15,33 +14,26 @@ from bms_estimator.calibration.adapt import Adaptation, adapt
 from bms_estimator.cli.captures import (
     AsJson,
     CapacityAh,
+    CapturesFromRest,
     CellName,
     Force,
+    InitialSoc,
     NewCellFile,
     SignOfCurrent,
     check_once,
     check_out,
-    name_of,
+    write_as_named,
 )
-from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.cell_file import write_cell
 from bms_estimator.sources.replay import load_capture
 
 
 def adapt_command(
-    captures: Annotated[
-        list[Path], typer.Argument(help="recorded captures, CSV (.gz) or Parquet, each from rest", show_default=False)
-    ],
+    captures: CapturesFromRest,
     cell: CellName,
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
-    soc: Annotated[
-        float | None,
-        typer.Option(
-            parser=decimal(0.0, 1.0), help="at the first sample of each capture; else from the first rest's voltage"
-        ),
-    ] = None,
+    soc: InitialSoc = None,
     current_sign: SignOfCurrent = None,
     force: Force = False,
     as_json: AsJson = False,
@@ -56,8 +48,7 @@ def adapt_command(
     check_once(captures)
     model = load_cell(cell, capacity_ah)
     found = adapt([load_capture(path, current_sign=current_sign) for path in captures], model, soc=soc)
-    renamed = found.cell.model_copy(update={"cell": found.cell.cell.model_copy(update={"name": name_of(out)})})
-    write_cell(out, renamed, _remarks(cell, found))
+    write_as_named(out, found.cell, _remarks(cell, found))
     if as_json:
         sys.stdout.write(json.dumps(_json(out, found)) + "\n")
         return

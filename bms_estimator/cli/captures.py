@@ -1,4 +1,4 @@
-"""What the commands that work on recordings have in common: their options, and that nothing is overwritten unasked."""
+"""Options and checks of the commands that work on recordings; nothing is overwritten unasked."""
 
 import filecmp
 from collections.abc import Sequence
@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.decimal_option import decimal
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 
@@ -19,6 +21,15 @@ CapacityAh = Annotated[
     float | None,
     typer.Option(
         parser=decimal(), help="what the cell holds; a generic one needs it, else the cell file's", show_default=False
+    ),
+]
+CapturesFromRest = Annotated[
+    list[Path], typer.Argument(help="recorded captures, CSV (.gz) or Parquet, each from rest", show_default=False)
+]
+InitialSoc = Annotated[
+    float | None,
+    typer.Option(
+        parser=decimal(0.0, 1.0), help="at the first sample of each capture; else from the first rest's voltage"
     ),
 ]
 NewCellFile = Annotated[Path, typer.Option(help="cell file to write", show_default=False)]
@@ -60,5 +71,10 @@ def unlike(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
 
 
 def name_of(path: Path) -> str:
-    """What to call a capture: its file's name without the endings."""
+    """Name of a capture or cell: its file's name without the endings."""
     return path.name.split(".")[0]
+
+
+def write_as_named(out: Path, cell: CellModel, remarks: list[str]) -> None:
+    """Write a cell file whose cell has the file's name, with ``remarks`` on top."""
+    write_cell(out, cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})}), remarks)

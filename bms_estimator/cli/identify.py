@@ -17,34 +17,28 @@ from bms_estimator.cli.captures import (
     OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
+    CapturesFromRest,
     Force,
+    InitialSoc,
     NewCellFile,
     SignOfCurrent,
     check_once,
     check_out,
-    name_of,
+    write_as_named,
 )
 from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.identify_fuel_cell import identify_fuel_cell
 from bms_estimator.model.cell import is_fuel_cell, load_cell
-from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture
 
 
 def identify_command(
-    captures: Annotated[
-        list[Path], typer.Argument(help="recorded captures, CSV (.gz) or Parquet, each from rest", show_default=False)
-    ],
+    captures: CapturesFromRest,
     cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; its capacity and OCV", show_default=False)],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
-    soc: Annotated[
-        float | None,
-        typer.Option(
-            parser=decimal(0.0, 1.0), help="at the first sample of each capture; else from the first rest's voltage"
-        ),
-    ] = None,
+    soc: InitialSoc = None,
     temperature_c: Annotated[
         float | None,
         typer.Option(
@@ -75,9 +69,8 @@ def identify_command(
     started_s = time.perf_counter()
     found = identify(loaded, model, refine_ocv=not keep_ocv, initial_soc=soc, temperature_c=temperature_c)
     seconds = time.perf_counter() - started_s
-    renamed = found.cell.model_copy(update={"cell": found.cell.cell.model_copy(update={"name": name_of(out)})})
     start = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
-    write_cell(out, renamed, _remarks(start, found))
+    write_as_named(out, found.cell, _remarks(start, found))
     if as_json:
         sys.stdout.write(json.dumps(_json(out, found, seconds)) + "\n")
     else:

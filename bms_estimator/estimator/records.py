@@ -76,6 +76,7 @@ def estimator_settings(
     p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
     p["hand_over"] = observer.law in ("improved", "scheme-3")  # (3.16) and (3.17) have no limit to set
+    p["series_resistance"] = observer.law == "improved" and not identifier.enabled
     p["map_memory_s"] = identifier.map_memory_h * 3600.0
     p["configured"][1:] = cell.a[1:PARAMETERS]
     for i in range(1, PARAMETERS):
@@ -112,7 +113,7 @@ def observer_settings(
 
 
 def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage_resolution_v: float) -> None:
-    """What the observer of every pack has: the gain, its dead zone, the lock, what a sample may hold.
+    """Settings of the observer for every pack: the gain, its dead zone, the lock, limits of a sample.
 
     Args:
         p: Of dtype ``OBSERVER_SETTINGS``; written.
@@ -141,7 +142,7 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
 
 
 def _pace(p: np.void, sampling: Sampling) -> None:
-    """How long a step is usual; ``p`` is of dtype ``OBSERVER_SETTINGS``, written."""
+    """Usual length of a step; ``p`` is of dtype ``OBSERVER_SETTINGS``, written."""
     p["gap_s"] = max(GAP_S, PERIODS * sampling.period_s)
     p["unmeasured_s"] = unmeasured_s(sampling)
 

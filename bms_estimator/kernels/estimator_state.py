@@ -7,6 +7,7 @@ from bms_estimator.kernels.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS
 from bms_estimator.kernels.equivalent import EQUIVALENT
 from bms_estimator.kernels.input_checks import CHECKS, COUNTERS
 from bms_estimator.kernels.learning_state import LEARNING_SETTINGS, LEARNING_STATE
+from bms_estimator.kernels.series_resistance import SERIES_RESISTANCE
 from bms_estimator.kernels.state import OBSERVER_SETTINGS, OBSERVER_STATE, PARAMETERS
 
 ESTIMATOR_SETTINGS = np.dtype(
@@ -15,6 +16,7 @@ ESTIMATOR_SETTINGS = np.dtype(
         ("learning", LEARNING_SETTINGS),
         ("filter", EKF_SETTINGS),
         ("identify", "i8"),  # 0: SOC by coulomb counting, parameters as configured
+        ("series_resistance", "i8"),  # 1: R_s by (4.2), step 3 of the thesis
         ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
         ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
         ("lower", "f8", PARAMETERS),  # the configured bounds guard what is handed over
@@ -28,6 +30,7 @@ ESTIMATOR_STATE = np.dtype(
     [
         ("observer", OBSERVER_STATE),
         ("learning", LEARNING_STATE),
+        ("series_resistance", SERIES_RESISTANCE),
         ("filter", EKF_STATE),
         ("elements", EQUIVALENT),  # what the filter's ladder amounts to now
         ("checks", CHECKS),

@@ -14,6 +14,7 @@ from bms_estimator.kernels.identification import UNSEEN_MOST, identify, restart_
 from bms_estimator.kernels.ladder import REFERENCE_C
 from bms_estimator.kernels.learning import begin_learning, learning_step, take_as_rest
 from bms_estimator.kernels.observer import count_charge, observer_step, start
+from bms_estimator.kernels.series_resistance import begin_series_resistance, series_resistance, series_resistance_step
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
 
@@ -21,7 +22,7 @@ Records = NDArray[np.void]
 
 
 class Verdict(IntEnum):
-    """What became of a sample."""
+    """Outcome of a sample: accepted, or why it was dropped."""
 
     ACCEPTED = 0
     NOT_FINITE = 1
@@ -42,7 +43,7 @@ _SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SAT
 
 @njit(cache=True)
 def judge(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
-    """Whether a sample can be used; counts those that cannot by their kind.
+    """Verdict on a sample; dropped samples are counted by kind.
 
     ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
     """
@@ -100,7 +101,8 @@ def step(
     new_clock = dt_s == -math.inf
     if new_clock:
         dt_s = state[0].unseen_s
-        state[0].learning.settle_s = settings[0].learning.settle_s  # the load meanwhile is not known
+        settle_s = settings[0].learning.settle_s  # the load meanwhile is not known
+        state[0].learning.settle_s = state[0].series_resistance.settle_s = settle_s
     if not 0.0 <= dt_s < math.inf:  # the clock was set back, or nobody knows how long nobody measured: go on from here
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
@@ -110,7 +112,7 @@ def step(
             s.time_steps_back += 1
         return verdict
     gap = new_clock or is_gap(s, p, dt_s)
-    before_a = s.current_a
+    before_a, before_soc = s.current_a, s.soc
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
         identify(state[0], settings[0], dt_s, gap, current_a, voltage_v, temperature_c)
@@ -120,12 +122,14 @@ def step(
         learning_step(state[0], settings[0], dt_s, before_a, voltage_v)
     else:
         observer_step(s, p, dt_s, voltage_v)
+    if settings[0].series_resistance:
+        series_resistance_step(state[0], settings[0], dt_s, before_a, before_soc, voltage_v)
     return verdict
 
 
 @njit(cache=True)
 def is_gap(s: Record, p: Record, dt_s: float) -> bool:
-    """Whether samples are missing in a step of ``dt_s``; counts them. Records as in ``judge``."""
+    """True when samples are missing in a step of ``dt_s``; such gaps are counted. Records as in ``judge``."""
     gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
     s.step_s = dt_s
     if gap:
@@ -142,6 +146,8 @@ def begin(s: Record, p: Record, current_a: float, voltage_v: float, temperature_
         start_filter(s, p, current_a, voltage_v, temperature_c)
     if p.learning.enabled:
         begin_learning(s, p, voltage_v)
+    if p.series_resistance:
+        begin_series_resistance(s, p)
 
 
 @njit(cache=True)
@@ -181,7 +187,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
     for j in range(samples.shape[0]):
         x = samples[j]
         if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
-            write_observer(trace[rows], state[0].observer, settings[0].observer, x)
+            write_observer(trace[rows], state[0].observer, settings[0], x)
             write_filter(trace[rows], state[0], settings[0])
             rows += 1
     return rows
@@ -189,7 +195,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
 
 @njit(cache=True)
 def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
-    """What the observer says of an accepted sample ``x``; records as in ``judge``."""
+    """Columns of the observer for an accepted sample ``x``; records of OBSERVER_STATE and ESTIMATOR_SETTINGS."""
     row.time_s = x.time_s
     row.voltage_v = x.voltage_v
     row.current_a = x.current_a
@@ -197,26 +203,28 @@ def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
     row.soc = s.soc
     row.voltage_estimate_v = s.voltage_estimate_v
     row.tracking_error_v = s.innovation_v
-    row.nussbaum_gain = s.gain
+    row.nussbaum_gain = math.nan if p.learning.enabled else s.gain
+    row.adaptation_gain_hz = s.gain if p.learning.enabled else math.nan
     row.k = s.k
     row.delta_1 = s.delta_1
     row.delta_2 = s.delta_2
     row.stability_margin = s.soc - max(s.delta_1, s.delta_2)
     row.lock = s.lock
-    row.converged = 1 if abs(s.innovation_v) < p.epsilon_v else 0
+    row.converged = 1 if abs(s.innovation_v) < p.observer.epsilon_v else 0
     row.soc_coulomb = s.soc_coulomb
 
 
 @njit(cache=True)
 def write_filter(row: Record, s: Record, p: Record) -> None:
-    """What the filter says; records as in ``step``. Without it: the observer's e, and NaN.
+    """Columns of the filter; records as in ``step``. Without it: the observer's e, R_s by (4.2) where that is on, and NaN.
 
     The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.
     """
     if not p.identify:
         row.innovation_v = s.observer.innovation_v
         row.soc_ocv = row.soc_std = math.nan
-        row.r_s_ohm = row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
+        row.r_s_ohm = series_resistance(s) if p.series_resistance else math.nan
+        row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
         row.r_s_std_ohm = row.r_ts_std_ohm = row.tau_ts_std_s = row.r_tl_std_ohm = row.tau_tl_std_s = math.nan
         return
     f, e = s.filter, s.elements

@@ -60,7 +60,7 @@ OBSERVER_STATE = np.dtype(
         ("v_ts", "f8"),  # x2 [V]
         ("v_tl", "f8"),  # x3 [V]
         ("k", "f8"),  # adaptive gain state (3.13) [V^2 s]
-        ("gain", "f8"),  # N(k)
+        ("gain", "f8"),  # N(k); gamma k [1/s] of the learning law
         ("a", "f8", PARAMETERS),  # a1..a15 (3.16)-(3.18)
         ("target", "f8", PARAMETERS),  # where (3.18) leads; the identifier moves it
         ("decay", "f8", PARAMETERS),  # e^(-rate dt) for ``decay_dt_s``
@@ -97,7 +97,8 @@ TRACE = np.dtype(
         ("voltage_estimate_v", "f8"),
         ("innovation_v", "f8"),  # measured less predicted: the identifier's, else the observer's e
         ("tracking_error_v", "f8"),  # the observer's e (3.15)
-        ("nussbaum_gain", "f8"),
+        ("nussbaum_gain", "f8"),  # N(k) (3.12) of a printed law, else NaN
+        ("adaptation_gain_hz", "f8"),  # gamma k of the learning law, else NaN [1/s]
         ("k", "f8"),
         ("delta_1", "f8"),
         ("delta_2", "f8"),

@@ -61,9 +61,14 @@ class Estimate(Report):
     tracking_error_v: float | None = Field(description="the observer's e (3.15) [V]")
     delta_1: float | None = Field(description="SOC below which C_ts is negative (2.11)")
     delta_2: float | None = Field(description="SOC below which C_tl is negative (2.12)")
+    delta_configured: bool = Field(
+        description="delta_1 and delta_2 are constants of the cell file, because the learning law leaves the shape of C_ts "
+        "and C_tl over SOC as it is"
+    )
     stability_margin: float | None = Field(description="soc - max(delta_1, delta_2)")
     adaptive_gain_k: float | None = Field(description="k of (3.13) [V^2 s]")
-    nussbaum_gain: float | None = Field(description="N(k) of (3.12); gamma k [1/s] of the law that learns")
+    nussbaum_gain: float | None = Field(description="N(k) of (3.12); null with the learning law, which has none")
+    adaptation_gain_hz: float | None = Field(description="gamma k of the learning law [1/s]; null with a printed law")
     converged: bool = Field(description="|tracking_error_v| is below eps2 of Algorithm 1")
     lock: bool = Field(description="the observer tracks the measured voltage")
     frames_received: int = Field(description="valid frames since start")

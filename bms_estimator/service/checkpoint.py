@@ -83,7 +83,8 @@ def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDAr
 
 def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Of a state's fields by their names those that hold under other settings of the observer: all but its own."""
-    kept, dropped = ("observer.soc", "observer.soc_coulomb", "observer.started"), ("observer.", "learning.")
+    kept = "observer.soc", "observer.soc_coulomb", "observer.started"
+    dropped = "observer.", "learning.", "series_resistance."
     return {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}
 
 

@@ -22,7 +22,7 @@ OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_
 GROWING = {"filter.mean": 1, "filter.covariance": 2}
 """Fields whose last axes, so many, are along the states of the filter; states that a version adds come last."""
 SAME_SOC = 0.03
-"""Where the SOC of the filter is further from the observer's, it was switched off."""
+"""Largest difference between the SOC of filter and observer; beyond it the filter was switched off."""
 
 
 def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
@@ -45,7 +45,11 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     was_on = bool(saved.get("filter.started", np.zeros(1))[0])
     fill(
         estimator.record,
-        {name: v for name, v in saved.items() if was_on or name.startswith(("observer.", "learning."))},
+        {
+            name: v
+            for name, v in saved.items()
+            if was_on or name.startswith(("observer.", "learning.", "series_resistance."))
+        },
     )
     wrong = _insane(estimator, begun)
     if wrong:
@@ -80,7 +84,7 @@ def fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _is_shorter(known: tuple[int, ...], field: tuple[int, ...], axes: int) -> bool:
-    """Whether the shapes are the same but for the last ``axes``, along which less is known."""
+    """True when the shapes are the same but for the last ``axes``, along which less is known."""
     return known[:-axes] == field[:-axes] and max(known[-axes:]) <= field[-1]
 
 
@@ -109,7 +113,10 @@ def _insane(estimator: Estimator, begun: NDArray[np.void]) -> str:
     for (name, field), (_, first) in zip(fields(record), fields(begun), strict=True):
         part, _, what = name.partition(".")
         known = np.isfinite(first)
-        if part in ("observer", "learning", "filter", "checks", "map") and not np.isfinite(field[known]).all():
+        if (
+            part in ("observer", "learning", "series_resistance", "filter", "checks", "map")
+            and not np.isfinite(field[known]).all()
+        ):
             return f"{what} of the {part} is not finite"
     s = record[0]["observer"]
     if not s["started"]:

@@ -28,13 +28,16 @@ def _state(device: str, e: Fields, true_soc: float | None) -> str:
         value = e.number(name)
         return "-" if value is None else f"{value * factor:{form}}"
 
+    gain = f"N {number('nussbaum_gain', '.4f')}"
+    if e.number("adaptation_gain_hz") is not None:
+        gain = f"gamma k {number('adaptation_gain_hz', '.4f')}/s"
     truth = "" if true_soc is None else f"  true {100.0 * true_soc:.2f} %"
     return (
         f"{e.text('time')} {device}: soc {number('soc_percent', '.2f')}{band_text(e)} %{truth}  "
         f"{number('voltage_v', '.3f')} V  {number('current_a', '+.3f')} A  {number('power_w', '+.2f')} W  "
         f"margin {number('stability_margin', '.4f')}  "
         f"delta1 {number('delta_1', '.4f')}  delta2 {number('delta_2', '.4f')}  "
-        f"N {number('nussbaum_gain', '.4f')}  k {number('adaptive_gain_k', '.3g')}  "
+        f"{gain}  k {number('adaptive_gain_k', '.3g')}  "
         f"innovation {number('innovation_v', '+.2f', 1e3)} mV  {'lock' if e.flag('lock') else 'NO LOCK'}  "
         f"{'converged' if e.flag('converged') else 'converging'}  "
         f"frames {e.count('frames_received')}  lost {e.count('frames_lost')}"

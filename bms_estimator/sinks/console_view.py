@@ -321,9 +321,17 @@ def _observer(state: Fields) -> Flow:
         Text(f"δ1 {_number(state.number('delta_1'), '.4f')}"),
         Text(f"δ2 {_number(state.number('delta_2'), '.4f')}"),
         Text(f"margin {_number(margin, '.4f')}", style="bold red" if narrow else ""),
-        Text(f"N {_number(state.number('nussbaum_gain'), '.4f')}"),
+        _gain(state),
         Text(f"k {_number(state.number('adaptive_gain_k'), '.3g')}"),
     )
+
+
+def _gain(state: Fields) -> Text:
+    """N(k) of a printed law, gamma k of the learning law."""
+    adaptation_hz = state.number("adaptation_gain_hz")
+    if adaptation_hz is not None:
+        return Text(f"gamma k {adaptation_hz:.4f}/s")
+    return Text(f"N {_number(state.number('nussbaum_gain'), '.4f')}")
 
 
 def _link(state: Fields, health: Fields) -> Flow:

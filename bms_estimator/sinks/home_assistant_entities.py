@@ -40,18 +40,18 @@ class Entity(NamedTuple):
 
 
 def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
-    """What the observer looks like inside."""
+    """Internal value of the observer."""
     return Entity(name, unit, decimals, 10.0**-decimals, device_class, enabled=False)
 
 
 def _total(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
-    """What is counted over all runs."""
+    """Total over all runs."""
     step = 10.0**-decimals
     return Entity(name, unit, decimals, step, device_class, main=True, state_class="total_increasing")
 
 
 def _count(name: str) -> Entity:
-    """What is counted since start."""
+    """Count since start."""
     return Entity(name, None, 0, 1.0, enabled=False, state_class="total_increasing")
 
 
@@ -69,7 +69,7 @@ ESTIMATE = {
     "voltage_estimate_v": _raw("Estimated voltage", "V", 2, "voltage"),
     "innovation_v": _raw("Innovation", "V", 3, "voltage"),
     "adaptive_gain_k": _raw("Adaptive gain k", "V²s", 6),
-    "nussbaum_gain": _raw("Nussbaum gain", None, 3),
+    "adaptation_gain_hz": _raw("Adaptation gain", "1/s", 4),
     "sample_rate_hz": _raw("Sample rate", "Hz", 1, "frequency"),
 }
 OF_CHARGE = {
@@ -86,15 +86,16 @@ OF_CHARGE = {
     "stability_margin": _raw("Stability margin", None, 3),
     "delta_1": _raw("delta 1", None, 4),
     "delta_2": _raw("delta 2", None, 4),
+    "nussbaum_gain": _raw("Nussbaum gain", None, 3),
 }
-"""What a fuel cell has not."""
+"""Entities that a fuel cell does not have."""
 OF_CELLS = {
     "cell_lowest": Entity("Weakest cell", None, 0, 1.0, state_class=None),
     "cell_lowest_v": Entity("Weakest cell, voltage", "V", 3, 0.005, "voltage"),
     "cell_highest": Entity("Highest cell", None, 0, 1.0, enabled=False, state_class=None),
     "cell_highest_v": _raw("Highest cell, voltage", "V", 3, "voltage"),
 }
-"""Where single cells are measured."""
+"""Entities of packs whose single cells are measured."""
 CELL = "cell_v"
 """Names all single cells, with their number behind."""
 ELEMENTS = {
@@ -120,7 +121,7 @@ FUEL_CELL = ESTIMATE | STACK
 
 
 def cell_key(number: int) -> str:
-    """Of the voltage of a single cell, numbers from 1."""
+    """Entity of the voltage of a single cell, numbers from 1."""
     return f"cell_{number}_v"
 
 

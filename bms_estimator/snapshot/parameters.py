@@ -24,10 +24,11 @@ from bms_estimator.model.estimate import OcvCurve, Parameter, ParameterReport
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.snapshot.fuel_cell import VALID_STD, fuel_cell_parameters
 from bms_estimator.snapshot.ocv_formula import formula
+from bms_estimator.snapshot.series_resistance import series_resistance_parameters
 from bms_estimator.snapshot.topics import finite
 
 OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
-"""Where the OCV is published."""
+"""SOCs at which the OCV is published."""
 CONFIGURED = "configured value: no data has identified it"
 LEARNED = "learned by the observer's law, which knows no error of it"
 VALID_FIT_STD = 0.5
@@ -80,6 +81,10 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
         for name, one in present_elements(record).items():
             elements[name] = _identified(one, elements[name], VALID_STD, now_s)
         health = _state_of_health(estimator, now_s)
+    if estimator.settings_record["series_resistance"][0]:
+        found = series_resistance_parameters(estimator)
+        elements["r_s_ohm"] = found.pop("r_s_ohm")
+        parameters |= found
     return ParameterReport(
         publish_time=iso_utc(now_s),
         soc=finite(state["soc"]),
@@ -151,7 +156,7 @@ def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]
 
 
 def _bias(learned: Learned, limit: float, setting: str, now_s: float) -> Parameter:
-    """What is known of sensor or capacity, valid below ``limit`` [its unit]."""
+    """Bias of the sensor or the capacity, valid below ``limit`` [its unit]."""
     value, std = finite(learned.value), finite(learned.std)
     if std == 0.0:
         declared = f"{setting} is 0: taken as declared"
@@ -170,7 +175,7 @@ def _led(estimator: Estimator) -> np.ndarray:
 
 
 def _of_source(held: Parameter, led: np.bool_, learning: bool) -> Parameter:
-    """What the observer holds, said to be from data where those have led it."""
+    """Parameter of the observer; its source is the data where those have moved it."""
     if not led:
         return held
     return held.model_copy(update={"source": "identified"} | ({"reason": LEARNED} if learning else {}))
@@ -185,7 +190,7 @@ def _parameter(held: Parameter, fit: Learned | None, now_s: float) -> Parameter:
 
 
 def _identified(learned: Learned, held: Parameter, limit: float, now_s: float) -> Parameter:
-    """What was learned where that is known well enough, else what the observer holds and how far learning has come."""
+    """Learned value if its error is small enough, else the observer's value and how far learning has come."""
     if math.isinf(learned.unlearned_s):
         return held
     if learned.relative_std < limit:

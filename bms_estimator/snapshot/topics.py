@@ -74,9 +74,11 @@ def estimate_report(
         tracking_error_v=last["tracking_error_v"],
         delta_1=last["delta_1"],
         delta_2=last["delta_2"],
+        delta_configured=last["adaptation_gain_hz"] is not None and last["delta_1"] is not None,
         stability_margin=last["stability_margin"],
         adaptive_gain_k=last["k"],
         nussbaum_gain=last["nussbaum_gain"],
+        adaptation_gain_hz=last["adaptation_gain_hz"],
         converged=bool(last["converged"]),
         lock=bool(last["lock"]),
         frames_received=counters.get("frames_received", 0),
@@ -87,7 +89,7 @@ def estimate_report(
 
 
 def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
-    """What is told of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
+    """Fields of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
     if not (cells_v.size and np.isfinite(cells_v).any()):
         return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))
     lowest, highest = int(np.nanargmin(cells_v)), int(np.nanargmax(cells_v))

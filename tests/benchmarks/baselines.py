@@ -12,8 +12,8 @@ from bms_estimator.kernels.ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
 EKF_VOLTAGE_SIGMA_V = 0.005
 """Measurement noise of the textbook filter [V]."""
 ELEMENT_STD, ELEMENT_WALK = 0.7, 1e-6
-"""Joint filter: std of ln of each element at the start, a factor of two, and the variance of its random walk [1/s]: of 1e-8,
-1e-7 and 1e-6 what suits NCR 5 best."""
+"""Joint filter: std of ln of each element at the start, a factor of two, and the variance of its random walk [1/s]. Of 1e-8, 1e-7
+and 1e-6 the last has the smallest voltage error on the captures that are learned from (docs/comparison.md)."""
 NOISE_WINDOW_S = 60.0
 """Joint filter: time constant with which the noise of the voltage follows the innovations [s]."""
 LN_SPAN = math.log(4.0)

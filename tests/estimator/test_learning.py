@@ -9,7 +9,11 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell import simulate_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.snapshot.remaining import remaining_charge
+from bms_estimator.snapshot.topics import estimate_report
+from bms_estimator.snapshot.window import Window
 from tests.estimator.random_steps import (
     FIRST_SOC,
     RATED_A,
@@ -268,3 +272,23 @@ def test_what_was_learned_is_published_with_its_source(ten_hours: SampleBlock) -
     assert report.a["a15"].value == estimator.state["a"][0, 15]
     assert "law" in (report.a["a15"].reason or "")
     assert report.a["a14"].source == "configured"
+
+
+def test_gamma_k_has_its_own_name_and_delta_is_said_to_be_configured(ten_hours: SampleBlock) -> None:
+    """Beside it a printed law, which has N(k) and adapts what delta1 and delta2 come from."""
+    states = {}
+    for law in ("learning", "improved"):
+        estimator = Estimator(file_off_by(*OFF), ObserverSettings(law=law), identifier=None, initial_soc=FIRST_SOC)
+        window = Window()
+        window.add(estimator.run(ten_hours[:600]), 0.0)
+        summary = window.take()
+        assert summary is not None
+        states[law] = estimate_report(summary, remaining_charge(estimator, 0.0), {}, 0.0, Flow(), 3.0)
+        k = float(estimator.state["k"][0])
+        assert states[law].adaptive_gain_k == k
+    learning, improved = states["learning"], states["improved"]
+    assert learning.adaptive_gain_k is not None
+    assert learning.adaptation_gain_hz == pytest.approx(learning.adaptive_gain_k / 60.0)
+    assert (learning.nussbaum_gain, learning.delta_configured) == (None, True)
+    assert (improved.adaptation_gain_hz, improved.delta_configured) == (None, False)
+    assert improved.nussbaum_gain is not None

@@ -189,7 +189,16 @@ def test_no_entity_has_more_attributes_than_the_reason() -> None:
 
 
 def test_raw_observer_values_are_disabled_until_the_user_wants_them() -> None:
-    raw = {"delta_1", "delta_2", "adaptive_gain_k", "nussbaum_gain", "innovation_v", "sample_rate_hz", "r_ts_ohm"}
+    raw = {
+        "delta_1",
+        "delta_2",
+        "adaptive_gain_k",
+        "nussbaum_gain",
+        "adaptation_gain_hz",
+        "innovation_v",
+        "sample_rate_hz",
+        "r_ts_ohm",
+    }
     assert not SHOWN & raw
     assert raw < set(COMPONENTS)
     assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_h", "r_s_ohm"} <= SHOWN

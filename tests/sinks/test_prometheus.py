@@ -106,6 +106,7 @@ def test_a_field_s_unit_becomes_that_of_prometheus() -> None:
     assert named("rss_mib") == ("bms_rss_bytes", 1048576.0)
     assert named("innovation_v") == ("bms_innovation_volts", 1.0)
     assert named("nussbaum_gain") == ("bms_nussbaum_gain", 1.0)
+    assert named("adaptation_gain_hz") == ("bms_adaptation_gain_hertz", 1.0)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,153 @@
+"""R_s by (4.2) while samples come: steps 1 to 3 of the thesis live."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.adapt_steps import Start, steps_2_and_3
+from bms_estimator.calibration.prediction import predict
+from bms_estimator.calibration.series_resistance import (
+    LOWEST_SOC,
+    fit_series_resistance,
+    series_resistance,
+    summed,
+)
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.series_resistance import BINS, MOST_SAMPLES
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from bms_estimator.service.checkpoint import fields, without_observer
+from bms_estimator.service.resume import resume
+from bms_estimator.snapshot.parameters import parameter_report
+from tests.calibration.simulated_load import TRUTH, capture, steps
+
+FIRST_SOC = 0.98
+WHOLE_BIN = 100
+"""Samples; a bin at the end of the capture holds fewer, and one of them on the other side of its edge matters."""
+R_S_ERROR = 0.002
+"""Tolerance, measured 0.0008. Live (3.18) holds a1..a12 of the moment, `adapt` their mean (3.19), and live SOC is counted by the mean of two samples."""
+
+
+def thesis() -> Estimator:
+    """The improved law without the identifier."""
+    return Estimator(
+        TRUTH,
+        ObserverSettings(law="improved"),
+        identifier=None,
+        voltage_resolution_v=1e-3,
+        initial_soc=FIRST_SOC,
+    )
+
+
+@pytest.fixture(scope="module")
+def load() -> SampleBlock:
+    """Five hours of random steps with rests, from rest, at 1 Hz."""
+    samples: SampleBlock = capture(steps(3), soc=FIRST_SOC)  # type: ignore[no-untyped-call]
+    return samples
+
+
+def test_live_r_s_is_that_of_steps_2_and_3_on_the_same_capture(load: SampleBlock) -> None:
+    estimator = thesis()
+    estimator.run(load)
+    offline = steps_2_and_3(TRUTH, [Start(load, FIRST_SOC)], LOWEST_SOC)
+    run = predict(TRUTH, load, FIRST_SOC, a=offline.run.average, lowest_soc=LOWEST_SOC)
+    expected, found = series_resistance(TRUTH, run), summed(estimator.record[0])
+    live = dict(zip(np.floor(found.soc * BINS), found.r_s_ohm, strict=True))
+    count = np.bincount(np.floor(run.soc * BINS).astype(int), np.abs(run.current_a) > 0.06, BINS)
+    pairs = [
+        (r, live[b])
+        for b, r in zip(np.floor(expected.soc * BINS), expected.r_s_ohm, strict=True)
+        if count[int(b)] >= WHOLE_BIN
+    ]
+    assert len(pairs) > 10
+    of_4_2, of_live = np.array(pairs).T
+    assert of_live == pytest.approx(of_4_2, rel=R_S_ERROR)
+    soc = np.linspace(0.4, 0.95, 50)  # the capture ends at 0.37
+    assert fit_series_resistance(found, LOWEST_SOC)(soc) == pytest.approx(offline.r_s(soc), rel=R_S_ERROR)
+
+
+def test_steps_and_a_run_leave_the_same_r_s_to_the_last_bit(load: SampleBlock) -> None:
+    whole, single = thesis(), thesis()
+    trace = whole.run(load[:3000])
+    for time_s, current_a, voltage_v, *_ in load[:3000].tolist():
+        single.step(time_s, current_a, voltage_v)
+    assert single.record.tobytes() == whole.record.tobytes()
+    resting = int(np.argmax(np.abs(load["current_a"]) > 0.06))
+    assert np.isnan(trace["r_s_ohm"][:resting]).all()
+    assert np.isfinite(trace["r_s_ohm"][-1])
+
+
+def test_r_s_is_published_as_of_4_2_and_null_until_a_current_flows(load: SampleBlock) -> None:
+    estimator = thesis()
+    estimator.run(load[:10])
+    before = parameter_report(estimator, 0.0).elements["r_s_ohm"]
+    assert (before.value, before.valid) == (None, False)
+    assert before.reason == "(4.2) needs a current: none above 0.06 A has flowed"
+    estimator.run(load[10:600])
+    first = parameter_report(estimator, 0.0)
+    assert first.elements["r_s_ohm"].value is not None
+    assert (first.elements["r_s_ohm"].std, first.a["a15"].source) == (None, "configured")
+    estimator.run(load[600:])
+    report, offline = parameter_report(estimator, 0.0), steps_2_and_3(TRUTH, [Start(load, FIRST_SOC)], LOWEST_SOC)
+    r_s, a15 = report.elements["r_s_ohm"], report.a["a15"]
+    assert r_s.value == pytest.approx(float(offline.r_s(np.array(report.soc))), rel=R_S_ERROR)
+    assert (r_s.source, a15.source, r_s.valid) == ("identified", "identified", False)
+    assert "(4.2)" in (r_s.reason or "")
+    assert a15.value == pytest.approx(offline.r_s.a[2], rel=R_S_ERROR)
+    assert r_s.value is not None
+    assert r_s.std is not None
+    assert 0.0 < r_s.std < R_S_ERROR * r_s.value
+
+
+def test_a_checkpoint_goes_on_from_the_same_sums(load: SampleBlock) -> None:
+    estimator, next_run = thesis(), thesis()
+    estimator.run(load[:5000])
+    saved = {name: field.copy() for name, field in fields(estimator.record)}
+    assert resume(next_run, saved, 5.0) == ""
+    sums = ("samples", "square_a2", "product_va", "v_ts", "v_tl")
+    for name in sums:
+        assert next_run.record["series_resistance"][name].tobytes() == saved[f"series_resistance.{name}"].tobytes()
+    settle_s = float(next_run.settings_record["learning"]["settle_s"][0])
+    next_run.run(load[5000 : 5000 + int(settle_s) - 10])  # the load meanwhile is not known
+    assert next_run.record["series_resistance"]["samples"].tobytes() == saved["series_resistance.samples"].tobytes()
+    next_run.run(load[5000 + int(settle_s) - 10 :])
+    assert next_run.record["series_resistance"]["samples"].sum() > saved["series_resistance.samples"].sum()
+
+
+def test_a_damaged_or_foreign_sum_is_not_taken_up(load: SampleBlock) -> None:
+    estimator = thesis()
+    estimator.run(load[:5000])
+    saved = {name: field.copy() for name, field in fields(estimator.record)}
+    assert not any(name.startswith("series_resistance.") for name in without_observer(saved))
+    saved["series_resistance.product_va"][0, 5] = np.nan
+    assert resume(thesis(), saved, 5.0) == "product_va of the series_resistance is not finite"
+
+
+def test_nothing_is_summed_with_branches_that_nobody_knows(load: SampleBlock) -> None:
+    """A start under load, and a gap: x2 and x3 depend on a load that was not measured."""
+    under_load = int(np.argmax(np.abs(load["current_a"]) > 0.5))
+    estimator = thesis()
+    estimator.run(load[under_load : under_load + 1000])
+    assert not estimator.record["series_resistance"]["samples"].any()
+    after_gap = thesis()
+    after_gap.run(load[:1000])
+    before = after_gap.record["series_resistance"]["samples"].sum()
+    after_gap.run(load[1100:2000])
+    assert after_gap.record["series_resistance"]["samples"].sum() == before
+
+
+def test_a_bin_forgets_so_that_r_s_can_age(load: SampleBlock) -> None:
+    flowing = 5000 + int(np.argmax(np.abs(load["current_a"][5000:]) > 0.06))
+    estimator = thesis()
+    estimator.run(load[:flowing])
+    sums = estimator.record["series_resistance"]
+    full = int(estimator.state["soc"][0] * BINS)
+    sums["samples"][0, full], sums["square_a2"][0, full], sums["product_va"][0, full] = MOST_SAMPLES, 2e4, 2e3
+    estimator.run(load[flowing : flowing + 1])
+    assert sums["samples"][0, full] == MOST_SAMPLES / 2 + 1
+
+
+def test_the_identifier_or_another_law_has_no_r_s_by_4_2(load: SampleBlock) -> None:
+    for law, identifier in (("improved", IdentifierSettings()), ("learning", None), ("scheme-3", None)):
+        estimator = Estimator(TRUTH, ObserverSettings(law=law), identifier=identifier, initial_soc=FIRST_SOC)
+        estimator.run(load[:2000])
+        assert not estimator.record["series_resistance"]["samples"].any()
