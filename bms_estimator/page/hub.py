@@ -22,6 +22,8 @@ RECENT_STEP_S = 1.0
 """Between the states that are kept for the curves of whoever opens the page later [s]."""
 MAX_AHEAD_S = 86_400.0
 """Maximum time of a state ahead of the wall clock [s]."""
+SET_BACK_S = 60.0
+"""A state further ahead of the wall clock and of the next state than this [s] is taken to have had a wrong clock."""
 RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
 
 _Row = tuple[float, tuple[float | None, ...]]
@@ -133,6 +135,8 @@ class Hub(Newest):
         if row[0] > self._wall() + MAX_AHEAD_S:  # would keep all later states out
             return
         rows = self._recent.setdefault(pack, deque(maxlen=RECENT_STATES))
+        while rows and rows[-1][0] > max(row[0], self._wall()) + SET_BACK_S:
+            rows.pop()
         if not rows or row[0] >= rows[-1][0] + RECENT_STEP_S:
             rows.append(row)
 

@@ -43,6 +43,13 @@ class _Connection:
     address: str
     deadline: asyncio.TimerHandle
     serving: bool = False
+    unsent: int = 0
+    """Bytes of a response that waited for the client when the deadline was last set."""
+
+    @property
+    def is_busy(self) -> bool:
+        """True while a request is handled or a response is being sent."""
+        return self.serving or self.transport.get_write_buffer_size() > 0
 
 
 class Connections:
@@ -85,8 +92,20 @@ class Connections:
             yield
         finally:
             connection.serving = False
-            loop = asyncio.get_running_loop()
-            connection.deadline = loop.call_later(IDLE_S, connection.transport.abort)
+            self._wait(connection)
+
+    def _wait(self, connection: _Connection) -> None:
+        """Start the deadline of the next request, or of the response that is being sent."""
+        connection.unsent = connection.transport.get_write_buffer_size()
+        connection.deadline = asyncio.get_running_loop().call_later(IDLE_S, self._expire, connection)
+
+    def _expire(self, connection: _Connection) -> None:
+        """Close a connection, unless its client has read a part of the response since."""
+        unsent = connection.transport.get_write_buffer_size()
+        if unsent and (not connection.unsent or unsent < connection.unsent):
+            self._wait(connection)
+        else:
+            connection.transport.abort()
 
     def _make_room(self, address: str) -> bool:
         """Return whether an address may have one more connection, displacing another if necessary."""
@@ -97,7 +116,7 @@ class Connections:
         return len(self._open) < self.limit or self._displace(list(self._open.values()))
 
     def _displace(self, candidates: list[_Connection]) -> bool:
-        idle = next((each for each in candidates if not each.serving), None)
+        idle = next((each for each in candidates if not each.is_busy), None)
         if idle is None:
             return False
         self._drop(idle)

@@ -121,7 +121,8 @@ class Published:
         if len(self.devices) < MAX_DEVICES:
             return True
         name = min(self.devices, key=lambda each: self.devices[each].priority)
-        if not urgent and now_s - self.devices[name].last_s < SILENT_S:
+        is_silent = now_s - self.devices[name].last_s >= SILENT_S
+        if not is_silent and not (urgent and not self.devices[name].alarms):
             return False
         del self.devices[name]
         self._hide(name)

@@ -148,6 +148,15 @@ async def test_a_state_dated_far_in_the_future_does_not_stop_the_curves() -> Non
     assert found["attic/recent"]["voltage_v"] == [13.0, 15.0]
 
 
+async def test_a_clock_that_is_set_back_does_not_stop_the_curves() -> None:
+    hub = Hub(lambda: epoch_s(TIME.format(0.0)))
+    hub.put("attic", "state", state(0.0))
+    hub.put("attic", "state", state(1.0) | {"time": "2026-11-23T23:00:00.000Z"})
+    hub.put("attic", "state", state(2.0))
+    with hub.reading() as reader:
+        assert (await read(reader))["attic/recent"]["voltage_v"] == [13.0, 15.0]
+
+
 async def test_a_message_to_a_reader_is_bounded_and_the_rest_comes_next() -> None:
     hub = Hub()
     for number in range(100):

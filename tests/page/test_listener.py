@@ -72,6 +72,27 @@ async def test_connections_with_a_request_in_progress_are_not_displaced() -> Non
             ]
 
 
+async def test_a_slow_client_gets_its_response_and_one_that_does_not_read_is_disconnected() -> None:
+    connections = Connections(2)
+    own, peer = socket.socketpair()
+    transport, _ = await asyncio.get_running_loop().connect_accepted_socket(asyncio.Protocol, own)
+    connections.add(own, transport, "192.0.2.1")
+    with connections.serving(transport):
+        pass
+    transport.write(bytes(8 << 20))
+    (held,) = connections._open.values()
+    connections._expire(held)
+    unsent = transport.get_write_buffer_size()
+    async with asyncio.timeout(LONG_S):
+        while transport.get_write_buffer_size() == unsent:
+            await asyncio.get_running_loop().run_in_executor(None, peer.recv, 1 << 16)
+    connections._expire(held)
+    assert not transport.is_closing()
+    connections._expire(held)
+    assert transport.is_closing()
+    peer.close()
+
+
 @contextlib.asynccontextmanager
 async def connection() -> AsyncIterator[tuple[socket.socket, asyncio.Transport]]:
     own, peer = socket.socketpair()

@@ -108,6 +108,13 @@ def test_a_raised_alarm_finds_room_at_once_and_its_device_is_kept() -> None:
     assert "new" not in published.devices
 
 
+def test_raised_alarms_of_new_devices_do_not_replace_a_device_with_a_raised_alarm() -> None:
+    published = Published("bms")
+    for number in range(2 * MAX_DEVICES):
+        published.take(f"bms/d{number}/alarm/over_temperature", b'{"active": true}', NOW)
+    assert set(published.devices) == {f"d{number}" for number in range(MAX_DEVICES)}
+
+
 @given(st.text(string.printable), st.binary(max_size=200))
 def test_nothing_that_comes_raises(topic, payload):
     published = Published("bms")
