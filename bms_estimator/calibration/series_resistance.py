@@ -27,9 +27,9 @@ LOWEST_SOC = 0.1
 EXPONENTS = np.geomspace(2.0, 200.0, 200)
 """Exponents a14 tried."""
 TINY = 1e-300
-"""Smallest determinant of the normal equations: an amplitude that no bin shows is none."""
+"""Lower limit of the determinant of the normal equations; avoids division by zero."""
 LEAST_BINS = 5
-"""As many bins as a fit of three parameters should have."""
+"""Minimum number of bins for a fit of three parameters."""
 
 
 @dataclass(frozen=True)
@@ -119,10 +119,10 @@ def _bins(soc: Floats) -> NDArray[np.int64]:
 
 
 def summed(record: np.void) -> SeriesResistance:
-    """The curve that an estimator has summed up sample by sample; SOC is the middle of each bin.
+    """Return the curve from the sums of an estimator; SOC is the middle of each bin.
 
     Args:
-        record: Of dtype ESTIMATOR_STATE.
+        record: Record of dtype ESTIMATOR_STATE.
     """
     sums = record["series_resistance"]
     used = np.flatnonzero(sums["square_a2"] > 0.0)
@@ -131,7 +131,7 @@ def summed(record: np.void) -> SeriesResistance:
 
 
 def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> SeriesResistanceFit:
-    """Fit (2.9): for each of ``EXPONENTS`` non-negative weighted linear least squares, the best of them taken.
+    """Fit (2.9) by non-negative weighted linear least squares for each of ``EXPONENTS``; the best fit is returned.
 
     Raises:
         UserError: Too few bins of SOC with data.
@@ -154,7 +154,7 @@ def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> S
 
 
 def _best(soc: Floats, r_s: Floats, weight: Floats) -> tuple[float, float, float]:
-    """a13 >= 0, a14 and a15 >= 0 of the smallest weighted sum of squares, by the normal equations of each exponent."""
+    """Return a13 >= 0, a14 and a15 >= 0 with the smallest weighted sum of squares, by normal equations."""
     decay = np.exp(-EXPONENTS[:, None] * soc)
     dd, d1, dr = decay**2 @ weight, decay @ weight, decay @ (weight * r_s)
     one, r1 = weight.sum(), (weight * r_s).sum()

@@ -4,11 +4,11 @@ import time
 from collections.abc import Callable
 
 SHARE = 0.1
-"""Fraction of a core that a pack may use for long: a source at 1,000 Hz needs 0.005."""
+"""Fraction of a core that a pack may use continuously: a source at 1,000 Hz needs 0.005."""
 BURST_S = 0.2
 """Processor time that a pack may use at once after a pause [s]: five hundred minute blocks at 1 Hz."""
 MAX_CHARGE_S = 0.1
-"""Maximum charge for one block [s], which 20,000 samples need: the first one may load or compile kernels, which is no fault of its pack."""
+"""Maximum charge for one block [s], the cost of 20,000 samples. The first block may take longer, because it compiles kernels."""
 MAX_PACKS = 10_000
 """Maximum number of levels that are stored before those of idle packs are removed."""
 

@@ -1,4 +1,4 @@
-"""Messages of packs that have to wait. They stay in the stream, and are read from there when it is the pack's turn."""
+"""Deferred messages. They stay in the stream and are read from there when it is the pack's turn."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
@@ -11,7 +11,7 @@ class Span(NamedTuple):
     """Messages of one pack that wait."""
 
     first: int
-    """Sequence in the stream from which on they are read."""
+    """Sequence of the first of them in the stream."""
     last: int
     """Sequence of the last of them."""
 
@@ -20,10 +20,10 @@ class Deferred:
     """The packs that wait, in the order of their turns.
 
     Args:
-        spans: Of each pack that waits.
+        spans: Span of each pack that waits.
 
     Attributes:
-        is_saved: Whether a checkpoint has all that was taken from here.
+        is_saved: True if a checkpoint covers all messages that were taken from here.
     """
 
     def __init__(self, spans: Mapping[str, Span] | None = None) -> None:
@@ -44,7 +44,7 @@ class Deferred:
         return dict(self._spans)
 
     def add(self, pack: str, sequence: int) -> None:
-        """Let a message of a pack wait."""
+        """Defer a message of a pack."""
         before = self._spans.get(pack)
         self._spans[pack] = Span(before.first if before else sequence, sequence)
 
@@ -66,6 +66,6 @@ class Deferred:
         self.is_saved = False
 
     def clear(self) -> None:
-        """Forget all packs, as of a stream that was made anew."""
+        """Remove all packs, because the stream was recreated."""
         self._spans.clear()
         self.is_saved = False

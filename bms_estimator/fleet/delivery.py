@@ -18,8 +18,8 @@ ASKED_EACH = 5
 """Blocks that came too early: so often it hears again from where to send."""
 
 MAX_PASSED = 20
-"""A missing block is lost when the one after it has come this often: the edge has sent both again at least 30 s apart each time, so
-the server refuses the missing one, or it is damaged on the edge's disk."""
+"""A missing block counts as lost after its successor has come this many times. The edge resends both, at least 30 s apart, so the
+server refuses the missing block, or it is damaged on the edge's disk."""
 
 
 class Order(Enum):
@@ -72,7 +72,7 @@ def _lose(d: np.void, number: int) -> int:
 
 
 def _await(d: np.void, number: int) -> int:
-    """Await a block, of which none was missed yet; returns its number."""
+    """Set the number of the awaited block, reset the counts of early blocks, and return the number."""
     d["awaited"], d["ahead"], d["passed"] = number, 0, 0
     return number
 

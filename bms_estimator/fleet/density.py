@@ -8,13 +8,13 @@ from bms_estimator.model.sample import SampleBlock
 MAX_RATE_HZ = 1000.0
 """Highest sample rate of a source."""
 MAX_SAMPLES = 20_000
-"""Maximum number of samples in a block: edges of earlier versions cut here, and later ones at ``MOST_SAMPLES``."""
+"""Maximum number of samples in a block: the limit of earlier edges; later ones cut at ``MOST_SAMPLES``."""
 LONGEST_STORE_S = 2.0**33
 """Latest plausible time stamp [s since the store was made]: a store may be made in 1970, before its machine knows the time."""
 
 
 def density_fault(samples: SampleBlock) -> str:
-    """Return why a block has more samples than it may have, or than its time allows; empty when it has not.
+    """Return why a block has too many samples, in total or for its duration; empty if it has not.
 
     ``MOST_SAMPLES`` are allowed beyond the rate: an edge's clock may stand still while a source's is corrected.
     """

@@ -57,7 +57,7 @@ class Holding:
         turn: Held while a block is stepped: of all partitions one at a time, so that the loop sees to requests and heartbeats
             between any two.
         partitions: Number of partitions of the stream.
-        is_busy: Whether any partition of the worker has messages that were given and not taken.
+        is_busy: Returns true while any partition of the worker has received messages that are not taken.
 
     Attributes:
         consumer: What asks for messages.
@@ -206,7 +206,7 @@ class Holding:
             self._turns.set()
 
     async def _run_deferred(self) -> None:
-        """Take messages that wait for ever: one of each pack at a time."""
+        """Take deferred messages for ever, one of each pack at a time."""
         while True:
             self._turns.clear()
             while self.partition and (found := self.partition.deferred.next(self._is_due)):
@@ -215,12 +215,12 @@ class Holding:
             await self._turns.wait()
 
     def _is_due(self, pack: str) -> bool:
-        """Return whether a pack that waits may go on: within its budget, or while no other pack needs the processor."""
+        """Return whether a deferred pack may resume: within its budget, or while no other pack needs the processor."""
         is_known = self.partition is not None and self.partition.is_known(pack)
         return is_known and not (self._budget.is_exhausted(pack) and self._is_busy())
 
     async def _take_deferred(self, partition: Partition, pack: str, span: Span) -> None:
-        """Take the next message of a pack that waits."""
+        """Take the next deferred message of a pack."""
         js, subject = self._nc.jetstream(), subjects.kept(self.number, pack)
         try:
             message = await js.get_msg(subjects.RAW_STREAM, span.first, subject, next=True)
@@ -330,7 +330,7 @@ class Holding:
             await self._publish(taken)
 
     async def _take_or_defer(self, partition: Partition, pack: str, data: bytes, sequence: int) -> Taken:
-        """Take a message, or let it wait where its pack has to."""
+        """Take a message, or defer it if its pack has to wait."""
         if subjects.partition_of(pack, self._partitions) != self.number:
             return partition.refuse(pack, sequence)
         if pack in partition.deferred or self._budget.is_exhausted(pack):

@@ -61,7 +61,7 @@ class Partition:
 
     Attributes:
         number: The same.
-        sequence: Of the last message that was taken or deferred; 0: none was.
+        sequence: Sequence of the last message that was taken or deferred; 0: none.
         deferred: Packs whose messages wait in the stream.
     """
 
@@ -143,7 +143,7 @@ class Partition:
         return self._take(pack, block, known)
 
     def defer(self, pack: str, sequence: int) -> Taken:
-        """Let a message wait in the stream."""
+        """Leave a message in the stream until its pack's turn."""
         self.sequence = max(self.sequence, sequence)
         if pack in self.deferred or len(self.deferred) < MAX_UNKNOWN or self.is_known(pack):
             self.deferred.add(pack, sequence)

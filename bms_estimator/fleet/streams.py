@@ -28,8 +28,8 @@ HOURS_PART, HOURS_AGE_S = 1 / 16, 30 * 86_400.0
 MAX_BLOCK_BYTES = 256 << 10
 """Maximum size of a block in ``RAW`` [bytes]: 7,000 samples that do not compress fit."""
 PACK_FRACTION = 1 / 3
-"""Fraction of ``RAW`` that one pack can fill with blocks of the maximum size: by default seven days of minute blocks. Beyond it its own
-oldest block goes."""
+"""Fraction of ``RAW`` that one pack can fill with blocks of the maximum size: by default seven days of minute blocks. Beyond it, the
+pack's oldest block is removed."""
 MIN_PACK_BLOCKS = 60
 """Blocks of a pack that even a small ``RAW`` keeps: an hour of minute blocks."""
 DUPLICATES_S = 3600.0

@@ -235,7 +235,7 @@ def observe(s: Record, q: int, j: int, value: float, variance: float) -> None:
 
 @njit(cache=True)
 def states_to_hold(s: Record, p: Record, q: int) -> int:
-    """Return what a voltage must not change, ``HOLD_NOTHING`` to ``HOLD_CELL_AND_CURVE``.
+    """Return which states a voltage must not change, ``HOLD_NOTHING`` to ``HOLD_CELL_AND_CURVE``.
 
     A SOC outside 0..1 is limited, so the voltage error there is not one of the sensor, the capacity or the curve.
     Where resistances are hardly known, resistance and capacity change the voltage alike under a large constant current, and

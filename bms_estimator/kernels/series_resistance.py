@@ -1,7 +1,7 @@
 """Step 3 of the thesis, sample by sample: R_s by (4.2), least squares over each 1 % of SOC.
 
-x2 and x3 of (4.2) are those of the model with the present a1..a12 under the measured current. The observer's own make up
-for every error of the voltage, so that they leave nothing for R_s.
+x2 and x3 of (4.2) are those of the model with the present a1..a12 under the measured current. The observer's own x2 and x3
+absorb every error of the voltage and leave nothing for R_s.
 """
 
 import math
@@ -14,17 +14,17 @@ from bms_estimator.kernels.observer import floor
 from bms_estimator.kernels.state import Record
 
 BINS = 100
-"""Steps of SOC that R_s has a value for."""
+"""Number of SOC bins, one value of R_s each."""
 SMALLEST_CURRENT_C = 0.02
 """Smallest current that (4.2) is evaluated at: below it, the sensor's noise dominates [1/h]."""
 MOST_SAMPLES = 20_000
-"""When a bin holds so many samples its sums are halved, so that R_s follows the cell's ageing."""
+"""Samples of a bin at which its sums are halved, so that R_s follows the cell's ageing."""
 
 SERIES_RESISTANCE = np.dtype(
     [
         ("v_ts", "f8"),  # x2 of the model [V]
         ("v_tl", "f8"),  # x3 of the model [V]
-        ("settle_s", "f8"),  # nothing is summed for so long: x2 and x3 depend on a load that was not measured [s]
+        ("settle_s", "f8"),  # remaining time without sums, while x2 and x3 depend on an unmeasured load [s]
         ("samples", "f8", BINS),  # samples of the sums
         ("square_a2", "f8", BINS),  # sum of i^2 [A^2]
         ("product_va", "f8", BINS),  # sum of i (E_o - x2 - x3 - y) [V A]
@@ -35,9 +35,9 @@ SERIES_RESISTANCE = np.dtype(
 
 @njit(cache=True)
 def begin_series_resistance(s: Record, p: Record) -> None:
-    """Empty sums and branches; records of ESTIMATOR_STATE and ESTIMATOR_SETTINGS, the observer has started.
+    """Reset sums and RC voltages; records of ESTIMATOR_STATE and ESTIMATOR_SETTINGS. The observer has started.
 
-    Branches are taken to be empty at rest. Under load they are unknown, and nothing is summed until they have settled.
+    At rest the RC voltages are 0. Under load they are unknown, and nothing is summed until they have settled.
     """
     r = s.series_resistance
     r.v_ts = r.v_tl = 0.0

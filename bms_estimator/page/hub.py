@@ -21,9 +21,9 @@ RECENT_STATES = 600
 RECENT_STEP_S = 1.0
 """Between the states that are kept for the curves of whoever opens the page later [s]."""
 MAX_AHEAD_S = 86_400.0
-"""Maximum time of a state ahead of the wall clock [s]."""
+"""Maximum lead of a state's time over the wall clock [s]."""
 SET_BACK_S = 60.0
-"""A state further ahead of the wall clock and of the next state than this [s] is taken to have had a wrong clock."""
+"""A state leads by a wrong clock if it leads the wall clock and the next state by more than this [s]."""
 RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
 
 _Row = tuple[float, tuple[float | None, ...]]
@@ -132,7 +132,7 @@ class Hub(Newest):
             row = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
         except (TypeError, ValueError, KeyError):  # somebody else's
             return
-        if row[0] > self._wall() + MAX_AHEAD_S:  # would keep all later states out
+        if row[0] > self._wall() + MAX_AHEAD_S:  # all later states would be ignored
             return
         rows = self._recent.setdefault(pack, deque(maxlen=RECENT_STATES))
         while rows and rows[-1][0] > max(row[0], self._wall()) + SET_BACK_S:

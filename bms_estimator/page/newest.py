@@ -45,7 +45,7 @@ class Newest:
         self.say(LINK, json.dumps({"up": trouble is None, "reason": trouble}))
 
     def hand_on(self, key: str) -> None:
-        """Have the newest text of a key sent to all readers."""
+        """Queue the newest text of a key for all readers."""
         for reader in self._readers:
             reader.put(key)
 
@@ -66,7 +66,7 @@ class Newest:
 
 
 class Reader:
-    """Keys whose newest text one reader has not been sent yet. Texts are shared, so that readers cost no memory.
+    """Keys whose newest text one reader has not been sent yet. The texts are shared by all readers.
 
     Args:
         newest: Source of the keys and texts.

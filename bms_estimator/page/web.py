@@ -154,7 +154,7 @@ class WebServer:
 
     @web.middleware
     async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Keep the connection of a request open while the request is handled."""
+        """Exempt the connection from displacement while its request is handled."""
         with CONNECTIONS.serving(request.transport):
             return await self._checked(request, handler)
 
@@ -191,7 +191,7 @@ class WebServer:
         return web.Response(body=file.body, content_type=file.kind, charset="utf-8", headers=headers)
 
     async def _events(self, request: web.Request) -> web.StreamResponse:
-        """Stream what is known, then what is new, until either side closes."""
+        """Stream all known texts, then changes, until either side closes."""
         response = web.StreamResponse(
             headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         )
@@ -209,7 +209,7 @@ class WebServer:
 
     @contextlib.contextmanager
     def _streaming(self, reader: Reader, request: web.Request) -> Iterator[None]:
-        """Count a stream, which replaces another one when there are too many."""
+        """Register a stream, closing another one if there are too many."""
         if len(self._streams) >= MAX_STREAMS:
             self._close_one(request.remote)
         self._streams[reader] = _Stream(request.remote, request.transport)
@@ -219,7 +219,7 @@ class WebServer:
             self._streams.pop(reader, None)
 
     def _close_one(self, newcomer: str | None) -> None:
-        """Close the oldest stream of the address that has the most; of the newcomer's own where several have as many."""
+        """Close the oldest stream of the address with most streams; the newcomer's address is preferred in a tie."""
         counts = Counter(stream.address for stream in self._streams.values())
         most = max(counts, key=lambda address: (counts[address], address == newcomer))
         reader = next(reader for reader, stream in self._streams.items() if stream.address == most)

@@ -72,7 +72,7 @@ class Hooks:
         )
 
     def tell(self, change: Change) -> None:
-        """Pass on that an alarm has changed; returns at once."""
+        """Pass a change of an alarm to its hooks; returns at once."""
         for hook in self._hooks:
             if hook.covers(change.alarm.name):
                 hook.tell(change)

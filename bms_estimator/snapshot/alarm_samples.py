@@ -22,20 +22,20 @@ _NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
 
 @dataclass
 class Steps:
-    """Times between samples: between two samples a value is taken to be as at both, unless there is a gap.
+    """Times between samples. Between two samples a value is assumed to hold, unless there is a gap.
 
     A gap is much longer than the longest step shortly before. Samples that come in bursts have one long step for each
     burst: from the second on these are no gaps.
 
     Attributes:
-        gap_s: Shorter steps are no gaps [s].
+        gap_s: Minimum length of a gap [s].
     """
 
     gap_s: float
     _last_s: float = math.nan
     _step_s: float = math.inf
     _longest_s: float = 0.0
-    """Longest step of late [s]."""
+    """Longest recent step [s]."""
     _longest_at_s: float = -math.inf
     """When a step of about this length was last seen [s]."""
 
@@ -52,7 +52,7 @@ class Steps:
         return passed_s, seen_s
 
     def _is_usual(self, at_s: float, step_s: float) -> bool:
-        """Whether a step of about this length was seen shortly before; takes note of it."""
+        """Return whether a step of about this length was seen recently, and record this one."""
         is_recent = abs(at_s - self._longest_at_s) <= RECENT_STEPS * self._longest_s
         is_usual = is_recent and step_s <= GAP_RATIO * self._longest_s
         if not is_recent or step_s >= self._longest_s:
@@ -91,7 +91,7 @@ class Waiting:
 
 
 class _Rows:
-    """Rows of one dtype that wait: written in place, since to join hundreds of short structured arrays takes milliseconds."""
+    """Buffer of rows of one dtype, written in place because joining hundreds of short structured arrays takes milliseconds."""
 
     def __init__(self, dtype: Any, columns: tuple[int, ...] = ()) -> None:
         self._rows = np.zeros((WAITING_ROWS, *columns), dtype=dtype)
@@ -107,7 +107,7 @@ class _Rows:
         self.size = end
 
     def take(self) -> Any:
-        """All of them; valid until the next call of ``add``."""
+        """Remove and return all rows; valid until the next call of ``add``."""
         rows, self.size = self._rows[: self.size], 0
         return rows
 

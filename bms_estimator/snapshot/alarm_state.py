@@ -39,7 +39,7 @@ class AlarmState:
         gone: The cause is gone, but it is latched.
         acknowledged: Somebody knows: it ends once the cause is gone.
         known: A value has come.
-        lost_s: A time without values that is shorter than this counts for a delay [s].
+        lost_s: Shorter times without values count toward a delay [s].
     """
 
     watched: Watched

@@ -162,7 +162,7 @@ class Alarms:
             self._keep()
 
     def judge_hooks(self, failing: Sequence[str], passed_s: float, now_s: float) -> None:
-        """Judge whether alarm hooks do their work.
+        """Judge the alarm ``hook_failed``.
 
         Args:
             failing: Hooks whose last attempt failed, each with its reason.
@@ -171,7 +171,7 @@ class Alarms:
         """
         if failing:
             self._reasons["hook_failed"] = Reasons(Suspect(0), tuple(failing))
-        value = np.array([math.inf if failing else 0.0])  # no number stands for it
+        value = np.array([math.inf if failing else 0.0])  # this alarm publishes no value
         self._take("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
         self._keep()
 

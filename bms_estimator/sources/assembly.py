@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from bms_estimator.model.mqtt_source_settings import MqttSource, Place
 from bms_estimator.sources.payload import MOST_CELLS, NoNumberError, cell_pattern, many, one
+from bms_estimator.sources.publisher_conflict import MIN_JUMPS, PublisherConflict
 from bms_estimator.sources.report_line import report_line
-from bms_estimator.sources.rivals import MIN_JUMPS, Rivals
 
 NEEDED = ("voltage", "current")
 
@@ -53,8 +53,8 @@ class Assembly:
         self._faults: dict[str, str] = {}  # of each quantity what was wrong last
         self._new: dict[str, float] = {}  # of voltage and current those that have come since the last sample, and when
         self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
-        self._rivals = {
-            (way.quantity, way.topic): Rivals(MIN_JUMPS[way.quantity], settings.interval_s)
+        self._detectors = {
+            (way.quantity, way.topic): PublisherConflict(MIN_JUMPS[way.quantity], settings.interval_s)
             for way in self._ways
             if way.quantity in NEEDED
         }
@@ -126,7 +126,7 @@ class Assembly:
                 self._faults[way.quantity] = f"{way.quantity}: {topic}: {error}"
             else:
                 self._faults.pop(way.quantity, None)
-                conflict |= self._has_rivals(way, now_s)
+                conflict |= self._has_conflict(way, now_s)
         self._counters["publisher_errors"] += conflict
 
     def line(self, now_s: float) -> bytes:
@@ -170,14 +170,14 @@ class Assembly:
             for each in gone:
                 self._cells.pop(each, None)
 
-    def _has_rivals(self, way: _Way, now_s: float) -> bool:
+    def _has_conflict(self, way: _Way, now_s: float) -> bool:
         """Return whether two publishers write the value that has just come on this topic."""
         key = way.quantity, way.topic
-        rivals = self._rivals.get(key)
-        if rivals is None or not rivals.take(self._told[way.quantity].value, now_s):
+        detector = self._detectors.get(key)
+        if detector is None or not detector.take(self._told[way.quantity].value, now_s):
             self._conflicts.pop(key, None)
             return False
-        self._conflicts[key] = f"{way.topic}: {way.quantity} {rivals.text}"
+        self._conflicts[key] = f"{way.topic}: {way.quantity} {detector.text}"
         return True
 
     def _miss(self, name: str) -> None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 HISTORY = 64
 """Number of remembered messages of a topic."""
 MIN_INTERVALS = 8
-"""Number of intervals from which on the usual interval is known."""
+"""Minimum number of intervals for estimating the usual interval."""
 QUICK_FRACTION = 0.5
 """A message is out of turn if it follows the previous one within this fraction of the usual interval."""
 MIN_RETURNS = 4
@@ -30,8 +30,8 @@ class _Message(NamedTuple):
     """A message.
 
     Attributes:
-        is_back: It went back to the value before the last jump.
-        is_quick: It came out of turn.
+        is_back: The value returned to that before the last jump.
+        is_quick: It came sooner than one publisher would publish.
     """
 
     value: float
@@ -41,7 +41,7 @@ class _Message(NamedTuple):
     is_quick: bool = False
 
 
-class Rivals:
+class PublisherConflict:
     """Detects a second publisher of one quantity on one topic.
 
     Two publishers with different values make the value jump back and forth, and one of the two jumps comes sooner than one
@@ -97,7 +97,7 @@ class Rivals:
     def _is_quick(self, interval_s: float) -> bool:
         """Return whether a message came sooner than one publisher would publish.
 
-        The upper quartile of the intervals is that of one publisher also while there are two.
+        The upper quartile of the intervals stays that of one publisher while there are two.
         """
         intervals_s = _intervals_s(self._messages)
         if len(intervals_s) < MIN_INTERVALS:
