@@ -58,7 +58,9 @@ class Deferred:
 
     def advance(self, pack: str, sequence: int) -> None:
         """Note that the messages of a pack up to a sequence were taken or are not in the stream any more."""
-        span = self._spans[pack]
+        span = self._spans.get(pack)
+        if span is None:  # cleared while the message was read
+            return
         if sequence < span.last:
             self._spans[pack] = span._replace(first=max(span.first, sequence + 1))
         else:

@@ -18,8 +18,8 @@ ASKED_EACH = 5
 """Blocks that came too early: so often it hears again from where to send."""
 
 MAX_PASSED = 20
-"""A missing block counts as lost after its successor has come this many times. The edge resends both, at least 30 s apart, so the
-server refuses the missing block, or it is damaged on the edge's disk."""
+"""Missing blocks count as lost after the first one behind them has come this many times. The edge resends them all, at least 30 s
+apart, so the server refuses the missing ones, or they are damaged on the edge's disk."""
 
 
 class Order(Enum):
@@ -52,7 +52,7 @@ def judge(d: np.void, block: Block) -> Order:
         return Order.RESENT
     if block.number > number:
         d["ahead"] += 1
-        d["passed"] += block.number == number + 1
+        _count_passed(d, block.number)
         if d["passed"] < MAX_PASSED:
             return Order.AHEAD
         _lose(d, block.number)
@@ -71,9 +71,16 @@ def _lose(d: np.void, number: int) -> int:
     return _await(d, number)
 
 
+def _count_passed(d: np.void, number: int) -> None:
+    """Count the arrivals of the first block behind the missing ones."""
+    if not d["first_ahead"] or number < d["first_ahead"]:
+        d["first_ahead"], d["passed"] = number, 0
+    d["passed"] += number == d["first_ahead"]
+
+
 def _await(d: np.void, number: int) -> int:
     """Set the number of the awaited block, reset the counts of early blocks, and return the number."""
-    d["awaited"], d["ahead"], d["passed"] = number, 0, 0
+    d["awaited"], d["ahead"], d["first_ahead"], d["passed"] = number, 0, 0, 0
     return number
 
 

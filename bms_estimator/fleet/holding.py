@@ -156,8 +156,8 @@ class Holding:
             if self.kept and self.kept.sequence == partition.sequence and partition.deferred.is_saved:
                 return
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
-            await self.send_hours()  # those of what is in the checkpoint: nobody would make them again
             try:
+                await self.send_hours()  # those of what is in the checkpoint: nobody would make them again
                 self.claim = await self._keeping.write(claim, snapshot.sequence, snapshot.chunks())
             except FencedError as error:
                 self._fenced(error)

@@ -27,7 +27,8 @@ DELIVERY = np.dtype(
         ("store", "u8"),  # the edge's, whose blocks are awaited [ns since 1970]; 0: none came yet
         ("awaited", "u8"),  # number of the next block
         ("ahead", "i8"),  # blocks that came since one is missing
-        ("passed", "i8"),  # times that the block after the missing one came
+        ("first_ahead", "u8"),  # lowest number of these; 0: none
+        ("passed", "i8"),  # times that it came
         ("blocks", "i8"),  # taken
         ("lost_blocks", "i8"),  # that never came
         ("clock", "u8"),  # store of the last sample's block: its time stamps are since then; 0: no sample came yet

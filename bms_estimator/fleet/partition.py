@@ -71,6 +71,7 @@ class Partition:
         self._counters: Counter[str] = Counter()
         self._packs: dict[str, bytes] = {}
         self._former: dict[str, Former] = {}
+        self._former_deliveries: dict[str, np.void] = {}
         self.deferred = Deferred()
         self._known: dict[str, PackType] = {}
         self._greeted: set[str] = set()
@@ -198,6 +199,8 @@ class Partition:
         former = self._open(pack)
         d = self._bench.delivery
         lost = int(d["lost_blocks"])
+        if pack in self._former_deliveries:
+            self._bench.record["delivery"][0] = self._former_deliveries[pack]
         order = judge(d, block)
         lost = int(d["lost_blocks"]) - lost
         self._bench.count_lost(lost)
@@ -216,8 +219,11 @@ class Partition:
             made = stepped or Taken(pack, failed=int(not fault))
             taken(d)
             self._former.pop(pack, None)
+            self._former_deliveries.pop(pack, None)
         else:
             self._counters[order.value] += 1
+            if former is not None:  # its estimator is not made yet; the count of resent blocks must go on
+                self._former_deliveries[pack] = d.copy()
         if order is Order.NEXT or former is None:  # what another version left stays as it is until a block is taken
             self._counters["lost_blocks"] += lost
             self._packs[pack] = self._bench.take()

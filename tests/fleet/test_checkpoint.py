@@ -20,6 +20,7 @@ from bms_estimator.fleet.checkpoint import (
     read_checkpoint,
 )
 from bms_estimator.fleet.deferred import Span
+from bms_estimator.fleet.delivery import MAX_PASSED
 from bms_estimator.fleet.pack_state import PACK_STATE, Bench
 from bms_estimator.fleet.partition import Partition
 from bms_estimator.model.estimate import Estimate
@@ -175,6 +176,15 @@ class TestAnotherVersion:
         assert partition.snapshot().former == read_checkpoint(data).former
         again = Partition.restore(5, table, whole(partition.snapshot()))
         assert again.take("a", blocks[150], again.sequence + 1).state
+
+    def test_goes_on_without_a_block_that_never_comes(self, before, samples) -> None:
+        _, data = before
+        partition = Partition.restore(5, table, data)
+        behind = blocks_of(samples)[151]
+        states = [partition.take("a", behind, partition.sequence + 1).state for _ in range(MAX_PASSED)]
+        assert [state is None for state in states] == (MAX_PASSED - 1) * [True] + [False]
+        assert partition.counters["lost_blocks"] == 1
+        assert partition.snapshot().former == {}
 
     def test_whose_bytes_are_none_of_its_layout_begins_anew(self, samples) -> None:
         former = Former(layout_of(np.dtype([("x", "<f8")])), b"1234567")

@@ -223,6 +223,21 @@ def test_a_block_that_the_edge_sends_in_vain_is_lost_and_the_rest_goes_on(stream
     assert stream.partition.counters["lost_blocks"] == 1
 
 
+def test_several_blocks_that_never_come_are_lost_and_the_rest_goes_on(stream, samples) -> None:
+    blocks = blocks_of(samples[:400])
+    deliver(stream, "a", blocks[:5])
+    for _ in range(MAX_PASSED - 1):
+        assert stream.send("a", blocks[8]).state is None
+        assert stream.send("a", blocks[7]).state is None
+    assert stream.send("a", blocks[7]).state
+    assert stream.partition.counters["lost_blocks"] == 2
+    deliver(stream, "a", blocks[8:], first=9)
+    estimator = estimator_of(SETTINGS, CELL)
+    estimator.run(samples[:100])
+    estimator.run(samples[140:400])
+    assert_same(stream, "a", estimator.record)
+
+
 class TestWhatIsPublished:
     def test_the_state_is_that_of_run_for_the_block(self, samples) -> None:
         stream = Stream(Partition(5, table, wall=lambda: 2e9))
