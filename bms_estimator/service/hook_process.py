@@ -66,8 +66,8 @@ async def run(command: Sequence[str], text: bytes, variables: Mapping[str, str],
             env={**variables, MARK: mark},
             start_new_session=True,
         )
-    except (OSError, ValueError) as error:
-        raise StartError(str(error)) from None
+    except (OSError, ValueError, RuntimeError, MemoryError) as error:
+        raise StartError(str(error) or repr(error)) from None
     entry = f"{MARK}={mark}".encode()
     try:
         async with asyncio.timeout(timeout_s):
@@ -86,9 +86,10 @@ async def _kill(process: asyncio.subprocess.Process, entry: bytes) -> None:
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(KILL_S):
             while (found := await _find(process.pid, entry)) != []:
-                if found is None:
-                    found = [process.pid] if process.returncode is None else []
-                for pid in found:
+                if found is None and process.returncode is None:  # until then the number is that of its group
+                    with contextlib.suppress(ProcessLookupError, PermissionError):
+                        os.killpg(process.pid, signal.SIGKILL)
+                for pid in found or ():
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.kill(pid, signal.SIGKILL)
                 await asyncio.sleep(POLL_S)

@@ -29,6 +29,8 @@ ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """These are watched before anything was measured."""
 INPUTS = "inputs"
 """Key of the saved state of measured quantities, beside the alarms' names."""
+SILENCE = "silence"
+"""Key of the saved reason why no samples came."""
 SHARE_S = 1.0
 """Lost and unusable samples are set against the good ones of so long at least [s]."""
 
@@ -224,6 +226,7 @@ class Alarms:
         """
         entries = json.loads(kept or "{}")
         self._inputs.restore(entries.pop(INPUTS, {}))
+        self._silence = str(entries.pop(SILENCE, ""))
         self._unwatched = self._reasons_unwatched()
         for name, told in entries.items():
             state = self._states.get(name)
@@ -361,7 +364,7 @@ class Alarms:
         return f"{LOST[quantity]}: {names} cannot be raised" if names else LOST[quantity]
 
     def _keep(self) -> None:
-        """Save the raised alarms and the lost quantities: a relay that has cut the load stays so over a restart."""
+        """Save the raised alarms, the lost quantities and the silence: a relay that has cut the load stays so over a restart."""
         kept: dict[str, Any] = {
             name: {**state.raising._asdict(), "gone": state.gone, "acknowledged": state.acknowledged}
             for name, state in self._states.items()
@@ -369,6 +372,8 @@ class Alarms:
         }
         if inputs := self._inputs.kept:
             kept[INPUTS] = inputs
+        if self._silence:
+            kept[SILENCE] = self._silence
         self.kept = json.dumps(kept) if kept else ""
 
 

@@ -3,7 +3,7 @@
 import itertools
 from collections import deque
 from collections.abc import Sequence
-from statistics import quantiles
+from statistics import median, quantiles
 from typing import NamedTuple
 
 HISTORY = 64
@@ -14,6 +14,8 @@ QUICK_FRACTION = 0.5
 """A message is out of turn if it follows the previous one within this fraction of the usual interval."""
 MIN_RETURNS = 4
 """Number of quick returns to an earlier value, among the remembered messages, that show two publishers."""
+GRID_FRACTION = 0.1
+"""Largest deviation of a publisher's interval, as a fraction of their median, when another publisher's message lies between."""
 BACK_FRACTION = 0.75
 """Fraction of the jumps that must go back: a load that varies at random has fewer."""
 MIN_REPEATS = 0.25
@@ -78,10 +80,33 @@ class PublisherConflict:
     def _are_two(self) -> bool:
         jumps = [message for message in self._messages if message.is_jump]
         backs = [message for message in jumps if message.is_back]
-        if sum(message.is_quick for message in backs) < MIN_RETURNS or len(backs) < BACK_FRACTION * len(jumps):
+        if self._quick_returns() < MIN_RETURNS or len(backs) < BACK_FRACTION * len(jumps):
             return False
         repeats = len(self._messages) - len(jumps)
         return repeats >= MIN_REPEATS * len(self._messages) or self._are_regular(jumps)
+
+    def _quick_returns(self) -> int:
+        """Count quick returns to the more frequent value that come when its publisher was due anyway.
+
+        A publisher that also reports changes goes back to its value between two of its regular messages.
+        """
+        messages, levels = list(self._messages), self._levels
+        if levels is None:
+            return 0
+        same = max(
+            (
+                [i for i, each in enumerate(messages) if _is_back((level, other), each.value)]
+                for level, other in (levels, levels[::-1])
+            ),
+            key=len,
+        )
+        pairs = list(itertools.pairwise(same))
+        usual_s = median([messages[j].at_s - messages[i].at_s for i, j in pairs] or [0.0])
+        return sum(
+            any(each.is_back and each.is_quick for each in messages[i + 1 : j + 1])
+            and abs(messages[j].at_s - messages[i].at_s - usual_s) < GRID_FRACTION * usual_s
+            for i, j in pairs
+        )
 
     def _are_regular(self, jumps: Sequence[_Message]) -> bool:
         """Return whether every second jump comes at the expected interval or faster, with little spread."""

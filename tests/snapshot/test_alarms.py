@@ -373,6 +373,22 @@ def test_without_samples_alarms_are_unwatched_until_some_come() -> None:
         assert "over_temperature" not in shown, "it was never measured"
 
 
+def test_an_alarm_that_silence_kept_from_being_watched_is_so_over_a_restart_until_samples_come() -> None:
+    before, after = (Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0) for _ in range(2))
+    block = np.zeros(1, dtype=SAMPLE)
+    block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
+    before.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    before.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    before.silent(10.0, WALL_S, "no cable")
+    after.restore(before.kept)
+    assert "pack_over_voltage" in after.unwatched
+    after.silent(0.0, WALL_S, "")
+    changed = {change.alarm.name: change for change in after.changes()}
+    assert (changed["pack_over_voltage"].turn, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
+    assert after.unwatched == ()
+    assert "silence" not in json.loads(after.kept)
+
+
 def test_saved_quantities_that_are_damaged_are_refused() -> None:
     alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     with pytest.raises(ValueError, match="temperature: measured = 77"):

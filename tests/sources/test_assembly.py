@@ -385,6 +385,27 @@ def test_a_load_of_which_only_the_changes_are_published_is_no_second_publisher(
     assert (assembly.conflict, found) == ("", [])
 
 
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_publisher_that_reports_changes_beside_its_regular_messages_is_no_second_one(*, restarts: bool) -> None:
+    """A message each 10 s, counted from the last change or not, and a load that is on for 3 s of 61 s."""
+    messages: list[tuple[float, float]] = []
+    for cycle in range(30):
+        on_s = 61.0 * cycle
+        messages += [(on_s, 80.0), (on_s + 3.0, 5.0)]
+        if restarts:
+            messages += [(on_s + 3.0 + 10.0 * i, 5.0) for i in range(1, 6)]
+    if not restarts:
+        messages += [(10.0 * i + 0.5, 80.0 if (10.0 * i + 0.5) % 61.0 < 3.0 else 5.0) for i in range(183)]
+    assembly, found = _errors(sorted(messages))
+    assert (assembly.conflict, found) == ("", [])
+
+
+def test_a_second_publisher_that_is_slower_is_found() -> None:
+    _, found = _errors(_merged((1.0, 0.0, 400.0, 5.0), (10.0, 100.3, 400.0, -80.0)))
+    assert found
+    assert found[0] < 160.0
+
+
 def test_a_publisher_with_a_current_of_its_own_at_random_times_is_a_second_one() -> None:
     chance, rival, at_s = random.Random(1), list[tuple[float, float]](), 100.0
     while at_s < 160.0:
