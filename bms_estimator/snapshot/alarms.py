@@ -97,6 +97,7 @@ class Alarms:
         self._charging_a = charging_a
         self._inputs, self._silent_s = inputs, silent_s
         self._silence = ""  # why no samples come; empty while they do
+        self._has_samples = False  # since the start
         self._unwatched: dict[AlarmName, str] = {}  # reasons
         self._sampled, self._traced, self._shared = Steps(gap_s), Steps(gap_s), Steps(math.inf)
         self._waiting = Waiting()
@@ -129,6 +130,7 @@ class Alarms:
         """
         if not self.rows:
             return
+        self._has_samples = True
         samples, trace, extremes_v = self._waiting.take()
         self._suspect("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._suspect("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
@@ -148,7 +150,8 @@ class Alarms:
             now_s: Wall clock [s since 1970].
             reason: Why, as far as that is known.
         """
-        if (silent_s >= self._silent_s) != bool(self._silence):
+        goes_on = bool(self._silence) and not self._has_samples  # that of the run before
+        if (silent_s >= self._silent_s or goes_on) != bool(self._silence):
             self._silence = "" if self._silence else reason or "no samples come"
             self._see(self._at_s)
             self._keep()

@@ -381,7 +381,10 @@ def test_an_alarm_that_silence_kept_from_being_watched_is_so_over_a_restart_unti
     before.judge(WALL_S, Counts(0, 0), Suspect(0), ())
     before.silent(10.0, WALL_S, "no cable")
     after.restore(before.kept)
-    assert "pack_over_voltage" in after.unwatched
+    after.silent(0.0, WALL_S, "")
+    assert "pack_over_voltage" in after.unwatched, "no sample has come since the restart"
+    after.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    after.judge(WALL_S, Counts(0, 0), Suspect(0), ())
     after.silent(0.0, WALL_S, "")
     changed = {change.alarm.name: change for change in after.changes()}
     assert (changed["pack_over_voltage"].turn, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
