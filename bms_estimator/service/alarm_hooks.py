@@ -77,14 +77,21 @@ class Hooks:
             if hook.covers(change.alarm.name):
                 hook.tell(change)
 
-    def begin(self, raised: Collection[str]) -> None:
-        """Take over alarms of an earlier run: their jobs have been done, but the relay must be as it was.
+    def begin(self, alarms: Sequence[Alarm]) -> None:
+        """Take over alarms of an earlier run.
 
-        Args:
-            raised: Alarms that are active, and critical ones that cannot be watched.
+        Their jobs have been done, but the relay must be as it was. If a hook had failed, all jobs are done again: one that
+        could not be done would be lost.
         """
+        raised = {alarm.name for alarm in alarms if _counts_as_raised(alarm)}
+        if "hook_failed" not in raised:
+            for hook in self._hooks:
+                hook.begin(raised)
+            return
         for hook in self._hooks:
-            hook.begin(raised)
+            hook.begin({"hook_failed"})
+        for alarm in alarms:
+            self.tell(Change(0.0, alarm))
 
     async def __aenter__(self) -> Self:
         """Start."""
@@ -173,12 +180,9 @@ class _Hook:
         raise NotImplementedError
 
     def _job(self, change: Change) -> Job | None:
-        """Note a change. Return the job that follows, if one does.
-
-        A critical alarm that cannot be watched counts as raised: that is the safe side.
-        """
+        """Note a change. Return the job that follows, if one does."""
         alarm = change.alarm
-        is_raised = alarm.active or (alarm.severity == "critical" and not alarm.watched)
+        is_raised = _counts_as_raised(alarm)
         if is_raised == (alarm.name in self._raised):
             return None
         self._raised ^= {alarm.name}
@@ -198,6 +202,11 @@ class _Hook:
         self.failures += 1
         if job.alarm.name != "hook_failed":
             self.trouble = trouble
+
+
+def _counts_as_raised(alarm: Alarm) -> bool:
+    """Return true for a raised alarm, and for a critical one that cannot be watched: that is the safe side."""
+    return alarm.active or (alarm.severity == "critical" and not alarm.watched)
 
 
 class _Program(_Hook):

@@ -109,7 +109,7 @@ async def run_live(
         on_alarm=hooks.tell,
     )
     _restore_alarms(publisher, ledger.alarms)
-    hooks.begin({*publisher.watch.alarms.active, *publisher.watch.alarms.unwatched})
+    hooks.begin(publisher.watch.alarms.report())
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
     every_s = settings.state.checkpoint_s

@@ -102,6 +102,26 @@ async def test_a_program_gets_the_alarm_on_stdin_and_in_its_environment_one_afte
     assert said[1].startswith("a b;c soc_low cleared  pack {")
 
 
+async def test_a_program_that_could_not_be_started_before_a_restart_is_started_after_it(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    tell = program(tmp_path / "tell", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
+    failed = RAISED.model_copy(update={"name": "hook_failed"})
+    async with hooks({"run": [tell]}) as made:
+        made.begin([RAISED, failed, CLEARED.model_copy(update={"name": "soc_high"})])
+        assert await until(out, 1) == ["soc_low raised"]
+        made.tell(Change(0.0, CLEARED))
+        assert await until(out, 2) == ["soc_low raised", "soc_low cleared"]
+
+
+async def test_an_alarm_of_a_former_run_is_not_announced_again(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    tell = program(tmp_path / "tell", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
+    async with hooks({"run": [tell]}) as made:
+        made.begin([RAISED])
+        made.tell(Change(0.0, CLEARED))
+        assert await until(out, 1) == ["soc_low cleared"]
+
+
 async def test_only_what_is_asked_for_is_done(tmp_path: Path) -> None:
     out = tmp_path / "out"
     tell = program(tmp_path / "tell", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
