@@ -157,7 +157,7 @@ class Holding:
                 return
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
             try:
-                await self.send_hours()  # those of what is in the checkpoint: nobody would make them again
+                await self.send_hours()  # no worker makes the summaries of saved samples again
                 self.claim = await self._keeping.write(claim, snapshot.sequence, snapshot.chunks())
             except FencedError as error:
                 self._fenced(error)

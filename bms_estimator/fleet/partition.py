@@ -199,8 +199,7 @@ class Partition:
         former = self._open(pack)
         d = self._bench.delivery
         lost = int(d["lost_blocks"])
-        if pack in self._former_deliveries:
-            self._bench.record["delivery"][0] = self._former_deliveries[pack]
+        self._put_former_delivery(pack)
         order = judge(d, block)
         lost = int(d["lost_blocks"]) - lost
         self._bench.count_lost(lost)
@@ -213,6 +212,7 @@ class Partition:
                 stepped = self._step(pack, block, of_type, former)
             if stepped is None:  # as if it had brought nothing
                 self._open(pack)
+                self._put_former_delivery(pack)
                 judge(d, block)
                 self._bench.count_lost(lost)
                 self._counters["too_dense" if fault else "failed"] += 1
@@ -230,6 +230,11 @@ class Partition:
         first = pack not in self._greeted
         self._greeted.add(pack)
         return made._replace(awaits=answer(order, d, block, first=first))
+
+    def _put_former_delivery(self, pack: str) -> None:
+        """Put the counts of blocks that came since the start on the bench, for a pack that another version left."""
+        if pack in self._former_deliveries:
+            self._bench.record["delivery"][0] = self._former_deliveries[pack]
 
     def _log_refusal(self, pack: str, why: str) -> None:
         """Log the first refused block of a pack; ``counters`` has the others."""

@@ -150,7 +150,7 @@ class Alarms:
             now_s: Wall clock [s since 1970].
             reason: Why, as far as that is known.
         """
-        goes_on = bool(self._silence) and not self._has_samples  # that of the run before
+        goes_on = bool(self._silence) and not self._has_samples  # restored, and no sample has ended it
         if (silent_s >= self._silent_s or goes_on) != bool(self._silence):
             self._silence = "" if self._silence else reason or "no samples come"
             self._see(self._at_s)

@@ -77,7 +77,7 @@ class Assembly:
 
     @property
     def conflict(self) -> str:
-        """Topics on which two publishers write, with their values, for people; empty where there is none."""
+        """Topics on which two publishers write, with the two values, as text for people; empty without a conflict."""
         return "; ".join(self._conflicts.values())
 
     @property

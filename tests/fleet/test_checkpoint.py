@@ -186,6 +186,17 @@ class TestAnotherVersion:
         assert partition.counters["lost_blocks"] == 1
         assert partition.snapshot().former == {}
 
+    def test_goes_on_where_the_block_behind_the_missing_one_is_refused(self, before, samples, monkeypatch) -> None:
+        _, data = before
+        partition = Partition.restore(5, table, data)
+        behind, following = blocks_of(samples)[151:153]
+        with monkeypatch.context() as refusing:
+            refusing.setattr("bms_estimator.fleet.partition.density_fault", lambda _: "too many samples")
+            for _ in range(MAX_PASSED):
+                partition.take("a", behind, partition.sequence + 1)
+        assert partition.take("a", following, partition.sequence + 1).state
+        assert (partition.counters["lost_blocks"], partition.counters["too_dense"]) == (1, 1)
+
     def test_whose_bytes_are_none_of_its_layout_begins_anew(self, samples) -> None:
         former = Former(layout_of(np.dtype([("x", "<f8")])), b"1234567")
         partition = Partition.restore(5, table, whole(Snapshot(5, 0, former={"a": former})))
