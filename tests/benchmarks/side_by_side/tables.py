@@ -107,7 +107,13 @@ def figure_table(name: str, figures: list[Figure], title: str, digits: int) -> T
 def seed_table(figures: Iterable[Figure]) -> Table:
     """Spread of PyBOP's voltage over its seeds: lowest, median and highest mean over both starts, for each row."""
     table = Table(
-        "", "seeds", "lowest", "median", "highest", title="PyBOP: voltage RMS over its seeds [mV]", box=box.MARKDOWN
+        "",
+        "seeds",
+        "lowest",
+        "median",
+        "highest",
+        title=escape("PyBOP: voltage RMS over its seeds [mV]"),
+        box=box.MARKDOWN,
     )
     of_it = [f for f in figures if (f.table, f.method) == (VOLTAGE, PYBOP)]
     for row in dict.fromkeys(f.row for f in of_it):
