@@ -6,6 +6,12 @@ import pytest
 from hypothesis import settings
 
 from bms_estimator.service.warm_up import load_kernels
+from tests.full_disk import disk_without_files, full_disk
+from tests.mosquitto import broker
+from tests.serial_line import line
+from tests.simavr_board import firmware
+
+__all__ = ["broker", "disk_without_files", "firmware", "full_disk", "line"]
 
 # compilation and shared machines make times meaningless
 settings.register_profile("project", deadline=None)

@@ -9,10 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.fuel_cell_open_loop import open_loop
+from bms_estimator.numba_cache import njit
 
 Floats = NDArray[np.float64]
 

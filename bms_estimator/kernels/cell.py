@@ -7,8 +7,9 @@ Parameters stand at their own index: ``a[1]`` is a1, ``a[0]`` is unused. Voltage
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from bms_estimator.numba_cache import njit
 
 Floats = NDArray[np.float64]
 State = tuple[float, float, float]

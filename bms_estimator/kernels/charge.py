@@ -1,6 +1,6 @@
 """Current between two samples."""
 
-from numba import njit
+from bms_estimator.numba_cache import njit
 
 UNMEASURED_S = 60.0
 """Over a longer step nobody measured the current [s], unless the source has slower samples: then over ``PERIODS`` of them."""

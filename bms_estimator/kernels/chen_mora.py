@@ -6,10 +6,9 @@ file's. ``x`` holds v_ts and v_tl of (2.2), (2.3) [V], and ``dx`` their derivati
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.cell import Floats, c_tl, c_ts, ocv, r_s, r_tl, r_ts
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 NAMES = ("r_s", "r_ts", "tau_ts", "r_tl", "tau_tl")
 """What is learned, in the order of theta."""

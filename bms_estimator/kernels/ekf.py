@@ -5,8 +5,6 @@
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.cell import Floats, ocv
 from bms_estimator.kernels.ekf_noise import add_process_noise, bias_variance, resistance_std
 from bms_estimator.kernels.ekf_state import (
@@ -26,6 +24,7 @@ from bms_estimator.kernels.ekf_state import (
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, TAUS, TREND, on_grid, resistances
 from bms_estimator.kernels.ocv_learning import learned_v, per_node_v, place
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 NARROWEST, WIDEST = 0.02, 0.3
 """The OCV's slope is that of the secant over one std of SOC, between these."""

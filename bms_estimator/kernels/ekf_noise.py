@@ -5,8 +5,6 @@
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.cell import Floats, ocv
 from bms_estimator.kernels.ekf_state import (
     B_FAST,
@@ -33,6 +31,7 @@ from bms_estimator.kernels.ladder import (
     resistances,
 )
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 FLOOR_C = 0.1
 """The load counts as at least so large [C]: an idle cell is not a perfect model [1/h]."""

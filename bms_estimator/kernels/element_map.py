@@ -7,10 +7,10 @@ of what it knew there. (2.5)-(2.9) are fitted to the map: one nonlinear exponent
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.cell import Floats
 from bms_estimator.kernels.state import PARAMETERS, Record
+from bms_estimator.numba_cache import njit
 
 BINS = 25
 """Bins of equal width over SOC 0..1."""

@@ -9,13 +9,13 @@ geometric mean weighted by resistance.
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.ekf_noise import resistance_std
 from bms_estimator.kernels.ekf_state import HYST, LN_R, LN_R0, OFFSET, SOC, X
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, RESISTANCES, TAU_S, TAUS, on_grid, resistances
 from bms_estimator.kernels.ocv_learning import learned_v
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
 """Of ``value`` and ``ln_variance``."""

@@ -1,9 +1,9 @@
 """What flows through the terminals from sample to sample."""
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.sample_step import GAP_RATIO, Records
+from bms_estimator.numba_cache import njit
 
 FLOW_SUMS = np.dtype(
     [

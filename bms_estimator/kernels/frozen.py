@@ -5,10 +5,9 @@
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.cell import ocv
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 FAST_S = 10.0
 """Changes of voltage and current within this time belong together [s]."""

@@ -17,10 +17,9 @@ slowly from the same C, because it takes the chord of Tafel's curve for its slop
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.cell import Floats
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 NAMES = (
     "r_ohm",

@@ -1,11 +1,11 @@
 """What a fuel cell does under a measured current: no voltage is looked at."""
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.cell import Floats
 from bms_estimator.kernels.charge import held_current
 from bms_estimator.kernels.fuel_cell import advance, give_file, output, settle
+from bms_estimator.numba_cache import njit
 
 
 @njit(cache=True)

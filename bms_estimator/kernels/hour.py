@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.sample_step import GAP_RATIO, Records
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 HOUR_SUMS = np.dtype(
     [

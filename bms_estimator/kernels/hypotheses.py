@@ -10,8 +10,6 @@ goes out is mean and standard deviation of the mixture.
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.charge import LONGEST_FLOW_S, along_line, held_current
 from bms_estimator.kernels.ekf import HIGHEST, LOWEST, OWN_R_STD, decay, inflate, predict, update
 from bms_estimator.kernels.ekf_noise import (
@@ -51,6 +49,7 @@ from bms_estimator.kernels.unseen import (
     watch_load,
 )
 from bms_estimator.kernels.zero_current import learn_from_zero, watch_smallest
+from bms_estimator.numba_cache import njit
 
 WINDOW_S = 0.99
 """Samples of about a second make one update [s]."""

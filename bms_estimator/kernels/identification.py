@@ -5,8 +5,6 @@
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.ekf import predict
 from bms_estimator.kernels.ekf_state import LN_R, LN_R0
 from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
@@ -36,6 +34,7 @@ from bms_estimator.kernels.input_checks import (
 from bms_estimator.kernels.margins import delta
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD, watch_steps
+from bms_estimator.numba_cache import njit
 
 FIT_EVERY_S = 120.0
 """One element is fitted this often, each in its turn [s of samples]."""

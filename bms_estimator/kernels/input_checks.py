@@ -6,7 +6,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.ekf_state import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS
@@ -17,6 +16,7 @@ from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
 from bms_estimator.kernels.unseen import first_load
 from bms_estimator.model.suspect import Suspect
+from bms_estimator.numba_cache import njit
 
 GATE_STDS = 6.0
 """A sample further from its prediction than so many std of the innovation is a glitch, ..."""

@@ -7,9 +7,9 @@ constant of its own; a ladder follows it from a second to an hour, and is linear
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.cell import Floats
+from bms_estimator.numba_cache import njit
 
 TAU_S = (1.0, 6.0, 30.0, 120.0, 500.0, 2000.0)
 """Time constants of the branches [s]."""

@@ -6,12 +6,11 @@ the observer's.
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.charge import held_current
 from bms_estimator.kernels.learning_model import advance, give, output, settle, write
 from bms_estimator.kernels.observer import change_of_lock, update_margins
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 LEARN_EVERY_S = 0.999
 """Theta moves no more often, nearly a second: more samples only add to what is remembered [s]."""

@@ -6,11 +6,10 @@ A model is a file of the shape of ``chen_mora``; what the law asks of it goes th
 import math
 from enum import IntEnum
 
-from numba import njit
-
 from bms_estimator.kernels import chen_mora, fuel_cell
 from bms_estimator.kernels.cell import Floats
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 
 class Model(IntEnum):

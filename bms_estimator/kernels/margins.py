@@ -2,7 +2,7 @@
 
 import math
 
-from numba import njit
+from bms_estimator.numba_cache import njit
 
 
 @njit(cache=True)

@@ -18,10 +18,10 @@ power series (3.11) serves.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.polynomial.legendre import leggauss
 
 from bms_estimator.kernels.cell import Floats
+from bms_estimator.numba_cache import njit
 
 SERIES_TERMS = 24
 SERIES_LIMIT = 2.0

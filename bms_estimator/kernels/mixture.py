@@ -5,10 +5,9 @@
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.ekf_state import SOC, STATES
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 UNLIKELY = -9.0
 """ln of a relative weight below which a hypothesis goes."""

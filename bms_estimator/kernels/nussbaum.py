@@ -3,10 +3,9 @@
 import math
 from enum import IntEnum
 
-from numba import njit
-
 from bms_estimator.kernels.mittag_leffler import mittag_leffler
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 
 class Nussbaum(IntEnum):

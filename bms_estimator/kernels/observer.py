@@ -7,13 +7,12 @@ solved exactly, so the step is stable for every N >= 0 and every step length. ``
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.cell import c_tl, c_ts, ocv, r_s, r_tl, r_ts, soc_from_ocv
 from bms_estimator.kernels.charge import LONGEST_FLOW_S, held_current
 from bms_estimator.kernels.margins import delta
 from bms_estimator.kernels.nussbaum import nussbaum_gain
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 SMALLEST_LOOP = 0.1
 """Least 1 + N R_s the algebraic loop of (3.14) is closed with; below it N has turned the loop's sign."""

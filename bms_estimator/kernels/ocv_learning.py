@@ -13,12 +13,11 @@ place in it: Smith, Self and Cheeseman 1990).
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.cell import Floats
 from bms_estimator.kernels.ekf_state import NODE, NODES
 from bms_estimator.kernels.ladder import on_grid
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 ALIKE_SOC = 0.6
 """Errors of a curve go together over so much [SOC]: makes of one chemistry differ in what is cut off of the electrodes."""

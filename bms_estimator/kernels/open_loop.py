@@ -7,12 +7,12 @@ than one a minute.
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.cell import Floats, c_tl, c_ts, r_s, r_tl, r_ts, rc_step
 from bms_estimator.kernels.charge import UNMEASURED_S, along_line, held_current
 from bms_estimator.kernels.ladder import BRANCHES, TAUS, TREND
 from bms_estimator.kernels.unseen import SLOW_S
+from bms_estimator.numba_cache import njit
 
 LEAST_CAPACITANCE = 1e-3
 """C_ts, C_tl are held at this fraction of a9, a12 below delta1, delta2, where (2.7), (2.8) turn negative."""

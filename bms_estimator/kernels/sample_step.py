@@ -4,7 +4,6 @@ import math
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import soc_from_ocv
@@ -17,6 +16,7 @@ from bms_estimator.kernels.observer import count_charge, observer_step, start
 from bms_estimator.kernels.series_resistance import begin_series_resistance, series_resistance, series_resistance_step
 from bms_estimator.kernels.state import Record
 from bms_estimator.kernels.step_resistance import UNHELD
+from bms_estimator.numba_cache import njit
 
 Records = NDArray[np.void]
 

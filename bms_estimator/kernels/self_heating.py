@@ -5,11 +5,10 @@
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.ekf_state import LN_R, LN_R0, X
 from bms_estimator.kernels.ladder import BRANCHES, REFERENCE_C, resistances
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 HEAT_J = 22.0
 """Heat that warms 1 Ah of a cell by a kelvin [J/(K Ah)] ..."""

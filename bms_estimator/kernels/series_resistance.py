@@ -7,11 +7,11 @@ absorb every error of the voltage and leave nothing for R_s.
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.cell import c_tl, c_ts, ocv, r_tl, r_ts, rc_step
 from bms_estimator.kernels.observer import floor
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 BINS = 100
 """Number of SOC bins, one value of R_s each."""

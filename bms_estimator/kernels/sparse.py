@@ -11,8 +11,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from bms_estimator.numba_cache import njit
 
 Words = NDArray[np.uint64]
 Mirror = NDArray[np.int32]

@@ -9,13 +9,12 @@ voltage and current of one row may be of two moments.
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.ekf import HUBER
 from bms_estimator.kernels.ekf_state import LN_R, SOC
 from bms_estimator.kernels.equivalent import LONGEST_S
 from bms_estimator.kernels.ladder import BRANCHES, resistances
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 UNHELD, HELD, STEPPED = range(3)
 LEAST_C = 0.2

@@ -5,9 +5,8 @@
 
 import math
 
-from numba import njit
-
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 LOAD_S = 600.0
 """The present load is judged over so long; it goes on for about as long [s]."""

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.sample_step import Records
+from bms_estimator.numba_cache import njit
 
 WINDOW_SUMS = np.dtype(
     [

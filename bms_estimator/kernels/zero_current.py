@@ -7,11 +7,10 @@ sensor shows at all, behind its steps and its dead band, is seen from the smalle
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
 
-from numba import njit
-
 from bms_estimator.kernels.ekf import observe
 from bms_estimator.kernels.ekf_state import OFFSET
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 REST_C, REST_S = 0.01, 60.0
 """Less than this, second by second, for so long is a rest [C, s] ..."""

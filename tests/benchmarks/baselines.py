@@ -3,11 +3,11 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell import Floats, ocv
 from bms_estimator.kernels.ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
+from bms_estimator.numba_cache import njit
 
 EKF_VOLTAGE_SIGMA_V = 0.005
 """Measurement noise of the textbook filter [V]."""

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 from load import CELL, RATE_HZ, pulses
-from numba import njit
 from table import Row
 from wire import hello, sample_frames
 
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.numba_cache import njit
 from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
 from bms_estimator.sources.wire.framing import SAMPLE_FRAME_BYTES, crc16
 

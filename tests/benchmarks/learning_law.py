@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numba import njit
 from rich.console import Console
 from rich.table import Table
 
@@ -30,6 +29,7 @@ from bms_estimator.kernels.state import TRACE, Record
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.settings import ObserverSettings
+from bms_estimator.numba_cache import njit
 from tests.conftest import SHARED_DATA
 from tests.estimator.random_steps import (
     FIRST_SOC,

@@ -4,9 +4,7 @@ from pathlib import Path
 
 from tests.benchmarks.endurance import fed
 from tests.benchmarks.lost_sensor import LOSSES, attack
-from tests.mosquitto import Broker, broker
-
-__all__ = ["broker"]
+from tests.mosquitto import Broker
 
 
 def test_ten_minutes_of_serial_bytes_are_all_estimated() -> None:

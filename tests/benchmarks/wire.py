@@ -1,10 +1,10 @@
 """What a board would put on the line for given samples, fast enough for millions."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.numba_cache import njit
 from bms_estimator.sources.protocol import PROTOCOL_VERSION, Hello
 from bms_estimator.sources.wire.framing import MESSAGE_SAMPLE, SAMPLE_BYTES, SAMPLE_FRAME_BYTES, crc16
 

@@ -16,7 +16,7 @@ from bms_estimator.sources.raw_capture import MAGIC, read_capture, read_header
 from bms_estimator.sources.wire.capture_records import RECORD_OVERHEAD_BYTES
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
-from tests.serial_line import Line, line  # noqa: F401
+from tests.serial_line import Line
 
 LENGTH_AT = 8
 DATA_AT = 12
@@ -75,7 +75,7 @@ def replayed(capsys, path):
     return ended.value.code or 0, json.loads(out), err
 
 
-def test_every_byte_of_the_line_is_in_the_file_and_ctrl_c_ends_it(line: Line, tmp_path, capsys):  # noqa: F811
+def test_every_byte_of_the_line_is_in_the_file_and_ctrl_c_ends_it(line: Line, tmp_path, capsys):
     out = tmp_path / "line.bms"
     line.plug()
     with program("record", out, "--port", line.path, "--text", "--baud", 115200) as process:

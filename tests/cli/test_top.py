@@ -11,11 +11,9 @@ from bms_estimator.cli.keys import meanings
 from bms_estimator.model.estimate import Snapshot
 from bms_estimator.sinks.messages import Messages, Sent
 from tests.command_line import PROGRAM, run
-from tests.mosquitto import Broker, Listener, broker
+from tests.mosquitto import Broker, Listener
 from tests.pseudo_terminal import BACK, PseudoTerminal
 from tests.sinks.snapshots import NOW, ONE
-
-__all__ = ["broker"]
 
 
 def of(device: str, voltage_v: float) -> Snapshot:

@@ -7,11 +7,10 @@ import numba
 from numba.core.caching import _CacheLocator
 
 import bms_estimator
+from bms_estimator.numba_cache import COMPILED_IN
 from bms_estimator.service.warm_up import load_kernels
 
 PACKAGE = Path(bms_estimator.__file__).parent
-COMPILED = ("kernels", "sources/wire")
-"""Folders of compiled code: numba gives each one of its own in the cache."""
 LEFT_OUT = "sample_step.run-"
 """Begin of the names of the kernel's files that the service has to compile itself."""
 
@@ -21,9 +20,11 @@ def fill(cache: Path, package: Path = PACKAGE) -> None:
     load_kernels()
     compiled = Path(numba.config.CACHE_DIR)
     named = _CacheLocator.get_suitable_cache_subpath  # by the folder of a source
-    for folder in COMPILED:
-        shutil.copytree(
-            compiled / named(str(PACKAGE / folder / "any.py")),
-            cache / compiled.name / named(str(package / folder / "any.py")),
-            ignore=shutil.ignore_patterns(f"{LEFT_OUT}*", "*.tmp.*"),
-        )
+    for folder in {source.parent.relative_to(PACKAGE) for source in COMPILED_IN}:
+        cached = compiled / named(str(PACKAGE / folder / "any.py"))
+        if cached.is_dir():
+            shutil.copytree(
+                cached,
+                cache / compiled.name / named(str(package / folder / "any.py")),
+                ignore=shutil.ignore_patterns(f"{LEFT_OUT}*", "*.tmp.*"),
+            )

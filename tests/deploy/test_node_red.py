@@ -12,11 +12,9 @@ import pytest
 from bms_estimator.model.estimate import Alarm, Estimate
 from bms_estimator.sinks.messages import Messages
 from tests.free_port import free_port
-from tests.mosquitto import Broker, Listener, broker
+from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE, SOC_LOW
-
-__all__ = ["broker"]
 
 ROOT = Path(__file__).parents[2]
 NODE_RED = ROOT / ".node/node_modules/.bin/node-red"

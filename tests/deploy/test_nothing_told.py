@@ -10,10 +10,8 @@ import pytest
 from tests.command_line import PROGRAM
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.patience import LONG_S
-from tests.serial_line import Line, line
+from tests.serial_line import Line
 from tests.sinks.certificates import Authority
-
-__all__ = ["line"]
 
 PASSWORD = "open-sesame-4711"
 PACK = """

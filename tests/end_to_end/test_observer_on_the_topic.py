@@ -15,9 +15,7 @@ from bms_estimator.model.cell import load_cell
 from tests.command_line import PROGRAM
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
-from tests.serial_line import Line, line
-
-__all__ = ["line"]
+from tests.serial_line import Line
 
 CELL = load_cell("chen_mora")
 STEP_S, START_SOC, LAMBDA = 0.1, 0.5, 50_000.0

@@ -20,11 +20,9 @@ from bms_estimator.model.estimate import EdgeHealth
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.fleet.engine import Engine, running
 from tests.fleet.receiver import Receiver
-from tests.mosquitto import Broker, Listener, broker
+from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.sinks.proxy import Proxy
-
-__all__ = ["broker"]
 
 WALL_S = 1.7e9
 SETTINGS = {"block_s": 60.0, "store_mib": 1.0}

@@ -23,9 +23,7 @@ from tests.command_line import PROGRAM, run
 from tests.fleet.engine import Engine, running
 from tests.fleet.receiver import Receiver
 from tests.patience import LONG_S
-from tests.serial_line import Line, line
-
-__all__ = ["line"]
+from tests.serial_line import Line
 
 
 @pytest.fixture(scope="module")

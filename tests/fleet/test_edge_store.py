@@ -20,10 +20,7 @@ from bms_estimator.fleet.gathering import Gathered
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.store.database import Database
-from tests.full_disk import full_disk
 from tests.patience import LONG_S
-
-__all__ = ["full_disk"]
 
 WALL_S = 1.7e9
 FAR = 1 << 30

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import bms_estimator
-from bms_estimator import kernels
+from bms_estimator import numba_cache
 from tests.patience import LONG_S
 
 PACKAGE = Path(bms_estimator.__file__).parent
@@ -29,13 +29,20 @@ def imported(source: Path) -> set[Path]:
 def test_every_file_with_compiled_code_is_in_the_caches_name() -> None:
     compiled = {path for path in PACKAGE.rglob("*.py") if re.search(r"^@njit\b", path.read_text(), re.MULTILINE)}
     assert PACKAGE / "sources" / "wire" / "framing.py" in compiled
-    assert compiled <= set(kernels.COMPILED_IN)
+    assert compiled <= set(numba_cache.COMPILED_IN)
 
 
 def test_every_file_that_a_kernel_imports_is_in_the_caches_name() -> None:
-    found = set().union(*(imported(source) for source in kernels.COMPILED_IN))
+    found = set().union(*(imported(source) for source in numba_cache.COMPILED_IN))
     assert PACKAGE / "model" / "suspect.py" in found
-    assert found <= set(kernels.COMPILED_IN)
+    assert found <= set(numba_cache.COMPILED_IN)
+
+
+def test_every_kernel_takes_njit_from_the_cache() -> None:
+    direct = {
+        path for path in PACKAGE.rglob("*.py") if re.search(r"^from numba import njit", path.read_text(), re.MULTILINE)
+    }
+    assert direct == {PACKAGE / "numba_cache.py"}
 
 
 def crc16_with_cache_in(folder: Path) -> str:

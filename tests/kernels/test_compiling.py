@@ -1,10 +1,9 @@
 """A person hears which kernel is being compiled."""
 
-from numba import njit
-
 from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.kernels import margins
 from bms_estimator.kernels.compiling import compiling_told
+from bms_estimator.numba_cache import njit
 from bms_estimator.sources.wire import scaling
 
 

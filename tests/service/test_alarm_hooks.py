@@ -25,10 +25,8 @@ from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.snapshot.alarms import Change
 from bms_estimator.sources.protocol import Relay
 from tests.collector import Collector
-from tests.mosquitto import Broker, Listener, broker
+from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
-
-__all__ = ["broker"]
 
 RAISED = Alarm(
     name="soc_low",

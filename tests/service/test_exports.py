@@ -13,9 +13,7 @@ from bms_estimator.service.serve import serve
 from tests.free_port import free_port
 from tests.influxdb import INFLUXD, InfluxDB
 from tests.patience import LONG_S
-from tests.serial_line import Line, line
-
-__all__ = ["line"]
+from tests.serial_line import Line
 
 
 async def test_what_a_board_measures_reaches_both(line: Line, tmp_path: Path) -> None:

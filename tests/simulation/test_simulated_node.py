@@ -8,10 +8,8 @@ from bms_estimator.model.settings import MqttSettings, Settings
 from bms_estimator.simulation.simulated_node import SimulatedNode
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources.kinds import open_reports
-from tests.mosquitto import Broker, Listener, broker
+from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
-
-__all__ = ["broker"]
 
 
 async def test_what_the_node_publishes_is_heard_with_signs_and_cells(broker: Broker) -> None:

@@ -20,11 +20,8 @@ from bms_estimator.store import database as database_module
 from bms_estimator.store.database import FREE_PAGES, Database, StoreError
 from bms_estimator.store.history import History
 from bms_estimator.store.outbox import Outbox
-from tests.full_disk import full_disk
 from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE
-
-__all__ = ["full_disk"]
 
 
 @pytest.fixture

@@ -6,12 +6,10 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from tests.mosquitto import Broker, Listener, broker
+from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
-from tests.serial_line import Line, line
+from tests.serial_line import Line
 from tests.service.test_process import ended, feed, pack_file, service
-
-__all__ = ["broker", "line"]
 
 TOPICS = ("bms/pack/state", "bms/pack/event")
 

@@ -8,9 +8,9 @@ the sample that came with the least delay counts, and of those the ones on the l
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 
 CLOCK_WINDOWS = 60
 """The last ten minutes: a resonator drifts with its temperature."""

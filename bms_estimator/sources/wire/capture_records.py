@@ -1,9 +1,9 @@
 """Records of a raw capture (``sources.raw_capture`` has the format) taken apart, a megabyte at a time."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bms_estimator.numba_cache import njit
 from bms_estimator.sources.wire.framing import Bytes, crc16, take
 
 ARRIVAL_BYTES = 8

@@ -7,11 +7,11 @@ depends on how the bytes were cut into calls, except for the arrival time of the
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.state import Record
 from bms_estimator.model.sample import LEAST_C, MOST_C, SampleStatus
+from bms_estimator.numba_cache import njit
 from bms_estimator.sources.protocol import MODULUS, PROTOCOL_VERSION, BoardStatus, MessageType
 from bms_estimator.sources.wire.board_clock import CLOCK_WINDOWS, forget_clock, take_arrival
 from bms_estimator.sources.wire.scaling import (

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from bms_estimator.kernels.state import Record
+from bms_estimator.numba_cache import njit
 from bms_estimator.sources.protocol import MODULUS
 
 SCALING = np.dtype(

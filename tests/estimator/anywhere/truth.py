@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.numba_cache import njit
 
 Floats = NDArray[np.float64]
 
