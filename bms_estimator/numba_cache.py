@@ -31,7 +31,7 @@ _PACKAGE = Path(__file__).parent
 COMPILED_IN = (
     *sorted((_PACKAGE / "kernels").rglob("*.py")),
     *sorted((_PACKAGE / "sources" / "wire").glob("*.py")),
-    *(_PACKAGE / constants for constants in ("model/sample.py", "model/suspect.py", "sources/protocol.py")),
+    *(_PACKAGE / constants for constants in ("model/sample.py", "model/input_faults.py", "sources/protocol.py")),
 )
 """Files whose content is compiled into kernels: kernels, frame decoding and the constants that they use."""
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.fuel_cell_open_loop import open_loop
+from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop
 from bms_estimator.numba_cache import njit
 
 Floats = NDArray[np.float64]

@@ -1,1 +1,1 @@
-"""From captures to cell models: relaxation test, OCV, series resistance, identification, validation."""
+"""Cell files from captures."""

@@ -16,7 +16,7 @@ from bms_estimator.calibration.relaxation import without_glitches
 from bms_estimator.calibration.replays import interval_score
 from bms_estimator.calibration.series_resistance import LOWEST_SOC
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, ROOM_C, SOC_GRID, ladder_of_branches
-from bms_estimator.kernels.ladder import weak_share
+from bms_estimator.kernels.cell_model.rc_ladder import weak_share
 from bms_estimator.model.cell import CellModel, Ladder, Resistance
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError

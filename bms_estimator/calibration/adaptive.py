@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.average import Settled, averaged, settled
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.margins import crossing, delta
+from bms_estimator.kernels.cell_model.margins import crossing, delta
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from bms_estimator.calibration.ladder_voltage import hats
-from bms_estimator.kernels.equivalent import LN_TAUS, SHORT
-from bms_estimator.kernels.ladder import RESISTANCES
+from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import LN_TAUS, SHORT
 from bms_estimator.model.cell import Capacitance, Ladder, Resistance
 
 Floats = NDArray[np.float64]

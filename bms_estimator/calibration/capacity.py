@@ -20,15 +20,15 @@ from bms_estimator.calibration.ocv_points import COLD_V, LONG_REST_S, RELAXED_V,
 from bms_estimator.calibration.relaxation import Rest, find_rests, resting_samples, runs, without_glitches
 from bms_estimator.estimator.filter_settings import CURVE_SOC, filter_settings
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.cell import ocv, soc_from_ocv
-from bms_estimator.kernels.hypotheses import HYST_STD
-from bms_estimator.kernels.ladder import HYSTERESIS_J, REFERENCE_C, arrhenius, on_grid
-from bms_estimator.kernels.open_loop import hysteresis
+from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
+from bms_estimator.kernels.cell_model.open_loop import hysteresis
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, arrhenius, on_grid
+from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings
+from bms_estimator.settings.pack import IdentifierSettings
 
 Floats = NDArray[np.float64]
 

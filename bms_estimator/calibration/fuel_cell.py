@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from bms_estimator.kernels.fuel_cell import NAMES
-from bms_estimator.kernels.fuel_cell_open_loop import open_loop, polarisation
-from bms_estimator.kernels.learning_state import LEARNABLE
+from bms_estimator.kernels.cell_model.fuel_cell import NAMES
+from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
+from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, Parameter
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.rest_elements import RestElements
-from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells, load_cell
 
 Floats = NDArray[np.float64]

@@ -35,8 +35,8 @@ from bms_estimator.calibration.replays import interval_score
 from bms_estimator.calibration.slow_curve import PAIR_V
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.cell import r_s, soc_from_ocv
-from bms_estimator.kernels.ladder import REFERENCE_C, RESISTANCES, STRONG_J, weak_share
+from bms_estimator.kernels.cell_model.chen_mora import r_s, soc_from_ocv
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, weak_share
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError

@@ -23,8 +23,8 @@ from scipy.optimize import lsq_linear
 from bms_estimator.calibration.ladder_voltage import arrhenius, hats
 from bms_estimator.calibration.load import Load
 from bms_estimator.calibration.relaxation import runs
-from bms_estimator.kernels.ladder import REFERENCE_C, RESISTANCES, STRONG_J, WEAK_J
-from bms_estimator.kernels.open_loop import branch_currents
+from bms_estimator.kernels.cell_model.open_loop import branch_currents
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, WEAK_J
 from bms_estimator.model.errors import UserError
 
 Floats = NDArray[np.float64]

@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.load import Load
-from bms_estimator.kernels.ekf_state import Noise
-from bms_estimator.kernels.ladder import GAS_J, HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
-from bms_estimator.kernels.open_loop import branch_currents, hysteresis, two_branches
+from bms_estimator.kernels.cell_model.open_loop import branch_currents, hysteresis, two_branches
+from bms_estimator.kernels.cell_model.rc_ladder import GAS_J, HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
+from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 
 Floats = NDArray[np.float64]

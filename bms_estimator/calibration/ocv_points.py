@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.relaxation import LEAST_POINTS, RelaxationTest
-from bms_estimator.kernels.ladder import REFERENCE_C
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.errors import UserError
 
 Floats = NDArray[np.float64]

@@ -23,7 +23,7 @@ from bms_estimator.calibration.slow_curve import (
     slow_branches,
     slow_curves,
 )
-from bms_estimator.kernels.ladder import HYSTERESIS_J, REFERENCE_C, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, arrhenius
 from bms_estimator.model.cell import Ladder
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock

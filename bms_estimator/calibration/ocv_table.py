@@ -21,7 +21,7 @@ from scipy.optimize import lsq_linear
 
 from bms_estimator.calibration.ladder_voltage import hats
 from bms_estimator.calibration.ocv_points import Points, check_points, rms_v, with_ends
-from bms_estimator.kernels.ladder import REFERENCE_C
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import TableOcv
 
 Floats = NDArray[np.float64]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.relaxation import soc_by_counting, without_glitches
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.cell import c_tl, c_ts, ocv, r_s, r_tl, r_ts, simulate_cell
-from bms_estimator.kernels.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_tl, r_ts, simulate_cell
+from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.prediction import Prediction, open_circuit
-from bms_estimator.kernels.series_resistance import BINS, SMALLEST_CURRENT_C
+from bms_estimator.kernels.observer.series_resistance import BINS, SMALLEST_CURRENT_C
 from bms_estimator.model.cell import CellModel, Resistance
 from bms_estimator.model.errors import UserError
 

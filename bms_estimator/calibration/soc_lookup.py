@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.prediction import Prediction, open_circuit
-from bms_estimator.kernels.cell import r_s
+from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.cell import CellModel
 
 Floats = NDArray[np.float64]

@@ -23,8 +23,8 @@ from bms_estimator.cli.pack import pack_or_cell, refuse_soc, with_pack
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
 from bms_estimator.service.live import new_estimator
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.alarm_watch import AlarmWatch
 from bms_estimator.snapshot.alarms import Change
 from bms_estimator.sources.replay import Replay, open_capture

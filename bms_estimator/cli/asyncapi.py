@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks.asyncapi import document
 
 

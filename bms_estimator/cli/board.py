@@ -7,8 +7,8 @@ import typer
 
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import Settings, load_settings
 from bms_estimator.service.state_folder import state_folder
+from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.board_memory import NO_BOARD, BoardMemory
 from bms_estimator.sources.ports import NoPortError, resolve_port
 from bms_estimator.sources.probe import AskedBoard

@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 from rich.console import Console
 from rich.status import Status
 
-from bms_estimator.kernels.compiling import compiling_told
+from bms_estimator.kernels.compile_events import compiling_told
 
 Show = Callable[[str], None]
 """Takes a line."""

@@ -14,17 +14,17 @@ from bms_estimator.estimator.lemma import Condition, failed
 from bms_estimator.estimator.plausible import implausible
 from bms_estimator.estimator.records import estimator_settings
 from bms_estimator.fleet.edge import check_edge
-from bms_estimator.kernels.margins import delta
-from bms_estimator.model.alarm_limits import out_of_range, watched
+from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.edge_settings import EdgeSettings
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.export_settings import InfluxSettings
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.page_settings import PageSettings
-from bms_estimator.model.settings import MqttSettings, SensorSettings, Settings
 from bms_estimator.page.guard import guard_of
 from bms_estimator.service.alarm_hooks import unusable
+from bms_estimator.settings.alarm_limits import out_of_range, watched
+from bms_estimator.settings.edge import EdgeSettings
+from bms_estimator.settings.exports import InfluxSettings
+from bms_estimator.settings.pack import MqttSettings, SensorSettings, Settings
+from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.credential import is_for_the_service
 from bms_estimator.sinks.influx import target

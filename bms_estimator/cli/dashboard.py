@@ -9,12 +9,12 @@ import typer
 from bms_estimator.cli.browser import open_browser
 from bms_estimator.cli.pack import with_broker
 from bms_estimator.cli.page_options import page_settings
-from bms_estimator.model.page_settings import DEFAULT_LISTEN, PageSettings
-from bms_estimator.model.settings import MqttSettings, Settings, load_settings
 from bms_estimator.page.dashboard import dashboard as serving
 from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.logs import configure_logs, drained
 from bms_estimator.service.state_folder import state_folder
+from bms_estimator.settings.pack import MqttSettings, Settings, load_settings
+from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
 
 
 def dashboard(

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import typer
 
-from bms_estimator.sources.number import number
+from bms_estimator.model.decimal_text import number
 
 Number = TypeVar("Number", int, float)
 

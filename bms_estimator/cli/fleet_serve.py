@@ -13,12 +13,12 @@ from bms_estimator.fleet import credentials
 from bms_estimator.fleet.server import Place, Told
 from bms_estimator.fleet.server import serve as serving
 from bms_estimator.fleet.server_config import CLUSTER_PORT, Accounts
+from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fleet_settings import FleetSettings
-from bms_estimator.model.page_settings import parse_listen
-from bms_estimator.model.settings import DeviceName
-from bms_estimator.model.toml_file import read_toml
 from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.settings.fleet import FleetSettings
+from bms_estimator.settings.pack import DeviceName
+from bms_estimator.settings.page import parse_listen
 
 SettingsFile = Annotated[
     Path | None, typer.Argument(help="settings of the fleet, fleet.toml; without, all as it comes", show_default=False)

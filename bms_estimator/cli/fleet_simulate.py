@@ -15,9 +15,9 @@ from bms_estimator.fleet.simulate import Report, run_edges
 from bms_estimator.fleet.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import DeviceName, MqttSettings
 from bms_estimator.model.text_file import write_text
 from bms_estimator.service.interrupt import stop_on_signal
+from bms_estimator.settings.pack import DeviceName, MqttSettings
 from bms_estimator.sinks.brokers import check
 
 MOST_PACKS = 999_999

@@ -32,7 +32,7 @@ from bms_estimator.calibration.relaxation import RelaxationTest, without_glitche
 from bms_estimator.calibration.rest_elements import rest_elements
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_once, check_out, name_of, unlike
 from bms_estimator.cli.decimal_option import decimal, whole
-from bms_estimator.kernels.ladder import REFERENCE_C
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError

@@ -5,7 +5,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.settings.page import PageSettings
 
 
 def page_settings(settings: PageSettings, **given: Any) -> PageSettings:

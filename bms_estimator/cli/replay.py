@@ -25,8 +25,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
 from bms_estimator.service.live import new_estimator
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests

@@ -16,7 +16,6 @@ from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings, load_settings
 from bms_estimator.service.interrupt import starting
 from bms_estimator.service.logs import configure_logs, drained
 from bms_estimator.service.reload import Reload, ask_all, reload_on_hangup
@@ -24,6 +23,7 @@ from bms_estimator.service.serve import serve
 from bms_estimator.service.several import serve_several
 from bms_estimator.service.state_folder import state_folder
 from bms_estimator.service.warm_up import load_kernels
+from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks.console_sink import ConsoleSink
 from bms_estimator.sinks.console_view import LOG_LINES
 from bms_estimator.sources.raw_capture import header_of

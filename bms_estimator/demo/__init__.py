@@ -1,1 +1,1 @@
-"""The demo: a broker and a board on one machine."""
+"""A pack, a broker and a page in one command."""

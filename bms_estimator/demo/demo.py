@@ -10,8 +10,10 @@ from bms_estimator.demo.broker import LOOPBACK, DemoBroker, choose_port
 from bms_estimator.demo.totals import Totals
 from bms_estimator.demo.truth import Truth
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.page_settings import DEFAULT_LISTEN, PageSettings, parse_listen
-from bms_estimator.model.settings import (
+from bms_estimator.page.sink import Pages
+from bms_estimator.service.interrupt import stop_on_signal
+from bms_estimator.service.serve import serve
+from bms_estimator.settings.pack import (
     MqttSettings,
     ObserverSettings,
     PackSettings,
@@ -19,9 +21,7 @@ from bms_estimator.model.settings import (
     SensorSettings,
     Settings,
 )
-from bms_estimator.page.sink import Pages
-from bms_estimator.service.interrupt import stop_on_signal
-from bms_estimator.service.serve import serve
+from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings, parse_listen
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from bms_estimator.sinks.console_sink import ConsoleSink
 

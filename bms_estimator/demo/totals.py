@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Self
 
-from bms_estimator.model.estimate import Estimate, Snapshot
+from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.sinks.console_view import BAND_STDS
 
 

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.records import estimator_settings
-from bms_estimator.kernels import sample_step as kernel
-from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.hypotheses import tell
-from bms_estimator.kernels.input_checks import UNUSABLE, keep
-from bms_estimator.kernels.sample_step import Verdict
-from bms_estimator.kernels.state import TRACE
+from bms_estimator.kernels import step as kernel
+from bms_estimator.kernels.kalman_filter.hypotheses import tell
+from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, keep
+from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.kernels.records import ESTIMATOR_STATE
+from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
-from bms_estimator.model.resolution import BOARD, Sampling
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings, ObserverSettings, Settings
+from bms_estimator.settings.device_resolution import BOARD, Sampling
+from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings, Settings
 
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""

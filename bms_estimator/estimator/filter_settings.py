@@ -5,13 +5,13 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels import cell as chen_mora
-from bms_estimator.kernels.charge import PERIODS, UNMEASURED_S
-from bms_estimator.kernels.ekf_state import EKF_SETTINGS, Noise
-from bms_estimator.kernels.ladder import BRANCHES, GRID, RESISTANCES, TAU_S, weak_share
+from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.kernels.cell_model.current_interpolation import PERIODS, UNMEASURED_S
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANCES, TAU_S, weak_share
+from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, Noise
 from bms_estimator.model.cell import CellModel, TableOcv
-from bms_estimator.model.resolution import BOARD, Sampling
-from bms_estimator.model.settings import IdentifierSettings
+from bms_estimator.settings.device_resolution import BOARD, Sampling
+from bms_estimator.settings.pack import IdentifierSettings
 
 CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
 """Where the cell file does not say how wrong its OCV is: std of one cell [V], and std along SOC."""

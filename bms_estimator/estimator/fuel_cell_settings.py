@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.learning_settings import LEAK_S, RATE_HZ, REACH
-from bms_estimator.kernels.fuel_cell import NAMES
-from bms_estimator.kernels.learning_model import Model
-from bms_estimator.kernels.learning_state import LEARNING_SETTINGS
+from bms_estimator.kernels.cell_model.fuel_cell import NAMES
+from bms_estimator.kernels.observer.learning_model import Model
+from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
 from bms_estimator.model.fuel_cell import FuelCellModel
 
 MEMORY_S = 60.0

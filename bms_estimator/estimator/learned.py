@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.kernels.cell import emf
-from bms_estimator.kernels.ekf_state import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
-from bms_estimator.kernels.element_map import ELEMENT_NAMES
-from bms_estimator.kernels.equivalent import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
-from bms_estimator.kernels.identification import LEAST_BINS
-from bms_estimator.kernels.ladder import on_grid
-from bms_estimator.kernels.ocv_learning import per_node_v, place
+from bms_estimator.kernels.cell_model.chen_mora import emf
+from bms_estimator.kernels.cell_model.rc_ladder import on_grid
+from bms_estimator.kernels.identifier import LEAST_BINS
+from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
+from bms_estimator.kernels.kalman_filter.ocv_correction import per_node_v, place
+from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
 from bms_estimator.model.cell import CellModel, TableOcv
 
 WIDEST_CAPACITY_STD = 0.3

@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.chen_mora import NAMES
-from bms_estimator.kernels.learning_model import Model
-from bms_estimator.kernels.learning_state import LEARNING_SETTINGS
-from bms_estimator.kernels.margins import delta
-from bms_estimator.kernels.state import PARAMETERS
+from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
+from bms_estimator.kernels.observer.learning_model import Model
+from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
+from bms_estimator.kernels.observer.records import PARAMETERS
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.settings import ObserverSettings
+from bms_estimator.settings.pack import ObserverSettings
 
 MEMORY_S = 3600.0
 """Under load data are forgotten with this time constant [s]."""

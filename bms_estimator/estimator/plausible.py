@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.fuel_cell_open_loop import polarisation
-from bms_estimator.kernels.learning_state import LEARNABLE
+from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
+from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 
 LARGEST_AH = 2000.0
 """The largest Li-ion cells on sale hold some 1300 Ah [Ah]."""

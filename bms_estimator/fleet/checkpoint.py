@@ -26,7 +26,7 @@ import numpy as np
 
 from bms_estimator.fleet.deferred import Span
 from bms_estimator.fleet.pack_state import PACK_STATE
-from bms_estimator.kernels.sparse import mirror_of
+from bms_estimator.kernels.packed_record import mirror_of
 
 FORMAT = 1
 CHUNK_BYTES = 1 << 20

@@ -20,11 +20,11 @@ from bms_estimator.fleet.edge_disk import EDGE_TABLES
 from bms_estimator.fleet.edge_store import EdgeStore
 from bms_estimator.fleet.gathering import MOST_SAMPLES, Gathering
 from bms_estimator.model.clock import Clock, since_boot
-from bms_estimator.model.edge_settings import EdgeSettings
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import EdgeHealth
+from bms_estimator.model.payloads import EdgeHealth
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.edge import EdgeSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.backlog import Sending
 from bms_estimator.sinks.brokers import brokers, check

@@ -13,12 +13,12 @@ from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.estimator.learned import current_offset, relative_capacity, relative_series_resistance
 from bms_estimator.fleet.block import Block
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
-from bms_estimator.kernels.ekf_state import LN_Q, OFFSET, SOC
-from bms_estimator.kernels.equivalent import R_S, R_TL, R_TS, TAU_TL, TAU_TS
-from bms_estimator.kernels.hour import HOUR_SUMS, OF_HOUR, add_rows
-from bms_estimator.kernels.hypotheses import pack_std
+from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, OF_HOUR, add_rows
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS
+from bms_estimator.kernels.kalman_filter.hypotheses import pack_std
+from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.model.settings import PackSettings
+from bms_estimator.settings.pack import PackSettings
 
 __all__ = ["HOUR_S", "HOUR_SUMS", "Hour", "add", "begin", "hour_of", "row"]
 

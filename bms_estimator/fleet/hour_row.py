@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from bms_estimator.model.estimate import Report
+from bms_estimator.model.payloads import Report
 
 HOUR_S = 3600
 Correlation = Annotated[float, Field(ge=-1.001, le=1.001)]

@@ -11,7 +11,7 @@ from bms_estimator.fleet.pack_row import PackKind, kind_of, known_cells, model_o
 from bms_estimator.fleet.pack_type import type_estimator
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 
 MOST_KINDS = 1024
 """So many kinds of packs are kept ready."""

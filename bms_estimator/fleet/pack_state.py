@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.estimator_state import ESTIMATOR_STATE
-from bms_estimator.kernels.flow import FLOW_SUMS
-from bms_estimator.kernels.hour import HOUR_SUMS
-from bms_estimator.kernels.sparse import WORD_BYTES, mirror_of, pack, room, unpack
+from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
+from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
+from bms_estimator.kernels.packed_record import WORD_BYTES, mirror_of, pack, room, unpack
+from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.service.checkpoint import fields
 from bms_estimator.service.resume import fill
 

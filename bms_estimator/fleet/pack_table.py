@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from bms_estimator.fleet.pack_row import COLUMNS, PackKind, known_cells, model_key, model_of, stored
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import DEVICE_NAME
+from bms_estimator.settings.pack import DEVICE_NAME
 
 MOST_SAID = 20
 """Of the errors of a table so many are shown."""

@@ -11,8 +11,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import PackSettings, Settings
 from bms_estimator.service.checkpoint import pack_identity
+from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.snapshot.flow import Flow, Meter
 
 MOST_TYPES = 256

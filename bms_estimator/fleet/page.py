@@ -13,10 +13,10 @@ from aiohttp import web
 from bms_estimator.fleet.page_feed import FleetFeed, Server
 from bms_estimator.fleet.page_view import FleetView
 from bms_estimator.fleet.subjects import PARTITIONS
-from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.page.newest import Newest
 from bms_estimator.page.server import STATIC as SHARED
 from bms_estimator.page.web import File, WebServer
+from bms_estimator.settings.page import PageSettings
 
 STEP_S = 2.0
 """Between two pictures of the fleet [s]."""

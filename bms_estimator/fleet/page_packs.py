@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic_core import from_json
 
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.input_faults import Suspect
 
 ALIVE_S = 180.0
 """A pack that sends a block a minute is silent when it has not been heard for so long [s]."""

@@ -23,7 +23,7 @@ from bms_estimator.fleet.pack_type import PackType, PackTypes
 from bms_estimator.fleet.stepping import Stepping
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 
 Table = Callable[[str], tuple[Settings, PackModel] | None]
 """The settings of a pack, and the pack as one object; None: it is not known."""

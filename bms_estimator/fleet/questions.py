@@ -19,7 +19,7 @@ import duckdb
 from bms_estimator.fleet.hour_files import DAY, FOLDER, SCHEMA, day_folder, is_whole
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.input_faults import Suspect
 
 SQL = resources.files("bms_estimator.fleet") / "sql"
 AGED_SOC, CHARGE_ERROR = 1000.0, 0.002

@@ -17,13 +17,13 @@ from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.learned import learned_cell
 from bms_estimator.fleet.pack_row import PackKind, cell_of, settings_of
-from bms_estimator.kernels.cell import r_s
+from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.resolution import Sampling
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.settings.device_resolution import Sampling
 
 Floats = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from bms_estimator.fleet.connection import part
 from bms_estimator.fleet.server_config import LET_IN_S, Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.fleet.streams import NoAnswerError, make_streams
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fleet_settings import FleetSettings, TenantSettings, TlsSettings, reachable
+from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSettings, reachable
 from bms_estimator.sinks.credential import credential
 from bms_estimator.store.private_file import write_private
 

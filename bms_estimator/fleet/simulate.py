@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from bms_estimator.fleet.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulated_fleet import SimulatedFleet
 from bms_estimator.fleet.subjects import Awaits, awaits, raw
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks.brokers import brokers, password, tls_context
 
 ROUND_S = 0.1

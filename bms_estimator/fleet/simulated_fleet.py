@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.records import ocv_grid
 from bms_estimator.fleet.block import Block, encode
-from bms_estimator.kernels.cell import OCV_POINTS
+from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 

@@ -15,7 +15,7 @@ from bms_estimator.fleet.density import LONGEST_STORE_S
 from bms_estimator.fleet.pack_state import PACK_STATE, Fields
 from bms_estimator.fleet.pack_type import Digest, PackType
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Report
+from bms_estimator.model.payloads import Report
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.service.checkpoint import fields, without_observer
 from bms_estimator.service.resume import resume

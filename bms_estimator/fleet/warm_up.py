@@ -6,8 +6,8 @@ from bms_estimator.fleet.block import Block, encode
 from bms_estimator.fleet.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import Settings
 from bms_estimator.service.warm_up import CELL, load_kernels
+from bms_estimator.settings.pack import Settings
 
 PACK = "a pack"
 HOUR_NS = 3600 * 10**9

@@ -1,1 +1,1 @@
-"""Compiled estimation kernels: no I/O, no clock, no Python objects."""
+"""Compiled estimation code: no I/O, no clock, no Python objects."""

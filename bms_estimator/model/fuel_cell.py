@@ -23,8 +23,8 @@ from bms_estimator.model.cell import (
     load_cell,
     shipped_fuel_cells,
 )
+from bms_estimator.model.config_file import Strict, read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.toml_file import Strict, read_toml
 
 Parameter = Literal[
     "r_ohm",

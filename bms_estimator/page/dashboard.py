@@ -4,11 +4,11 @@ import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-from bms_estimator.model.page_settings import PageSettings
-from bms_estimator.model.settings import MqttSettings
 from bms_estimator.page.hub import Hub
 from bms_estimator.page.past import Past
 from bms_estimator.page.server import PageServer
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.published import Heard
 from bms_estimator.sinks.subscriber import Subscriber
 

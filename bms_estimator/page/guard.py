@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.credential import credential
 
 SHORTEST_TOKEN = 16

@@ -7,10 +7,10 @@ from pathlib import Path
 from aiohttp import web
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.page_settings import PageSettings
 from bms_estimator.page.hub import Hub
 from bms_estimator.page.past import SPANS, Past
 from bms_estimator.page.web import File, WebServer
+from bms_estimator.settings.page import PageSettings
 
 HISTORY_S = 10.0
 """A disk that has not answered by then hangs [s]."""

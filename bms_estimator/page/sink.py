@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Self
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.page_settings import PageSettings
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.page.hub import Hub
 from bms_estimator.page.past import Past
 from bms_estimator.page.server import PageServer
+from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.messages import Message, Messages, Sent
 from bms_estimator.sinks.published import parsed
 

@@ -12,10 +12,10 @@ import structlog
 from aiohttp import web
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.page_settings import Listen, PageSettings
 from bms_estimator.page.guard import HEADERS, Guard, guard_of
 from bms_estimator.page.listener import CONNECTIONS, Listener
 from bms_estimator.page.newest import Newest, Reader
+from bms_estimator.settings.page import Listen, PageSettings
 
 PING_S = 5.0
 """A reader who hears nothing for so long hears that all is well: the page takes three times that for a lost line [s]."""

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from bms_estimator.estimator.lemma import Condition, lemma_conditions
-from bms_estimator.kernels.cell import emf
-from bms_estimator.kernels.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import emf
+from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.reports import printed, printed_pack
 from bms_estimator.reports.items import Table, Verdict, number

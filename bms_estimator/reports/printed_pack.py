@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import emf, r_s
-from bms_estimator.kernels.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
+from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed
 from bms_estimator.reports.items import Figure, Verdict

@@ -34,7 +34,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import ObserverSettings
+from bms_estimator.settings.pack import ObserverSettings
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell import c_tl, c_ts, cell_step, r_s, r_tl, r_ts, terminal_voltage
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, cell_step, r_s, r_tl, r_ts, terminal_voltage
 from bms_estimator.model.cell import Bounds, CellModel
 from bms_estimator.reports.simulation import block, observer_settings, with_bounds
 

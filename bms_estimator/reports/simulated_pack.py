@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import cell_step, terminal_voltage
+from bms_estimator.kernels.cell_model.chen_mora import cell_step, terminal_voltage
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.reports import printed

@@ -21,11 +21,11 @@ from bms_estimator.calibration.series_resistance import (
     series_resistance,
 )
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell import c_tl, c_ts, r_s, r_tl, r_ts, simulate_cell
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.model.cell import Bounds, CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.model.settings import ObserverSettings
 from bms_estimator.reports import printed
+from bms_estimator.settings.pack import ObserverSettings
 
 Floats = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.adaptive import AdaptiveRun
 from bms_estimator.calibration.prediction import Prediction
-from bms_estimator.kernels.cell import emf, r_s
-from bms_estimator.kernels.mittag_leffler import decay_table, mittag_leffler, series_coefficients
+from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
+from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
 from bms_estimator.reports.items import Figure, Verdict
 from bms_estimator.reports.plot import COLOURS, FAINT, plot, thin
 from bms_estimator.reports.simulation import (
@@ -80,7 +80,7 @@ def figure_9(_: Simulation) -> Figure:
         "Mittag-Leffler function as a Nussbaum function: block diagram",
         "",
         Verdict.GIVEN,
-        "A block diagram. Its function is kernels/mittag_leffler.py, exact to 1e-10 of its envelope.",
+        "A block diagram. Its function is kernels/observer/mittag_leffler.py, exact to 1e-10 of its envelope.",
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.lemma import lemma_conditions
-from bms_estimator.kernels.margins import delta
+from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed
 from bms_estimator.reports.items import Table, Verdict, number, percent

@@ -1,1 +1,1 @@
-"""The live loop around the estimator."""
+"""One pack as a process: live loop, publisher, alarm monitor and hooks, requests, reload."""

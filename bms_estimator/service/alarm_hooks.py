@@ -10,11 +10,11 @@ from typing import Literal, NamedTuple, Self
 
 import structlog
 
-from bms_estimator.model.alarm_settings import AlarmHook
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Alarm, HookHealth
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.payloads import Alarm, HookHealth
 from bms_estimator.service.hook_process import StartError, environment, run
+from bms_estimator.settings.alarms import AlarmHook
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.pauses import Pauses
 from bms_estimator.snapshot.alarms import Change
 from bms_estimator.sources.protocol import Relay

@@ -22,10 +22,10 @@ import structlog
 from numpy.typing import NDArray
 
 from bms_estimator.model.cell import ChenMoraOcv
-from bms_estimator.model.estimate import Totals
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.payloads import Totals
 from bms_estimator.service.moment import Moment, moment
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.totals import new_totals
 from bms_estimator.store.disk_thread import DiskThread

@@ -16,10 +16,9 @@ from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.fleet.edge import Edge
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.service.alarm_hooks import Hooks
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
 from bms_estimator.service.interrupt import until_first_ends
@@ -28,6 +27,7 @@ from bms_estimator.service.reload import Reload
 from bms_estimator.service.resume import resume
 from bms_estimator.service.saving import Saving
 from bms_estimator.service.stderr import stderr
+from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.snapshot.publisher import Publisher

@@ -8,8 +8,8 @@ from typing import Any, get_args
 
 import structlog
 
-from bms_estimator.model.settings import LogLevel
 from bms_estimator.service.stderr import stderr
+from bms_estimator.settings.pack import LogLevel
 
 LEVELS: tuple[LogLevel, ...] = get_args(LogLevel)
 _levels: dict[str, LogLevel] = {}

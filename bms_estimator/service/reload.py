@@ -8,7 +8,7 @@ from typing import Any
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.store.disk_thread import DiskThread
 
 HUNG_S = 10.0

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.ekf_noise import offset_variance
-from bms_estimator.kernels.ekf_state import HYPOTHESES, LN_Q, OFFSET, STATES
-from bms_estimator.kernels.input_checks import COUNTERS, keep
-from bms_estimator.kernels.mixture import forget
-from bms_estimator.kernels.ocv_learning import forget_curve
-from bms_estimator.kernels.state import OBSERVER_STATE
+from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS, keep
+from bms_estimator.kernels.kalman_filter.mixture import forget
+from bms_estimator.kernels.kalman_filter.noise import offset_variance
+from bms_estimator.kernels.kalman_filter.ocv_correction import forget_curve
+from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET, STATES
+from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.service.checkpoint import fields
 
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))

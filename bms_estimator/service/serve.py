@@ -11,10 +11,8 @@ import structlog
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.plausible import implausible
 from bms_estimator.fleet.edge import Edge
-from bms_estimator.model.alarm_limits import out_of_range, watched
-from bms_estimator.model.estimate import RecordingHealth
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.page.sink import Pages, PageSink
 from bms_estimator.service.alarm_hooks import Hooks, Say, relay_of
 from bms_estimator.service.alone import alone
@@ -24,6 +22,8 @@ from bms_estimator.service.live import run_live
 from bms_estimator.service.logs import set_level
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
+from bms_estimator.settings.alarm_limits import out_of_range, watched
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.influx import InfluxSink
 from bms_estimator.sinks.mqtt import MqttSink

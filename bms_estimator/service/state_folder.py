@@ -6,7 +6,7 @@ from pathlib import Path
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 
 log = structlog.get_logger(__name__)
 

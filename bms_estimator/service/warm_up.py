@@ -6,8 +6,8 @@ import numpy as np
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import Settings
 from bms_estimator.service.live import new_estimator
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.flow import Flow, Meter
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge

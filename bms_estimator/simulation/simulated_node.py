@@ -6,7 +6,7 @@ import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Self
 
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.brokers import brokers

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.payloads import Snapshot
 
 FRESH_PERIODS = 3
 """Values are stale when no sample was accepted for so many periods of publishing or of sampling, whichever are longer."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from typing import Self
 
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.console import LiveView
 from bms_estimator.sinks.messages import Message, Messages, Sent
 from bms_estimator.sinks.published import Published

@@ -9,7 +9,7 @@ import aiomqtt
 from aiomqtt import ProtocolVersion
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks.brokers import Broker, password, tls_context
 from bms_estimator.sinks.client import PATIENCE, Client, Patience, connected, may_know_3_1_1, refusal
 from bms_estimator.sinks.connection import Hello, LinkError

@@ -4,11 +4,11 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, get_args
 
-from bms_estimator.model.alarm_settings import ALARMS
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Info
-from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
-from bms_estimator.model.settings import LEAST_RATE_HZ, MOST_RATE_HZ, Command
+from bms_estimator.model.payloads import Info
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
+from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Command
 from bms_estimator.sinks import FRESH_PERIODS
 from bms_estimator.sinks.home_assistant_entities import BATTERY, CELL, FUEL_CELL, OF_CELLS, Entity, cell_key, entities
 

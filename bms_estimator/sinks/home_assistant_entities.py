@@ -7,7 +7,7 @@ Home Assistant keeps a row for each change of each entity. So it gets topics of 
 import math
 from typing import NamedTuple
 
-from bms_estimator.model.estimate import Info
+from bms_estimator.model.payloads import Info
 
 QUICK_S = 15.0
 """What a load moves all the time is shown anew no more often than this: four rows a minute [s]."""

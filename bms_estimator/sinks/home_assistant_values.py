@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.home_assistant import Described
 from bms_estimator.sinks.home_assistant_entities import Entity, cell_key, entities
 

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple, Self
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.export_settings import InfluxSettings
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.credential import credential
 from bms_estimator.sinks.line_protocol import lines
 from bms_estimator.sinks.pauses import FIRST_DELAY_S, Pauses

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 
-from bms_estimator.model.estimate import Alarm, Estimate, Snapshot
+from bms_estimator.model.payloads import Alarm, Estimate, Snapshot
 
 STATE, ALARM = "bms_state", "bms_alarm"
 """Measurements; the tag ``device`` is the pack."""

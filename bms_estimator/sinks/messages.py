@@ -5,10 +5,10 @@ from collections.abc import Collection, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
-from bms_estimator.model.alarm_settings import ALARMS
-from bms_estimator.model.estimate import Health, Report, Snapshot
-from bms_estimator.model.event import events
-from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.model.events import events
+from bms_estimator.model.payloads import Health, Report, Snapshot
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant import VALUES, Described, check_names, discovery, discovery_topic
 from bms_estimator.sinks.home_assistant_values import Shown, next_values
 from bms_estimator.sinks.payloads import schema

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from bms_estimator.model.estimate import Estimate, Health, Snapshot
+from bms_estimator.model.payloads import Estimate, Health, Snapshot
 
 
 class Unit(NamedTuple):

@@ -13,10 +13,10 @@ from typing import Self
 
 import structlog
 
-from bms_estimator.model.alarm_settings import ALARMS
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import ECHO_S, Availability
 from bms_estimator.sinks.backlog import Backlog

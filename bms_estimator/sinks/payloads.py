@@ -7,8 +7,8 @@ reader relied on. What is added does not raise it: a reader passes over what it 
 
 from typing import Any, NamedTuple
 
-from bms_estimator.model.estimate import PAYLOAD_VERSION, Alarm, Estimate, Health, Info, ParameterReport, Report
-from bms_estimator.model.event import Event
+from bms_estimator.model.events import Event
+from bms_estimator.model.payloads import PAYLOAD_VERSION, Alarm, Estimate, Health, Info, ParameterReport, Report
 
 
 class Topic(NamedTuple):

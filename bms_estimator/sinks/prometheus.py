@@ -11,9 +11,9 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.export_settings import PrometheusSettings
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.page.listener import CONNECTIONS, Listener
+from bms_estimator.settings.exports import PrometheusSettings
 from bms_estimator.sinks.metrics import metrics
 
 CLOSING_S = 1.0

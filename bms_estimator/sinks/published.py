@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from bms_estimator.model.settings import DEVICE_NAME
+from bms_estimator.settings.pack import DEVICE_NAME
 
 MAX_DEVICES = 64
 """Devices that are stored at a time."""

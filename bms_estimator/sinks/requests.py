@@ -14,7 +14,7 @@ from typing import Any, get_args
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import Command
+from bms_estimator.settings.pack import Command
 from bms_estimator.sinks import Delivery
 
 COMMANDS = get_args(Command)

@@ -9,7 +9,7 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError

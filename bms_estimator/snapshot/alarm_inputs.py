@@ -7,7 +7,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.alarm_limits import Quantity
+from bms_estimator.settings.alarm_limits import Quantity
 from bms_estimator.snapshot.alarm_state import Floats
 
 Counts = NDArray[np.int64]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.alarm_limits import Watched
+from bms_estimator.settings.alarm_limits import Watched
 
 Floats = NDArray[np.float64]
 

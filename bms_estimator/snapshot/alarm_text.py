@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from bms_estimator.model.alarm_limits import Watched
-from bms_estimator.model.alarm_settings import AlarmName
+from bms_estimator.settings.alarm_limits import Watched
+from bms_estimator.settings.alarms import AlarmName
 
 LATCHED = "the cause is gone; acknowledge it to end it: "
 

@@ -7,14 +7,14 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.model.alarm_limits import charging_a, silent_limit_s, watched
-from bms_estimator.model.alarm_settings import AlarmName
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.estimate import HookHealth
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.payloads import HookHealth
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import Settings
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.settings.alarm_limits import charging_a, silent_limit_s, watched
+from bms_estimator.settings.alarms import AlarmName
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.alarm_inputs import Inputs
 from bms_estimator.snapshot.alarms import Alarms, Change, Counts
 from bms_estimator.snapshot.health import sample_counters, suspicions

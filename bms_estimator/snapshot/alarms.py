@@ -12,12 +12,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.model.alarm_limits import NEEDED, Quantity, Watched
-from bms_estimator.model.alarm_settings import AlarmName
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Alarm
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.payloads import Alarm
 from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.settings.alarm_limits import NEEDED, Quantity, Watched
+from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.snapshot.alarm_inputs import LOST, Inputs, counted
 from bms_estimator.snapshot.alarm_samples import Steps, Waiting
 from bms_estimator.snapshot.alarm_state import AlarmState, Floats, Raising, Turn

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.flow import FLOW_SUMS, add_flow
-from bms_estimator.model.estimate import Totals
+from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS, add_flow
+from bms_estimator.model.payloads import Totals
 
 
 class Flow(NamedTuple):

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.kernels.input_checks import COUNTERS
-from bms_estimator.kernels.state import OBSERVER_STATE
+from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
+from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import EdgeHealth, Health, HookHealth, LoopHealth, RecordingHealth, Totals
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.payloads import EdgeHealth, Health, HookHealth, LoopHealth, RecordingHealth, Totals
 from bms_estimator.sinks import Delivery
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -16,12 +16,12 @@ from bms_estimator.estimator.learned import (
     relative_capacity,
     relative_series_resistance,
 )
-from bms_estimator.kernels import cell as chen_mora
-from bms_estimator.kernels.element_map import ELEMENT_NAMES
+from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import OcvCurve, Parameter, ParameterReport
 from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.model.payloads import OcvCurve, Parameter, ParameterReport
 from bms_estimator.snapshot.fuel_cell import VALID_STD, fuel_cell_parameters
 from bms_estimator.snapshot.ocv_formula import formula
 from bms_estimator.snapshot.series_resistance import series_resistance_parameters

@@ -9,7 +9,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.estimate import (
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.payloads import (
     EdgeHealth,
     Estimate,
     Health,
@@ -19,9 +20,8 @@ from bms_estimator.model.estimate import (
     RecordingHealth,
     Snapshot,
 )
-from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
 from bms_estimator.snapshot.alarm_watch import AlarmWatch
 from bms_estimator.snapshot.alarms import Change

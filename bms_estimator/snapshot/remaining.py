@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import present_resistance, relative_capacity
-from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.cell_model import chen_mora
 
 LONGEST_H = 1000.0
 """A load that would take longer to empty the pack is none, and a charge that would take longer to fill it."""

@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from bms_estimator.model.estimate import Estimate
+from bms_estimator.model.payloads import Estimate
 
 WATCHED_S = 30.0
 """So long current and voltage must have kept still [s]."""

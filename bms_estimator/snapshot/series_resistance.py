@@ -1,9 +1,9 @@
 """R_s by (4.2), step 3 of the thesis, as published parameters."""
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.series_resistance import SMALLEST_CURRENT_C
+from bms_estimator.kernels.observer.series_resistance import SMALLEST_CURRENT_C
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Parameter
+from bms_estimator.model.payloads import Parameter
 from bms_estimator.snapshot.topics import finite
 
 ORIGIN = "by (4.2), step 3 of the thesis; takes up what the OCV and a1..a12 have wrong, which std does not know"

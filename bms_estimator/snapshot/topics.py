@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator import __version__
-from bms_estimator.kernels.state import TRACE
+from bms_estimator.kernels.observer.records import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import PAYLOAD_VERSION, Estimate, Info
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.payloads import PAYLOAD_VERSION, Estimate, Info
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.remaining import RemainingCharge
 from bms_estimator.snapshot.window import WindowSummary

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.sample_step import GAP_RATIO
+from bms_estimator.kernels.step import GAP_RATIO
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Totals
+from bms_estimator.model.payloads import Totals
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.snapshot.flow import Flow, Meter
 from bms_estimator.snapshot.health import sample_counters

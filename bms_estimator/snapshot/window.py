@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.window import WINDOW_SUMS, add_window
+from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, add_window
 from bms_estimator.model.sample import NO_CELLS, CellBlock
 
 

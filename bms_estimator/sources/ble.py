@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from statistics import fmean
 from typing import Any
 
-from bms_estimator.model.ble_settings import BleSource
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.ble_source import BleSource
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.reports import Bringer
 from bms_estimator.sources.text_line import Reading
 

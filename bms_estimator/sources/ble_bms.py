@@ -11,8 +11,8 @@ from aiobmsble.utils import bms_cls, bms_identify
 from bleak import AdvertisementData, BleakScanner, BLEDevice
 from bleak.exc import BleakError
 
-from bms_estimator.model.ble_settings import BleSource
 from bms_estimator.model.errors import UserError
+from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.sources.ble import reading_of
 from bms_estimator.sources.report_line import CONNECTED, report_line
 from bms_estimator.sources.reports import Bringer, NothingComesError

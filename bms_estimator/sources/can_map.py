@@ -10,8 +10,8 @@ import cantools
 from cantools.database import DecodeError
 from cantools.database.can import Database, Message
 
-from bms_estimator.model.can_settings import CanSource, Signal
 from bms_estimator.model.errors import UserError
+from bms_estimator.settings.can_source import CanSource, Signal
 from bms_estimator.sources.text_line import Reading
 
 DECIMALS = 5

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.number import measured
 
 Floats = NDArray[np.float64]
 

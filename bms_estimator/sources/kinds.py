@@ -3,7 +3,7 @@
 import importlib
 from collections.abc import Mapping
 
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sources import Tap
 from bms_estimator.sources.reports import Bringer, Reports
 

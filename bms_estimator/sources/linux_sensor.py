@@ -6,8 +6,8 @@ from collections.abc import AsyncGenerator, Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from bms_estimator.model.linux_settings import LinuxSource
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.linux_source import LinuxSource
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.report_line import CONNECTED, report_line
 from bms_estimator.sources.reports import SILENT_PERIODS, Bringer, NothingComesError
 from bms_estimator.sources.sysfs import SYS, Channel, JunkError, find_channel, find_chip, read_number

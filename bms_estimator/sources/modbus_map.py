@@ -5,7 +5,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from bms_estimator.model.modbus_settings import MOST_WORDS, ModbusSource, Register
+from bms_estimator.settings.modbus_source import MOST_WORDS, ModbusSource, Register
 from bms_estimator.sources.text_line import Reading
 
 GAP_WORDS = 8

@@ -10,8 +10,8 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.mqtt_source_settings import MqttSource
-from bms_estimator.model.settings import MqttSettings, Settings
+from bms_estimator.settings.mqtt_source import MqttSource
+from bms_estimator.settings.pack import MqttSettings, Settings
 from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError, Received
 from bms_estimator.sinks.dial import Dial

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
-from bms_estimator.model.mqtt_source_settings import Place
-from bms_estimator.sources.number import number
+from bms_estimator.model.decimal_text import number
+from bms_estimator.settings.mqtt_source import Place
 
 SHOWN = 40
 """So much of what is no number is shown."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self, TypeVar
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.dialects.board import ASK_AGAIN_S, BoardDialect
 from bms_estimator.sources.dialects.table import DIALECTS

@@ -12,7 +12,7 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.sample import CellBlock, SampleBlock
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.sources import Pulse, Tap
 from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.fault_log import FaultLog

@@ -12,7 +12,7 @@ import structlog
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.sources import Pulse, Tap
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.dialects import Command, Dialect

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from bms_estimator.sources.number import number
+from bms_estimator.model.decimal_text import number
 from bms_estimator.sources.reports import NothingComesError
 
 SYS = Path("/sys")

@@ -15,9 +15,9 @@ from typing import IO, NamedTuple, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import LEAST_C, MOST_C, SAMPLE, CurrentSign, SampleBlock, forget_beyond
-from bms_estimator.sources.number import measured
 
 BLOCK_ROWS = 65_536
 SHOWN = 40

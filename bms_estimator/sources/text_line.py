@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from math import nan
 from typing import NamedTuple
 
-from bms_estimator.sources.number import NUMBER, measured, number
+from bms_estimator.model.decimal_text import NUMBER, measured, number
 
 PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
 """What printed lines are made of."""

@@ -1,1 +1,1 @@
-"""What must not be lost: messages on their way to the broker, and the pack's history."""
+"""SQLite storage: outbox, history, one-minute rows, migrations."""

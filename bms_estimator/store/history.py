@@ -11,8 +11,8 @@ import sqlite3
 from collections import deque
 from typing import Self, TypeVar
 
-from bms_estimator.model.estimate import Estimate, Snapshot
-from bms_estimator.model.event import Event, events
+from bms_estimator.model.events import Event, events
+from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.minute import MINUTE_S, Minute, OpenMinute, epoch_s, minute_of, seen
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import NamedTuple
 
-from bms_estimator.model.estimate import Estimate
+from bms_estimator.model.payloads import Estimate
 
 MINUTE_S = 60
 LONGEST_S = 30.0

@@ -16,9 +16,9 @@ from rich.table import Table
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import CURVE_SOC
-from bms_estimator.kernels.ekf_state import HYPOTHESES, SOC
-from bms_estimator.kernels.ladder import GRID, REFERENCE_C
-from bms_estimator.kernels.mixture import combine, copy
+from bms_estimator.kernels.cell_model.rc_ladder import GRID, REFERENCE_C
+from bms_estimator.kernels.kalman_filter.mixture import combine, copy
+from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, SOC
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import GROUPS, Group, chosen, runs

@@ -29,10 +29,10 @@ from rich.table import Table
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings
+from bms_estimator.settings.pack import IdentifierSettings
 from tests.benchmarks.baselines import FIVE_TAU_S, five_branches, fixed_ekf, ladder_ekf
 from tests.benchmarks.pulses import pulse_table
 from tests.benchmarks.recipes import GROUPS, Group, charge_ah, chosen, runs

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import Floats, ocv
-from bms_estimator.kernels.ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
+from bms_estimator.kernels.cell_model.chen_mora import Floats, ocv
+from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
 from bms_estimator.numba_cache import njit
 
 EKF_VOLTAGE_SIGMA_V = 0.005

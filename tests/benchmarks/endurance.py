@@ -24,7 +24,7 @@ import numpy as np
 import psutil
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell import simulate_cell
+from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.dialects.board import BoardDialect

@@ -13,7 +13,7 @@ import numpy as np
 from bms_estimator.calibration.fuel_cell import KEYS, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.fuel_cell_settings import MEMORY_S
-from bms_estimator.kernels.fuel_cell_open_loop import open_loop
+from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters

@@ -37,8 +37,8 @@ from serial.tools.list_ports_common import ListPortInfo
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
-from bms_estimator.model.settings import SensorSettings, Settings, load_settings
 from bms_estimator.service.checkpoint import CheckpointFile
+from bms_estimator.settings.pack import SensorSettings, Settings, load_settings
 from bms_estimator.sinks import Delivery, console_line
 from bms_estimator.sinks.console_scene import Scene
 from bms_estimator.sinks.console_view import View

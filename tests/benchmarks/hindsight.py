@@ -25,7 +25,7 @@ from bms_estimator.fleet.hour_files import write
 from bms_estimator.fleet.questions import LIMITS, Limits, ask
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import PackSettings
+from bms_estimator.settings.pack import PackSettings
 from tests.benchmarks.recipes import GROUPS, Floats, Group, chosen, runs
 
 SLOT_S = 360.0

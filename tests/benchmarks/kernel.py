@@ -13,11 +13,11 @@ from observer_in_c import ObserverInC
 from table import Row
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels import sample_step as kernel
-from bms_estimator.kernels.state import TRACE
+from bms_estimator.kernels import step as kernel
+from bms_estimator.kernels.observer.records import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
 
 BLOCK = 65_536
 ROUNDS = 10

@@ -21,15 +21,16 @@ from rich.table import Table
 from bms_estimator import load_capture, load_cell
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learning_settings import RATE_HZ
-from bms_estimator.kernels import cell as elements
-from bms_estimator.kernels import learning, sample_step
-from bms_estimator.kernels.chen_mora import NAMES
-from bms_estimator.kernels.observer import integral_of_exponential
-from bms_estimator.kernels.state import TRACE, Record
+from bms_estimator.kernels import step
+from bms_estimator.kernels.cell_model import chen_mora as elements
+from bms_estimator.kernels.observer import learning_law
+from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
+from bms_estimator.kernels.observer.observer import integral_of_exponential
+from bms_estimator.kernels.observer.records import TRACE, Record
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import ObserverSettings
 from bms_estimator.numba_cache import njit
+from bms_estimator.settings.pack import ObserverSettings
 from tests.conftest import SHARED_DATA
 from tests.estimator.random_steps import (
     FIRST_SOC,
@@ -50,7 +51,7 @@ NOISES_V = (0.0, 1e-3, 5e-3)
 CONVERGING = [0, 2, 4]
 K_STILL_V = 9.0
 """A dead zone that nothing gets out of [V]."""
-K_BOUND = learning.FASTEST_HZ / RATE_HZ
+K_BOUND = learning_law.FASTEST_HZ / RATE_HZ
 OF_OBSERVER = ("dead_zone_v", "k0")
 LEAK = 1e-4
 """Of the law without a memory, of its gain: already ten times as much leads it visibly away from the truth."""
@@ -66,7 +67,7 @@ Run = Callable[[Any, Any, Any, Any], int]
 def learned(
     block: SampleBlock,
     soc: float = FIRST_SOC,
-    run: Run = sample_step.run,
+    run: Run = step.run,
     settings: Mapping[str, float] | None = None,
     ohms: float = 1.0,
 ) -> np.ndarray:
@@ -133,8 +134,8 @@ def put_in(kernel: Any, **others: Any) -> Any:
 
 def run_with(**others: Any) -> Run:
     """The kernels' ``run`` with other parts of the learning law."""
-    law = put_in(learning.learning_step, **others)
-    run: Run = put_in(sample_step.run, step=put_in(sample_step.step, learning_step=law))
+    law = put_in(learning_law.learning_step, **others)
+    run: Run = put_in(step.run, step=put_in(step.step, learning_step=law))
     return run
 
 
@@ -145,7 +146,7 @@ def step_alone(m: Record, q: Record, share: float) -> None:
     for j in range(q.count):
         way += m.step[j] * m.step[j]
         m.theta[j] = min(max(m.theta[j] + share * m.step[j], q.lower[j]), q.upper[j])
-    learning.forget(m, q, share * way / (q.reach * q.reach))
+    learning_law.forget(m, q, share * way / (q.reach * q.reach))
 
 
 @njit
@@ -206,7 +207,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "k = 1": {"settings": {"dead_zone_v": K_STILL_V}},
     "k at its bound from the start": {"settings": {"k0": K_BOUND}},
     "ten times this bound, k there from the start": {
-        "others": {"FASTEST_HZ": 10.0 * learning.FASTEST_HZ},
+        "others": {"FASTEST_HZ": 10.0 * learning_law.FASTEST_HZ},
         "settings": {"k0": 10.0 * K_BOUND},
     },
 }
@@ -215,7 +216,7 @@ PARTS: dict[str, dict[str, Any]] = {
 def ablation(blocks: Mapping[str, tuple[SampleBlock, float]]) -> Iterator[tuple[str, ...]]:
     """A row for each part: without it, errors at 1 h and 10 h for each of the blocks."""
     for name, changed in PARTS.items():
-        run = run_with(**changed["others"]) if "others" in changed else sample_step.run
+        run = run_with(**changed["others"]) if "others" in changed else step.run
         cells = []
         for block, soc in blocks.values():
             at = percent(learned(block, soc, run, changed.get("settings")))

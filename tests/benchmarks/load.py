@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.kernels.cell import simulate_cell
+from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 

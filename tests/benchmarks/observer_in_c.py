@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import INVERSE_ERROR_V, OCV_POINTS
-from bms_estimator.kernels.mittag_leffler import SERIES_LIMIT, SERIES_TERMS, TABLE_POINTS
-from bms_estimator.kernels.state import OBSERVER_SETTINGS, OBSERVER_STATE, TRACE
+from bms_estimator.kernels.cell_model.chen_mora import INVERSE_ERROR_V, OCV_POINTS
+from bms_estimator.kernels.observer.mittag_leffler import SERIES_LIMIT, SERIES_TERMS, TABLE_POINTS
+from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS, OBSERVER_STATE, TRACE
 from bms_estimator.model.sample import SAMPLE
 
 Records = NDArray[np.void]

@@ -13,7 +13,7 @@ from bms_estimator.fleet.block import Block, decode, encode
 from bms_estimator.fleet.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.topics import estimate_report

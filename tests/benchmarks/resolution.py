@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.resolution import Sampling
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.settings.device_resolution import Sampling
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, WRONG, Case, cell_file, load_a
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.truth import Floats, simulate

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.state import TRACE
+from bms_estimator.kernels.observer.records import TRACE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.settings import ObserverSettings
+from bms_estimator.settings.pack import ObserverSettings
 
 sys.path.insert(0, str(Path(__file__).parent))
 from load import CELL, pulses

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell import simulate_cell
+from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.sample import SAMPLE
 from tests.benchmarks.side_by_side.references import (
     pulse_resistance,

@@ -6,12 +6,12 @@ import pytest
 from bms_estimator.calibration.adaptive import adaptive_run
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.cell import ocv, r_s
-from bms_estimator.kernels.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import ocv, r_s
+from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import Bounds, load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
 from bms_estimator.reports.simulation import discharge, with_bounds
+from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
 
 CELL = load_cell("chen_mora")
 SMALL = [1, 3, 6, 13, 15]

@@ -15,7 +15,7 @@ from bms_estimator.calibration.ocv_sources import (
 )
 from bms_estimator.calibration.ocv_table import NODES, fit_table
 from bms_estimator.calibration.slow_curve import GRID
-from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.replay import load_capture

@@ -10,7 +10,7 @@ from bms_estimator.calibration.series_resistance import (
     mean_of,
     series_resistance,
 )
-from bms_estimator.kernels.cell import r_s
+from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.simulation import discharge

@@ -3,7 +3,7 @@ import pytest
 
 from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels.ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError

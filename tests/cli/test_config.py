@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
-from bms_estimator.model.settings import Settings, load_settings
+from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources.kinds import KINDS

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.model.settings import load_settings
+from bms_estimator.settings.pack import load_settings
 from bms_estimator.sources.replay import RawCapture
 from tests.command_line import run
 from tests.sources.sysfs_folder import hwmon

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.cli.keys import meanings
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.messages import Messages, Sent
 from tests.command_line import PROGRAM, run
 from tests.mosquitto import Broker, Listener

@@ -11,8 +11,8 @@ import pytest
 from bms_estimator.cli.fleet_serve import _nodes
 from bms_estimator.fleet.server import Place, Told, node_of
 from bms_estimator.fleet.server_config import Accounts, configuration
-from bms_estimator.model.fleet_settings import FleetSettings
-from bms_estimator.model.toml_file import read_toml
+from bms_estimator.model.config_file import read_toml
+from bms_estimator.settings.fleet import FleetSettings
 from tests.deploy.test_unit import HIGHEST_EXPOSURE, verify
 
 Program = Callable[[str, str], str]

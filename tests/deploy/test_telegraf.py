@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.line_protocol import lines
 from bms_estimator.sinks.messages import Messages
 from tests.sinks.snapshots import ONE, SOC_LOW

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell import simulate_cell
-from bms_estimator.kernels.chen_mora import NAMES
+from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
+from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.model.settings import ObserverSettings
+from bms_estimator.settings.pack import ObserverSettings
 
 TRUTH = load_cell("chen_mora").model_copy(update={"adaptation": {}})
 """Bounds a quarter to four times the file's: those of Table 5 are not around a file that is wrong."""

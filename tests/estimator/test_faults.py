@@ -8,8 +8,8 @@ import pytest
 
 from bms_estimator import Estimator, load_capture, load_cell
 from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.input_faults import Suspect
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.suspect import Suspect
 from tests.estimator.simulated_cell import TRUTH, pulses
 
 FAULT_S = 3600.0, 7200.0

@@ -8,10 +8,10 @@ import pytest
 from bms_estimator import Estimator
 from bms_estimator.estimator.filter_settings import BEYOND_BRANCHES, BRANCHES_STD, SOC_GRID, ladder_of_branches
 from bms_estimator.estimator.learned import present_elements
-from bms_estimator.kernels import cell as chen_mora
-from bms_estimator.kernels.ladder import GRID, RESISTANCES, STRONG_J, WEAK_J, arrhenius
+from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.kernels.cell_model.rc_ladder import GRID, RESISTANCES, STRONG_J, WEAK_J, arrhenius
 from bms_estimator.model.cell import Ladder, TableOcv, load_cell
-from bms_estimator.model.settings import IdentifierSettings
+from bms_estimator.settings.pack import IdentifierSettings
 
 CELL = load_cell("ncr18650")
 

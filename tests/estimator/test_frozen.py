@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell import ocv
-from bms_estimator.kernels.ladder import BRANCHES
-from bms_estimator.kernels.open_loop import branch_currents
+from bms_estimator.kernels.cell_model.chen_mora import ocv
+from bms_estimator.kernels.cell_model.open_loop import branch_currents
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.resolution import Sampling
+from bms_estimator.model.input_faults import Suspect
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.settings.device_resolution import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
 
 HOUR = 3600

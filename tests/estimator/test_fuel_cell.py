@@ -8,8 +8,8 @@ import pytest
 from bms_estimator.calibration.fuel_cell import KEYS
 from bms_estimator.cli.summary import Summary
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.fuel_cell import NAMES
-from bms_estimator.kernels.sample_step import Verdict
+from bms_estimator.kernels.cell_model.fuel_cell import NAMES
+from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters

@@ -5,13 +5,13 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter, present_elements
-from bms_estimator.kernels import cell as chen_mora
-from bms_estimator.kernels.ekf_noise import offset_variance
-from bms_estimator.kernels.ekf_state import LN_Q, OFFSET, SOC
-from bms_estimator.kernels.element_map import CAPACITANCES, ELEMENTS
-from bms_estimator.kernels.identification import hand_over
+from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.kernels.identifier import hand_over
+from bms_estimator.kernels.kalman_filter.element_map import CAPACITANCES, ELEMENTS
+from bms_estimator.kernels.kalman_filter.noise import offset_variance
+from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 
 ON = IdentifierSettings()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell import simulate_cell
+from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
 from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge

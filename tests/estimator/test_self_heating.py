@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.ladder import REFERENCE_C
-from bms_estimator.kernels.self_heating import COOLS_S, WARMEST_C
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.kernels.kalman_filter.temperature import COOLS_S, WARMEST_C
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.replay import load_capture

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.ekf_state import EKF_SETTINGS, EKF_STATE
-from bms_estimator.kernels.unseen import rounded_charge
-from bms_estimator.model.resolution import Sampling
+from bms_estimator.kernels.kalman_filter.gap_charge import rounded_charge
+from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.device_resolution import Sampling
+from bms_estimator.settings.pack import Settings
 from tests.benchmarks.resolution import Source, scores
 from tests.estimator.simulated_cell import TRUTH, pulses
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels import ekf
-from bms_estimator.kernels.ekf_state import EKF_STATE, OFFSET, STATES
+from bms_estimator.kernels.kalman_filter import ekf
+from bms_estimator.kernels.kalman_filter.records import EKF_STATE, OFFSET, STATES
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.resolution import Sampling
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import IdentifierSettings
+from bms_estimator.settings.device_resolution import Sampling
+from bms_estimator.settings.pack import IdentifierSettings
 from tests.estimator.anywhere.cases import LFP, Case, capture, load_a
 from tests.estimator.anywhere.score import score
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleStatus
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.virtual_converter import aux_readings_of, window_of
 from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.sources.protocol import (

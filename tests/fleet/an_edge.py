@@ -6,7 +6,7 @@ from bms_estimator.fleet.block import Block, encode
 from bms_estimator.fleet.partition import Partition, Taken
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import PackSettings, Settings
+from bms_estimator.settings.pack import PackSettings, Settings
 
 STORE = 480_000 * 3600 * 10**9
 """When a store was made: the begin of an hour [ns since 1970]."""

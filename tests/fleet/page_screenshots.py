@@ -14,8 +14,8 @@ from bms_estimator.fleet import subjects
 from bms_estimator.fleet.page import fleet_page
 from bms_estimator.fleet.page_feed import Server
 from bms_estimator.fleet.streams import make_streams
-from bms_estimator.model.page_settings import PageSettings
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.settings.page import PageSettings
 from tests.fleet.engine import running
 from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
 from tests.fleet.many_packs import Pack, beat, load, many, publish

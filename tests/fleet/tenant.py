@@ -14,8 +14,8 @@ from bms_estimator.fleet import credentials
 from bms_estimator.fleet.block import Block, encode
 from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.streams import make_streams
-from bms_estimator.model.fleet_settings import TenantSettings
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.settings.fleet import TenantSettings
 from tests.fleet.engine import Engine, running
 from tests.patience import LONG_S
 

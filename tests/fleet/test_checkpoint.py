@@ -23,7 +23,7 @@ from bms_estimator.fleet.deferred import Span
 from bms_estimator.fleet.delivery import MAX_PASSED
 from bms_estimator.fleet.pack_state import PACK_STATE, Bench
 from bms_estimator.fleet.partition import Partition
-from bms_estimator.model.estimate import Estimate
+from bms_estimator.model.payloads import Estimate
 from tests.estimator.simulated_cell import pulses
 from tests.fleet.an_edge import SAMPLES, Stream, blocks_of, deliver, table
 

@@ -24,8 +24,8 @@ from bms_estimator.fleet.server_config import Accounts, configuration
 from bms_estimator.fleet.streams import consumer, make_streams
 from bms_estimator.fleet.worker import Options, work
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fleet_settings import TenantSettings
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.settings.fleet import TenantSettings
 from tests.command_line import run
 from tests.fleet.engine import Engine, running
 from tests.patience import LONG_S

@@ -14,10 +14,10 @@ from bms_estimator.fleet.block import decode
 from bms_estimator.fleet.edge import Edge
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.edge_settings import EdgeSettings
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import EdgeHealth
+from bms_estimator.model.payloads import EdgeHealth
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.settings.edge import EdgeSettings
 from tests.fleet.engine import Engine, running
 from tests.fleet.receiver import Receiver
 from tests.mosquitto import Broker, Listener

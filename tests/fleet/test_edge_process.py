@@ -15,9 +15,9 @@ import pytest
 
 from bms_estimator.fleet.edge import Edge
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.edge_settings import EdgeSettings
-from bms_estimator.model.settings import Settings
 from bms_estimator.service.serve import serve
+from bms_estimator.settings.edge import EdgeSettings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.health import sample_counters
 from tests.command_line import PROGRAM, run
 from tests.fleet.engine import Engine, running

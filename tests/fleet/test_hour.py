@@ -11,7 +11,7 @@ from bms_estimator.fleet.block import Block
 from bms_estimator.fleet.hour import HOUR_SUMS, Hour, add, begin, hour_of, row
 from bms_estimator.model.fuel_cell import load_any
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import PackSettings
+from bms_estimator.settings.pack import PackSettings
 from tests.estimator.simulated_cell import pulses
 
 STORE = 500_000 * 3600 * 10**9

@@ -23,8 +23,8 @@ from bms_estimator.fleet.page_feed import FleetFeed, Server
 from bms_estimator.fleet.page_view import FleetView
 from bms_estimator.fleet.streams import make_streams
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.page_settings import PageSettings
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.settings.page import PageSettings
 from tests.fleet.engine import Engine, connected, running
 from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
 from tests.fleet.many_packs import HOME, VAN, Pack, beat, load, publish, state

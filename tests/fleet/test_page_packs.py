@@ -9,7 +9,7 @@ from bms_estimator.fleet.page_feed import type_name
 from bms_estimator.fleet.page_packs import ALIVE_S, LISTED, OTHER, UNLISTED, FleetPacks
 from bms_estimator.fleet.page_view import FleetView
 from bms_estimator.fleet.page_workers import FleetWorkers
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.input_faults import Suspect
 from tests.fleet.many_packs import HOME, many, state
 from tests.sinks.snapshots import ONE
 

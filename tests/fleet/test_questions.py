@@ -7,9 +7,9 @@ import pytest
 
 from bms_estimator.fleet.hour_files import SCHEMA, compact, write
 from bms_estimator.fleet.questions import AGED_SOC, CHARGE_ERROR, QUESTIONS, ask, select
-from bms_estimator.kernels.ekf_state import Noise
+from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.input_faults import Suspect
 from tests.fleet.fleets import BEGIN, FIRST_STD, an_hour, capacities, states_of_charge, write_fleet
 
 

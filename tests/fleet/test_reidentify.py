@@ -7,7 +7,7 @@ from bms_estimator.fleet.pack_row import PackKind
 from bms_estimator.fleet.reidentify import reidentify
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.cell_file import cell_text
-from bms_estimator.model.toml_file import parse_toml
+from bms_estimator.model.config_file import parse_toml
 from tests.calibration.simulated_load import TRUTH, capture, wrong_start
 
 SERIES, PARALLEL = 14, 4

@@ -23,9 +23,9 @@ from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.server import Place, Told, find_server
 from bms_estimator.fleet.server import serve as serving
 from bms_estimator.fleet.streams import NoAnswerError
+from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fleet_settings import FleetSettings, ServerSettings, TenantSettings, TlsSettings
-from bms_estimator.model.toml_file import read_toml
+from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from tests.command_line import run
 from tests.free_port import free_port
 from tests.patience import LONG_S

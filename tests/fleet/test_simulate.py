@@ -14,7 +14,7 @@ from bms_estimator.fleet.simulated_edges import RESEND_S, SimulatedEdges
 from bms_estimator.fleet.simulated_fleet import SimulatedFleet
 from bms_estimator.fleet.streams import make_streams
 from bms_estimator.fleet.subjects import RAW_STREAM, Awaits, awaits, raw
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from tests.command_line import run
 from tests.fleet.engine import running
 from tests.patience import LONG_S

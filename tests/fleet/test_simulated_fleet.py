@@ -9,7 +9,7 @@ from bms_estimator.fleet.simulated_edges import RESEND_S, SimulatedEdges
 from bms_estimator.fleet.simulated_fleet import BLOCK_S, KINDS, SimulatedFleet
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.resolution import Sampling
+from bms_estimator.settings.device_resolution import Sampling
 
 BEGIN_NS = 1_800_000_000 * 10**9
 HOURS = 4

@@ -12,8 +12,8 @@ from typing import Any
 import aiomqtt
 import pytest
 
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant import Described, discovery
 from bms_estimator.sinks.messages import Message, Messages, Sent
 from bms_estimator.snapshot.rest import WATCHED_S

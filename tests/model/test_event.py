@@ -3,9 +3,9 @@
 import itertools
 from typing import Any
 
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.event import events
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.events import events
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.payloads import Snapshot
 from tests.sinks.snapshots import ONE
 
 WARM = f"no data at 41 C, the cell file knows 25 C: {Suspect.TEMPERATURE.text}"

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.fuel_cell import NAMES
-from bms_estimator.kernels.fuel_cell_open_loop import polarisation
+from bms_estimator.kernels.cell_model.fuel_cell import NAMES
+from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.model.cell import is_fuel_cell, load_cell, shipped_fuel_cells
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError

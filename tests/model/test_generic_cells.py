@@ -9,10 +9,10 @@ from scipy.interpolate import PchipInterpolator
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.lemma import failed
 from bms_estimator.estimator.plausible import implausible
-from bms_estimator.kernels.sample_step import Verdict
+from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.cell import TableOcv, generic_cells, load_cell, shipped_cells
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import PackSettings, SensorSettings, Settings
+from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
 from bms_estimator.sources.replay import load_capture
 
 OHM_AH_10_S = {"lfp": 0.045, "nmc": 0.13, "nca": 0.13, "lco": 0.13, "lmo": 0.08, "lto": 0.016}

@@ -17,7 +17,7 @@ from typing import Any
 from playwright.async_api import Browser
 
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.payloads import Snapshot
 from tests.free_port import free_port
 from tests.mosquitto import Broker
 from tests.page.chromium import PHONE, Tab, chromium, tab

@@ -17,10 +17,10 @@ import pytest
 import pytest_asyncio
 from playwright.async_api import Browser
 
-from bms_estimator.model.estimate import Alarm
-from bms_estimator.model.page_settings import PageSettings
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.model.payloads import Alarm
 from bms_estimator.page.dashboard import dashboard
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.published import MAX_DEVICES
 from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener

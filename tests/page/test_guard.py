@@ -3,8 +3,8 @@
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.page_settings import PageSettings, parse_listen
 from bms_estimator.page.guard import Guard, guard_of
+from bms_estimator.settings.page import PageSettings, parse_listen
 
 TOKEN = "0123456789abcdef"
 

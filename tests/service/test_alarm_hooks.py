@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.model.alarm_settings import AlarmHook
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Alarm, HookHealth
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.payloads import Alarm, HookHealth
 from bms_estimator.service import alarm_hooks
 from bms_estimator.service.alarm_hooks import Hooks, unusable
 from bms_estimator.service.serve import serve
+from bms_estimator.settings.alarms import AlarmHook
+from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.snapshot.alarms import Change

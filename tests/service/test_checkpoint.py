@@ -16,14 +16,14 @@ import pytest
 from numpy.lib.recfunctions import repack_fields
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.ekf_state import NODE, OFFSET
+from bms_estimator.kernels.kalman_filter.records import NODE, OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.estimate import Health
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.payloads import Health
 from bms_estimator.service import live, saving
 from bms_estimator.service.checkpoint import FORMAT, KEPT, CheckpointFile, Ledger, fields, pack_identity
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.resume import resume
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.totals import new_totals
 from tests.collector import Collector
 from tests.patience import LONG_S

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.settings import Settings
 from bms_estimator.service.checkpoint import CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator
 from bms_estimator.service.moment import Moment, moment, synchronised
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.totals import new_totals
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()

@@ -9,10 +9,10 @@ from pathlib import Path
 import aiomqtt
 from structlog.testing import capture_logs
 
-from bms_estimator.model.alarm_settings import AlarmSettings
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.settings import Settings
 from bms_estimator.service.serve import serve
+from bms_estimator.settings.alarms import AlarmSettings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording

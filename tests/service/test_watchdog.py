@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.model.settings import SensorSettings
 from bms_estimator.service.live import run_live
 from bms_estimator.service.notify import Notifier
 from bms_estimator.service.serve import recording_health
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.snapshot import publisher
 from bms_estimator.snapshot.latency import Latency
 from bms_estimator.sources import Pulse

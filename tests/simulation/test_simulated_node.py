@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from bms_estimator.model.settings import MqttSettings, Settings
+from bms_estimator.settings.pack import MqttSettings, Settings
 from bms_estimator.simulation.simulated_node import SimulatedNode
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources.kinds import open_reports

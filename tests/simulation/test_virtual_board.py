@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading, window_of
 from bms_estimator.sources.dialects.table import make_dialect

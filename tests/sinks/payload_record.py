@@ -55,7 +55,7 @@ def main() -> int:
     before = recorded() if RECORD.exists() else after
     lost = broken(before["fields"], after["fields"])
     if lost and before["payload_version"] >= after["payload_version"]:
-        sys.stderr.write("\n".join([*lost, "raise PAYLOAD_VERSION in bms_estimator/model/estimate.py"]) + "\n")
+        sys.stderr.write("\n".join([*lost, "raise PAYLOAD_VERSION in bms_estimator/model/payloads.py"]) + "\n")
         return 1
     RECORD.write_text(json.dumps(after, indent=1) + "\n", encoding="utf-8")
     return 0

@@ -6,8 +6,8 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, Self
 
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.backlog import WINDOW
 from bms_estimator.sinks.mqtt import MqttSink

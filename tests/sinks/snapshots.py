@@ -4,10 +4,10 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.estimate import Alarm, LoopHealth, Snapshot
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
+from bms_estimator.model.payloads import Alarm, LoopHealth, Snapshot
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks import Delivery
 from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.health import health_report

@@ -11,7 +11,7 @@ import pytest
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.brokers import check, tls_context
 from bms_estimator.sinks.mqtt import MqttSink

@@ -10,11 +10,11 @@ from rich.console import Console
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.model.settings import Settings
-from bms_estimator.model.suspect import Suspect
 from bms_estimator.service.live import new_estimator
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.console_line import line
 from bms_estimator.sinks.console_scene import Lost, Pack, Scene
 from bms_estimator.sinks.console_view import View

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.fuel_cell import KEYS
-from bms_estimator.model.alarm_settings import ALARMS
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Alarm, Parameter, Snapshot
-from bms_estimator.model.home_assistant_settings import HomeAssistantSettings
+from bms_estimator.model.payloads import Alarm, Parameter, Snapshot
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant import Described, discovery
 from bms_estimator.sinks.messages import Messages, Sent
 from tests.sinks.snapshots import ONE, STACK

@@ -13,8 +13,8 @@ import pytest
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.export_settings import InfluxSettings
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.influx import BATCH, MOST_WAITING, InfluxSink
 from bms_estimator.sinks.line_protocol import lines
 from tests.influxdb import INFLUXD, InfluxDB

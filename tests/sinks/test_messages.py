@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.model.alarm_settings import ALARMS
-from bms_estimator.model.estimate import Alarm
+from bms_estimator.model.payloads import Alarm
+from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.sinks.messages import Message, Messages, Sent
 from bms_estimator.sinks.payloads import schema
 from tests.sinks.snapshots import NOTHING_YET, NOW, ONE, snapshot

@@ -12,8 +12,8 @@ from aiomqtt import ProtocolVersion
 
 from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.event import events
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.model.events import events
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import CORRECTION_S
 from bms_estimator.sinks.brokers import brokers, check

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks.client import Patience
 from bms_estimator.sinks.dial import Dial
 from tests.mosquitto import MOSQUITTO, Broker, Listener

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.model.estimate import PAYLOAD_VERSION
+from bms_estimator.model.payloads import PAYLOAD_VERSION
 from bms_estimator.sinks.asyncapi import ARGUMENTS, document
 from bms_estimator.sinks.messages import Messages, Sent
 from bms_estimator.sinks.payloads import TOPICS
@@ -22,7 +22,7 @@ def test_no_field_vanishes_or_changes_its_type_in_the_same_version() -> None:
     before, after = recorded(), now()
     lost = broken(before["fields"], after["fields"])
     if after["payload_version"] == before["payload_version"]:
-        assert lost == [], "readers rely on these: raise PAYLOAD_VERSION in bms_estimator/model/estimate.py"
+        assert lost == [], "readers rely on these: raise PAYLOAD_VERSION in bms_estimator/model/payloads.py"
     assert after["payload_version"] >= before["payload_version"]
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.estimate import Estimate, Health, Snapshot
-from bms_estimator.model.export_settings import PrometheusSettings
+from bms_estimator.model.payloads import Estimate, Health, Snapshot
+from bms_estimator.settings.exports import PrometheusSettings
 from tests.free_port import free_port
 from tests.patience import LONG_S
 from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW, STACK, snapshot

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.backlog import WINDOW
 from bms_estimator.sinks.mqtt import MqttSink

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks.brokers import check
 from tests.command_line import run
 

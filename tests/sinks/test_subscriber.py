@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.model.settings import MqttSettings
+from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks.published import Heard
 from bms_estimator.sinks.subscriber import MOST_BYTES, Subscriber
 from tests.mosquitto import MOSQUITTO, Broker, Listener

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.settings import Settings
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.service.live import new_estimator
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.alarms import Change
 from bms_estimator.snapshot.publisher import Publisher
 from bms_estimator.sources.raw_capture import CaptureWriter, header_of

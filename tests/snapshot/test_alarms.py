@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.state import TRACE
-from bms_estimator.model.alarm_limits import Watched, out_of_range, watched
-from bms_estimator.model.alarm_settings import ALARMS
+from bms_estimator.kernels.observer.records import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.event import events
+from bms_estimator.model.events import events
 from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.input_faults import Suspect
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.settings.alarm_limits import Watched, out_of_range, watched
+from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.snapshot.alarm_inputs import Inputs
 from bms_estimator.snapshot.alarm_state import AlarmState
 from bms_estimator.snapshot.alarms import Alarms, Counts

@@ -3,7 +3,7 @@
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.settings import ObserverSettings, Settings
+from bms_estimator.settings.pack import ObserverSettings, Settings
 from bms_estimator.snapshot.topics import info_report
 
 

@@ -5,8 +5,8 @@ from structlog.testing import capture_logs
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.settings import Settings
-from bms_estimator.model.suspect import Suspect
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.publisher import Publisher
 from tests.scripted_source import ScriptedSource
 

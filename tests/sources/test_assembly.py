@@ -1,6 +1,6 @@
 """What other projects publish of a battery, each in its own form: one sample of it, and what is wrong with it said.
 
-The payloads are those of the projects named in ``model/mqtt_profiles.py``, with numbers of ours.
+The payloads are those of the projects named in ``settings/mqtt_profiles.py``, with numbers of ours.
 """
 
 import json
@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.model.mqtt_source_settings import MqttSource
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.mqtt_source import MqttSource
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.assembly import Assembly
 from bms_estimator.sources.dialects.text import TextDialect
 from bms_estimator.sources.payload import MOST_CELLS, NoNumberError, many, one

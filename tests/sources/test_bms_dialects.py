@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.sources.dialects import daly, jbd, jk
 from bms_estimator.sources.dialects.asked import GAP_S, PACE_S, UNANSWERED_ROUNDS, AskedDialect
 from bms_estimator.sources.dialects.daly import sealed

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading
 from bms_estimator.sources.dialects.board import BoardDialect

@@ -10,9 +10,9 @@ from contextlib import aclosing
 import can
 import pytest
 
-from bms_estimator.model.can_settings import CanSource
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.can_source import CanSource
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.can_bus import BUS_OFF, CanBringer
 from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.report_line import CONNECTED

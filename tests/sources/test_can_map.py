@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from bms_estimator.model.can_settings import CanSource, CellSignals, Signal
 from bms_estimator.model.errors import UserError
+from bms_estimator.settings.can_source import CanSource, CellSignals, Signal
 from bms_estimator.sources.can_map import KEPT_S, CanMap, Place, bits_of
 
 PYLONTECH = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.pack import Settings
 
 TEXT = (Path(__file__).parents[2] / "docs" / "sources-fieldbus.md").read_text(encoding="utf-8")
 

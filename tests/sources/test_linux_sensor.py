@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.model.linux_settings import LinuxSource
+from bms_estimator.settings.linux_source import LinuxSource
 from bms_estimator.sources.linux_sensor import LinuxSensor
 from bms_estimator.sources.report_line import CONNECTED
 from bms_estimator.sources.reports import NothingComesError

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources.dialects import Dialect

@@ -10,8 +10,8 @@ import pytest
 from pymodbus import FramerType
 from pymodbus.constants import ExcCodes
 
-from bms_estimator.model.modbus_settings import ModbusSource
-from bms_estimator.model.settings import Settings
+from bms_estimator.settings.modbus_source import ModbusSource
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.modbus import ModbusBringer
 from bms_estimator.sources.report_line import CONNECTED

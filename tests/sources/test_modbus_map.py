@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from bms_estimator.model.modbus_settings import MOST_WORDS, PROFILES, CellRegisters, ModbusSource, Register
+from bms_estimator.settings.modbus_source import MOST_WORDS, PROFILES, CellRegisters, ModbusSource, Register
 from bms_estimator.sources.modbus_map import GAP_WORDS, Value, decode, plan, reading_of, split, values_of
 
 FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}

@@ -18,10 +18,10 @@ from serial.tools import list_ports
 from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.estimate import Snapshot
+from bms_estimator.model.payloads import Snapshot
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import PackSettings, SensorSettings, Settings
 from bms_estimator.service.serve import serve
+from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading
 from bms_estimator.sources import doorkeeper, ports, serial_board

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter, read_capture
 from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.serial_board import SerialBoard

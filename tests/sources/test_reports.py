@@ -9,7 +9,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.model.settings import SensorSettings, Settings
+from bms_estimator.settings.pack import SensorSettings, Settings
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.replay import RawCapture

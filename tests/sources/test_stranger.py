@@ -10,7 +10,7 @@ import pytest
 from serial.tools import list_ports
 
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources import ports

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.model.decimal_text import measured, number
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.curve import read_curve
 from bms_estimator.sources.dialects.board import BoardDialect
 from bms_estimator.sources.dialects.text import TextDialect
-from bms_estimator.sources.number import measured, number
 from bms_estimator.sources.protocol import Hello, SampleMessage, unseal
 from bms_estimator.sources.raw_capture import MAGIC, CaptureHeader, CaptureWriter, read_capture, read_header
 from bms_estimator.sources.replay import Replay, load_capture, open_capture

@@ -16,8 +16,10 @@ from typing import Any, Self
 
 import structlog
 
-from bms_estimator.model.estimate import Snapshot
-from bms_estimator.model.settings import (
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.service import serve as service
+from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Restored
+from bms_estimator.settings.pack import (
     IdentifierSettings,
     MqttSettings,
     PackSettings,
@@ -26,8 +28,6 @@ from bms_estimator.model.settings import (
     Settings,
     StateSettings,
 )
-from bms_estimator.service import serve as service
-from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Restored
 from bms_estimator.simulation.virtual_converter import BoardParts
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.doorkeeper import HELD_READS, Doorkeeper

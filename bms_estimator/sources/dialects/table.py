@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 
-from bms_estimator.model.settings import SensorSettings
+from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.dialects.daly import DalyDialect
 from bms_estimator.sources.dialects.jbd import JbdDialect

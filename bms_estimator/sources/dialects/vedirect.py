@@ -10,9 +10,9 @@ import re
 from collections.abc import Iterator, Mapping
 from math import nan
 
+from bms_estimator.model.decimal_text import number
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.dialects.meter import MeterDialect
-from bms_estimator.sources.number import number
 from bms_estimator.sources.text_line import Reading
 
 BLOCK_BYTES = 2048

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.state import Record
+from bms_estimator.kernels.observer.records import Record
 from bms_estimator.model.sample import LEAST_C, MOST_C, SampleStatus
 from bms_estimator.numba_cache import njit
 from bms_estimator.sources.protocol import MODULUS, PROTOCOL_VERSION, BoardStatus, MessageType

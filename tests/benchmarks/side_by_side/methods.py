@@ -19,11 +19,11 @@ from bms_estimator.calibration.relaxation import soc_by_counting
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.learned import fitted_parameter
 from bms_estimator.estimator.records import ocv_grid
-from bms_estimator.kernels import cell as chen_mora
+from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.model.settings import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
 from tests.benchmarks.baselines import fixed_ekf, joint_ekf, rls_arx, simulate_arx
 
 Floats = NDArray[np.float64]

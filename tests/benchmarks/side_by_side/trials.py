@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.branches import sections
 from bms_estimator.calibration.relaxation import without_glitches
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, SOC_GRID, ladder_of_branches
-from bms_estimator.kernels.ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius, weak_share
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius, weak_share
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import LEAF, LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_PULSES, Recipe, load

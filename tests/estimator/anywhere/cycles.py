@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.ekf_state import LN_Q
+from bms_estimator.kernels.kalman_filter.records import LN_Q
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, rising

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.hypotheses import pack_std
-from bms_estimator.kernels.sample_step import Verdict
+from bms_estimator.kernels.kalman_filter.hypotheses import pack_std
+from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.sample import SampleBlock
 
 Floats = NDArray[np.float64]

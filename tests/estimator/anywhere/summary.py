@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.ekf_state import LN_Q
+from bms_estimator.kernels.kalman_filter.records import LN_Q
 from tests.estimator.anywhere.cases import CASES, WRONG, Capture, Case, capture
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import Score, score

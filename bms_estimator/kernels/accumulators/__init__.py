@@ -1,0 +1,1 @@
+"""Sums over samples: charge and energy, publish window, hour."""

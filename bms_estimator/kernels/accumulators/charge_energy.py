@@ -1,0 +1,42 @@
+"""What flows through the terminals from sample to sample."""
+
+import numpy as np
+
+from bms_estimator.kernels.step import GAP_RATIO, Records
+from bms_estimator.numba_cache import njit
+
+FLOW_SUMS = np.dtype(
+    [
+        ("charge_as", "f8"),  # since somebody looked, positive on discharge [A s]
+        ("energy_ws", "f8"),  # the same [W s]
+        ("last_s", "f8"),  # the last sample: its time stamp [s], ...
+        ("last_a", "f8"),  # ... current [A] ...
+        ("last_w", "f8"),  # ... and power [W]
+        ("step_s", "f8"),  # to it from the one before [s]
+        ("counted", "i8"),  # 1: there is a last sample
+    ],
+    align=True,
+)
+"""All zero: nothing came yet."""
+
+
+@njit(cache=True)
+def add_flow(sums: Records, trace: Records, gap_s: float) -> None:
+    """Add accepted samples: straight between them, nothing over a gap nor where the clock was set back.
+
+    Args:
+        sums: Shape (1,), dtype FLOW_SUMS; updated in place.
+        trace: Shape (n,), dtype TRACE.
+        gap_s: A longer step is a gap, unless the one before was about as long [s]; as ``sample_step.is_gap``.
+    """
+    s = sums[0]
+    for j in range(trace.shape[0]):
+        x = trace[j]
+        power_w = x.voltage_v * x.current_a
+        if s.counted:
+            dt_s = x.time_s - s.last_s
+            if 0.0 < dt_s <= max(gap_s, GAP_RATIO * s.step_s):
+                s.charge_as += 0.5 * dt_s * (s.last_a + x.current_a)
+                s.energy_ws += 0.5 * dt_s * (s.last_w + power_w)
+            s.step_s = dt_s
+        s.last_s, s.last_a, s.last_w, s.counted = x.time_s, x.current_a, power_w, 1

@@ -1,0 +1,118 @@
+"""What an hour of a pack adds up to, block after block."""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.kernels.step import GAP_RATIO, Records
+from bms_estimator.numba_cache import njit
+
+HOUR_SUMS = np.dtype(
+    [
+        ("store", "u8"),  # of the last block: another one has another clock; 0: none came yet
+        ("last_s", "f8"),  # the last sample: its time stamp [s],
+        ("last_a", "f8"),  # current [A]
+        ("last_w", "f8"),  # and power [W]; these and what follows go on from hour to hour
+        ("step_s", "f8"),  # to it from the one before [s]
+        ("rest_s", "f8"),  # for so long next to no current has flowed [s]
+        ("outliers_before", "i8"),  # counters of the estimator at the hour's begin
+        ("searches_before", "i8"),
+        ("samples", "i8"),  # accepted; from here on of this hour alone
+        ("dropped", "i8"),  # samples that were not
+        ("gaps", "i8"),  # steps over which nothing is counted
+        ("lost_blocks", "i8"),  # that never came
+        ("seen_s", "f8"),  # so much of it was measured [s]
+        ("out_as", "f8"),  # charge [A s] and energy [W s], each step in its direction
+        ("in_as", "f8"),
+        ("out_ws", "f8"),
+        ("in_ws", "f8"),
+        ("sum_v", "f8"),
+        ("min_v", "f8"),
+        ("max_v", "f8"),
+        ("sum_a", "f8"),
+        ("min_a", "f8"),
+        ("max_a", "f8"),
+        ("temperatures", "i8"),  # samples that told one
+        ("sum_c", "f8"),
+        ("min_c", "f8"),
+        ("max_c", "f8"),
+        ("innovations", "i8"),  # samples with one
+        ("sum_innovation_v2", "f8"),
+        ("min_margin", "f8"),  # soc - max(delta_1, delta_2)
+    ],
+    align=True,
+)
+"""All zero: nothing came yet."""
+OF_HOUR = tuple(HOUR_SUMS.names or ())[(HOUR_SUMS.names or ()).index("samples") :]
+"""What begins anew with each hour."""
+
+
+@njit(cache=True)
+def add_rows(sums: Records, trace: Records, new_clock: bool, gap_s: float, rest_a: float) -> None:
+    """Add accepted samples.
+
+    Args:
+        sums: Shape (1,), dtype HOUR_SUMS; updated in place.
+        trace: Shape (n,), dtype TRACE.
+        new_clock: The time stamps have nothing to do with those before.
+        gap_s: A longer step is a gap, unless the one before was about as long [s].
+        rest_a: A smaller current is none [A].
+    """
+    h = sums[0]
+    known = h.store != 0 and not new_clock
+    for j in range(trace.shape[0]):
+        x = trace[j]
+        add_step(h, x, known, gap_s, rest_a)
+        add_values(h, x)
+        known = True
+
+
+@njit(cache=True)
+def add_step(h: Record, x: Record, known: bool, gap_s: float, rest_a: float) -> None:
+    """Charge, energy and time since the sample before: straight between the two, nothing over a gap.
+
+    Args:
+        h: Record of HOUR_SUMS.
+        x: Record of TRACE.
+        known: There is one before, on the same clock.
+        gap_s: As in ``add_rows``.
+        rest_a: As in ``add_rows``.
+    """
+    power_w, dt_s = x.voltage_v * x.current_a, x.time_s - h.last_s
+    seen = known and 0.0 < dt_s <= max(gap_s, GAP_RATIO * h.step_s)
+    if seen:
+        charge_as, energy_ws = 0.5 * dt_s * (h.last_a + x.current_a), 0.5 * dt_s * (h.last_w + power_w)
+        h.seen_s += dt_s
+        h.out_as += max(charge_as, 0.0)
+        h.in_as += max(-charge_as, 0.0)
+        h.out_ws += max(energy_ws, 0.0)
+        h.in_ws += max(-energy_ws, 0.0)
+    elif h.store != 0:
+        h.gaps += 1
+    h.step_s = dt_s if known and dt_s > 0.0 else 0.0
+    h.rest_s = h.rest_s + dt_s if seen and abs(x.current_a) <= rest_a else 0.0
+    h.last_s, h.last_a, h.last_w = x.time_s, x.current_a, power_w
+
+
+@njit(cache=True)
+def add_values(h: Record, x: Record) -> None:
+    """Means and extremes. Records as in ``add_step``."""
+    first = h.samples == 0
+    h.samples += 1
+    h.sum_v += x.voltage_v
+    h.min_v = x.voltage_v if first else min(h.min_v, x.voltage_v)
+    h.max_v = x.voltage_v if first else max(h.max_v, x.voltage_v)
+    h.sum_a += x.current_a
+    h.min_a = x.current_a if first else min(h.min_a, x.current_a)
+    h.max_a = x.current_a if first else max(h.max_a, x.current_a)
+    h.min_margin = x.stability_margin if first else min(h.min_margin, x.stability_margin)
+    if math.isfinite(x.innovation_v):
+        h.innovations += 1
+        h.sum_innovation_v2 += x.innovation_v * x.innovation_v
+    if math.isfinite(x.temperature_c):
+        told = h.temperatures > 0
+        h.temperatures += 1
+        h.sum_c += x.temperature_c
+        h.min_c = min(h.min_c, x.temperature_c) if told else x.temperature_c
+        h.max_c = max(h.max_c, x.temperature_c) if told else x.temperature_c

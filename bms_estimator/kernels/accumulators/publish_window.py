@@ -1,0 +1,44 @@
+"""What the samples of a publish window add up to."""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.step import Records
+from bms_estimator.numba_cache import njit
+
+WINDOW_SUMS = np.dtype(
+    [
+        ("samples", "i8"),
+        ("first_s", "f8"),  # time stamp of the first [s]
+        ("voltage_v", "f8"),
+        ("current_a", "f8"),
+        ("power_w", "f8"),
+        ("temperatures", "i8"),  # samples that told one
+        ("temperature_c", "f8"),
+    ],
+    align=True,
+)
+"""All zero: nothing came yet."""
+
+
+@njit(cache=True)
+def add_window(sums: Records, trace: Records) -> None:
+    """Add accepted samples.
+
+    Args:
+        sums: Shape (1,), dtype WINDOW_SUMS; updated in place.
+        trace: Shape (n,), dtype TRACE.
+    """
+    s = sums[0]
+    for j in range(trace.shape[0]):
+        x = trace[j]
+        if s.samples == 0:
+            s.first_s = x.time_s
+        s.samples += 1
+        s.voltage_v += x.voltage_v
+        s.current_a += x.current_a
+        s.power_w += x.voltage_v * x.current_a
+        if math.isfinite(x.temperature_c):
+            s.temperatures += 1
+            s.temperature_c += x.temperature_c

@@ -1,0 +1,1 @@
+"""Equations of the cell: Chen and Mora, RC ladder, fuel cell, current between samples, open loop."""

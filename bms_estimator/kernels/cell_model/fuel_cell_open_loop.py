@@ -1,0 +1,51 @@
+"""What a fuel cell does under a measured current: no voltage is looked at."""
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.chen_mora import Floats
+from bms_estimator.kernels.cell_model.current_interpolation import held_current
+from bms_estimator.kernels.cell_model.fuel_cell import advance, give_file, output, settle
+from bms_estimator.numba_cache import njit
+
+
+@njit(cache=True)
+def open_loop(
+    file: Floats, theta: Floats, time_s: Floats, current_a: Floats, temperature_c: Floats
+) -> tuple[Floats, Floats]:
+    """Voltage at each sample, from the state that the first current settles to.
+
+    Args:
+        file: What the file gives, shape (16,).
+        theta: ln of each parameter over the file's, shape (8,).
+        time_s: Shape (n,), increasing [s].
+        current_a: Shape (n,), positive when the stack delivers [A].
+        temperature_c: Shape (n,), NaN where nobody measured it [C].
+
+    Returns:
+        Voltage [V], shape (n,), and its derivatives by theta, shape (n, 8).
+    """
+    n = time_s.size
+    voltage_v, psi = np.empty(n), np.zeros((n, theta.size))
+    x, dx, given = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)
+    for j in range(n):
+        give_file(given, file, temperature_c[j])
+        if j == 0:
+            settle(x, dx, theta, given, current_a[0])
+        else:
+            dt_s = time_s[j] - time_s[j - 1]
+            advance(x, dx, theta, given, held_current(dt_s, current_a[j - 1], current_a[j]), dt_s)
+        voltage_v[j] = output(x, dx, theta, given, current_a[j], psi[j])
+    return voltage_v, psi
+
+
+@njit(cache=True)
+def polarisation(file: Floats, theta: Floats, current_a: Floats, temperature_c: Floats) -> tuple[Floats, Floats]:
+    """Voltage that the stack settles to under each current; arguments and result as of ``open_loop``."""
+    n = current_a.size
+    voltage_v, psi = np.empty(n), np.zeros((n, theta.size))
+    x, dx, given = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)
+    for j in range(n):
+        give_file(given, file, temperature_c[j])
+        settle(x, dx, theta, given, current_a[j])
+        voltage_v[j] = output(x, dx, theta, given, current_a[j], psi[j])
+    return voltage_v, psi

@@ -1,0 +1,94 @@
+"""What a cell's branches do under a measured current, from rest: no voltage is looked at.
+
+Between two samples the current is taken as the filter takes it (``held_current``, ``along_line``), of a source that is no slower
+than one a minute.
+"""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.chen_mora import Floats, c_tl, c_ts, r_s, r_tl, r_ts, rc_step
+from bms_estimator.kernels.cell_model.current_interpolation import UNMEASURED_S, along_line, held_current
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS, TREND
+from bms_estimator.kernels.kalman_filter.gap_charge import SLOW_S
+from bms_estimator.numba_cache import njit
+
+LEAST_CAPACITANCE = 1e-3
+"""C_ts, C_tl are held at this fraction of a9, a12 below delta1, delta2, where (2.7), (2.8) turn negative."""
+
+
+@njit(cache=True)
+def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
+    """The current filtered by each time constant of the ladder.
+
+    Args:
+        time_s: Shape (n,), increasing [s].
+        current_a: Shape (n,), discharge positive [A].
+
+    Returns:
+        x_k at each sample, shape (n, BRANCHES) [A].
+    """
+    x = np.zeros((time_s.size, BRANCHES))
+    for j in range(1, time_s.size):
+        dt_s = time_s[j] - time_s[j - 1]
+        held_a = held_current(dt_s, current_a[j - 1], current_a[j])
+        straight_a = current_a[j] - current_a[j - 1] if SLOW_S < dt_s <= UNMEASURED_S else 0.0
+        for k in range(BRANCHES):
+            decay = math.exp(-dt_s / TAUS[k])
+            x[j, k] = held_a + (x[j - 1, k] - held_a) * decay + along_line(straight_a, dt_s / TAUS[k], decay)
+    return x
+
+
+@njit(cache=True)
+def hysteresis(time_s: Floats, soc: Floats, length: float, first: float) -> Floats:
+    """Hysteresis h over counted SOC: towards 1 in a charge, towards -1 in a discharge.
+
+    It follows the current's trend, that of branch ``TREND``, as in the filter.
+
+    Args:
+        time_s: Shape (n,), increasing [s].
+        soc: Shape (n,), counted.
+        length: Charge that leads from one branch to the other [SOC].
+        first: At the first sample.
+
+    Returns:
+        Shape (n,).
+    """
+    h = np.full(soc.size, first)
+    lagging = soc[0]
+    for j in range(1, soc.size):
+        moved = (1.0 - math.exp(-(time_s[j] - time_s[j - 1]) / TAUS[TREND])) * (soc[j] - lagging)
+        lagging += moved
+        decay = math.exp(-abs(moved) / length)
+        h[j] = decay * h[j - 1] + math.copysign(1.0 - decay, moved)
+    return h
+
+
+@njit(cache=True)
+def two_branches(time_s: Floats, current_a: Floats, soc: Floats, a: Floats) -> Floats:
+    """Overpotential of (2.2)-(2.9) with the ohmic drop, the current held from each sample on.
+
+    Below SOC 0 the elements stay as they are at 0: their exponentials would run away.
+
+    Args:
+        time_s: Shape (n,), increasing [s].
+        current_a: Shape (n,), discharge positive [A].
+        soc: Shape (n,), counted.
+        a: a1..a15 at index 1..15.
+
+    Returns:
+        Shape (n,) [V].
+    """
+    drop_v = np.empty(time_s.size)
+    v_ts = v_tl = 0.0
+    for j in range(time_s.size):
+        if j > 0:
+            dt_s, held_a, middle = time_s[j] - time_s[j - 1], current_a[j - 1], max(0.5 * (soc[j - 1] + soc[j]), 0.0)
+            ohm_ts, ohm_tl = r_ts(middle, a), r_tl(middle, a)
+            farad_ts = max(c_ts(middle, a), LEAST_CAPACITANCE * a[9])
+            farad_tl = max(c_tl(middle, a), LEAST_CAPACITANCE * a[12])
+            v_ts = rc_step(v_ts, held_a, ohm_ts, ohm_ts * farad_ts, dt_s)
+            v_tl = rc_step(v_tl, held_a, ohm_tl, ohm_tl * farad_tl, dt_s)
+        drop_v[j] = v_ts + v_tl + current_a[j] * r_s(max(soc[j], 0.0), a)
+    return drop_v

@@ -1,0 +1,1 @@
+"""Joint state and parameter EKF: filter bank, noise, input checks, OCV correction, element map."""

@@ -1,0 +1,56 @@
+"""A sensor that shows no current while the pack rests is right: it takes a coincidence to hide an offset.
+
+What is shown is true current and offset together. That both are zero is common, that one makes up for the other is not.
+A rest that shows 50 mA tells nothing: they may be the sensor's, or those of a load that stays on. How small a current a
+sensor shows at all, behind its steps and its dead band, is seen from the smallest that it has shown.
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
+"""
+
+from bms_estimator.kernels.kalman_filter.ekf import observe
+from bms_estimator.kernels.kalman_filter.records import OFFSET
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+REST_C, REST_S = 0.01, 60.0
+"""Less than this, second by second, for so long is a rest [C, s] ..."""
+ZERO_C = 0.002
+"""... and shows no current when its mean is below this [C]."""
+FORGOTTEN = 4.0
+"""The offset is not learned again before its variance has grown to so many times what a rest leaves: a rest in an hour errs
+as that of now does."""
+
+
+@njit(cache=True)
+def watch_smallest(s: Record, current_a: float) -> None:
+    """Keep the smallest current that was shown twice in a row and is not 0: one sample may be the mean over an edge."""
+    shown_a = max(abs(current_a), abs(s.current_a))
+    if current_a != 0.0 and s.current_a != 0.0 and (s.smallest_a == 0.0 or shown_a < s.smallest_a):
+        s.smallest_a = shown_a
+
+
+@njit(cache=True)
+def learn_from_zero(s: Record, p: Record) -> None:
+    """Each minute of rest that shows no current tells every hypothesis the offset to ``p.zero_std_c``, or to what may be hidden.
+
+    What little it shows may be the sensor's or that of a load: half of it is the offset, give or take the other half.
+    """
+    w, one_c = s.window, p.capacity_as / 3600.0
+    moved_as2 = w.charge_as * w.charge_as + w.between_as2 + w.unknown_as * w.unknown_as
+    if not moved_as2 <= (REST_C * one_c * w.time_s) ** 2:
+        s.rest_s = s.rest_as = 0.0
+        return
+    s.rest_s += w.time_s
+    s.rest_as += w.charge_as
+    if s.rest_s < REST_S:
+        return
+    half_a = 0.5 * s.rest_as / s.rest_s
+    s.rest_s = s.rest_as = 0.0
+    if s.smallest_a == 0.0 or abs(half_a) > 0.5 * ZERO_C * one_c:
+        return
+    hidden_a = max(s.smallest_a, p.current_step_a, p.dead_band_a)
+    left_a2 = (p.zero_std_c * one_c) ** 2 + hidden_a * hidden_a / 3.0 + half_a * half_a
+    for q in range(s.count):
+        known_a2 = s.covariance[q, OFFSET, OFFSET]
+        if known_a2 > FORGOTTEN * left_a2:
+            observe(s, q, OFFSET, half_a, known_a2 * left_a2 / (known_a2 - left_a2))

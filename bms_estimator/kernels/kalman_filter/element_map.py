@@ -1,0 +1,264 @@
+"""What the identifier has learned of each element over SOC, and the thesis's functions fitted to it.
+
+The identifier knows the elements where the cell is now. A map keeps, for each SOC bin, the information-weighted mean
+of what it knew there. (2.5)-(2.9) are fitted to the map: one nonlinear exponent, searched; amplitude and offset, linear.
+"""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.chen_mora import Floats
+from bms_estimator.kernels.observer.records import PARAMETERS, Record
+from bms_estimator.numba_cache import njit
+
+BINS = 25
+"""Bins of equal width over SOC 0..1."""
+ELEMENT_NAMES = ("r_ts_ohm", "r_tl_ohm", "c_ts_farad", "c_tl_farad", "r_s_ohm")
+"""In the order of their parameters: a1..a3, a4..a6, a7..a9, a10..a12, a13..a15."""
+ELEMENTS = len(ELEMENT_NAMES)
+CAPACITANCES = (2, 3)
+"""C_ts, C_tl among the elements."""
+LEARNED_VARIANCE = 0.5**2
+"""A logarithm known worse than this (50 %) adds nothing to the map."""
+MODEL_ERROR = 0.02
+"""An element is no closer to (2.5)-(2.9) than this, relative."""
+PRIOR_ERROR = 0.7
+"""How far the configured function, brought to the level of the visited bins, may be off in others, relative."""
+EXPONENT_MIN, EXPONENT_MAX = 0.5, 300.0
+SEARCH_POINTS = 24
+REFINEMENTS = 12
+ALTERNATIONS = 12
+"""Amplitude and offset within bounds, each in its turn."""
+
+ELEMENT_MAP = np.dtype(
+    [
+        ("weight", "f8", (ELEMENTS, BINS)),  # sum of dt / variance [s]
+        ("moment", "f8", (ELEMENTS, BINS)),  # sum of dt ln(value) / variance
+        ("soc_moment", "f8", (ELEMENTS, BINS)),  # sum of dt soc / variance
+        ("dwell_s", "f8", (ELEMENTS, BINS)),  # sum of dt
+    ],
+    align=True,
+)
+
+ELEMENT_FIT = np.dtype(
+    [
+        ("a", "f8", PARAMETERS),  # a1..a15 at their own index
+        ("std", "f8", PARAMETERS),  # standard errors, NaN where nothing was learned
+        ("bins", "i8", ELEMENTS),  # bins that the element was seen in
+        ("soc", "f8", BINS),  # what the last fit was made to: SOC,
+        ("value", "f8", BINS),  # the element there
+        ("weight", "f8", BINS),  # and one over its variance
+    ],
+    align=True,
+)
+
+
+@njit(cache=True)
+def learn(m: Record, element: int, soc: float, ln_value: float, variance: float, dt_s: float) -> bool:
+    """Add what is known of one element at ``soc`` to its bin: ln of its value and the variance of that.
+
+    Returns:
+        Whether it was known well enough to be added.
+    """
+    if not 0.0 < variance < LEARNED_VARIANCE:
+        return False
+    b = min(max(int(soc * BINS), 0), BINS - 1)
+    m.weight[element, b] += dt_s / variance
+    m.moment[element, b] += ln_value * dt_s / variance
+    m.soc_moment[element, b] += soc * dt_s / variance
+    m.dwell_s[element, b] += dt_s
+    return True
+
+
+@njit(cache=True)
+def age(m: Record, e: int, factor: float) -> None:
+    """Let row ``e`` of the map forget: what it knows counts ``factor`` times as much from now on."""
+    for b in range(BINS):
+        m.weight[e, b] *= factor
+        m.moment[e, b] *= factor
+        m.soc_moment[e, b] *= factor
+        m.dwell_s[e, b] *= factor
+
+
+@njit(cache=True)
+def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
+    """Fit the function of one element, of (2.5)-(2.9), to its row of the map.
+
+    Args:
+        m: Record of ELEMENT_MAP.
+        e: Row of the map, 0..4.
+        prior: Configured a1..a15 at index 1..15: stands in, weakly, where the map is empty.
+        fit: Record of ELEMENT_FIT, written.
+    """
+    x, y, w = fit.soc, fit.value, fit.weight
+    base = 3 * e + 1
+    sign = _sign(e)
+    fit.bins[e] = _observations(m, e, prior, base, sign, x, y, w)
+    if fit.bins[e] == 0:
+        for i in range(base, base + 3):
+            fit.a[i] = prior[i]
+            fit.std[i] = math.nan
+        return
+    exponent = _best_exponent(prior[base + 1], sign, x, y, w)
+    amplitude, offset, _ = _linear_part(exponent, sign, x, y, w)
+    fit.a[base], fit.a[base + 1], fit.a[base + 2] = amplitude, exponent, offset
+    _standard_errors(fit, base, sign, x, w)
+
+
+@njit(cache=True)
+def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float, float, float]:
+    """Amplitude, exponent and offset of the element fitted last, within bounds.
+
+    Where a bound holds one of them, the others are fitted anew: each clipped by itself would be another function.
+
+    Args:
+        fit: Record of ELEMENT_FIT, as ``fit_element`` left it for this element.
+        e: Row of the map, 0..4.
+        lower: Bounds of a1..a15 at index 1..15.
+        upper: The same.
+    """
+    i = 3 * e + 1
+    amplitude, exponent, offset = fit.a[i], fit.a[i + 1], fit.a[i + 2]
+    if (
+        lower[i] <= amplitude <= upper[i]
+        and lower[i + 1] <= exponent <= upper[i + 1]
+        and lower[i + 2] <= offset <= upper[i + 2]
+    ):
+        return amplitude, exponent, offset
+    exponent = min(max(exponent, lower[i + 1]), upper[i + 1])
+    sw, sg, sgg, sy, sgy, _ = _sums(exponent, _sign(e), fit.soc, fit.value, fit.weight)
+    for _ in range(ALTERNATIONS):
+        amplitude = min(max((sgy - sg * offset) / sgg, lower[i]), upper[i])
+        offset = min(max((sy - sg * amplitude) / sw, lower[i + 2]), upper[i + 2])
+    return amplitude, exponent, offset
+
+
+@njit(cache=True)
+def _sign(e: int) -> float:
+    """Capacitances rise with SOC, (2.7), (2.8): theirs is -1."""
+    return -1.0 if e in CAPACITANCES else 1.0
+
+
+@njit(cache=True)
+def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: Floats, y: Floats, w: Floats) -> int:
+    """SOC, value and weight of the element in each bin; returns how many bins were visited."""
+    visited = 0
+    ratios = weights = 0.0
+    for b in range(BINS):
+        x[b] = (b + 0.5) / BINS
+        if m.weight[e, b] > 0.0:
+            x[b] = m.soc_moment[e, b] / m.weight[e, b]
+        configured = prior[base + 2] + sign * prior[base] * math.exp(-prior[base + 1] * x[b])
+        y[b] = max(configured, 0.05 * prior[base + 2])
+        w[b] = 0.0
+        if m.weight[e, b] > 0.0:
+            visited += 1
+            # samples of one pass are no independent witnesses: the mean variance stands, not the variance of the mean
+            w[b] = 1.0 / (m.dwell_s[e, b] / m.weight[e, b] + MODEL_ERROR**2)
+            ratios += w[b] * (m.moment[e, b] / m.weight[e, b] - math.log(y[b]))
+            weights += w[b]
+    level = math.exp(ratios / weights) if visited > 0 else 1.0
+    for b in range(BINS):
+        if m.weight[e, b] > 0.0:
+            y[b] = math.exp(m.moment[e, b] / m.weight[e, b])
+            w[b] /= y[b] * y[b]
+        else:
+            y[b] *= level
+            w[b] = 1.0 / (PRIOR_ERROR * y[b]) ** 2
+    return visited
+
+
+@njit(cache=True)
+def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -> float:
+    """The exponent of least cost: a logarithmic search, then golden sections around its best point."""
+    ratio = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
+    lowest, highest = math.log(EXPONENT_MIN), math.log(EXPONENT_MAX)
+    best = min(max(math.log(start), lowest), highest)
+    least = _linear_part(math.exp(best), sign, x, y, w)[2]
+    for j in range(SEARCH_POINTS):
+        candidate = lowest + ratio * j
+        cost = _linear_part(math.exp(candidate), sign, x, y, w)[2]
+        if cost < least:
+            best, least = candidate, cost
+    low, high = max(best - ratio, lowest), min(best + ratio, highest)
+    golden = 0.5 * (math.sqrt(5.0) - 1.0)
+    left, right = high - golden * (high - low), low + golden * (high - low)
+    cost_left = _linear_part(math.exp(left), sign, x, y, w)[2]
+    cost_right = _linear_part(math.exp(right), sign, x, y, w)[2]
+    for _ in range(REFINEMENTS):
+        if cost_left < cost_right:
+            high, right, cost_right = right, left, cost_left
+            left = high - golden * (high - low)
+            cost_left = _linear_part(math.exp(left), sign, x, y, w)[2]
+        else:
+            low, left, cost_left = left, right, cost_right
+            right = low + golden * (high - low)
+            cost_right = _linear_part(math.exp(right), sign, x, y, w)[2]
+    return math.exp(0.5 * (low + high))
+
+
+@njit(cache=True)
+def _sums(
+    exponent: float, sign: float, x: Floats, y: Floats, w: Floats
+) -> tuple[float, float, float, float, float, float]:
+    """Weighted sums of 1, g, g g, y, g y, y y with g = sign e^(-exponent x)."""
+    sw = sg = sgg = sy = sgy = syy = 0.0
+    for b in range(BINS):
+        g = sign * math.exp(-exponent * x[b])
+        sw += w[b]
+        sg += w[b] * g
+        sgg += w[b] * g * g
+        sy += w[b] * y[b]
+        sgy += w[b] * g * y[b]
+        syy += w[b] * y[b] * y[b]
+    return sw, sg, sgg, sy, sgy, syy
+
+
+@njit(cache=True)
+def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) -> tuple[float, float, float]:
+    """Amplitude and offset, both positive, of least weighted squares for this exponent; and the cost."""
+    sw, sg, sgg, sy, sgy, syy = _sums(exponent, sign, x, y, w)
+    det = sw * sgg - sg * sg
+    offset = sy / sw
+    amplitude = 1e-3 * offset
+    if det > 1e-12 * sw * sgg:
+        free = (sw * sgy - sg * sy) / det
+        amplitude = max(amplitude, free)
+    offset = max((sy - sg * amplitude) / sw, 1e-3 * offset)
+    cross = offset * sw * offset + amplitude * (2.0 * offset * sg + amplitude * sgg)
+    cost = syy + cross - 2.0 * (offset * sy + amplitude * sgy)
+    return amplitude, offset, cost
+
+
+@njit(cache=True)
+def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats) -> None:
+    """Square roots of the diagonal of (J' W J)^-1, by elimination; NaN where that matrix is singular."""
+    amplitude, exponent, offset = fit.a[base], fit.a[base + 1], fit.a[base + 2]
+    # a parameter that the map says nothing of is known to a factor e^3, not less
+    h00, h11, h22 = (3.0 * amplitude) ** -2, (3.0 * exponent) ** -2, (3.0 * offset) ** -2
+    h01 = h02 = h12 = 0.0
+    for b in range(BINS):
+        by_amplitude = sign * math.exp(-exponent * x[b])
+        by_exponent = -x[b] * amplitude * by_amplitude
+        h00 += w[b] * by_amplitude * by_amplitude
+        h01 += w[b] * by_amplitude * by_exponent
+        h02 += w[b] * by_amplitude
+        h11 += w[b] * by_exponent * by_exponent
+        h12 += w[b] * by_exponent
+        h22 += w[b]
+    for i in range(base, base + 3):
+        fit.std[i] = math.nan
+    if not h00 > 0.0:
+        return
+    l10, l20 = h01 / h00, h02 / h00
+    d1 = h11 - l10 * h01
+    if not d1 > 0.0:
+        return
+    l21 = (h12 - l10 * h02) / d1
+    d2 = h22 - l20 * h02 - l21 * l21 * d1
+    if not d2 > 0.0:
+        return
+    fit.std[base] = math.sqrt(1.0 / h00 + l10 * l10 / d1 + (l10 * l21 - l20) ** 2 / d2)
+    fit.std[base + 1] = math.sqrt(1.0 / d1 + l21 * l21 / d2)
+    fit.std[base + 2] = math.sqrt(1.0 / d2)

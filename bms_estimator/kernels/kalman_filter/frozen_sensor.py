@@ -1,0 +1,91 @@
+"""A voltage or a current that stays the same to the last digit though it cannot: a wire is off, a converter hangs.
+
+``c`` is a record of CHECKS, ``f`` of EKF_STATE, ``p`` of EKF_SETTINGS.
+"""
+
+import math
+
+from bms_estimator.kernels.cell_model.chen_mora import ocv
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+FAST_S = 10.0
+"""Changes of voltage and current within this time belong together [s]."""
+VISIBLE_V = 0.003
+"""A change of the overpotential of one cell that shows fully [V]."""
+DOUBT_S = 5.0
+"""A voltage is not believed from so long on [s] in which it cannot be the same."""
+FROZEN_S = 60.0
+"""What cannot be for so long is not [s]: that the current is the same ..."""
+SWING_V, RESOLVED = 0.02, 3.0
+"""... where the voltage of one cell changes by so much [V], that the voltage is where what the current drops is visible, ..."""
+HELD_V, LOAD_C = 0.01, 0.1
+"""... or where the open-circuit voltage of one cell has moved by so much [V]. Below a discharge of this [C] only sudden changes count:
+chargers hold a voltage. All are more than ``RESOLVED`` steps of the voltage's resolution."""
+UNCOUNTED = 0.1
+"""Charge that goes wrong while the voltage tells nothing, relative."""
+OUTLIERS_S = 3600.0
+"""Memory of single samples that were not believed [s]."""
+
+
+@njit(cache=True)
+def watch_frozen(c: Record, f: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> bool:
+    """Whether a voltage may be believed. For how long each of the two has been the same though it cannot; before ``watch_sign``."""
+    counted_s = min(dt_s, FAST_S)
+    fast = dt_s <= FAST_S and c.slow_v != 0.0
+    moved = stuck = False
+    resolved_v = RESOLVED * max(c.step_v, math.sqrt(3.0 * p.sensor_v2))
+    change_v = abs(voltage_v - c.last_v)
+    if c.last_v == 0.0 or change_v > 0.0:
+        if c.last_v != 0.0:
+            c.step_v = change_v if c.step_v == 0.0 else min(c.step_v, change_v)
+        c.frozen_v_s = c.held_as = 0.0
+        c.held_a, c.held_soc, c.held_soc_std = current_a, f.soc, f.soc_std
+    else:
+        c.held_as += 0.5 * (c.last_a + current_a) * min(dt_s, p.unmeasured_s)
+        loaded = current_a >= LOAD_C * p.capacity_as / 3600.0
+        moved = loaded and has_moved(c, f, p, current_a, resolved_v)
+        change_a = abs(current_a - c.held_a) if loaded else min(abs(current_a - c.held_a), abs(current_a - c.slow_a))
+        dropped_v = series_ohm(p) * change_a if fast else 0.0
+        stuck = moved or dropped_v > max(VISIBLE_V * p.series, resolved_v)
+        if stuck:
+            c.frozen_v_s += counted_s
+    c.same_s += dt_s
+    if c.last_v == 0.0 or current_a != c.last_a:
+        c.frozen_a_s = c.same_s = 0.0
+        c.same_soc, c.same_soc_std = f.soc, f.soc_std
+    elif moved or (fast and abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > max(SWING_V * p.series, resolved_v)):
+        c.frozen_a_s += counted_s
+    elif c.frozen_a_s < FROZEN_S:  # single glitches at rest
+        c.frozen_a_s -= c.frozen_a_s * min(1.0, counted_s / OUTLIERS_S)
+    c.last_v, c.last_a = voltage_v, current_a
+    return not stuck or c.frozen_v_s <= DOUBT_S or c.frozen_v_s > FROZEN_S
+
+
+@njit(cache=True)
+def series_ohm(p: Record) -> float:
+    """R_0 in the middle of the SOC, at 25 C [ohm]."""
+    middle = p.weak_ohm.shape[0] // 2
+    return p.weak_ohm[middle, 0] + p.strong_ohm[middle, 0]
+
+
+@njit(cache=True)
+def has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: float) -> bool:
+    """Whether the charge since the voltage last changed has moved the open-circuit voltage, whatever the current drops."""
+    if f.count > 1:
+        return False
+    now_soc = c.held_soc - c.held_as / p.capacity_as
+    moved_v = ocv(c.held_soc, p.ocv_v, p.ocv_slope_v) - ocv(now_soc, p.ocv_v, p.ocv_slope_v)
+    dropped_v = p.middle_ohm * (current_a - c.held_a)
+    least_v = max(HELD_V * p.series, resolved_v, abs(dropped_v))
+    return min(abs(moved_v), abs(moved_v + dropped_v)) > least_v
+
+
+@njit(cache=True)
+def take_back(c: Record, f: Record, p: Record) -> None:
+    """What was concluded since one of the two froze is worth nothing: the SOC of then, and counted since, if the current is one."""
+    if c.frozen_a_s > FROZEN_S:
+        f.soc, f.soc_std = c.same_soc, c.same_soc_std + p.load_mean_c * c.same_s / 3600.0
+    else:
+        moved = c.held_as / p.capacity_as
+        f.soc, f.soc_std = min(max(c.held_soc - moved, 0.0), 1.0), c.held_soc_std + UNCOUNTED * abs(moved)

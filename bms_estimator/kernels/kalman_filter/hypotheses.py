@@ -1,0 +1,330 @@
+"""Several filters side by side, from SOCs apart, until they agree: switched on anywhere.
+
+At switch-on neither the SOC nor the polarisation is known, and far from the truth the OCV's slope is another. So filters
+start at ``HYPOTHESES`` SOCs around the one that is told. Each is weighted by its likelihood to a power below 1, since
+successive errors of the model are not independent (tempering); those that agree become one, unlikely ones go. What
+goes out is mean and standard deviation of the mixture.
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. At more than 1 Hz the filters see the mean of a second's samples.
+"""
+
+import math
+
+from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, along_line, held_current
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    BRANCHES,
+    HYSTERESIS_J,
+    REFERENCE_C,
+    STRONG_J,
+    TAUS,
+    WEAK_J,
+    arrhenius,
+    on_grid,
+)
+from bms_estimator.kernels.kalman_filter.current_offset import learn_from_zero, watch_smallest
+from bms_estimator.kernels.kalman_filter.ekf import HIGHEST, LOWEST, OWN_R_STD, decay, inflate, predict, update
+from bms_estimator.kernels.kalman_filter.gap_charge import (
+    SLOW_S,
+    between_samples,
+    first_load,
+    goes_on,
+    rounded_charge,
+    unseen_charge,
+    watch_load,
+)
+from bms_estimator.kernels.kalman_filter.mixture import combine, copy, forget, merge, vacate
+from bms_estimator.kernels.kalman_filter.noise import (
+    bias_variance,
+    measurement_variance,
+    offset_variance,
+    outside,
+    resistance_std,
+    switch_on,
+)
+from bms_estimator.kernels.kalman_filter.ocv_correction import forget_curve
+from bms_estimator.kernels.kalman_filter.records import (
+    B_FAST,
+    B_SLOW,
+    CURVE,
+    HYPOTHESES,
+    HYST,
+    LN_Q,
+    LN_R,
+    LN_R0,
+    OFFSET,
+    SOC,
+    X,
+)
+from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
+from bms_estimator.kernels.kalman_filter.temperature import warm
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+WINDOW_S = 0.99
+"""Samples of about a second make one update [s]."""
+SAME_STEP = 0.005
+"""A step as long as that before within this, relative, has its decays."""
+ONE_STD = 0.06
+"""An SOC known better than this needs one filter only."""
+REACH_STDS = 2.25
+"""Hypotheses reach so far to both sides."""
+OVERLAP = 0.62
+"""Std of a hypothesis over the distance to the next."""
+BEYOND_STD = 0.03
+"""How far outside 0..1 a told SOC may mean, std."""
+TEMPERATURE_S = 10.0
+"""A temperature sensor's noise is averaged over so long [s]."""
+FASTEST_K_S = 0.1
+"""No cell warms or cools faster [K/s], ..."""
+SETTLED_S = 60.0
+"""... once a minute has shown that the first sample was right: some sensors begin with 85 C."""
+COLDEST_C, HOTTEST_C = -60.0, 120.0
+"""Where a cell's temperature may be [C]."""
+LEAST_STD = 0.005
+"""What full and empty are of a cell is known no better, std of SOC."""
+UNKNOWN_FULL = 0.03
+"""Std of the SOC, over that of ln R, of a cell that was not measured: another make is full elsewhere on the curve."""
+HYST_STD = 0.7
+"""Std of the first hysteresis."""
+KNOWN_S = 1800.0
+"""What was before switch-on is forgotten in so long [s]."""
+REOPEN_STDS = 4.0
+"""A model that would have to be wrong by so many std is not: the SOC is ..."""
+STRAINED_STDS = 2.0
+"""Beyond so many of them a hypothesis loses weight: as its biases follow what they see, its innovations are small, whatever the
+biases have become."""
+REOPEN_STD = 0.2
+"""... by as much as at switch-on."""
+TOLD_STD = 0.03
+"""An SOC that is told is known to this std, ..."""
+WRONG_STD = 0.12
+"""... or it is wrong, by as much as this, ..."""
+LN_RIGHT = 3.0
+"""... which is less likely by so much, in ln: one in ten in all."""
+
+
+@njit(cache=True)
+def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: float) -> None:
+    """First sample: nothing is known but the told ``soc``, to ``p.soc_std``."""
+    s.started, s.best = 1, 0
+    s.current_a = current_a
+    s.smallest_a = 0.0
+    s.sensed = 1 if is_temperature(temperature_c) else 0
+    s.temperature_c = temperature_c if s.sensed else REFERENCE_C
+    follow_temperature(s)
+    first_load(s, p, current_a)
+    s.x_a[:] = 0.0
+    x, cov = s.mean[0], s.covariance[0]
+    x[:] = 0.0
+    cov[:, :] = 0.0
+    cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
+    cov[LN_R0, LN_R] = cov[LN_R, LN_R0] = max(resistance_std(s, p) ** 2 - OWN_R_STD**2, 0.0)
+    s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
+    cov[OFFSET, OFFSET] = offset_variance(p)
+    cov[LN_Q, LN_Q] = p.capacity_std**2
+    forget_curve(x, cov)
+    seed(s, p, soc, p.soc_std)
+    clear(s)
+
+
+@njit(cache=True)
+def is_temperature(temperature_c: float) -> bool:
+    """Whether a cell can have it: sensors say -127 or -300 C where a wire is off. NaN is none."""
+    return COLDEST_C <= temperature_c <= HOTTEST_C
+
+
+@njit(cache=True)
+def follow_temperature(s: Record) -> None:
+    """The Arrhenius factors at the cell's temperature."""
+    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
+    s.hysteresis = arrhenius(HYSTERESIS_J, s.temperature_c)
+
+
+@njit(cache=True)
+def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
+    """Begin again at ``soc`` with all that the likeliest hypothesis knows of sensor and cell.
+
+    SOC, polarisation, hysteresis and errors of the model are unknown.
+    """
+    known = s.mean[s.best], s.covariance[s.best]
+    for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
+        forget(known[0], known[1], j)
+    for k in range(BRANCHES):
+        forget(known[0], known[1], X + k)
+    s.x_a[:] = 0.0
+    switch_on(p, s.current_a, known[0], known[1])
+    known[1][HYST, HYST], known[1][CURVE, CURVE] = HYST_STD**2, 1.0
+    s.count = HYPOTHESES if soc_std > ONE_STD else 1
+    apart = 2.0 * REACH_STDS * soc_std / (HYPOTHESES - 1)
+    if s.best != 0:
+        copy(s, s.best, 0)
+    for q in range(s.count - 1, -1, -1):
+        if q > 0:
+            copy(s, 0, q)
+        away = (q - (s.count - 1) // 2) * apart
+        std = OVERLAP * apart if s.count > 1 else soc_std
+        s.mean[q, SOC] = min(max(soc + away, LOWEST), HIGHEST)
+        s.covariance[q, SOC, SOC] = std * std
+        s.ln_weight[q] = -0.5 * (away / soc_std) ** 2 - 0.5 * ((soc + away - s.mean[q, SOC]) / BEYOND_STD) ** 2
+        half_v2 = 0.5 * bias_variance(s, p, q)
+        s.covariance[q, B_SLOW, B_SLOW] = s.covariance[q, B_FAST, B_FAST] = half_v2
+        s.minute_u[q] = s.ten_minutes_u[q] = 0.0
+        s.fast_inflation[q] = s.slow_inflation[q] = 1.0
+    for q in range(s.count, HYPOTHESES):
+        vacate(s, q)
+    s.best = (s.count - 1) // 2
+    s.seeded_s = s.rest_s = s.rest_as = 0.0
+    combine(s)
+
+
+@njit(cache=True)
+def tell(s: Record, p: Record, soc: float) -> None:
+    """Begin again at an SOC that somebody told: mostly it is right, and the voltage shows where it is not."""
+    seed(s, p, soc, WRONG_STD)
+    s.covariance[s.best, SOC, SOC] = TOLD_STD**2
+    s.ln_weight[s.best] += LN_RIGHT
+    combine(s)
+
+
+@njit(cache=True)
+def clear(s: Record) -> None:
+    """Begin a new window."""
+    w = s.window
+    w.samples = w.gap = 0
+    w.time_s = w.charge_as = w.throughput_as = w.unknown_as = w.between_as2 = w.rounded_as2 = 0.0
+    w.sum_v = w.sum_a = w.sum_as = 0.0
+    w.sum_x_a[:] = 0.0
+
+
+@njit(cache=True)
+def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, temperature_c: float) -> None:
+    """Charge and branches from the sample before to this one; ``gap``: samples are missing between them."""
+    if is_temperature(temperature_c):
+        share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
+        most_k = FASTEST_K_S * dt_s if s.sensed and s.seeded_s > SETTLED_S else math.inf
+        s.temperature_c += min(max(share * (temperature_c - s.temperature_c), -most_k), most_k)
+        s.sensed = 1
+    w = s.window
+    held_a, change_a = held_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
+    unseen = gap or dt_s > p.unmeasured_s
+    charge_as = held_a * min(dt_s, LONGEST_FLOW_S)
+    if gap and dt_s > p.unmeasured_s:
+        charge_as += goes_on(s, held_a, dt_s)
+        held_a = charge_as / dt_s
+    if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
+        s.decay_s = dt_s
+        for k in range(BRANCHES):
+            s.decay[k] = math.exp(-dt_s / TAUS[k])
+    for k in range(BRANCHES):
+        s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
+        if dt_s > SLOW_S and not unseen:
+            s.x_a[k] += along_line(change_a, dt_s / TAUS[k], s.decay[k])
+    w.time_s += dt_s
+    w.charge_as += charge_as
+    w.throughput_as += abs(charge_as)
+    if gap:
+        w.gap = 1
+    if unseen:
+        w.unknown_as += unseen_charge(s, p, held_a, dt_s)
+    else:
+        w.between_as2 += between_samples(change_a, dt_s)
+    if p.current_step_a > 0.0 or p.dead_band_a > 0.0:
+        w.rounded_as2 += rounded_charge(s, p, dt_s, current_a)
+    s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
+    watch_smallest(s, current_a)
+    s.current_a = current_a
+
+
+@njit(cache=True)
+def gather(s: Record, current_a: float, voltage_v: float) -> None:
+    """Add a sample to the window."""
+    w = s.window
+    w.samples += 1
+    w.sum_v += voltage_v
+    w.sum_a += current_a
+    w.sum_as += w.charge_as
+    for k in range(BRANCHES):
+        w.sum_x_a[k] += s.x_a[k]
+
+
+@njit(cache=True)
+def pass_time(s: Record, p: Record) -> None:
+    """What the time of the window does to the temperature, where nobody measures it, and to F."""
+    if not s.sensed:
+        warm(s, p)
+    decay(s, p)
+
+
+@njit(cache=True)
+def update_all(s: Record, p: Record) -> None:
+    """Take the window in, with every hypothesis."""
+    w = s.window
+    dt_s = w.time_s
+    if dt_s > 0.0:
+        if not w.gap:
+            watch_load(s, w.charge_as / dt_s, dt_s)
+        pass_time(s, p)
+    follow_temperature(s)
+    s.seeded_s += dt_s
+    variance_v2 = measurement_variance(s, p, dt_s, w.samples)
+    share, best = size_of_errors(s, p), 0
+    for q in range(s.count):
+        if dt_s > 0.0:
+            predict(s, p, q)
+        innovation_v, total_v2, straight_v2 = update(s, p, q, variance_v2)
+        u = innovation_v / math.sqrt(total_v2)
+        # a bend's part of S stays while nothing moves: counted each second, it would tell against the knee at full rest
+        s.ln_weight[q] -= p.temper * (innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2))
+        if s.count > 1:
+            s.ln_weight[q] -= p.strain * max(strain2(s, p, q) - STRAINED_STDS**2, 0.0)
+        if dt_s > 0.0 and not w.gap:  # one innovation is no error that stays, however long the gap
+            inflate(s, q, dt_s, u)
+        if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
+            best = q
+            s.innovation_v, s.innovation_variance = innovation_v, total_v2
+    s.voltage_v = w.sum_v / w.samples - s.innovation_v
+    s.best = best
+    learn_from_zero(s, p)
+    merge(s)
+    combine(s)
+    reopen(s, p)
+    clear(s)
+
+
+@njit(cache=True)
+def size_of_errors(s: Record, p: Record) -> float:
+    """What S is in truth, over what the filters take it for.
+
+    R and the biases allow for loads and cells that the file fits worst. Mostly it fits better, once what was before switch-on
+    is forgotten: innovations far within S would leave it to ln S to judge, and the hypothesis of the smallest S would win.
+    Outside the temperatures of the cell file less of the kind is known, ``OUTSIDE_K`` away nothing.
+    """
+    return min(max(math.exp(-s.seeded_s / KNOWN_S), p.least_share * outside(p, s.temperature_c) ** 2), 1.0)
+
+
+@njit(cache=True)
+def reopen(s: Record, p: Record) -> None:
+    """Begin again where the model would have to be wrong by far more than it is: then the SOC is, by any amount."""
+    if s.count == 1 and strain2(s, p, 0) > REOPEN_STDS**2:
+        forget_curve(s.mean[0], s.covariance[0])
+        seed(s, p, s.mean[0, SOC], REOPEN_STD)
+        s.reopened += 1
+
+
+@njit(cache=True)
+def strain2(s: Record, p: Record, q: int) -> float:
+    """By how many std a hypothesis holds the model for wrong, squared.
+
+    The biases take what is wrong with OCV and hysteresis, too: on a plateau that is most of it.
+    """
+    bias_v, soc = s.mean[q, B_SLOW] + s.mean[q, B_FAST], s.mean[q, SOC]
+    hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)
+    wrong_v2 = bias_variance(s, p, q) + on_grid(soc, p.curve_error_v) ** 2 + hysteresis_v**2
+    return bias_v * bias_v / wrong_v2
+
+
+@njit(cache=True)
+def pack_std(s: Record, p: Record) -> float:
+    """Std of the SOC as of the emptiest of cells in series: nobody sees how far below their mean it lies."""
+    spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
+    return math.hypot(max(s.soc_std, LEAST_STD, UNKNOWN_FULL * p.r_std), spread)

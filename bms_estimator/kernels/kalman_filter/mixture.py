@@ -1,0 +1,106 @@
+"""The mixture of hypotheses: one row of EKF_STATE each, of which likely ones stay and those that agree become one.
+
+``s`` is a record of EKF_STATE.
+"""
+
+import math
+
+from bms_estimator.kernels.kalman_filter.records import SOC, STATES
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+UNLIKELY = -9.0
+"""ln of a relative weight below which a hypothesis goes."""
+ALIKE_STDS = 0.7
+"""Two hypotheses closer than this many std of SOC are one."""
+
+
+@njit(cache=True)
+def forget(mean: Record, covariance: Record, j: int) -> None:
+    """State ``j`` is 0 and belongs to none."""
+    mean[j] = 0.0
+    covariance[j, :] = 0.0
+    covariance[:, j] = 0.0
+
+
+@njit(cache=True)
+def copy(s: Record, source: int, to: int) -> None:
+    """Hypothesis ``to`` becomes as ``source``."""
+    s.mean[to, :] = s.mean[source]
+    s.covariance[to, :, :] = s.covariance[source]
+    s.ln_weight[to] = s.ln_weight[source]
+    s.minute_u[to], s.ten_minutes_u[to] = s.minute_u[source], s.ten_minutes_u[source]
+    s.fast_inflation[to], s.slow_inflation[to] = s.fast_inflation[source], s.slow_inflation[source]
+
+
+@njit(cache=True)
+def vacate(s: Record, q: int) -> None:
+    """Row ``q`` holds no hypothesis: all 0, so that a state that is kept without its zeros costs what it knows."""
+    s.mean[q, :] = 0.0
+    s.covariance[q, :, :] = 0.0
+    s.ln_weight[q] = s.minute_u[q] = s.ten_minutes_u[q] = s.fast_inflation[q] = s.slow_inflation[q] = 0.0
+
+
+@njit(cache=True)
+def merge(s: Record) -> None:
+    """Drop what is unlikely, and make one of neighbours that agree."""
+    top, q = s.ln_weight[s.best], 0
+    while q < s.count:
+        s.ln_weight[q] -= top
+        if s.ln_weight[q] < UNLIKELY:
+            remove(s, q)
+        else:
+            q += 1
+    q = 1
+    while q < s.count:
+        apart = abs(s.mean[q, SOC] - s.mean[q - 1, SOC])
+        if apart * apart < ALIKE_STDS**2 * min(s.covariance[q, SOC, SOC], s.covariance[q - 1, SOC, SOC]):
+            unite(s, q - 1, q)
+            remove(s, q)
+        else:
+            q += 1
+
+
+@njit(cache=True)
+def unite(s: Record, a: int, b: int) -> None:
+    """Hypothesis ``a`` becomes the normal distribution with mean and covariance of both."""
+    most = max(s.ln_weight[a], s.ln_weight[b])
+    weight_a, weight_b = math.exp(s.ln_weight[a] - most), math.exp(s.ln_weight[b] - most)
+    share = weight_b / (weight_a + weight_b)
+    apart = s.ph
+    for j in range(STATES):
+        apart[j] = s.mean[b, j] - s.mean[a, j]
+        s.mean[a, j] += share * apart[j]
+    for j in range(STATES):
+        for k in range(j, STATES):
+            both = s.covariance[a, j, k] + share * (s.covariance[b, j, k] - s.covariance[a, j, k])
+            s.covariance[a, j, k] = s.covariance[a, k, j] = both + share * (1.0 - share) * apart[j] * apart[k]
+    s.ln_weight[a] = most + math.log(weight_a + weight_b)
+    if s.best == b:
+        s.best = a
+
+
+@njit(cache=True)
+def remove(s: Record, q: int) -> None:
+    """Close the row."""
+    for j in range(q, s.count - 1):
+        copy(s, j + 1, j)
+    s.count -= 1
+    vacate(s, s.count)
+    if s.best > q:
+        s.best -= 1
+
+
+@njit(cache=True)
+def combine(s: Record) -> None:
+    """Mean and std of SOC of the mixture."""
+    total = mean = variance = 0.0
+    for q in range(s.count):
+        weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
+        total += weight
+        mean += weight * s.mean[q, SOC]
+    mean /= total
+    for q in range(s.count):
+        weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best]) / total
+        variance += weight * (s.covariance[q, SOC, SOC] + (s.mean[q, SOC] - mean) ** 2)
+    s.soc, s.soc_std = min(max(mean, 0.0), 1.0), math.sqrt(variance)

@@ -1,0 +1,58 @@
+"""The OCV learned while the filter runs: the error of the curve of the cell file as states of the filter, along SOC.
+
+``learned`` of the variance of that error belongs to the curve itself: it is the same whenever the SOC comes back. It is
+blended between ``NODES`` states so that its variance stays, each in units of the curve's std there, correlated with its
+neighbours over ``ALIKE_SOC``. The rest, CURVE, is of temperature, load and history, and is another each time.
+
+A voltage tells SOC and curve together: what it tells of the curve is no more certain than the SOC was without it. The
+joint covariance holds exactly that, so no rule is needed which voltages may be learned from (the same with a map and a
+place in it: Smith, Self and Cheeseman 1990).
+
+``x`` is a mean of EKF_STATE, ``p`` a record of EKF_SETTINGS.
+"""
+
+import math
+
+from bms_estimator.kernels.cell_model.chen_mora import Floats
+from bms_estimator.kernels.cell_model.rc_ladder import on_grid
+from bms_estimator.kernels.kalman_filter.records import NODE, NODES
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+ALIKE_SOC = 0.6
+"""Errors of a curve go together over so much [SOC]: makes of one chemistry differ in what is cut off of the electrodes."""
+NEIGHBOURS = math.exp(-1.0 / (NODES - 1) / ALIKE_SOC)
+"""Correlation of two nodes beside each other, before anything is learned."""
+
+
+@njit(cache=True)
+def place(soc: float) -> tuple[int, float]:
+    """The node below ``soc``, and how far it is on the way to the next."""
+    position = min(max(soc, 0.0), 1.0) * (NODES - 1)
+    i = min(int(position), NODES - 2)
+    return i, position - i
+
+
+@njit(cache=True)
+def per_node_v(p: Record, soc: float, t: float) -> float:
+    """Error of the curve at ``soc`` by nodes of 1 on both sides [V]: of the same variance between nodes as at them."""
+    kept = 1.0 - 2.0 * t * (1.0 - t) * (1.0 - NEIGHBOURS)
+    return on_grid(soc, p.curve_error_v) * math.sqrt(p.learned / kept)
+
+
+@njit(cache=True)
+def learned_v(p: Record, x: Floats, soc: float) -> float:
+    """What the true curve is above that of the cell file, as far as it was learned [V]."""
+    i, t = place(soc)
+    return per_node_v(p, soc, t) * ((1.0 - t) * x[NODE + i] + t * x[NODE + i + 1])
+
+
+@njit(cache=True)
+def forget_curve(x: Floats, covariance: Floats) -> None:
+    """Nothing is learned yet."""
+    x[NODE : NODE + NODES] = 0.0
+    covariance[NODE : NODE + NODES, :] = 0.0
+    covariance[:, NODE : NODE + NODES] = 0.0
+    for j in range(NODES):
+        for k in range(NODES):
+            covariance[NODE + j, NODE + k] = NEIGHBOURS ** abs(j - k)

@@ -1,0 +1,32 @@
+"""How warm a cell makes itself, where nobody measures it.
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
+"""
+
+import math
+
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, REFERENCE_C, resistances
+from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0, X
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+HEAT_J = 22.0
+"""Heat that warms 1 Ah of a cell by a kelvin [J/(K Ah)] ..."""
+COOLS_S = 600.0
+"""... and the time constant in which it cools in still air [s]: an LG M50 at C/2 and 1C takes 22 and 24, 650 and 570."""
+WARMEST_C = 80.0
+"""No cell that is used gets warmer [C]: a current that is no truth would leave it hot for an hour."""
+
+
+@njit(cache=True)
+def warm(s: Record, p: Record) -> None:
+    """The temperature at the end of the window under the losses i^2 R_0 + sum x_k^2 R_k, in a room of ``REFERENCE_C``."""
+    w, x = s.window, s.mean[s.best]
+    resistances(s.soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
+    current_a = w.charge_as / w.time_s
+    loss_w = math.exp(x[LN_R0]) * s.ohm[0] * current_a * current_a
+    for k in range(BRANCHES):
+        loss_w += math.exp(x[LN_R]) * s.ohm[1 + k] * (s.x_a[k] + x[X + k]) ** 2
+    in_the_end_c = REFERENCE_C + loss_w / p.series * COOLS_S / (HEAT_J * p.capacity_as / 3600.0)
+    s.temperature_c = in_the_end_c + (s.temperature_c - in_the_end_c) * math.exp(-w.time_s / COOLS_S)
+    s.temperature_c = min(s.temperature_c, WARMEST_C)

@@ -1,0 +1,1 @@
+"""The thesis's adaptive observer: Nussbaum gain, Mittag-Leffler function, adaptive law."""

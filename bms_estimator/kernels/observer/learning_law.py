@@ -1,0 +1,195 @@
+"""The learning law: sensitivity times e with a memory, for any model of ``learning_model``.
+
+``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS; ``m`` and ``q`` are the law's own parts of them, ``o`` is
+the observer's.
+"""
+
+import math
+
+from bms_estimator.kernels.cell_model.current_interpolation import held_current
+from bms_estimator.kernels.observer.learning_model import advance, give, output, settle, write
+from bms_estimator.kernels.observer.observer import change_of_lock, update_margins
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+LEARN_EVERY_S = 0.999
+"""Theta moves no more often, nearly a second: more samples only add to what is remembered [s]."""
+FASTEST_HZ = 0.1
+"""Greatest gamma k, since k only grows: theta that follows noise faster than in some 10 s is led astray by it [1/s]."""
+RESTING_C = 0.02
+"""A first sample of no more is of a cell at rest [C]."""
+
+
+@njit(cache=True)
+def begin_learning(s: Record, p: Record, voltage_v: float) -> None:
+    """The file's parameters, nothing remembered, and a cell at rest."""
+    m, q = s.learning, p.learning
+    for j in range(q.count):
+        m.theta[j] = 0.0
+    empty_memory(m, q)
+    s.observer.k = max(p.observer.k0, 1.0)
+    take_as_rest(s, p, voltage_v)
+    if abs(s.observer.current_a) <= RESTING_C * p.observer.capacity_as / 3600.0:
+        m.settle_s = 0.0
+
+
+@njit(cache=True)
+def empty_memory(m: Record, q: Record) -> None:
+    """Nothing is remembered."""
+    m.waited_s = 0.0
+    for j in range(q.count):
+        m.pull[j] = 0.0
+        for i in range(j + 1):
+            m.information[j, i] = 0.0
+
+
+@njit(cache=True)
+def take_as_rest(s: Record, p: Record, voltage_v: float) -> None:
+    """The states of a cell at rest. What else is in the voltage is the offset's, and tells nothing of the parameters.
+
+    Nothing is learned until the states would have forgotten that they were otherwise.
+    """
+    m, q, o = s.learning, p.learning, s.observer
+    give(q.model, m.given, p, o.soc, m.temperature_c)
+    settle(q.model, m.x, m.dx, m.theta, m.given, o.current_a)
+    injects = math.isfinite(q.offset_s)
+    m.offset_v = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) if injects else 0.0
+    for j in range(q.count):
+        m.d_offset[j] = -m.psi[j] if injects else 0.0
+    m.settle_s = q.settle_s
+    o.innovation_v = 0.0
+    show(s, p, voltage_v)
+
+
+@njit(cache=True)
+def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v: float) -> None:
+    """Advance by one sample at the SOC that the observer has; the current was ``before_a`` [A] at the sample before."""
+    m, q, o = s.learning, p.learning, s.observer
+    give(q.model, m.given, p, o.soc, m.temperature_c)
+    unmeasured_s = p.observer.unmeasured_s
+    held_a = held_current(dt_s, before_a, o.current_a, unmeasured_s)
+    advance(q.model, m.x, m.dx, m.theta, m.given, held_a, dt_s)
+    e = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) - m.offset_v
+    o.innovation_v = e
+    inject(m, q, dt_s, e)
+    o.adapting = 0 if o.soc <= q.soc_floor else 1  # without a SOC always
+    m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= unmeasured_s else q.settle_s
+    if o.adapting and m.settle_s == 0.0:
+        remember(m, q, dt_s, e)
+        m.waited_s += dt_s
+        if m.waited_s >= LEARN_EVERY_S:
+            if find_step(m, q):
+                take_step(m, q, -math.expm1(-q.rate * o.k * m.waited_s))
+                m.waited_s = 0.0
+            else:
+                empty_memory(m, q)
+        excess = max(abs(e) - p.observer.dead_zone_v, 0.0) / q.cells
+        o.k = min(o.k + excess * excess * dt_s, FASTEST_HZ / q.rate)  # (3.13) with the dead zone of E2
+    estimate = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) + m.offset_v
+    show(s, p, estimate)
+    broken = not math.isfinite(estimate)
+    change_of_lock(o, p.observer, dt_s, broken)
+    if broken:
+        begin_learning(s, p, voltage_v)
+
+
+@njit(cache=True)
+def inject(m: Record, q: Record, dt_s: float, e: float) -> None:
+    """The offset follows e, and the sensitivities know: ``m.psi`` becomes that of y^ with the offset."""
+    share = -math.expm1(-dt_s / q.offset_s)
+    m.offset_v += share * e
+    for j in range(q.count):
+        m.psi[j] += m.d_offset[j]
+        m.d_offset[j] -= share * m.psi[j]
+
+
+@njit(cache=True)
+def remember(m: Record, q: Record, dt_s: float, e: float) -> None:
+    """Kreisselmeier's filters: psi psi' and psi (e + psi' theta). What is remembered is forgotten while a load tells anew."""
+    told, known = 0.0, e
+    for j in range(q.count):
+        told += m.psi[j] * m.psi[j]
+        known += m.psi[j] * m.theta[j]
+    forget(m, q, dt_s / q.memory_s * told / (told + q.told_v * q.told_v))
+    for j in range(q.count):
+        m.pull[j] += dt_s * m.psi[j] * known
+        for i in range(j + 1):
+            m.information[j, i] += dt_s * m.psi[j] * m.psi[i]
+
+
+@njit(cache=True)
+def forget(m: Record, q: Record, times: float) -> None:
+    """What is remembered counts e^-times as much."""
+    keep = math.exp(-times)
+    for j in range(q.count):
+        m.pull[j] *= keep
+        for i in range(j + 1):
+            m.information[j, i] *= keep
+
+
+@njit(cache=True)
+def find_step(m: Record, q: Record) -> bool:
+    """The way from theta to where memory and leakage balance, into ``m.step``; False where there is none."""
+    n = q.count
+    for j in range(n):
+        m.step[j] = m.pull[j] + q.leak_v2s[j] * (q.middle[j] - m.theta[j])
+        for i in range(n):
+            m.step[j] -= m.information[max(i, j), min(i, j)] * m.theta[i]
+    if not factorise(m, q):
+        return False
+    for j in range(n):
+        for i in range(j):
+            m.step[j] -= m.factor[j, i] * m.step[i]
+        m.step[j] /= m.factor[j, j]
+    for j in range(n - 1, -1, -1):
+        for i in range(j + 1, n):
+            m.step[j] -= m.factor[i, j] * m.step[i]
+        m.step[j] /= m.factor[j, j]
+    return True
+
+
+@njit(cache=True)
+def factorise(m: Record, q: Record) -> bool:
+    """Cholesky's factor of information and leakage; False where that is no positive matrix, by rounding or a damaged state."""
+    for j in range(q.count):
+        rest = m.information[j, j] + q.leak_v2s[j]
+        for i in range(j):
+            inner = m.information[j, i]
+            for h in range(i):
+                inner -= m.factor[j, h] * m.factor[i, h]
+            m.factor[j, i] = inner / m.factor[i, i]
+            rest -= m.factor[j, i] ** 2
+        if not rest > 0.0:
+            return False
+        m.factor[j, j] = math.sqrt(rest)
+    return True
+
+
+@njit(cache=True)
+def take_step(m: Record, q: Record, share: float) -> None:
+    """Move theta within its bounds, and the states with it: as though it had been so all along.
+
+    Sensitivities were of another theta: what is remembered fades with the square of the way that is to be gone.
+    """
+    way = 0.0
+    for j in range(q.count):
+        way += m.step[j] * m.step[j]
+        moved = min(max(m.theta[j] + share * m.step[j], q.lower[j]), q.upper[j])
+        m.step[j] = moved - m.theta[j]
+        m.theta[j] = moved
+        m.offset_v += m.d_offset[j] * m.step[j]
+        for branch in range(2):
+            m.x[branch] += m.dx[branch, j] * m.step[j]
+    forget(m, q, share * way / (q.reach * q.reach))
+
+
+@njit(cache=True)
+def show(s: Record, p: Record, estimate_v: float) -> None:
+    """What the observer's record says of the law: states, parameters, gain, estimated voltage."""
+    m, q, o = s.learning, p.learning, s.observer
+    o.v_ts, o.v_tl = m.x[0], m.x[1]
+    o.voltage_estimate_v = estimate_v
+    o.gain = q.rate * o.k
+    write(q.model, m.theta, q.file, o.a)
+    if p.observer.capacity_as > 0.0:
+        update_margins(o)

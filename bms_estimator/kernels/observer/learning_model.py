@@ -1,0 +1,72 @@
+"""The models that the learning law knows, chosen by an integer: numba's disk cache keeps no first-class functions.
+
+A model is a file of the shape of ``chen_mora``; what the law asks of it goes through the functions here.
+"""
+
+import math
+from enum import IntEnum
+
+from bms_estimator.kernels.cell_model import fuel_cell
+from bms_estimator.kernels.cell_model.chen_mora import Floats
+from bms_estimator.kernels.observer import chen_mora_sensitivity
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+
+class Model(IntEnum):
+    """Which model is learned."""
+
+    CHEN_MORA = 0
+    FUEL_CELL = 1
+
+
+_CHEN_MORA = int(Model.CHEN_MORA)
+_FUEL_CELL = int(Model.FUEL_CELL)
+NAMES = {Model.CHEN_MORA: chen_mora_sensitivity.NAMES, Model.FUEL_CELL: fuel_cell.NAMES}
+"""What is learned of each, in the order of theta."""
+
+
+@njit(cache=True)
+def give(model: int, given: Floats, p: Record, soc: float, temperature_c: float) -> None:
+    """What is not learned, at this sample; ``p`` is a record of ESTIMATOR_SETTINGS."""
+    if model == _CHEN_MORA:
+        chen_mora_sensitivity.give(given, p, soc, temperature_c)
+    elif model == _FUEL_CELL:
+        fuel_cell.give(given, p, soc, temperature_c)
+
+
+@njit(cache=True)
+def settle(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
+    """The states and their derivatives at a first sample, when nobody knows what was before; in place."""
+    if model == _CHEN_MORA:
+        chen_mora_sensitivity.settle(x, dx, theta, given, current_a)
+    elif model == _FUEL_CELL:
+        fuel_cell.settle(x, dx, theta, given, current_a)
+
+
+@njit(cache=True)
+def advance(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, dt_s: float) -> None:
+    """States ``x`` (2,) [V] and their derivatives ``dx`` (2, 8) after ``dt_s`` under a held current, in place."""
+    if model == _CHEN_MORA:
+        chen_mora_sensitivity.advance(x, dx, theta, given, current_a, dt_s)
+    elif model == _FUEL_CELL:
+        fuel_cell.advance(x, dx, theta, given, current_a, dt_s)
+
+
+@njit(cache=True)
+def output(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, psi: Floats) -> float:
+    """Terminal voltage y^ [V]; psi = dy^/dtheta (8,) in place."""
+    if model == _CHEN_MORA:
+        return chen_mora_sensitivity.output(x, dx, theta, given, current_a, psi)
+    if model == _FUEL_CELL:
+        return fuel_cell.output(x, dx, theta, given, current_a, psi)
+    return math.nan
+
+
+@njit(cache=True)
+def write(model: int, theta: Floats, file: Floats, a: Floats) -> None:
+    """The parameters that are published, ``a`` (16,), from the file's and theta."""
+    if model == _CHEN_MORA:
+        chen_mora_sensitivity.write(theta, file, a)
+    elif model == _FUEL_CELL:
+        fuel_cell.write(theta, file, a)

@@ -1,0 +1,118 @@
+"""The Mittag-Leffler function E_a(-lambda k^a), 2 < a <= 3, as the Nussbaum gain needs it.
+
+(3.10) is printed with a plus sign, which makes every term of (3.11) positive; with the minus sign it is a
+Nussbaum function (Li & Chen, Automatica 2009). With r = lambda^(1/a) k its exact value is
+
+    E_a(-r^a) = (2/a) e^(r cos(pi/a)) cos(r sin(pi/a)) + G_a(r),
+    G_a(r) = (sin(pi a)/pi) int_0^inf e^(-r s) s^(a-1) / (s^(2a) + 2 s^a cos(pi a) + 1) ds.
+
+Substituting s^a = -cos(pi a) + sin(pi a) tan(theta) turns G into a mean of exponentials without the pole that
+nears the real axis as a goes to 3,
+
+    G_a(r) = 1/(pi a) int e^(-r s(theta)) d theta,    s(0) .. s = inf,
+
+which is tabulated over 1/(1 + r) once per a. Near r = 0, where G is not smooth (it holds a term r^a), the
+power series (3.11) serves.
+"""
+
+import math
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+
+from bms_estimator.kernels.cell_model.chen_mora import Floats
+from bms_estimator.numba_cache import njit
+
+SERIES_TERMS = 24
+SERIES_LIMIT = 2.0
+"""Up to this r the series (3.11) is summed: its terms stay below 2, so no digits are lost."""
+TABLE_POINTS = 1025
+"""Nodes of G over w = 1/(1 + r) in [0, 1/(1 + SERIES_LIMIT)]: cubic Hermite error below 1e-12."""
+
+_W_END = 1.0 / (1.0 + SERIES_LIMIT)
+
+
+def series_coefficients(alpha: float) -> Floats:
+    """Coefficients (-1)^k / Gamma(alpha k + 1) of the series (3.11) in r^alpha. Shape (SERIES_TERMS,)."""
+    k = np.arange(SERIES_TERMS)
+    return np.array([(-1.0) ** j * math.exp(-math.lgamma(alpha * j + 1.0)) for j in k])
+
+
+def decay_table(alpha: float) -> tuple[Floats, Floats]:
+    """G_alpha and its derivative by w at ``TABLE_POINTS`` nodes of w = 1/(1 + r) in [0, 1/3].
+
+    Raises:
+        ValueError: When ``alpha`` is not in (2, 3]: E_a(-lambda k^a) is a Nussbaum function only there.
+    """
+    if not 2.0 < alpha <= 3.0:
+        raise ValueError(f"alpha = {alpha}: must be in (2, 3], where E_a(-lambda k^a) is a Nussbaum function")
+    s, weight = _mean_of_exponentials(alpha)
+    w = np.linspace(0.0, _W_END, TABLE_POINTS)
+    value = np.zeros(TABLE_POINTS)
+    slope = np.zeros(TABLE_POINTS)
+    for i in range(1, TABLE_POINTS):  # at w = 0, r is infinite and G is zero
+        r = 1.0 / w[i] - 1.0
+        terms = weight * np.exp(-r * s)
+        value[i] = terms.sum()
+        slope[i] = (terms * s).sum() / w[i] ** 2  # dG/dw = dG/dr * dr/dw, dr/dw = -1/w^2
+    return value, slope
+
+
+def _mean_of_exponentials(alpha: float) -> tuple[Floats, Floats]:
+    """Nodes s and weights of G = sum(weight * exp(-r s)): Gauss-Legendre in theta, graded to both ends."""
+    c, sine = math.cos(math.pi * alpha), abs(math.sin(math.pi * alpha))
+    # theta runs from atan2(c, sine) (s = 0) to pi/2 (s = inf); z = s^alpha on a logarithmic scale has
+    # d theta = sine dz / ((z + c)^2 + sine^2), smooth but for the peak at z = -c, which theta removes.
+    theta_start = math.atan2(c, sine)
+    theta_one = math.atan2(1.0 + c, sine)  # s = 1
+    nodes, weights = leggauss(40)
+    s_all, w_all = [], []
+
+    def panel(low: float, high: float) -> None:
+        theta = 0.5 * (low + high) + 0.5 * (high - low) * nodes
+        z = np.maximum(sine * np.tan(theta) - c, 0.0)
+        s_all.append(z ** (1.0 / alpha))
+        w_all.append(0.5 * (high - low) * weights / (math.pi * alpha))
+
+    for end in (theta_start, 0.5 * math.pi):
+        # geometric panels from s = 1 towards the end: s ~ (theta - start)^(1/alpha) and s -> inf are singular there
+        edge = theta_one
+        for _ in range(60):
+            nearer = end + 0.4 * (edge - end)
+            panel(min(edge, nearer), max(edge, nearer))
+            edge = nearer
+    return np.concatenate(s_all), np.concatenate(w_all)
+
+
+@njit(cache=True)
+def mittag_leffler(r: float, alpha: float, series: Floats, decay_value: Floats, decay_slope: Floats) -> float:
+    """E_alpha(-r^alpha) for r >= 0, to 1e-10 of its envelope.
+
+    Args:
+        r: lambda^(1/alpha) k, not negative.
+        alpha: In (2, 3].
+        series: From ``series_coefficients(alpha)``.
+        decay_value: First table of ``decay_table(alpha)``.
+        decay_slope: Second table of ``decay_table(alpha)``.
+    """
+    if r <= SERIES_LIMIT:
+        z = r**alpha
+        total = 0.0
+        for j in range(SERIES_TERMS - 1, -1, -1):  # (3.11) by Horner
+            total = total * z + series[j]
+        return total
+    angle = math.pi / alpha
+    wave = 2.0 / alpha * math.exp(r * math.cos(angle)) * math.cos(r * math.sin(angle))
+    return wave + _decay(r, decay_value, decay_slope)
+
+
+@njit(cache=True)
+def _decay(r: float, value: Floats, slope: Floats) -> float:
+    """G_alpha(r) from its table over w = 1/(1 + r), cubic Hermite."""
+    step = _W_END / (TABLE_POINTS - 1)
+    position = 1.0 / (1.0 + r) / step
+    i = min(int(position), TABLE_POINTS - 2)
+    t = position - i
+    w = t * t * (3.0 - 2.0 * t)
+    bend = t * (1.0 - t) * step
+    return value[i] + w * (value[i + 1] - value[i]) + bend * ((1.0 - t) * slope[i] - t * slope[i + 1])

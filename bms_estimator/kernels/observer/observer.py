@@ -1,0 +1,197 @@
+"""The high-gain adaptive observer, Algorithm 1: one sample in, one record updated.
+
+Over a sample y, i, N and a_i are held. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix, e
+decays with one of its eigenvalues, and (3.18) is a first-order lag driven by the mean of e^2 over the sample. Each is
+solved exactly, so the step is stable for every N >= 0 and every step length. ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+"""
+
+import math
+
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_tl, r_ts, soc_from_ocv
+from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, held_current
+from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.numba_cache import njit
+
+SMALLEST_LOOP = 0.1
+"""Least 1 + N R_s the algebraic loop of (3.14) is closed with; below it N has turned the loop's sign."""
+LOST, REGAINED = -1, 1
+
+
+@njit(cache=True)
+def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float) -> None:
+    """Initial conditions of Algorithm 1 at the first sample."""
+    s.time_s = time_s
+    s.current_a = current_a
+    for i in range(1, 16):
+        s.a[i] = p.a_initial[i]
+        s.target[i] = p.target[i]
+    s.k = p.k0
+    s.gain = nussbaum_gain(s.k, p)
+    s.lock = 1
+    s.adapting = 1
+    s.started = 1
+    if p.capacity_as == 0.0:
+        s.soc = s.soc_coulomb = s.delta_1 = s.delta_2 = math.nan
+        return
+    s.soc = p.soc_initial
+    if math.isnan(s.soc):
+        ohmic = current_a * r_s(1.0, s.a)
+        s.soc = soc_from_ocv(voltage_v + ohmic, p.ocv_v, p.ocv_slope_v)
+    s.soc_coulomb = s.soc
+    s.voltage_estimate_v = ocv(s.soc, p.ocv_v, p.ocv_slope_v)  # (4.1), x2 = x3 = 0
+    s.innovation_v = voltage_v - s.voltage_estimate_v
+    update_margins(s)
+
+
+@njit(cache=True)
+def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
+    """SOC by coulomb counting (3.1); none of a fuel cell."""
+    if p.capacity_as > 0.0:
+        charge_as = held_current(dt_s, s.current_a, current_a, p.unmeasured_s) * min(dt_s, LONGEST_FLOW_S)
+        s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
+    s.current_a = current_a
+
+
+@njit(cache=True)
+def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
+    """Advance the observer by one sample at the SOC it finds: Algorithm 1, lines 2 to 7."""
+    e_o = ocv(s.soc, p.ocv_v, p.ocv_slope_v)
+
+    s.adapting = 1 if s.soc > floor(s, p) else 0
+    soc = max(s.soc, floor(s, p))
+    ohm_s = p.output_r_s * r_s(soc, s.a) if p.output_r_s > 0.0 else 0.0
+    loop = max(1.0 + s.gain * ohm_s, SMALLEST_LOOP)
+    e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop  # (3.15) with (3.14) or (4.1)
+    s.innovation_v = e
+
+    tau_ts, tau_tl = r_ts(soc, s.a) * c_ts(soc, s.a), r_tl(soc, s.a) * c_tl(soc, s.a)
+    rate_e = states_step(s, s.gain / loop, voltage_v - e_o, tau_ts, tau_tl, dt_s)
+    mean_square = integral_of_exponential(2.0 * rate_e * dt_s, 1.0)  # mean of e^2 over the sample / e^2 at its start
+
+    if s.adapting:
+        adapt(s, p, dt_s, e * e * mean_square)
+        update_margins(s)
+
+    excess = max(abs(e) - p.dead_zone_v, 0.0)
+    if excess > 0.0:
+        s.k += excess * excess * mean_square * dt_s  # (3.13) with the dead zone of E2
+        s.gain = nussbaum_gain(s.k, p)
+    s.voltage_estimate_v = e_o - s.v_ts - s.v_tl  # (4.1)
+    if p.output_r_s > 0.0:
+        s.voltage_estimate_v = voltage_v - (voltage_v - s.voltage_estimate_v) / loop  # (3.14), u = -N e
+    watch_lock(s, p, dt_s, voltage_v, e_o)
+
+
+@njit(cache=True)
+def adapt(s: Record, p: Record, dt_s: float, e_squared: float) -> None:
+    """Adaptation laws (3.16)-(3.18), a' = drive e^2 + rate (target - a), exact for an e^2 held at its mean over the sample."""
+    if dt_s != s.decay_dt_s:
+        s.decay_dt_s = dt_s
+        for i in range(1, 16):
+            s.decay[i] = math.exp(-p.rate[i] * dt_s)
+            s.settle[i] = integral_of_exponential(-p.rate[i], dt_s)
+    for i in range(1, 16):
+        s.a[i] = s.target[i] + (s.a[i] - s.target[i]) * s.decay[i] + p.drive[i] * e_squared * s.settle[i]
+
+
+@njit(cache=True)
+def update_margins(s: Record) -> None:
+    """delta1 (2.11) and delta2 (2.12) of the present parameters."""
+    s.delta_1 = delta(s.a[8], s.a[9], s.a[7])
+    s.delta_2 = delta(s.a[11], s.a[12], s.a[10])
+
+
+@njit(cache=True)
+def floor(s: Record, p: Record) -> float:
+    """SOC down to which the elements are evaluated: below it a capacitance may be negative (E14)."""
+    return max(s.delta_1, s.delta_2) + p.margin_guard
+
+
+@njit(cache=True)
+def states_step(s: Record, gain: float, drop_v: float, tau_ts: float, tau_tl: float, dt_s: float) -> float:
+    """x2, x3 after ``dt_s``: (3.2)-(3.3) with u = -gain (drop_v + x2 + x3), gain and inputs held, exactly.
+
+    The matrix is [[-1/tau_ts - gain, -gain], [-gain, -1/tau_tl - gain]]. Returns the eigenvalue that the
+    output error e follows [1/s].
+    """
+    mean = -gain - 0.5 * (1.0 / tau_ts + 1.0 / tau_tl)
+    half = 0.5 * (1.0 / tau_tl - 1.0 / tau_ts)
+    q = max(math.sqrt(half * half + gain * gain), 1e-300)
+    low, high = mean - q, mean + q
+    phi_low = integral_of_exponential(low, dt_s)
+    phi_high = integral_of_exponential(high, dt_s)
+    decay_low = 1.0 + low * phi_low
+    decay_high = 1.0 + high * phi_high
+    along, across = 0.5 * (decay_high + decay_low), 0.5 * (decay_high - decay_low) / q
+    phi_along, phi_across = 0.5 * (phi_high + phi_low), 0.5 * (phi_high - phi_low) / q
+    u = -gain * drop_v
+    v_ts, v_tl = s.v_ts, s.v_tl
+    s.v_ts = along * v_ts + across * (half * v_ts - gain * v_tl) + u * (phi_along + phi_across * (half - gain))
+    s.v_tl = along * v_tl + across * (-half * v_tl - gain * v_ts) + u * (phi_along + phi_across * (-half - gain))
+    return low if gain >= 0.0 else high
+
+
+@njit(cache=True)
+def integral_of_exponential(rate: float, dt_s: float) -> float:
+    """Integral of e^(rate t) over 0..dt_s [s]."""
+    x = rate * dt_s
+    if abs(x) < 1e-8:
+        return dt_s * (1.0 + 0.5 * x)
+    return math.expm1(x) / rate
+
+
+@njit(cache=True)
+def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) -> None:
+    """Loss of lock (E2), detected and recovered from.
+
+    Lost is lock when the error stays beyond ``lock_error_v`` for ``lock_time_s``, or gets there under a gain whose
+    sign has turned, or when the gain overflows. It is back when the error has been within for ``lock_time_s``.
+    In lock, a gain that falls below ``rearm_gain`` starts again from k0 before its sign turns, where it is above
+    ``rearm_gain`` at k0: N1 to N3 begin at or near 0.
+    """
+    beyond = not abs(s.innovation_v) <= p.lock_error_v
+    turned = beyond and s.gain <= 0.0
+    overflow = not (math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and abs(s.gain) < p.gain_limit)
+    change = change_of_lock(s, p, dt_s, turned or overflow)
+    if change == LOST:
+        recover(s, p, voltage_v, e_o)
+    elif change == 0 and s.gain < p.rearm_gain and not beyond and nussbaum_gain(p.k0, p) > p.rearm_gain:
+        s.k = p.k0
+        s.gain = nussbaum_gain(s.k, p)
+        s.gain_rearms += 1
+
+
+@njit(cache=True)
+def change_of_lock(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
+    """``LOST`` when the error has been beyond for long enough, or ``at_once``; ``REGAINED`` when it has been within; else 0."""
+    beyond = not abs(s.innovation_v) <= p.lock_error_v
+    if beyond == (s.lock == 1):
+        # a single sample after a long gap must not decide: at most a fifth of the time counts per sample
+        s.unlocked_s += min(dt_s, 0.2 * p.lock_time_s)
+    else:
+        s.unlocked_s = 0.0
+    expired = s.unlocked_s >= p.lock_time_s
+    if not (at_once or expired):
+        return 0
+    s.unlocked_s = 0.0
+    if at_once or s.lock == 1:
+        s.lock = 0
+        s.lock_losses += 1
+        return LOST
+    s.lock = 1
+    return REGAINED
+
+
+@njit(cache=True)
+def recover(s: Record, p: Record, voltage_v: float, e_o: float) -> None:
+    """Start again from the measurement: e = 0, k = k0, parameters at their limit."""
+    s.k = p.k0
+    s.gain = nussbaum_gain(s.k, p)
+    s.v_ts = 0.5 * (e_o - voltage_v)
+    s.v_tl = s.v_ts
+    for i in range(1, 16):
+        s.a[i] = s.target[i]
+    s.voltage_estimate_v = voltage_v
+    update_margins(s)

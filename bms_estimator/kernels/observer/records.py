@@ -1,0 +1,123 @@
+"""The records that kernels work on: settings that stay, state that ``step`` updates, one row of trace per sample.
+
+State is data: what a step changes, what a checkpoint stores, what a test compares bit by bit.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
+from bms_estimator.kernels.observer.mittag_leffler import SERIES_TERMS, TABLE_POINTS
+
+Record = Any
+"""An element of a structured array inside a kernel: numba knows its fields, the type checker does not."""
+
+PARAMETERS = 16
+"""a1..a15 at their own index; index 0 is unused."""
+
+OBSERVER_SETTINGS = np.dtype(
+    [
+        ("capacity_as", "f8"),  # C_c of (2.1) [A s]; 0: a fuel cell, which holds no charge
+        ("ocv_v", "f8", OCV_POINTS),  # E_o over SOC 0..1 [V]
+        ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
+        ("a_initial", "f8", PARAMETERS),  # a_i(t0)
+        ("target", "f8", PARAMETERS),  # (lx au + ly al) / (lx + ly), limit of Lemma 4.1.3
+        ("rate", "f8", PARAMETERS),  # lx + ly of (3.18), lambda of (3.17) [1/s]
+        ("drive", "f8", PARAMETERS),  # 1 where e^2 drives the parameter, 0 where it is held
+        ("output_r_s", "f8"),  # 1: output (3.14) with u R_s; 0: output (4.1)
+        ("nussbaum", "i8"),  # kernels.nussbaum.Nussbaum
+        ("alpha", "f8"),  # a of (3.10), in (2, 3]
+        ("gain_scale", "f8"),  # lambda^(1/a) of (3.10) [1/(V^2 s)]
+        ("ml_series", "f8", SERIES_TERMS),  # kernels.mittag_leffler tables
+        ("ml_decay", "f8", TABLE_POINTS),
+        ("ml_decay_slope", "f8", TABLE_POINTS),
+        ("k0", "f8"),  # k(t0) [V^2 s]
+        ("gain_limit", "f8"),  # clamp of |N|
+        ("rearm_gain", "f8"),  # below this N, in lock, k starts again from k0; -inf, or above N(k0): never
+        ("dead_zone_v", "f8"),  # e_dead of E2 [V]; 0 gives the printed (3.13)
+        ("epsilon_v", "f8"),  # eps2 of Algorithm 1 [V]
+        ("lock_error_v", "f8"),  # |e| beyond which the observer does not track [V]
+        ("lock_time_s", "f8"),  # for how long, until lock is lost or back [s]
+        ("margin_guard", "f8"),  # adaptation stops this far above max(delta1, delta2)
+        ("soc_initial", "f8"),  # 0..1; NaN: from the first sample's voltage through the OCV
+        ("voltage_min_v", "f8"),  # what a sample may hold
+        ("voltage_max_v", "f8"),
+        ("current_max_a", "f8"),  # magnitude
+        ("gap_s", "f8"),  # a longer step counts as a gap, unless the one before was about as long [s]
+        ("unmeasured_s", "f8"),  # over a longer step nobody measured the current [s]
+    ],
+    align=True,
+)
+
+OBSERVER_STATE = np.dtype(
+    [
+        ("time_s", "f8"),  # of the last accepted sample
+        ("current_a", "f8"),  # of the last accepted sample
+        ("step_s", "f8"),  # to it from the one before [s]
+        ("soc", "f8"),  # x1, 0..1: the identifier's, else by coulomb counting
+        ("soc_coulomb", "f8"),  # by coulomb counting alone (3.1), 0..1
+        ("v_ts", "f8"),  # x2 [V]
+        ("v_tl", "f8"),  # x3 [V]
+        ("k", "f8"),  # adaptive gain state (3.13) [V^2 s]
+        ("gain", "f8"),  # N(k); gamma k [1/s] of the learning law
+        ("a", "f8", PARAMETERS),  # a1..a15 (3.16)-(3.18)
+        ("target", "f8", PARAMETERS),  # where (3.18) leads; the identifier moves it
+        ("decay", "f8", PARAMETERS),  # e^(-rate dt) for ``decay_dt_s``
+        ("settle", "f8", PARAMETERS),  # (1 - decay) / rate for ``decay_dt_s`` [s]
+        ("decay_dt_s", "f8"),
+        ("innovation_v", "f8"),  # e = y - y^ before the sample corrected the states (3.15)
+        ("voltage_estimate_v", "f8"),  # y^ after it (4.1)
+        ("delta_1", "f8"),  # (2.11)
+        ("delta_2", "f8"),  # (2.12)
+        ("unlocked_s", "f8"),  # how long |e| has been beyond (lock) or within (no lock) the lock error
+        ("started", "i8"),  # a first sample was taken
+        ("lock", "i8"),  # 1 while the observer tracks
+        ("adapting", "i8"),  # 0 below the margins
+        ("samples", "i8"),  # accepted
+        ("dropped_not_finite", "i8"),
+        ("dropped_range", "i8"),
+        ("dropped_repeated", "i8"),  # time stamp of the sample before
+        ("dropped_saturated", "i8"),  # voltage or current at the end of the converter's range
+        ("time_steps_back", "i8"),  # the clock went back; the sample is taken, its step is not
+        ("gaps", "i8"),  # steps longer than ``gap_s`` and than those before
+        ("lock_losses", "i8"),
+        ("gain_rearms", "i8"),
+    ],
+    align=True,
+)
+
+TRACE = np.dtype(
+    [
+        ("time_s", "f8"),
+        ("voltage_v", "f8"),
+        ("current_a", "f8"),  # positive on discharge
+        ("temperature_c", "f8"),
+        ("soc", "f8"),
+        ("voltage_estimate_v", "f8"),
+        ("innovation_v", "f8"),  # measured less predicted: the identifier's, else the observer's e
+        ("tracking_error_v", "f8"),  # the observer's e (3.15)
+        ("nussbaum_gain", "f8"),  # N(k) (3.12) of a printed law, else NaN
+        ("adaptation_gain_hz", "f8"),  # gamma k of the learning law, else NaN [1/s]
+        ("k", "f8"),
+        ("delta_1", "f8"),
+        ("delta_2", "f8"),
+        ("stability_margin", "f8"),  # soc - max(delta_1, delta_2)
+        ("lock", "i8"),
+        ("converged", "i8"),  # |e| < eps2
+        ("soc_coulomb", "f8"),  # by coulomb counting alone
+        ("soc_ocv", "f8"),  # by the inverted OCV (7.1); from here on the identifier's, NaN without it
+        ("soc_std", "f8"),
+        ("r_s_ohm", "f8"),
+        ("r_s_std_ohm", "f8"),
+        ("r_ts_ohm", "f8"),
+        ("r_ts_std_ohm", "f8"),
+        ("tau_ts_s", "f8"),
+        ("tau_ts_std_s", "f8"),
+        ("r_tl_ohm", "f8"),
+        ("r_tl_std_ohm", "f8"),
+        ("tau_tl_s", "f8"),
+        ("tau_tl_std_s", "f8"),
+    ],
+    align=True,
+)

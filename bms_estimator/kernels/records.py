@@ -1,0 +1,46 @@
+"""The records of the whole estimator, in one each: observer, learning law, filter and its checks, map of the elements, fit to it."""
+
+import numpy as np
+
+from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import EQUIVALENT
+from bms_estimator.kernels.kalman_filter.input_checks import CHECKS, COUNTERS
+from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE
+from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS, LEARNING_STATE
+from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS, OBSERVER_STATE, PARAMETERS
+from bms_estimator.kernels.observer.series_resistance import SERIES_RESISTANCE
+
+ESTIMATOR_SETTINGS = np.dtype(
+    [
+        ("observer", OBSERVER_SETTINGS),
+        ("learning", LEARNING_SETTINGS),
+        ("filter", EKF_SETTINGS),
+        ("identify", "i8"),  # 0: SOC by coulomb counting, parameters as configured
+        ("series_resistance", "i8"),  # 1: R_s by (4.2), step 3 of the thesis
+        ("hand_over", "i8"),  # 1: identified parameters become the limits of (3.18)
+        ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
+        ("lower", "f8", PARAMETERS),  # the configured bounds guard what is handed over
+        ("upper", "f8", PARAMETERS),
+        ("map_memory_s", "f8"),  # time constant with which the map forgets [s]
+    ],
+    align=True,
+)
+
+ESTIMATOR_STATE = np.dtype(
+    [
+        ("observer", OBSERVER_STATE),
+        ("learning", LEARNING_STATE),
+        ("series_resistance", SERIES_RESISTANCE),
+        ("filter", EKF_STATE),
+        ("elements", EQUIVALENT),  # what the filter's ladder amounts to now
+        ("checks", CHECKS),
+        ("counters", COUNTERS),
+        ("map", ELEMENT_MAP),
+        ("fit", ELEMENT_FIT),
+        ("fit_age_s", "f8"),  # since an element was fitted
+        ("next_element", "i8"),  # to be fitted
+        ("unseen_s", "f8"),  # before the first sample of a new clock; infinite when nobody knows
+        ("unlearned_s", "f8", ELEMENTS),  # since the map learned of each element; infinite: never did
+    ],
+    align=True,
+)

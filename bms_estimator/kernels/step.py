@@ -1,0 +1,249 @@
+"""The way of one sample through the numbers: ``step`` takes it, ``run`` loops ``step`` over a block."""
+
+import math
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.cell_model.chen_mora import soc_from_ocv
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.kernels.identifier import UNSEEN_MOST, identify, restart_filter, start_filter
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
+from bms_estimator.kernels.kalman_filter.hypotheses import is_temperature, pack_std
+from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
+from bms_estimator.kernels.observer.learning_law import begin_learning, learning_step, take_as_rest
+from bms_estimator.kernels.observer.observer import count_charge, observer_step, start
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.kernels.observer.series_resistance import (
+    begin_series_resistance,
+    series_resistance,
+    series_resistance_step,
+)
+from bms_estimator.numba_cache import njit
+
+Records = NDArray[np.void]
+
+
+class Verdict(IntEnum):
+    """Outcome of a sample: accepted, or why it was dropped."""
+
+    ACCEPTED = 0
+    NOT_FINITE = 1
+    OUT_OF_RANGE = 2
+    REPEATED = 3
+    SATURATED = 4
+
+
+_ACCEPTED = int(Verdict.ACCEPTED)
+_NOT_FINITE = int(Verdict.NOT_FINITE)
+_OUT_OF_RANGE = int(Verdict.OUT_OF_RANGE)
+_REPEATED = int(Verdict.REPEATED)
+_SATURATED = int(Verdict.SATURATED)
+GAP_RATIO = 3.0
+"""A step this many times as long as the one before may be a gap: slow sampling is none."""
+_SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED
+
+
+@njit(cache=True)
+def judge(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
+    """Verdict on a sample; dropped samples are counted by kind.
+
+    ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+    """
+    if not (math.isfinite(time_s) and math.isfinite(current_a) and math.isfinite(voltage_v)):
+        s.dropped_not_finite += 1
+        return _NOT_FINITE
+    if status & _SATURATED_BITS:
+        s.dropped_saturated += 1
+        return _SATURATED
+    if not (p.voltage_min_v <= voltage_v <= p.voltage_max_v and abs(current_a) <= p.current_max_a):
+        s.dropped_range += 1
+        return _OUT_OF_RANGE
+    if s.started and time_s == s.time_s:
+        s.dropped_repeated += 1
+        return _REPEATED
+    return _ACCEPTED
+
+
+@njit(cache=True)
+def step(
+    state: Records,
+    settings: Records,
+    time_s: float,
+    current_a: float,
+    voltage_v: float,
+    status: int,
+    temperature_c: float,
+) -> int:
+    """Take one sample.
+
+    Args:
+        state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
+        settings: Shape (1,), dtype ESTIMATOR_SETTINGS.
+        time_s: Time stamp [s].
+        current_a: Current [A], positive on discharge.
+        voltage_v: Terminal voltage [V].
+        status: Bits of ``SampleStatus``.
+        temperature_c: Of the cell [C]; NaN without a sensor.
+
+    Returns:
+        A ``Verdict``.
+    """
+    s, p = state[0].observer, settings[0].observer
+    verdict = judge(s, p, time_s, current_a, voltage_v, status)
+    if verdict != _ACCEPTED:
+        return verdict
+    s.samples += 1
+    if not s.started:
+        start(s, p, time_s, current_a, voltage_v)
+        begin(state[0], settings[0], current_a, voltage_v, temperature_c)
+        return verdict
+    sense(state[0].learning, temperature_c)
+    dt_s = time_s - s.time_s
+    s.time_s = time_s
+    new_clock = dt_s == -math.inf
+    if new_clock:
+        dt_s = state[0].unseen_s
+        settle_s = settings[0].learning.settle_s  # the load meanwhile is not known
+        state[0].learning.settle_s = state[0].series_resistance.settle_s = settle_s
+    if not 0.0 <= dt_s < math.inf:  # the clock was set back, or nobody knows how long nobody measured: go on from here
+        s.current_a = state[0].filter.current_a = current_a
+        state[0].filter.step.phase = UNHELD
+        if new_clock:
+            after_restart(state[0], settings[0], current_a, voltage_v, temperature_c)
+        else:
+            s.time_steps_back += 1
+        return verdict
+    gap = new_clock or is_gap(s, p, dt_s)
+    before_a, before_soc = s.current_a, s.soc
+    count_charge(s, p, dt_s, current_a)
+    if settings[0].identify:
+        identify(state[0], settings[0], dt_s, gap, current_a, voltage_v, temperature_c)
+    else:
+        s.soc = s.soc_coulomb
+    if settings[0].learning.enabled:
+        learning_step(state[0], settings[0], dt_s, before_a, voltage_v)
+    else:
+        observer_step(s, p, dt_s, voltage_v)
+    if settings[0].series_resistance:
+        series_resistance_step(state[0], settings[0], dt_s, before_a, before_soc, voltage_v)
+    return verdict
+
+
+@njit(cache=True)
+def is_gap(s: Record, p: Record, dt_s: float) -> bool:
+    """True when samples are missing in a step of ``dt_s``; such gaps are counted. Records as in ``judge``."""
+    gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
+    s.step_s = dt_s
+    if gap:
+        s.gaps += 1
+    return gap
+
+
+@njit(cache=True)
+def begin(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
+    """The first sample of all, of filter and learning law. Records as in ``step``."""
+    s.learning.temperature_c = math.nan
+    sense(s.learning, temperature_c)
+    if p.identify:
+        start_filter(s, p, current_a, voltage_v, temperature_c)
+    if p.learning.enabled:
+        begin_learning(s, p, voltage_v)
+    if p.series_resistance:
+        begin_series_resistance(s, p)
+
+
+@njit(cache=True)
+def sense(m: Record, temperature_c: float) -> None:
+    """Keep the last temperature that a cell can have; ``m`` is a record of LEARNING_STATE."""
+    if is_temperature(temperature_c):
+        m.temperature_c = temperature_c
+
+
+@njit(cache=True)
+def after_restart(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
+    """The first sample of a new clock: nobody knows how long nobody measured. Records as in ``step``."""
+    if p.identify:
+        if is_temperature(temperature_c):
+            s.filter.temperature_c, s.filter.sensed = temperature_c, 1
+        elif not s.filter.sensed:
+            s.filter.temperature_c = REFERENCE_C
+        restart_filter(s, p, UNSEEN_MOST, current_a, voltage_v)
+    if p.learning.enabled:
+        take_as_rest(s, p, voltage_v)
+
+
+@njit(cache=True)
+def run(state: Records, settings: Records, samples: Records, trace: Records) -> int:
+    """Take a block of samples: ``step`` for each, a row of ``trace`` for each accepted one.
+
+    Args:
+        state: As in ``step``.
+        settings: As in ``step``.
+        samples: Shape (n,), dtype SAMPLE.
+        trace: Shape (m,) with m >= n, dtype TRACE; written from its start.
+
+    Returns:
+        How many rows of ``trace`` were written.
+    """
+    rows = 0
+    for j in range(samples.shape[0]):
+        x = samples[j]
+        if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
+            write_observer(trace[rows], state[0].observer, settings[0], x)
+            write_filter(trace[rows], state[0], settings[0])
+            rows += 1
+    return rows
+
+
+@njit(cache=True)
+def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
+    """Columns of the observer for an accepted sample ``x``; records of OBSERVER_STATE and ESTIMATOR_SETTINGS."""
+    row.time_s = x.time_s
+    row.voltage_v = x.voltage_v
+    row.current_a = x.current_a
+    row.temperature_c = x.temperature_c
+    row.soc = s.soc
+    row.voltage_estimate_v = s.voltage_estimate_v
+    row.tracking_error_v = s.innovation_v
+    row.nussbaum_gain = math.nan if p.learning.enabled else s.gain
+    row.adaptation_gain_hz = s.gain if p.learning.enabled else math.nan
+    row.k = s.k
+    row.delta_1 = s.delta_1
+    row.delta_2 = s.delta_2
+    row.stability_margin = s.soc - max(s.delta_1, s.delta_2)
+    row.lock = s.lock
+    row.converged = 1 if abs(s.innovation_v) < p.observer.epsilon_v else 0
+    row.soc_coulomb = s.soc_coulomb
+
+
+@njit(cache=True)
+def write_filter(row: Record, s: Record, p: Record) -> None:
+    """Columns of the filter; records as in ``step``. Without it: the observer's e, R_s by (4.2) where that is on, and NaN.
+
+    The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.
+    """
+    if not p.identify:
+        row.innovation_v = s.observer.innovation_v
+        row.soc_ocv = row.soc_std = math.nan
+        row.r_s_ohm = series_resistance(s) if p.series_resistance else math.nan
+        row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
+        row.r_s_std_ohm = row.r_ts_std_ohm = row.tau_ts_std_s = row.r_tl_std_ohm = row.tau_tl_std_s = math.nan
+        return
+    f, e = s.filter, s.elements
+    row.innovation_v = f.innovation_v
+    e_o = open_circuit(f, p.filter, e, row.current_a, row.voltage_v)
+    row.soc_ocv = soc_from_ocv(e_o, p.filter.ocv_v, p.filter.ocv_slope_v)
+    row.soc_std = pack_std(f, p.filter)
+    row.r_s_ohm, row.r_s_std_ohm = value_and_std(e, R_S)
+    row.r_ts_ohm, row.r_ts_std_ohm = value_and_std(e, R_TS)
+    row.tau_ts_s, row.tau_ts_std_s = value_and_std(e, TAU_TS)
+    row.r_tl_ohm, row.r_tl_std_ohm = value_and_std(e, R_TL)
+    row.tau_tl_s, row.tau_tl_std_s = value_and_std(e, TAU_TL)
+
+
+@njit(cache=True)
+def value_and_std(e: Record, j: int) -> tuple[float, float]:
+    """An element of a record of EQUIVALENT, and its standard deviation, in its unit."""
+    return e.value[j], e.value[j] * math.sqrt(e.ln_variance[j])

@@ -1,0 +1,1 @@
+"""Sections of the settings file, one file each, with defaults and checks."""

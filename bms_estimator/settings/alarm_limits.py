@@ -1,0 +1,217 @@
+"""From ``[alarms]`` and the cell to what is watched: each alarm with its limit, and where it ends. docs/alarms.md has the sources."""
+
+import math
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
+from bms_estimator.settings.pack import Settings
+
+LEAST_SILENT_S = 10.0
+"""A link that is silent for less is not lost yet [s]."""
+SILENT_PERIODS = 3
+"""Nor before so many samples or publications are missing."""
+
+
+Quantity = Literal["voltage", "current", "temperature", "cells"]
+"""Measured quantity of a sample."""
+NEEDED: dict[AlarmName, tuple[Quantity, ...]] = {
+    "pack_over_voltage": ("voltage",),
+    "pack_under_voltage": ("voltage",),
+    "cell_over_voltage": ("cells",),
+    "cell_under_voltage": ("cells",),
+    "discharge_over_current": ("current",),
+    "charge_over_current": ("current",),
+    "over_temperature": ("temperature",),
+    "under_temperature": ("temperature",),
+    "charging_below_freezing": ("current", "temperature"),
+    "soc_low": ("voltage", "current"),
+    "stability_margin_low": ("voltage", "current"),
+    "cell_imbalance": ("cells",),
+    "model_mismatch": ("voltage", "current"),
+}
+"""Quantities without which an alarm cannot be watched. The alarms that are missing here judge the samples themselves."""
+
+
+class Watched(NamedTuple):
+    """One alarm that is watched."""
+
+    name: AlarmName
+    severity: Literal["warning", "critical"]
+    unit: str | None
+    above: bool
+    """Raised from ``limit`` on upwards, and else downwards."""
+    limit: float
+    clear: float
+    """It ends beyond; where this is ``limit`` there is no hysteresis."""
+    delay_s: float
+    clear_delay_s: float
+    latch: bool
+
+
+class Chemistry(NamedTuple):
+    """What a cell may have [V], and from where on it is well again."""
+
+    over_v: float
+    over_clear_v: float
+    under_v: float
+    under_clear_v: float
+
+
+_BY_NOMINAL_V = (
+    (2.8, Chemistry(2.85, 2.70, 1.60, 1.90)),  # titanate: charged to 2.7..2.8 V, empty at 1.5
+    (3.45, Chemistry(3.65, 3.40, 2.70, 3.10)),  # LFP: as the Seplos BMS 3.0 is delivered
+    (math.inf, Chemistry(4.25, 4.15, 2.70, 3.00)),  # all that is charged to 4.2 V
+)
+"""Up to which nominal voltage of a cell [V] it is taken to be of which chemistry."""
+
+LEAST_CHARGE = 0.02
+"""Of the capacity, per hour: a smaller current into the cell is the sensor's offset and no charging."""
+
+
+DIGITS = 9
+"""0.1 - 0.08 is to be 0.02."""
+MOST_DISCHARGE = 5.0
+"""Of the capacity, per hour: a generic cell's file takes far more for a reading than most cells of its kind stand for long."""
+
+
+class _Default(NamedTuple):
+    """An alarm's limit and what it ends at, as the pack has them; None: not watched unless it is set."""
+
+    limit: float | None
+    clear: float | None
+    unit: str | None
+    above: bool = True
+
+
+def watched(settings: Settings, cell: PackModel) -> tuple[Watched, ...]:
+    """What is watched of a pack, in the order of ``ALARMS``.
+
+    Args:
+        settings: The pack's.
+        cell: The pack as one object (``CellModel.pack``).
+
+    Raises:
+        UserError: A limit beyond what ends the alarm.
+    """
+    defaults = _defaults(settings, cell)
+    found = (_watched(name, getattr(settings.alarms, name), defaults[name]) for name in ALARMS)
+    return tuple(each for each in found if each is not None)
+
+
+def silent_limit_s(settings: Settings) -> float:
+    """Time without a sample after which no alarm is watched any more [s]: the limit of ``link_lost``."""
+    rule = settings.alarms.link_lost
+    return (rule.limit_s or _silent_s(settings)) + rule.delay_s
+
+
+def _silent_s(settings: Settings) -> float:
+    """Default limit of ``link_lost`` [s]."""
+    return max(LEAST_SILENT_S, SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s))
+
+
+def charging_a(cell: PackModel) -> float:
+    """From this current into the pack on it is charged [A]."""
+    of = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
+    return LEAST_CHARGE * of
+
+
+def out_of_range(settings: Settings, cell: PackModel) -> list[str]:
+    """One line for each limit that cannot be meant so; empty where all may be."""
+    return list(_out_of_range(watched(settings, cell), cell))
+
+
+def _out_of_range(alarms: tuple[Watched, ...], cell: PackModel) -> Iterator[str]:
+    c = cell.cell
+    n, middle_v = c.series_count, c.nominal_voltage_v
+    ranges = {
+        "pack_over_voltage": (middle_v, c.voltage_max_v),
+        "pack_under_voltage": (c.voltage_min_v, middle_v),
+        "cell_over_voltage": (middle_v / n, c.voltage_max_v / n),
+        "cell_under_voltage": (c.voltage_min_v / n, middle_v / n),
+        "discharge_over_current": (0.0, c.current_max_a),
+        "charge_over_current": (0.0, c.current_max_a),
+    }
+    for alarm in alarms:
+        low, high = ranges.get(alarm.name, (-math.inf, math.inf))
+        if not low <= alarm.limit <= high:
+            key = f"alarms.{alarm.name}.limit_{'a' if alarm.unit == 'A' else 'v'}"
+            yield (
+                f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {alarm.unit}, as the cell file has it; "
+                "is it meant for a cell, or for the pack?"
+            )
+
+
+def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> Watched | None:
+    """None: it is switched off, or has no limit."""
+    told = rule.model_dump(exclude_none=True)
+    key = next((key for key in type(rule).model_fields if key.startswith("limit")), "limit")
+    limit = told.get(key, default.limit)
+    if not rule.enabled or limit is None:
+        return None
+    hysteresis = 0.0 if default.clear is None or default.limit is None else default.clear - default.limit
+    clear_key = key.replace("limit", "clear")
+    clear = told.get(clear_key, round(limit + hysteresis, DIGITS))
+    if (clear > limit) if default.above else (clear < limit):
+        beyond = "above" if default.above else "below"
+        raise UserError(
+            f"alarms.{name}.{clear_key} = {clear:g}: must not be {beyond} {key} = {limit:g}: there the alarm is raised"
+        )
+    delay_s = rule.delay_s
+    if name == "link_lost":  # silence is its own delay
+        limit, clear, delay_s = limit + delay_s, clear + delay_s, 0.0
+    return Watched(
+        name, rule.severity, default.unit, default.above, limit, clear, delay_s, rule.clear_delay_s, rule.latch
+    )
+
+
+def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
+    """By alarm; a fuel cell has no SOC, no chemistry, and stands no charge."""
+    n = cell.cell.series_count
+    common: dict[AlarmName, _Default] = {
+        "over_temperature": _Default(60.0, 55.0, "°C"),
+        "under_temperature": _Default(-20.0, -15.0, "°C", above=False),
+        "charging_below_freezing": _Default(0.0, 2.0, "°C", above=False),
+        "soc_low": _Default(0.1, 0.15, None, above=False),
+        "stability_margin_low": _Default(0.05, 0.08, None, above=False),
+        "cell_imbalance": _Default(0.05, 0.03, "V"),
+        "sensor_fault": _Default(0.1, 0.02, None),
+        "model_mismatch": _Default(0.05 * n, 0.03 * n, "V"),
+        "link_lost": _Default(_silent_s(settings), None, "s"),
+        "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0, None),
+    }
+    return common | (_of_battery(cell) if isinstance(cell, CellModel) else _of_stack(cell))
+
+
+def _of_battery(cell: CellModel) -> dict[AlarmName, _Default]:
+    c, n = cell.cell, cell.cell.series_count
+    each_v = c.nominal_voltage_v / n
+    v = next(chemistry for most_v, chemistry in _BY_NOMINAL_V if each_v < most_v)
+    charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
+    discharge_a = min(MOST_DISCHARGE * c.capacity_ah, c.current_max_a)
+    return {
+        "pack_over_voltage": _Default(n * v.over_v, n * v.over_clear_v, "V"),
+        "pack_under_voltage": _Default(n * v.under_v, n * v.under_clear_v, "V", above=False),
+        "cell_over_voltage": _Default(v.over_v, v.over_clear_v, "V"),
+        "cell_under_voltage": _Default(v.under_v, v.under_clear_v, "V", above=False),
+        "discharge_over_current": _Default(discharge_a, 0.95 * discharge_a, "A"),
+        "charge_over_current": _Default(charge_a, 0.95 * charge_a, "A"),
+    }
+
+
+def _of_stack(cell: PackModel) -> dict[AlarmName, _Default]:
+    c = cell.cell
+    nothing = _Default(None, None, "V")
+    return {
+        "pack_over_voltage": _Default(c.voltage_max_v, 0.98 * c.voltage_max_v, "V"),
+        "pack_under_voltage": _Default(c.voltage_min_v, 1.1 * c.voltage_min_v, "V", above=False),
+        "cell_over_voltage": nothing,
+        "cell_under_voltage": nothing._replace(above=False),
+        "discharge_over_current": _Default(c.current_max_a, 0.95 * c.current_max_a, "A"),
+        "charge_over_current": _Default(None, None, "A"),
+        "charging_below_freezing": _Default(None, None, "°C", above=False),
+        "over_temperature": _Default(90.0, 85.0, "°C"),
+    }

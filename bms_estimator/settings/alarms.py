@@ -1,0 +1,197 @@
+"""``[alarms]`` of a pack's settings: what is watched, from where on, for how long."""
+
+from string import Template
+from typing import Annotated, Any, Literal, Self, get_args
+
+from pydantic import Field, model_validator
+
+from bms_estimator.model.config_file import Strict
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+AlarmName = Literal[
+    "pack_over_voltage",
+    "pack_under_voltage",
+    "cell_over_voltage",
+    "cell_under_voltage",
+    "discharge_over_current",
+    "charge_over_current",
+    "over_temperature",
+    "under_temperature",
+    "charging_below_freezing",
+    "soc_low",
+    "stability_margin_low",
+    "cell_imbalance",
+    "sensor_fault",
+    "model_mismatch",
+    "link_lost",
+    "hook_failed",
+]
+ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
+"""All alarms that there are, in the order in which they are shown."""
+
+
+class AlarmRule(Strict):
+    """What all alarms have."""
+
+    enabled: bool = True
+    severity: Literal["warning", "critical"] = "warning"
+    delay_s: NotNegative = Field(default=10.0, description="so long the limit must be reached until it is raised")
+    clear_delay_s: NotNegative = Field(default=60.0, description="so long it must be back beyond clear until it ends")
+    latch: bool = Field(default=False, description="stays until it is acknowledged")
+
+
+class VoltageRule(AlarmRule):
+    """An alarm of a voltage; what is left out follows from the cell."""
+
+    limit_v: Positive | None = None
+    clear_v: Positive | None = None
+
+
+class CurrentRule(AlarmRule):
+    """An alarm of a current's magnitude; what is left out follows from the cell."""
+
+    limit_a: Positive | None = None
+    clear_a: NotNegative | None = None
+
+
+class TemperatureRule(AlarmRule):
+    """An alarm of a temperature."""
+
+    limit_c: float | None = None
+    clear_c: float | None = None
+
+
+class ShareRule(AlarmRule):
+    """An alarm of something between 0 and 1."""
+
+    limit: Fraction | None = None
+    clear: Fraction | None = None
+
+
+class LinkRule(AlarmRule):
+    """An alarm of silence: its limit is its delay."""
+
+    limit_s: Positive | None = None
+
+
+class AlarmHook(Strict):
+    """What is done when alarms are raised and end: run a program, publish a message, or switch the board's relay."""
+
+    alarms: tuple[AlarmName, ...] = Field(default=(), description="which ones; all but hook_failed when left out")
+    on: tuple[Literal["raised", "cleared"], ...] = Field(
+        default=("raised", "cleared"), description="when a program is run or a message published"
+    )
+    run: tuple[Annotated[str, Field(min_length=1)], ...] | None = Field(
+        default=None, description="program and its arguments; no shell"
+    )
+    timeout_s: Annotated[float, Field(gt=0, le=3600)] = Field(
+        default=10.0, description="a program that takes longer, with all it started, is killed"
+    )
+    pass_environment: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = Field(
+        default=(), description="further environment variables of the service that a program gets"
+    )
+    topic: Annotated[str, Field(pattern=r"^[^+#\s]{1,200}$")] | None = Field(
+        default=None, description="where a message is published at QoS 1, not retained"
+    )
+    payload: str = Field(
+        default="$json", description="of the message; $json, $name, $state, $text and so on are filled in"
+    )
+    relay: Literal["high", "low"] | None = Field(
+        default=None,
+        description="level of the board's relay pin while one of the alarms is active; else it is the other",
+    )
+    when_silent: Literal["keep", "high", "low"] | None = Field(
+        default=None,
+        description="level of the pin once the board has received nothing from the service for silent_s; "
+        "that of relay, the safe side, when left out",
+    )
+    silent_s: Annotated[int, Field(ge=15, le=3600)] = 30
+    dry_run: bool = Field(default=False, description="log what would be done, and do nothing")
+
+    @property
+    def level_when_silent(self) -> Literal["keep", "high", "low"] | None:
+        """Level of the relay pin while the service is silent; None for a hook without a relay."""
+        return self.when_silent or self.relay
+
+    @model_validator(mode="after")
+    def _one_of_three(self) -> Self:
+        told = [name for name in ("run", "topic", "relay") if getattr(self, name)]
+        if len(told) != 1:
+            raise ValueError("give one of run, topic and relay: a hook does one thing")
+        try:
+            Template(self.payload).substitute(dict.fromkeys(PAYLOAD_FIELDS, ""))
+        except (KeyError, ValueError) as error:
+            known = ", ".join(f"${name}" for name in PAYLOAD_FIELDS)
+            raise ValueError(f"payload: {error}: must be one of {known}, or $$ for a $") from None
+        return self
+
+
+PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value", "limit", "unit", "text")
+"""What a message's payload may name. ``state`` is ``raised`` or ``cleared``."""
+
+
+class AlarmSettings(Strict):
+    """What is an alarm; a table for each, as in pack_over_voltage = {limit_v = 29.2, delay_s = 5}. docs/alarms.md."""
+
+    pack_over_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=2.0, clear_delay_s=10.0, latch=True)
+    pack_under_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=5.0, clear_delay_s=30.0)
+    cell_over_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=2.0, clear_delay_s=10.0, latch=True)
+    cell_under_voltage: VoltageRule = VoltageRule(severity="critical", delay_s=5.0, clear_delay_s=30.0)
+    discharge_over_current: CurrentRule = CurrentRule(severity="critical", latch=True)
+    charge_over_current: CurrentRule = CurrentRule(severity="critical", latch=True)
+    over_temperature: TemperatureRule = TemperatureRule(severity="critical")
+    under_temperature: TemperatureRule = TemperatureRule()
+    charging_below_freezing: TemperatureRule = TemperatureRule(severity="critical", clear_delay_s=10.0, latch=True)
+    soc_low: ShareRule = ShareRule()
+    stability_margin_low: ShareRule = ShareRule()
+    cell_imbalance: VoltageRule = VoltageRule(delay_s=60.0)
+    sensor_fault: ShareRule = Field(
+        default=ShareRule(clear_delay_s=30.0), description="limit: share of samples that are lost or unusable"
+    )
+    model_mismatch: VoltageRule = Field(
+        default=VoltageRule(delay_s=60.0), description="limit_v: of the pack's innovation, measured less predicted"
+    )
+    link_lost: LinkRule = Field(
+        default=LinkRule(delay_s=0.0, clear_delay_s=5.0),
+        description="limit_s: without a sample; 10 s, or 3 periods where that is longer",
+    )
+
+    hook_failed: AlarmRule = Field(
+        default=AlarmRule(clear_delay_s=10.0),
+        description="a hook could not be started or has failed, until it works",
+    )
+
+    lost_s: NotNegative = Field(
+        default=10.0,
+        description="a quantity that was measured before counts as lost after this time without a value, "
+        "and as measured again after the same time with values",
+    )
+    hook: tuple[AlarmHook, ...] = Field(
+        default=(), description="what is done of it, as in [[alarms.hook]]; nothing when left out"
+    )
+
+    @model_validator(mode="after")
+    def _one_relay(self) -> Self:
+        if sum(hook.relay is not None for hook in self.hook) > 1:
+            raise ValueError("hook: the board has one relay: give it one hook, with all its alarms")
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _over_its_own_defaults(cls, table: object) -> object:
+        """What an alarm's table leaves out is as that alarm has it, not as its kind has it."""
+        if not isinstance(table, dict):
+            return table
+        return {
+            name: _completed(cls.model_fields[name].default, told) if name in ALARMS else told
+            for name, told in table.items()
+        }
+
+
+def _completed(default: AlarmRule, told: Any) -> Any:
+    """What was told of an alarm over its defaults."""
+    if not isinstance(told, dict):
+        return told
+    return default.model_dump(exclude_none=True) | told

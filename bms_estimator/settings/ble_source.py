@@ -1,0 +1,51 @@
+"""A BMS that is asked over Bluetooth: ``[source]`` with ``kind = "ble"``."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from bms_estimator.settings.polled_source import ReportSource
+
+STEP_V, STEP_A = 0.01, 0.01
+"""As JBD has them [V, A]; JK is finer, the current of Daly has steps of 0.1 A."""
+
+
+class BleSource(ReportSource):
+    """A BMS over Bluetooth Low Energy; needs Python 3.12."""
+
+    kind: Literal["ble"]
+    address: Annotated[str, Field(pattern=r"^[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}$")] | None = Field(
+        default=None, description='of the BMS, such as "A4:C1:38:00:11:22"; this or name'
+    )
+    name: Annotated[str, Field(min_length=1)] | None = Field(default=None, description="that the BMS advertises")
+    bms: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")] | None = Field(
+        default=None,
+        description='what it is, as aiobmsble calls it: "jbd", "jikong", "daly", ...; found by its advertisement when left out',
+    )
+    poll_s: Annotated[float, Field(ge=0.5, le=600)] = Field(default=2.0, description="between two readings")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.address is None) == (self.name is None):
+            raise ValueError("give address or name, and not both")
+        return self
+
+    @property
+    def period_s(self) -> float:
+        """Between two samples, as expected [s]."""
+        return self.poll_s
+
+    @property
+    def described(self) -> str:
+        """For people, in a few words."""
+        return f"BMS {self.address or self.name} over Bluetooth"
+
+    @property
+    def sensor(self) -> Mapping[str, object]:
+        """The library counts charge as positive, whatever the BMS does."""
+        return {
+            "current_sign": "charge_positive",
+            "voltage_resolution_v": STEP_V,
+            "current_resolution_a": STEP_A,
+        }

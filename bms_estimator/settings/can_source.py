@@ -1,0 +1,150 @@
+"""Where the frames of a CAN bus have a pack's values: ``[source]`` with ``kind = "can"``."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from bms_estimator.model.config_file import Strict
+from bms_estimator.settings.polled_source import ReportSource
+from bms_estimator.settings.profiles import with_profile
+
+LONGEST_ID, LONGEST_EXTENDED_ID = 0x7FF, 0x1FFF_FFFF
+"""Largest identifiers of eleven and of 29 bits."""
+FRAME_BITS = 512
+"""Of the longest frame of CAN FD."""
+PROFILES: dict[str, dict[str, object]] = {
+    # Frame 0x356 of the battery-to-inverter protocol of Pylontech's low voltage packs, as BMS, inverters and diyBMS
+    # (pylon_canbus.cpp) speak it: three int16, little endian, in 10 mV, 0.1 A and 0.1 degC; 500 kbit/s.
+    "pylontech-can": {
+        "bitrate": 500_000,
+        "voltage": {"id": 0x356, "start_bit": 0, "bits": 16, "signed": True, "scale": 0.01},
+        "current": {"id": 0x356, "start_bit": 16, "bits": 16, "signed": True, "scale": 0.1},
+        "temperature": {"id": 0x356, "start_bit": 32, "bits": 16, "signed": True, "scale": 0.1},
+    },
+}
+"""Buses whose signals are known, by name: what ``[source]`` does not say itself. All of them count charge as positive."""
+
+
+class Signal(Strict):
+    """One value on the bus: by its name in the DBC file, or by where it lies in a frame."""
+
+    signal: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None, description="name in the DBC file: Signal, or Message.Signal where several have it"
+    )
+    id: Annotated[int, Field(ge=0, le=LONGEST_EXTENDED_ID)] | None = Field(
+        default=None, description="identifier of the frame, such as 0x356"
+    )
+    extended: bool = Field(default=False, description="the identifier has 29 bits")
+    start_bit: Annotated[int, Field(ge=0, lt=FRAME_BITS)] = Field(
+        default=0, description="first bit as a DBC file counts: of a big endian value the highest one"
+    )
+    bits: Annotated[int, Field(ge=1, le=64)] = Field(default=16, description="length")
+    byte_order: Literal["little", "big"] = "little"
+    signed: bool = False
+    scale: float = Field(
+        default=1.0, description="from what is read, or what the DBC file makes of it, to V, A or degC"
+    )
+    offset: float = Field(default=0.0, description="added after the scale")
+    absent: int | None = Field(
+        default=None, description="what stands where nothing is measured, before the scale, such as 0x7FFF"
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if self.scale == 0.0:
+            raise ValueError("scale: must not be 0")
+        if (self.signal is None) == (self.id is None):
+            raise ValueError("give signal, a name in the DBC file, or id, start_bit and bits, and not both")
+        if self.id is not None and self.id > LONGEST_ID and not self.extended:
+            raise ValueError("id: above 0x7FF it has 29 bits: extended = true")
+        return self
+
+
+class CellSignals(Signal):
+    """Voltages of cells: one after the other in a frame, or signals that a number tells apart."""
+
+    count: Annotated[int, Field(ge=1, le=96)] = Field(
+        default=1, description="so many of the same length follow each other; or numbers from first for {} in signal"
+    )
+    first: Annotated[int, Field(ge=0)] = Field(default=1, description="number of the first of them in signal")
+
+    @model_validator(mode="after")
+    def _counted(self) -> Self:
+        if self.signal is not None and self.count > 1 and "{}" not in self.signal:
+            raise ValueError("signal: of several cells it holds {}, which stands for their number")
+        whole_bytes = self.start_bit % 8 == 7 and self.bits % 8 == 0
+        if self.signal is None and self.count > 1 and self.byte_order == "big" and not whole_bytes:
+            raise ValueError("count: big endian values that follow each other are whole bytes; give each by itself")
+        return self
+
+    def members(self) -> tuple[Signal, ...]:
+        """One signal for each cell."""
+        one = Signal(**self.model_dump(exclude={"count", "first"}))
+        if self.signal is not None:
+            names = [self.signal.replace("{}", str(self.first + number)) for number in range(self.count)]
+            return tuple(one.model_copy(update={"signal": name}) for name in names)
+        starts = [self.start_bit + number * self.bits for number in range(self.count)]
+        return tuple(one.model_copy(update={"start_bit": start}) for start in starts)
+
+
+class CanSource(ReportSource):
+    """A bus that is listened to; nothing is ever sent."""
+
+    kind: Literal["can"]
+    profile: str | None = Field(default=None, description=f"a bus whose signals are known: {', '.join(PROFILES)}")
+    interface: Annotated[str, Field(min_length=1)] = Field(
+        default="socketcan", description="of python-can: socketcan, slcan, pcan, gs_usb, ..."
+    )
+    channel: Annotated[str, Field(min_length=1)] = Field(
+        default="can0", description="interface of the system, or path of the adapter's serial port"
+    )
+    bitrate: Annotated[int, Field(ge=10_000, le=8_000_000)] | None = Field(
+        default=None, description="for adapters that set it; of socketcan the system does"
+    )
+    options: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, description="further arguments of python-can's bus"
+    )
+    dbc: Path | None = Field(default=None, description="DBC file (or KCD, ARXML, SYM) that names the signals")
+    interval_s: Annotated[float, Field(ge=0.001, le=600)] = Field(
+        default=1.0, description="between two samples, as the bus brings them"
+    )
+    voltage: Signal = Field(
+        description='of the pack: { signal = "PackVoltage" }, or { id = 0x356, start_bit = 0, bits = 16, scale = 0.01 }'
+    )
+    current: Signal = Field(description="as voltage; sensor.current_sign says what is positive")
+    temperature: Signal | None = Field(default=None, description="as voltage")
+    cells: tuple[CellSignals, ...] = Field(default=(), description="a list of such, each with its count")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _profile(cls, table: object) -> object:
+        return with_profile(table, PROFILES)
+
+    @model_validator(mode="after")
+    def _named_in_a_file(self) -> Self:
+        signals = [self.voltage, self.current, *self.cells, *([self.temperature] if self.temperature else [])]
+        if self.dbc is None and any(signal.signal is not None for signal in signals):
+            raise ValueError("dbc: missing, and signals are named that only a DBC file knows")
+        if sum(cells.count for cells in self.cells) > 96:
+            raise ValueError("cells: at most 96 of them")
+        return self
+
+    @property
+    def period_s(self) -> float:
+        """Between two samples, as expected [s]."""
+        return self.interval_s
+
+    @property
+    def described(self) -> str:
+        """For people, in a few words."""
+        return f"CAN {self.interface} {self.channel}"
+
+    @property
+    def sensor(self) -> Mapping[str, object]:
+        """The sign of a known bus, and the steps of what is placed by hand."""
+        sign = {"current_sign": "charge_positive"} if self.profile else {}
+        volts = {} if self.voltage.signal else {"voltage_resolution_v": abs(self.voltage.scale)}
+        amperes = {} if self.current.signal else {"current_resolution_a": abs(self.current.scale)}
+        return {**sign, **volts, **amperes}

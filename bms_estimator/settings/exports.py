@@ -1,0 +1,66 @@
+"""Where values go beside MQTT: InfluxDB, Prometheus."""
+
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from bms_estimator.model.config_file import Strict
+
+Name = Annotated[str, Field(min_length=1)]
+
+
+class InfluxSettings(Strict):
+    """InfluxDB, or what takes its line protocol over HTTP: each state, and alarms when they change."""
+
+    url: Annotated[str, Field(pattern=r"^https?://[^/@\s?#]+(/[^@\s?#]*)?$")] = Field(
+        default="http://localhost:8086", description="http://host:port or https://host:port; name and password not here"
+    )
+    database: Name = Field(default="bms", description="of InfluxDB 1; of no use with bucket")
+    username: str | None = Field(default=None, description="of InfluxDB 1, where it asks for one")
+    password_file: Path | None = Field(
+        default=None, description="file that holds its password; a name alone: systemd's credential of this name"
+    )
+    bucket: Name | None = Field(default=None, description="of InfluxDB 2, in place of database")
+    org: Name | None = Field(default=None, description="organisation, of InfluxDB 2")
+    token_file: Path | None = Field(
+        default=None, description="file that holds a token which may write, of InfluxDB 2; as password_file"
+    )
+    ca_file: Path | None = Field(default=None, description="certificate authority for https, else the system's")
+    every_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
+        default=10.0, description="what came meanwhile is sent in one request"
+    )
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        if self.bucket and (self.username or self.password_file):
+            raise ValueError("username and password_file: of no use with bucket, give token_file")
+        if not self.bucket and (self.token_file or self.org):
+            raise ValueError("org and token_file: of no use without bucket")
+        return self
+
+
+class PrometheusSettings(Strict):
+    """Prometheus: an address where it fetches the values."""
+
+    listen: Annotated[str, Field(pattern=r"^([^:\s/@]+|\[[0-9A-Fa-f:]+\]):\d{1,5}$")] = Field(
+        default="127.0.0.1:9108",
+        description="host:port of this pack alone; anybody who reaches it may read, so the loopback unless told",
+    )
+
+    @property
+    def host(self) -> str:
+        """Without brackets."""
+        return self.listen.rpartition(":")[0].strip("[]")
+
+    @property
+    def port(self) -> int:
+        """TCP port."""
+        return int(self.listen.rpartition(":")[2])
+
+    @model_validator(mode="after")
+    def _an_address(self) -> Self:
+        if not 0 < self.port < 65536:
+            raise ValueError("port: must be 1 to 65535")
+        self.host.encode("idna")  # as the resolver has it
+        return self

@@ -1,0 +1,57 @@
+"""``[source] kind = "linux"``: a sensor of this machine."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from bms_estimator.settings.polled_source import Name, Positive, ReportSource
+
+RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
+"""One step of the voltage by chip, at its own pins: INA219 data sheet, ADS1015 at 4.096 V full scale [V]."""
+FINE_V = 1.25e-3
+"""Of the INA226; what is finer shows through hwmon in millivolts only [V]."""
+
+
+class LinuxSource(ReportSource):
+    """A current sensor whose driver is in the kernel: INA2xx by hwmon, ADS1x15 by iio."""
+
+    kind: Literal["linux"]
+    chip: Name = Field(
+        default="ina226", description="name of the chip, its place on the bus such as 1-0040, or a folder of sysfs"
+    )
+    voltage: Name = Field(
+        default="in1_input",
+        description="file of the chip; of an iio chip the channel, such as in_voltage0; chip/file: of another chip",
+    )
+    current: Name = Field(
+        default="curr1_input", description="as voltage; a channel in volts is taken over shunt_ohm, which it needs then"
+    )
+    temperature: Name | None = Field(
+        default=None, description="as voltage, such as temp1_input; of the pack, not of the chip"
+    )
+    voltage_scale: Positive = Field(default=1.0, description="of the divider: volts at the pack for one at the chip")
+    voltage_offset_v: float = Field(default=0.0, description="added to the pack's voltage")
+    current_scale: Positive = Field(default=1.0, description="correction of the shunt's tolerance")
+    current_offset_a: float = Field(default=0.0, description="added to the current")
+    shunt_ohm: Positive | None = Field(
+        default=None, description="the shunt that is fitted; what the driver takes it for, when left out"
+    )
+    interval_s: Annotated[float, Field(ge=0.01, le=3600)] | None = Field(
+        default=None, description="between two samples; the chip's own, 0.1 s at least, when left out, 1 s without one"
+    )
+
+    @property
+    def period_s(self) -> float:
+        """Between two samples, as expected [s]."""
+        return self.interval_s or 1.0
+
+    @property
+    def described(self) -> str:
+        """For people, in a few words."""
+        return f"{self.chip} of this machine"
+
+    @property
+    def sensor(self) -> Mapping[str, object]:
+        """The chip's step, as the divider makes it."""
+        return {"voltage_resolution_v": RESOLUTION_V.get(self.chip, FINE_V) * self.voltage_scale}

@@ -1,0 +1,144 @@
+"""Where a Modbus device has its values: ``[source]`` with ``kind = "modbus"``."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from bms_estimator.model.config_file import Strict
+from bms_estimator.settings.polled_source import ReportSource
+from bms_estimator.settings.profiles import with_profile
+
+MOST_WORDS = 125
+"""Registers that one request may ask for, of the Modbus application protocol V1.1b3, section 6.3."""
+WORDS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2}
+"""Registers of a value, by its type."""
+PROFILES: dict[str, dict[str, object]] = {
+    # Victron's register list (attributes.csv of dbus_modbustcp), service com.victronenergy.battery; functions 3 and 4
+    # do the same. The unit is the one under Settings, Services, Modbus TCP, Available services; 225 is a BMV's.
+    # What the service does not measure reads 0 (Mappings::getValue of dbus_modbustcp): a BMV without a sensor is not at 0 degC.
+    "victron-gx": {
+        "unit": 225,
+        "voltage": {"address": 259, "type": "uint16", "scale": 0.01, "absent": 0},
+        "current": {"address": 261, "type": "int16", "scale": 0.1},
+        "temperature": {"address": 262, "type": "int16", "scale": 0.1, "absent": 0},
+    },
+    # "SEPLOS-3.0 RS485 BMS Modbus RTU Protocol" V0.1 of 2023-02-09: blocks PIA and PIB, function 4, temperatures in 0.1 K.
+    "seplos-v3": {
+        "baud": 19200,
+        "unit": 0,
+        "voltage": {"address": 0x1000, "table": "input", "type": "uint16", "scale": 0.01},
+        "current": {"address": 0x1001, "table": "input", "type": "int16", "scale": 0.01},
+        "temperature": {"address": 0x1009, "table": "input", "type": "uint16", "scale": 0.1, "offset": -273.15},
+        "cells": {"address": 0x1100, "table": "input", "type": "uint16", "scale": 0.001, "count": 16},
+    },
+}
+"""Devices whose registers are known, by name: what ``[source]`` does not say itself. All of them count charge as positive."""
+
+
+class Register(Strict):
+    """One value of the device: ``scale`` times what its registers hold, plus ``offset``."""
+
+    address: Annotated[int, Field(ge=0, le=0xFFFF)] = Field(
+        description="as a request has it, from 0: what a manual calls 40001 is holding register 0"
+    )
+    table: Literal["holding", "input"] = Field(default="holding", description="read by function 3 or by function 4")
+    type: Literal["int16", "uint16", "int32", "uint32", "float32"] = "uint16"
+    low_word_first: bool = Field(default=False, description="of a value of two registers the lower half comes first")
+    scale: float = Field(default=1.0, description="from what is read to V, A or degC")
+    offset: float = Field(default=0.0, description="added after the scale, such as -273.15")
+    absent: int | None = Field(
+        default=None, description="what is read where nothing is measured, before the scale, such as 32767"
+    )
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if self.scale == 0.0:
+            raise ValueError("scale: must not be 0")
+        if self.address + self.words > 0x10000:
+            raise ValueError("address: the value ends behind the last register, 65535")
+        return self
+
+    @property
+    def words(self) -> int:
+        """Registers that it takes."""
+        return WORDS[self.type]
+
+
+class CellRegisters(Register):
+    """Voltages of cells, one after the other."""
+
+    count: Annotated[int, Field(ge=1, le=96)] = Field(description="how many cells")
+    step: Annotated[int, Field(ge=1, le=MOST_WORDS)] | None = Field(
+        default=None, description="registers from one cell to the next; those of a value when left out"
+    )
+
+    def cell(self, number: int) -> Register:
+        """Of the cell, from 0."""
+        first = Register(**self.model_dump(exclude={"count", "step"}))
+        return first.model_copy(update={"address": self.address + number * (self.step or self.words)})
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if self.cell(self.count - 1).address + self.words > 0x10000:
+            raise ValueError("count: the last cell lies behind the last register, 65535")
+        return self
+
+
+class ModbusSource(ReportSource):
+    """A device that is asked for its registers, over the network or over a serial line."""
+
+    kind: Literal["modbus"]
+    profile: str | None = Field(default=None, description=f"a device whose registers are known: {', '.join(PROFILES)}")
+    host: str | None = Field(default=None, description="Modbus TCP: name or address of the device or the gateway")
+    tcp_port: Annotated[int, Field(ge=1, le=65535)] = 502
+    port: str | None = Field(
+        default=None, description="Modbus RTU: path of the serial port, best under /dev/serial/by-id"
+    )
+    baud: Annotated[int, Field(ge=300, le=4_000_000)] = 9600
+    parity: Literal["none", "even", "odd"] = "none"
+    stop_bits: Literal[1, 2] = 1
+    framing: Literal["tcp", "rtu"] | None = Field(
+        default=None, description='"rtu" with a host: a gateway that hands serial frames on as they are'
+    )
+    unit: Annotated[int, Field(ge=0, le=255)] = Field(default=1, description="number of the device on the line")
+    poll_s: Annotated[float, Field(ge=0.02, le=600)] = Field(default=1.0, description="between two readings")
+    timeout_s: Annotated[float, Field(ge=0.05, le=60)] = Field(default=1.0, description="for one answer")
+    voltage: Register = Field(description='of the pack, such as { address = 259, type = "uint16", scale = 0.01 }')
+    current: Register = Field(description="as voltage; sensor.current_sign says what is positive")
+    temperature: Register | None = Field(default=None, description="as voltage")
+    cells: CellRegisters | None = Field(
+        default=None, description="the first cell as voltage, how many, and step where they do not follow each other"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _profile(cls, table: object) -> object:
+        return with_profile(table, PROFILES)
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.host is None) == (self.port is None):
+            raise ValueError("give host for Modbus TCP, or port for a serial line, and not both")
+        if self.port is not None and self.framing == "tcp":
+            raise ValueError('framing: a serial line has "rtu"')
+        return self
+
+    @property
+    def period_s(self) -> float:
+        """Between two samples, as expected [s]."""
+        return self.poll_s
+
+    @property
+    def described(self) -> str:
+        """For people, in a few words."""
+        where = f"{self.host}:{self.tcp_port}" if self.port is None else self.port
+        return f"Modbus unit {self.unit} at {where}"
+
+    @property
+    def sensor(self) -> Mapping[str, object]:
+        """The sign of a known device, and the steps of what is told in whole numbers."""
+        sign = {"current_sign": "charge_positive"} if self.profile else {}
+        volts = {} if self.voltage.type == "float32" else {"voltage_resolution_v": abs(self.voltage.scale)}
+        amperes = {} if self.current.type == "float32" else {"current_resolution_a": abs(self.current.scale)}
+        return {**sign, **volts, **amperes}

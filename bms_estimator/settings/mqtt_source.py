@@ -1,0 +1,166 @@
+"""``[source] kind = "mqtt"``: what somebody else publishes of a battery."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from bms_estimator.model.config_file import Strict
+from bms_estimator.settings.broker_url import of_brokers
+from bms_estimator.settings.mqtt_profiles import PROFILES, ProfileName
+from bms_estimator.settings.polled_source import Name, Positive, ReportSource
+
+Unit = Literal["V", "mV", "A", "mA", "C", "F", "K", "s", "ms", "iso"]
+UNITS: Mapping[str, tuple[Unit, ...]] = {
+    "voltage": ("V", "mV"),
+    "current": ("A", "mA"),
+    "temperature": ("C", "F", "K"),
+    "cells": ("V", "mV"),
+    "time": ("s", "ms", "iso"),
+}
+"""By quantity: what it may come in; the first is meant where nothing is said."""
+LINEAR: Mapping[Unit, tuple[float, float]] = {
+    "mV": (1e-3, 0.0),
+    "mA": (1e-3, 0.0),
+    "ms": (1e-3, 0.0),
+    "F": (5.0 / 9.0, -160.0 / 9.0),
+    "K": (1.0, -273.15),
+}
+"""Of a unit: factor and offset that make V, A, degC, s of it."""
+
+
+class Place(Strict):
+    """Where a quantity is found, and what makes SI of it. A text alone is the path."""
+
+    topic: Name | tuple[Name, ...] | None = Field(
+        default=None, description="or several, of which one comes; source.topic when left out; {cell}: number of a cell"
+    )
+    path: str = Field(
+        default="",
+        description="in JSON: keys, and numbers in lists, with dots between; empty: the payload is the number; "
+        "{cell}: number of a cell; of cells also that of a list",
+    )
+    unit: Unit | None = Field(default=None, description="of what comes")
+    scale: float = Field(default=1.0, description="what comes is multiplied by it")
+    offset: float = Field(default=0.0, description="added after that, in what comes")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _path_alone(cls, table: object) -> object:
+        return {"path": table} if isinstance(table, str) else table
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """As told."""
+        return (self.topic,) if isinstance(self.topic, str) else self.topic or ()
+
+    def si(self, number: float) -> float:
+        """What came as V, A, degC or s."""
+        factor, offset = LINEAR.get(self.unit or "V", (1.0, 0.0))
+        return factor * (self.scale * number + self.offset) + offset
+
+
+class MqttSource(ReportSource):
+    """What somebody else publishes of a battery by MQTT: see docs/sources-mqtt.md."""
+
+    kind: Literal["mqtt"]
+    profile: ProfileName | None = Field(default=None, description="who publishes; tells all that is not set here")
+    prefix: Name | None = Field(default=None, description="name of the publisher in its topics, {prefix} in those here")
+    instance: str = Field(default="", description="which of its batteries, {instance} in topics and paths")
+    topic: Name | None = Field(default=None, description="of all quantities that have none of their own")
+    voltage: Place | None = Field(default=None, description='of the pack: a path, or {topic = "...", path = "..."}')
+    current: Place | None = Field(default=None, description="as voltage; sensor.current_sign says what is positive")
+    temperature: Place | None = Field(default=None, description="as voltage")
+    cells: Place | None = Field(default=None, description="as voltage, {cell} for the number of a cell, or a list")
+    time: Place | None = Field(default=None, description="as voltage: when it was measured, by the publisher's clock")
+    settle_s: Annotated[float, Field(ge=0, le=60)] = Field(
+        default=0.5, description="of voltage and current the one that does not come again in so long is as it was"
+    )
+    max_age_s: Positive = Field(default=30.0, description="but no older than this")
+    slow_max_age_s: Positive = Field(default=300.0, description="and temperature and cells no older than this")
+    interval_s: Positive = Field(default=10.0, description="between two samples, as expected; fresh for three of them")
+    availability_topic: str | None = Field(
+        default=None, description="where the publisher, or its will, says offline; only a reason is made of it"
+    )
+    ask: Mapping[str, str] = Field(default={}, description="payloads by the topic on which they make it publish")
+    ask_s: Positive = Field(default=10.0, description="they are sent so often")
+    url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] | None = Field(
+        default=None, description="of the broker, or a list of them, tried in turn; that of [mqtt] when left out"
+    )
+    username: str | None = Field(default=None, description="of the broker at url")
+    password_file: Path | None = Field(default=None, description="as mqtt.password_file, for the broker at url")
+    ca_file: Path | None = Field(default=None, description="as mqtt.ca_file, for the broker at url")
+
+    quantities: ClassVar[tuple[str, ...]] = tuple(UNITS)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_the_profile_has_it(cls, table: object) -> object:
+        """What is told goes before the profile; of a quantity each part."""
+        profile = PROFILES.get(table.get("profile", "")) if isinstance(table, dict) else None
+        if profile is None or not isinstance(table, dict):
+            return table
+        merged: dict[str, Any] = {**profile.table, **table}
+        for name in cls.quantities:
+            own = table.get(name)
+            own = {"path": own} if isinstance(own, str) else own
+            if name in profile.table and isinstance(own, dict):
+                merged[name] = {**profile.table[name], **own}
+        missing = [f"{name}: missing ({what})" for name, what in profile.needs.items() if not merged.get(name)]
+        if missing:
+            raise ValueError(f"profile {table['profile']}: {'; '.join(missing)}")
+        return merged
+
+    @model_validator(mode="after")
+    def _whole(self) -> "MqttSource":
+        for name in ("voltage", "current"):
+            if getattr(self, name) is None:
+                raise ValueError(f"{name}: missing; tell where it is found, or a profile: {', '.join(PROFILES)}")
+        for name, place in self.places():
+            if not place.topics and not self.topic:
+                raise ValueError(f"{name}.topic: missing, and there is no topic for all of them")
+            if place.unit and place.unit not in UNITS[name]:
+                raise ValueError(f"{name}.unit = {place.unit}: must be one of {', '.join(UNITS[name])}")
+            if place.scale == 0.0:
+                raise ValueError(f"{name}.scale = 0: must not be 0")
+        if self.url is None and (self.username or self.password_file or self.ca_file):
+            raise ValueError(
+                "username, password_file and ca_file are for a broker at url; without, those of [mqtt] count"
+            )
+        return self
+
+    def places(self) -> Iterator[tuple[str, Place]]:
+        """The quantities that are to be found, by name."""
+        for name in self.quantities:
+            place = getattr(self, name)
+            if place is not None:
+                yield name, place
+
+    def filled(self, text: str) -> str:
+        """A topic or a path with prefix and instance in it."""
+        return text.replace("{prefix}", self.prefix or "").replace("{instance}", self.instance)
+
+    def topics(self, place: Place) -> list[str]:
+        """Topics of a quantity; ``{cell}`` may be in them."""
+        return [self.filled(topic) for topic in place.topics or (self.topic or "",)]
+
+    @property
+    def period_s(self) -> float:
+        """Between two samples, as expected [s]."""
+        return self.interval_s
+
+    @property
+    def described(self) -> str:
+        """For people, in a few words."""
+        who = self.profile or (self.topics(self.voltage)[0] if self.voltage else "")
+        return f"{who} {self.prefix or ''}".strip() + " by MQTT"
+
+    @property
+    def sensor(self) -> Mapping[str, object]:
+        """Sign of the current and steps of what is shown, as the profile has them."""
+        if self.profile is None:
+            return {"voltage_resolution_v": 0.01}
+        profile = PROFILES[self.profile]
+        shown = ("current_sign", "voltage_resolution_v", "current_resolution_a")
+        return {name: getattr(profile, name) for name in shown}

@@ -1,0 +1,80 @@
+"""The settings of the live page: where it is served, and to whom."""
+
+import ipaddress
+from pathlib import Path
+from typing import Annotated, NamedTuple, Self
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field, model_validator
+
+from bms_estimator.model.config_file import Strict
+
+DEFAULT_LISTEN = "127.0.0.1:8765"
+
+
+class Listen(NamedTuple):
+    """Where a server listens."""
+
+    host: str
+    port: int
+    """0: any that is free."""
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only programs of this machine reach it."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+def parse_listen(text: str) -> Listen:
+    """``host:port``.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    try:
+        url = urlsplit(f"//{text}")
+        host, port = url.hostname, url.port
+        (host or "").encode("idna")  # as the resolver has it
+    except ValueError as error:
+        raise ValueError(f"must be host:port: {error}") from None
+    if not host or port is None or url.netloc != text or "@" in text:
+        raise ValueError('must be host:port, such as "127.0.0.1:8765" or "[::1]:8765"')
+    return Listen(host, port)
+
+
+def _of_listen(text: str) -> str:
+    parse_listen(text)
+    return text
+
+
+class PageSettings(Strict):
+    """The live page in a browser."""
+
+    listen: Annotated[str, AfterValidator(_of_listen)] = Field(
+        default=DEFAULT_LISTEN,
+        description="host:port; packs of one process that name the same share a page. Beyond this machine, "
+        "such as 0.0.0.0:8765, it needs token_file",
+    )
+    token_file: Path | None = Field(
+        default=None,
+        description="file that holds what a browser must show, read at start; as mqtt.password_file",
+    )
+    hosts: tuple[str, ...] = Field(
+        default=(), description="further names under which browsers reach it, as behind a proxy"
+    )
+
+    @property
+    def address(self) -> Listen:
+        """``listen`` in its parts."""
+        return parse_listen(self.listen)
+
+    @model_validator(mode="after")
+    def _needs_a_token(self) -> Self:
+        if self.token_file is None and not self.address.loopback:
+            raise ValueError(
+                f'listen = "{self.listen}" is open to other machines: name a token_file, or listen on 127.0.0.1'
+            )
+        return self

@@ -1,0 +1,30 @@
+"""What all kinds of ``[source]`` have in common."""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import Field
+
+from bms_estimator.model.config_file import Strict
+
+Positive = Annotated[float, Field(gt=0)]
+Name = Annotated[str, Field(min_length=1)]
+
+
+class ReportSource(Strict):
+    """What all kinds have in common."""
+
+    @property
+    def period_s(self) -> float:
+        """Between two samples, as expected [s]: values are fresh for three of them."""
+        raise NotImplementedError
+
+    @property
+    def described(self) -> str:
+        """For people, in a few words."""
+        raise NotImplementedError
+
+    @property
+    def sensor(self) -> Mapping[str, object]:
+        """What follows for ``[sensor]``, where that does not say otherwise: what is resolved, the sign of the current."""
+        return {}

@@ -1,0 +1,149 @@
+"""The fuel cell's physics: its limits, its exact step, its sensitivities, and that it is a model of the same shape."""
+
+import inspect
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from bms_estimator.kernels.cell_model import fuel_cell
+from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
+from bms_estimator.kernels.observer import chen_mora_sensitivity
+from bms_estimator.kernels.observer.learning_model import NAMES, Model
+from bms_estimator.model.fuel_cell import load_fuel_cell
+from tests import mann_stack
+
+PEM = load_fuel_cell("pem_30w")
+THETA = np.array([0.1, -0.05, 0.03, 0.2, 0.1, 0.05, 0.3, 0.0])
+"""Some parameters beside the file's."""
+STEPS = ((3.0, 0.01), (3.0, 0.02), (6.0, 0.005), (9.0, 0.1), (12.0, 0.1), (0.5, 0.03), (0.0, 0.5))
+"""Currents [A], one beyond the limiting one, and for how long [s]."""
+currents = st.floats(0.0, 8.0)
+lengths = st.floats(1e-4, 10.0)
+
+
+def given_by_file() -> np.ndarray:
+    values = np.zeros(8)
+    fuel_cell.give_file(values, PEM.a, np.nan)
+    return values
+
+
+def settled(current_a: float, theta: np.ndarray = THETA) -> tuple[np.ndarray, np.ndarray]:
+    x, dx = np.zeros(2), np.zeros((2, 8))
+    fuel_cell.settle(x, dx, theta, given_by_file(), current_a)
+    return x, dx
+
+
+def voltages(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Voltage after each of ``STEPS`` and its derivatives."""
+    (x, dx), out, slopes = settled(0.0, theta), [], []
+    for current_a, dt_s in STEPS:
+        fuel_cell.advance(x, dx, theta, given_by_file(), current_a, dt_s)
+        psi = np.zeros(8)
+        out.append(fuel_cell.output(x, dx, theta, given_by_file(), current_a, psi))
+        slopes.append(psi)
+    return np.array(out), np.array(slopes)
+
+
+def test_reversible_voltage_is_that_of_the_standard_state() -> None:
+    assert fuel_cell.nernst(298.15, 1.0, 1.0) == 1.229
+    assert fuel_cell.nernst(343.15, 1.0, 1.0) == pytest.approx(
+        1.191, abs=5e-4
+    )  # 1.19 V at 70 C, Larminie and Dicks 2.2
+    assert fuel_cell.nernst(343.15, 1.0, 0.21) < fuel_cell.nernst(343.15, 1.0, 1.0) < fuel_cell.nernst(343.15, 2.0, 1.0)
+
+
+@pytest.mark.parametrize("j", range(len(fuel_cell.NAMES)), ids=fuel_cell.NAMES)
+def test_sensitivities_are_those_of_finite_differences(j: int) -> None:
+    step = 1e-6 * np.eye(8)[j]
+    differences = (voltages(THETA + step)[0] - voltages(THETA - step)[0]) / 2e-6
+    np.testing.assert_allclose(voltages(THETA)[1][:, j], differences, atol=1e-7)
+    assert np.abs(differences).max() > 1e-3, "the load shows it"
+
+
+@given(currents, currents, lengths, lengths)
+def test_two_steps_under_one_current_are_one(
+    before_a: float, current_a: float, first_s: float, second_s: float
+) -> None:
+    (x, dx), (y, dy) = settled(before_a), settled(before_a)
+    for dt_s in (first_s, second_s):
+        fuel_cell.advance(x, dx, THETA, given_by_file(), current_a, dt_s)
+    fuel_cell.advance(y, dy, THETA, given_by_file(), current_a, first_s + second_s)
+    np.testing.assert_allclose(x, y, rtol=1e-9)
+    np.testing.assert_allclose(dx, dy, rtol=1e-7, atol=1e-9)
+
+
+def test_the_step_agrees_with_an_independent_integration() -> None:
+    values = given_by_file()
+    tafel_v, farad, internal_a = (values[i] for i in (fuel_cell.TAFEL, fuel_cell.C_DL, fuel_cell.INTERNAL))
+    x, dx = settled(0.2, np.zeros(8))
+    end_v = settled(5.0, np.zeros(8))[0][0]
+
+    def slope(_: float, v: np.ndarray) -> np.ndarray:
+        return (5.0 + internal_a) * -np.expm1((v - end_v) / tafel_v) / farad
+
+    way = solve_ivp(slope, (0.0, 0.02), [x[0]], rtol=1e-11, atol=1e-12).y[0, -1]
+    fuel_cell.advance(x, dx, np.zeros(8), values, 5.0, 0.02)
+    assert x[0] == pytest.approx(way, abs=1e-8)
+    assert 0.01 < end_v - x[0] < 2.0, "still on its way"
+
+
+@pytest.mark.parametrize("current_a", [0.5, 2.0, 5.0])
+def test_a_small_step_settles_with_the_resistance_of_tafel_s_slope(current_a: float) -> None:
+    """Time constant C A / I: what impedance calls charge transfer resistance is A / I."""
+    values = given_by_file()
+    values[fuel_cell.B] = 1e-9  # without concentration loss
+    reaction_a = current_a + values[fuel_cell.INTERNAL]
+    tau_s = values[fuel_cell.C_DL] * values[fuel_cell.TAFEL] / reaction_a
+    x, dx = np.zeros(2), np.zeros((2, 8))
+    fuel_cell.settle(x, dx, np.zeros(8), values, current_a)
+    start_v = x[0]
+    fuel_cell.advance(x, dx, np.zeros(8), values, 1.001 * current_a, tau_s)
+    reached = (x[0] - start_v) / (values[fuel_cell.TAFEL] / reaction_a * 0.001 * current_a)
+    assert reached == pytest.approx(1.0 - np.exp(-1.0), rel=2e-3)
+
+
+@given(st.lists(st.floats(-0.4, 0.4), min_size=7, max_size=7))
+def test_a_polarisation_curve_always_falls(of_file: list[float]) -> None:
+    theta = np.array([*of_file, 0.0])
+    current_a = np.linspace(0.0, 15.0, 200)
+    voltage_v, _ = polarisation(PEM.a, theta, current_a, np.full(200, np.nan))
+    assert np.isfinite(voltage_v).all()
+    assert (np.diff(voltage_v) < 0.0).all()
+
+
+def test_a_settled_record_lies_on_the_polarisation_curve() -> None:
+    current_a, none = np.repeat([1.0, 4.0], 100), np.full(200, np.nan)
+    voltage_v, _ = open_loop(PEM.a, THETA, np.arange(200) * 0.1, current_a, none)
+    curve_v, _ = polarisation(PEM.a, THETA, np.array([1.0, 4.0]), none[:2])
+    assert voltage_v[[99, 199]] == pytest.approx(curve_v, abs=1e-9)
+
+
+@pytest.mark.parametrize("celsius", [20.0, 60.0])
+def test_losses_follow_the_temperature_as_mann_s_coefficients_do(celsius: float) -> None:
+    values, kelvin = np.zeros(8), 273.15 + celsius
+    fuel_cell.give_file(values, PEM.a, celsius)
+    cells = mann_stack.CELLS
+    assert values[fuel_cell.TAFEL] == pytest.approx(-mann_stack.XI_4 * kelvin * cells, rel=1e-3)
+    assert values[fuel_cell.ACTIVATION] == pytest.approx(cells * mann_stack._activation_v(kelvin), rel=0.01)
+    assert values[fuel_cell.R] == pytest.approx(cells * mann_stack._cell_ohm(3.25, kelvin, 14.0), rel=0.03)
+    assert values[fuel_cell.E] == pytest.approx(cells * mann_stack._nernst_v(kelvin), rel=1e-4)
+
+
+def test_charge_and_overload_leave_the_model_finite() -> None:
+    for current_a in (-5.0, -1e-9, 0.0, 20.0):
+        x, dx = settled(current_a)
+        assert np.isfinite(x).all()
+        assert np.isfinite(dx).all()
+
+
+def test_the_cell_and_the_fuel_cell_are_two_files_of_one_shape() -> None:
+    for function in ("give", "settle", "advance", "output", "write"):
+        shapes = [
+            tuple(inspect.signature(getattr(m, function).py_func).parameters)
+            for m in (chen_mora_sensitivity, fuel_cell)
+        ]
+        assert shapes[0] == shapes[1], function
+    assert NAMES == {Model.CHEN_MORA: chen_mora_sensitivity.NAMES, Model.FUEL_CELL: fuel_cell.NAMES}

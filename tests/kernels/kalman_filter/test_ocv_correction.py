@@ -1,0 +1,94 @@
+"""The error of the OCV as states along SOC."""
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.learned import learned_ocv
+from bms_estimator.kernels.kalman_filter.ocv_correction import forget_curve, learned_v, per_node_v, place
+from bms_estimator.kernels.kalman_filter.records import NODE, NODES, STATES
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.sample import SAMPLE
+from tests.estimator.anywhere.cases import OXIDE, Case, cell_file, load_a
+from tests.estimator.anywhere.truth import simulate
+
+GENERIC = load_cell("nmc", 3.0)
+
+
+def test_the_first_variance_is_the_curve_s_at_nodes_and_between() -> None:
+    p = Estimator(GENERIC).settings_record[0]["filter"]
+    x, covariance = np.ones(STATES), np.ones((STATES, STATES))
+    forget_curve(x, covariance)
+    assert (x[NODE:] == 0.0).all()
+    assert (covariance[:NODE, NODE:] == 0.0).all()
+    for soc in (0.0, 0.3, 0.325, 0.34, 0.9876, 1.0):
+        i, t = place(soc)
+        row = np.zeros(STATES)
+        row[NODE + i], row[NODE + i + 1] = per_node_v(p, soc, t) * np.array([1.0 - t, t])
+        error_v = np.interp(soc, np.linspace(0.0, 1.0, 41), p["curve_error_v"])
+        assert np.isclose(row @ covariance @ row, p["learned"] * error_v**2, rtol=1e-12)
+
+
+def test_it_is_that_of_the_nodes_in_units_of_the_error() -> None:
+    p = Estimator(GENERIC).settings_record[0]["filter"]
+    x = np.zeros(STATES)
+    x[NODE:] = np.arange(NODES)
+    for soc in (0.05, 0.5, 0.95):
+        error_v = np.interp(soc, np.linspace(0.0, 1.0, 41), p["curve_error_v"])
+        assert np.isclose(learned_v(p, x, soc), soc * (NODES - 1) * error_v * np.sqrt(p["learned"]))
+    assert learned_v(p, x, -0.1) == learned_v(p, x, 0.0)
+    assert learned_v(p, x, 1.1) == learned_v(p, x, 1.0)
+
+
+def test_a_curve_with_a_plateau_is_left_as_it_is() -> None:
+    """There a voltage tells neither SOC nor curve: nothing is learned, and the error stays that of the file."""
+    estimator = Estimator(load_cell("lfp", 2.0), initial_soc=0.5)
+    for i in range(1200):
+        estimator.step(float(i), 1.0, 3.25)
+    f = estimator.record[0]["filter"]
+    assert (f["mean"][f["best"]][NODE:] == 0.0).all()
+    soc = np.linspace(0.0, 1.0, 41)
+    correction_v, std_v = learned_ocv(estimator.record[0], estimator.settings_record[0], soc)
+    assert (correction_v == 0.0).all()
+    assert np.allclose(std_v, estimator.settings_record[0]["filter"]["curve_error_v"])
+
+
+def partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, np.ndarray, Estimator]:
+    """Error of the SOC and its std over drives between about 0.85 and 0.3, charged between, rests after both."""
+    pieces, soc = [], 0.85
+    for n in range(cycles):
+        drive = load_a(Case("", seed=n), 3600)
+        drive = drive[: int(np.argmax(np.cumsum(drive) > 0.5 * 3600.0 * OXIDE.capacity_ah)) or drive.size]
+        charged = np.full(round(drive.sum() / (0.35 * OXIDE.capacity_ah)), -0.35 * OXIDE.capacity_ah)
+        pieces += [drive, np.zeros(2400), charged, np.zeros(2400)]
+    current_a = np.concatenate(pieces)
+    samples = np.zeros(current_a.size, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
+    curves = OXIDE.ocv_v, OXIDE.per_kelvin_v, OXIDE.hysteresis_v, OXIDE.ohm
+    samples["voltage_v"], true = simulate(1.0, current_a, samples["temperature_c"], soc, 1.0, 3.0, *curves)
+    estimator = Estimator(cell, initial_soc=soc + 0.1)
+    trace = estimator.run(samples)
+    return trace["soc"] - true, trace["soc_std"].copy(), estimator
+
+
+def test_the_same_curve_met_again_and_again_makes_no_certainty() -> None:
+    """A cell file that errs as much as it says, over six cycles: the band holds the truth to the end."""
+    errors = []
+    for seed in (51, 54, 57):
+        error, std, _ = partial_cycles(cell_file(Case("", seed=seed, capacity=1.03)), 6)
+        last = slice(error.size // 2, None)
+        errors.append(np.mean((error[last] / std[last]) ** 2))
+        assert np.mean(np.abs(error[last]) < 2.0 * std[last]) > 0.95
+    assert np.mean(errors) < 1.5
+
+
+def test_a_generic_curve_is_learned_as_far_as_the_soc_is_known() -> None:
+    """Between 0.35 and 0.85 no voltage says where the SOC is on a curve that is off: neither is taken for certain."""
+    error, std, estimator = partial_cycles(GENERIC, 6)
+    assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95
+    soc = np.linspace(0.4, 0.8, 9)
+    correction_v, std_v = learned_ocv(estimator.record[0], estimator.settings_record[0], soc)
+    p = estimator.settings_record[0]["filter"]
+    wrong_v = np.interp(soc, np.linspace(0.0, 1.0, 401), OXIDE.ocv_v - p["ocv_v"])
+    assert (np.abs(wrong_v - correction_v) < 2.0 * std_v).all()
+    assert (std_v < 0.8 * np.interp(soc, np.linspace(0.0, 1.0, 41), p["curve_error_v"])).all()
+    assert np.std(wrong_v - correction_v) < 0.5 * np.std(wrong_v)

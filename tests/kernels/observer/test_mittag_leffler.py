@@ -1,0 +1,45 @@
+"""E_a(-r^a) against its series in many digits."""
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+
+from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
+
+
+def exact(alpha: float, r: float) -> float:
+    """The series (3.11) at z = -r^alpha with enough digits to survive its cancellation."""
+    with mpmath.workdps(60 + int(r)):
+        a, z = mpmath.mpf(alpha), -(mpmath.mpf(r) ** mpmath.mpf(alpha))
+        return float(sum(z**k / mpmath.gamma(a * k + 1) for k in range(40 + int(3 * r))))
+
+
+@pytest.mark.parametrize("alpha", [2.05, 2.5, 2.9, 2.999, 3.0])
+def test_error_is_below_1e_10_of_the_envelope_for_r_in_0_to_60(alpha: float) -> None:
+    series, (value, slope) = series_coefficients(alpha), decay_table(alpha)
+    for r in np.concatenate([[0.0, 1.999, 2.001], np.linspace(0.05, 60.0, 40)]):
+        envelope = max(1.0, 2.0 / alpha * math.exp(r * math.cos(math.pi / alpha)))
+        assert abs(mittag_leffler(r, alpha, series, value, slope) - exact(alpha, r)) < 1e-10 * envelope
+
+
+def test_value_at_zero_is_one() -> None:
+    assert mittag_leffler(0.0, 2.5, series_coefficients(2.5), *decay_table(2.5)) == 1.0
+
+
+@pytest.mark.parametrize("alpha", [2.0, 3.01, 0.5, math.nan])
+def test_alpha_without_nussbaum_property_is_refused(alpha: float) -> None:
+    with pytest.raises(ValueError, match=r"must be in \(2, 3\]"):
+        decay_table(alpha)
+
+
+def test_running_mean_swings_both_ways() -> None:
+    """Definition 2.2.2.1: the mean of N over 0..k is unbounded above and below; its swings grow."""
+    series, (value, slope) = series_coefficients(2.5), decay_table(2.5)
+    k = np.linspace(0.0, 40.0, 40_001)
+    n = np.array([mittag_leffler(x, 2.5, series, value, slope) for x in k])
+    mean = np.cumsum(n)[1:] * (k[1] - k[0]) / k[1:]
+    early, late = mean[: len(mean) // 2], mean[len(mean) // 2 :]
+    assert late.max() > 10 * early.max() > 0
+    assert late.min() < 10 * early.min() < 0

@@ -1,0 +1,175 @@
+"""A wrong file gets one line that names file, key, value and what is allowed."""
+
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.settings.pack import Settings, load_settings
+
+CHEN_MORA = Path(__file__).parents[2] / "bms_estimator" / "model" / "cells" / "chen_mora.toml"
+
+
+def edited(tmp_path: Path, old: str, new: str) -> Path:
+    text = CHEN_MORA.read_text()
+    assert old in text
+    path = tmp_path / "cell.toml"
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "capacity_ah = 0.275",
+            "capacity_ah = -6.6",
+            r"cell\.toml: cell\.capacity_ah = -6\.6: .*greater than 0.*ampere-hours",
+        ),
+        ("capacity_ah = 0.275", "", r"cell\.toml: cell\.capacity_ah: missing \(rated capacity"),
+        ("capacity_ah = 0.275", "capacity_ah = 0.275\ncapacty = 1", r"cell\.toml: cell\.capacty.*: unknown key"),
+        ("capacity_ah = 0.275", 'capacity_ah = "much"', r"cell\.capacity_ah = 'much': .*number"),
+        ("capacity_ah = 0.275", "capacity_ah = nan", r"cell\.capacity_ah = nan: .*"),
+        ("capacity_ah = 0.275", "capacity_ah = true", r"cell\.capacity_ah = True: must be a number \(rated capacity"),
+        ("capacity_ah = 0.275", 'capacity_ah = "3_9"', r"cell\.capacity_ah = '3_9': must be a number, without quotes"),
+        ("upper = 1.0, lower = 0.1", "upper = true, lower = 0.1", r"adaptation\.a1\.upper = True: must be a number"),
+        ("voltage_min_v = 1.5", "voltage_min_v = 4.6", r"must increase in this order"),
+        ("upper = 1.0, lower = 0.1", "upper = 1.0, lower = 2.0", r"adaptation\.a1.*lower = 2\.0 is above upper = 1\.0"),
+        ("a12 =", "a16 =", r"adaptation\.a16: no such parameter; a1 to a15 adapt"),
+        ('form = "chen-mora"', 'form = "spline"', r"ocv.*'chen-mora', 'table'"),
+        ("[cell]", "[cell", r"cell\.toml: not valid TOML: .*line 5"),
+    ],
+)
+def test_wrong_cell_file_is_named_with_key_value_and_what_is_allowed(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        load_cell(edited(tmp_path, old, new))
+
+
+def test_all_wrong_keys_are_named_at_once(tmp_path: Path) -> None:
+    path = edited(tmp_path, "capacity_ah = 0.275\nnominal_voltage_v = 3.7", "capacity_ah = 0\nnominal_voltage_v = -1")
+    with pytest.raises(UserError) as error:
+        load_cell(path)
+    assert len(str(error.value).splitlines()) >= 2
+
+
+def test_missing_cell_names_the_shipped_ones() -> None:
+    with pytest.raises(UserError, match=r"no such cell file, nor a shipped cell \(chen_mora, .*thunder_power_6s\)"):
+        load_cell("lifepo5")
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (
+            "soc = [0.0, 0.3, 0.6, 1.0]\nocv_v = [3.0, 3.6, 3.5, 4.1]",
+            r"ocv_v must increase, but 3\.5 follows 3\.6 at point 3",
+        ),
+        (
+            "soc = [0.1, 0.3, 0.6, 0.9]\nocv_v = [3.0, 3.4, 3.6, 4.1]",
+            r"soc runs from 0\.1 to 0\.9: give the voltages at 0 and at 1",
+        ),
+    ],
+)
+def test_table_ocv_must_increase_from_empty_to_full(tmp_path: Path, table: str, message: str) -> None:
+    text = CHEN_MORA.read_text()
+    head, rest = text.split("[ocv]", 1)
+    path = tmp_path / "cell.toml"
+    path.write_text(head + f'[ocv]\nform = "table"\n{table}\n' + "[adaptation]" + rest.split("[adaptation]", 1)[1])
+    with pytest.raises(UserError, match=message):
+        load_cell(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[pack]\nname = 'a/b'", r"pack\.name = 'a/b'.*letters, digits"),
+        ("[pack]\ninitial_soc = 80", r"pack\.initial_soc = 80: .*less than or equal to 1"),
+        ("[observer]\nalpha = 2.0", r"observer\.alpha = 2\.0: .*greater than 2.*\(2, 3\]"),
+        ("[mqtt]\nurl = 'http://x'", r"mqtt\.url = 'http://x'.*mqtts://host:port"),
+        (
+            "[mqtt]\ncommands = ['reboot']",
+            r"mqtt\.commands\.0 = 'reboot'.*'set_soc', 'current_zero', 'acknowledge_alarm' or 'publish_rate'",
+        ),
+        ("[mqtt]\npublish_rate_hz = 2", r"pack\.toml: mqtt: publish_rate_hz is now .* rate_hz .* section \[publish\]$"),
+        ("[sensor]\ncurrent_step_a = 0.05", r"sensor\.current_step_a.*: unknown key"),
+        ("[sensor]\nsample_rate_hz = 5000", r"sensor\.sample_rate_hz = 5000: .*1000"),
+    ],
+)
+def test_wrong_settings_are_named(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text(text)
+    with pytest.raises(UserError, match=message):
+        load_settings(path)
+
+
+def test_empty_settings_are_the_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text("")
+    assert load_settings(path) == Settings()
+
+
+def test_printed_gain_law_can_be_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text('[observer]\nrearm_gain = "never"\ndead_zone_v = 0.0\nlambda = 2.0\n')
+    observer = load_settings(path).observer
+    assert observer.rearm_gain is None
+    assert observer.lambda_ == 2.0
+
+
+@pytest.mark.parametrize(
+    ("text", "law"),
+    [
+        ("", "improved"),
+        ("[identifier]\nenabled = false", "learning"),
+        ('[identifier]\nenabled = false\n[observer]\nlaw = "improved"', "improved"),
+    ],
+)
+def test_without_the_identifier_the_law_learns_unless_another_is_named(tmp_path: Path, text: str, law: str) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text(text)
+    assert load_settings(path).observer.law == law
+
+
+def test_pack_scales_the_cell() -> None:
+    cell = load_cell("chen_mora")
+    pack = cell.pack(series=3, parallel=2)
+    assert pack.cell.capacity_ah == pytest.approx(0.55)
+    assert pack.cell.nominal_voltage_v == pytest.approx(11.1)
+    assert pack.cell.current_max_a == pytest.approx(10.0)
+    assert pack.cell.series_count == 3
+    assert pack.a[1] == pytest.approx(cell.a[1] * 1.5)
+    assert pack.a[9] == pytest.approx(cell.a[9] / 1.5)
+    assert pack.a[14] == cell.a[14]
+    assert pack.a[18] == pytest.approx(cell.a[18] * 3)
+    assert pack.bounds(1).limit == pytest.approx(cell.bounds(1).limit * 1.5)
+    assert pack.bounds(9).limit == pytest.approx(cell.bounds(9).limit / 1.5)
+    assert pack.bounds(8).limit == cell.bounds(8).limit
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[pack]\ncapacity_ah = true", "pack.capacity_ah = True: must be a number"),
+        ("[pack]\nseries = true", "pack.series = True: must be a number"),
+        ('[pack]\nseries = "1_4"', "pack.series = '1_4': must be a number, without quotes"),
+        ("[identifier]\nenabled = 1", "identifier.enabled = 1: Input should be a valid boolean"),
+        ('[identifier]\nenabled = "yes"', "identifier.enabled = 'yes': Input should be a valid boolean"),
+        ("[observer]\nrearm_gain = false", "observer.rearm_gain = False: must be a number"),
+        ("a = " + 3000 * "[", "not valid TOML: nested too deeply"),
+    ],
+)
+def test_a_number_is_a_number_and_a_truth_value_is_one(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text(text)
+    with pytest.raises(UserError) as error:
+        load_settings(path)
+    assert str(error.value).startswith(f"{path}: {said}")
+
+
+def test_a_whole_number_may_be_written_with_a_point(tmp_path: Path) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text("[pack]\nseries = 4.0\ncapacity_ah = 3\n")
+    assert load_settings(path).pack.series == 4

@@ -1,0 +1,32 @@
+"""The settings in the documents of sources are settings."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.settings.mqtt_profiles import PROFILES
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.kinds import make_bringer
+
+DOCS = Path(__file__).parents[2] / "docs"
+EXAMPLES = [
+    (document.name, text)
+    for document in sorted(DOCS.glob("sources-*.md"))
+    for text in re.findall(r"```toml\n(.*?)```", document.read_text(encoding="utf-8"), flags=re.DOTALL)
+]
+
+
+@pytest.mark.parametrize(("document", "text"), EXAMPLES, ids=lambda value: value[:30])
+def test_an_example_is_accepted(document: str, text: str) -> None:
+    tables = tomllib.loads(text)
+    settings = Settings.model_validate(tables)
+    assert settings.model_dump(include={"source"}) or settings.sensor.model_fields_set
+    if settings.source is not None and settings.source.kind in ("mqtt", "linux"):
+        assert make_bringer(Settings.model_validate({"mqtt": {}} | tables))
+
+
+def test_every_profile_stands_in_the_document() -> None:
+    text = (DOCS / "sources-mqtt.md").read_text(encoding="utf-8")
+    assert [name for name in PROFILES if f"| `{name}` |" not in text] == []
