@@ -30,8 +30,18 @@ _DUMP, _LOAD = _FILE._dump, _FILE._load_data  # noqa: SLF001 - numba has no othe
 _PACKAGE = Path(__file__).parent
 COMPILED_IN = (
     *sorted((_PACKAGE / "kernels").rglob("*.py")),
-    *sorted((_PACKAGE / "sources" / "wire").glob("*.py")),
-    *(_PACKAGE / constants for constants in ("model/sample.py", "model/input_faults.py", "sources/protocol.py")),
+    *(
+        _PACKAGE / file
+        for file in (
+            "model/sample.py",
+            "model/input_faults.py",
+            "protocols/firmware/clock_drift.py",
+            "protocols/firmware/framing.py",
+            "protocols/firmware/messages.py",
+            "protocols/firmware/scaling.py",
+            "sources/wire/capture_records.py",
+        )
+    ),
 )
 """Files whose content is compiled into kernels: kernels, frame decoding and the constants that they use."""
 

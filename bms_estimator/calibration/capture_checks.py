@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.load import Load
 from bms_estimator.calibration.relaxation import REST_CURRENT_C, SOC_SLACK, runs
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 

@@ -34,7 +34,7 @@ from bms_estimator.calibration.ocv_sources import REST_SHARE_STD, has_plateau
 from bms_estimator.calibration.replays import interval_score
 from bms_estimator.calibration.slow_curve import PAIR_V
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import r_s, soc_from_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, weak_share
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv

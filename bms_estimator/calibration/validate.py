@@ -10,7 +10,7 @@ from bms_estimator.calibration.identify import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ladder_voltage import overpotential
 from bms_estimator.calibration.load import whole_load
 from bms_estimator.calibration.relaxation import REST_CURRENT_C
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns

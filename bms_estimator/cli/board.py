@@ -7,12 +7,8 @@ import typer
 
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.state_folder import state_folder
-from bms_estimator.settings.pack import Settings, load_settings
-from bms_estimator.sources.board_memory import NO_BOARD, BoardMemory
-from bms_estimator.sources.ports import NoPortError, resolve_port
-from bms_estimator.sources.probe import AskedBoard
-from bms_estimator.sources.protocol import (
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.protocols.firmware.messages import (
     BAUD,
     LEAST_BANDGAP_V,
     LEAST_DIVIDER,
@@ -28,6 +24,10 @@ from bms_estimator.sources.protocol import (
     set_ratiometric_command,
     set_serial_command,
 )
+from bms_estimator.settings.pack import Settings, load_settings
+from bms_estimator.sources.board_memory import NO_BOARD, BoardMemory
+from bms_estimator.sources.ports import NoPortError, resolve_port
+from bms_estimator.sources.probe import AskedBoard
 
 
 def board(

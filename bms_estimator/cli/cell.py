@@ -11,13 +11,13 @@ import typer
 
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, check_out, name_of
 from bms_estimator.cli.pack import load_pack, unpacked_cell
-from bms_estimator.estimator.learned import learned_cell, learned_ocv, relative_capacity
+from bms_estimator.estimator.identified_parameters import learned_cell, learned_ocv, relative_capacity
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.live import new_estimator
 from bms_estimator.service.resume import resume
-from bms_estimator.service.state_folder import state_folder
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="What a pack's service has learned of its cells.")
 

@@ -10,15 +10,16 @@ import typer
 from bms_estimator.cli.pack import load_pack
 from bms_estimator.cli.ports import asking
 from bms_estimator.cli.settings_file import Given, settings_file
-from bms_estimator.estimator.lemma import Condition, failed
-from bms_estimator.estimator.plausible import implausible
-from bms_estimator.estimator.records import estimator_settings
+from bms_estimator.estimator.settings_plausibility import implausible
+from bms_estimator.estimator.settings_records import estimator_settings
+from bms_estimator.estimator.stability_conditions import Condition, failed
 from bms_estimator.fleet.edge import check_edge
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.page.guard import guard_of
+from bms_estimator.process.credential import is_for_the_service
 from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.settings.alarm_limits import out_of_range, watched
 from bms_estimator.settings.edge import EdgeSettings
@@ -26,7 +27,6 @@ from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.settings.pack import MqttSettings, SensorSettings, Settings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.brokers import check as check_brokers
-from bms_estimator.sinks.credential import is_for_the_service
 from bms_estimator.sinks.influx import target
 from bms_estimator.sources.kinds import make_bringer
 from bms_estimator.sources.ports import board_ports

@@ -10,9 +10,9 @@ from bms_estimator.cli.browser import open_browser
 from bms_estimator.cli.pack import with_broker
 from bms_estimator.cli.page_options import page_settings
 from bms_estimator.page.dashboard import dashboard as serving
-from bms_estimator.service.interrupt import stop_on_signal
-from bms_estimator.service.logs import configure_logs, drained
-from bms_estimator.service.state_folder import state_folder
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.pack import MqttSettings, Settings, load_settings
 from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
 

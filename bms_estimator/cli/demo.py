@@ -13,7 +13,7 @@ from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.demo.board import find_build
 from bms_estimator.demo.demo import run_demo
-from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, drained
 from bms_estimator.service.warm_up import load_kernels
 from bms_estimator.sinks.console_view import LOG_LINES
 

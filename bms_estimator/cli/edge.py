@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.pack import with_sensor
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import starting
+from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.edge import serve_edge
-from bms_estimator.service.interrupt import starting
-from bms_estimator.service.logs import configure_logs, drained
-from bms_estimator.service.state_folder import state_folder
 from bms_estimator.settings.pack import load_settings
 
 

@@ -30,7 +30,7 @@ def collect(
 ) -> None:
     """Write the summaries of hours to Parquet, until SIGINT or SIGTERM."""
     from bms_estimator.fleet.collector import only_collector  # noqa: PLC0415 - its packages are optional
-    from bms_estimator.service.logs import configure_logs, drained  # noqa: PLC0415
+    from bms_estimator.process.log_setup import configure_logs, drained  # noqa: PLC0415
 
     configure_logs()
     with drained(), only_collector(folder):
@@ -40,8 +40,8 @@ def collect(
 async def _collect(where: Where, folder: Path, period_s: float) -> None:
     from bms_estimator.fleet.collector import Collector  # noqa: PLC0415
     from bms_estimator.fleet.connection import connect, part  # noqa: PLC0415
-    from bms_estimator.fleet.tasks import end  # noqa: PLC0415
-    from bms_estimator.service.interrupt import stop_on_signal  # noqa: PLC0415
+    from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
+    from bms_estimator.process.tasks import end  # noqa: PLC0415
 
     server, creds, ca = where
     stop = stop_on_signal()

@@ -12,7 +12,7 @@ from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.fleet.demo import Demo, free_port, run_demo
 from bms_estimator.fleet.warm_up import load_fleet_kernels
-from bms_estimator.service.interrupt import stop_on_signal
+from bms_estimator.process.signals import stop_on_signal
 
 
 def demo(

@@ -11,8 +11,8 @@ from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server
 from bms_estimator.cli.page_options import page_settings
 from bms_estimator.fleet import page_feed
 from bms_estimator.fleet.page import fleet_page
-from bms_estimator.service.interrupt import stop_on_signal
-from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.page import PageSettings
 
 DEFAULT_LISTEN = "127.0.0.1:8080"

@@ -15,7 +15,7 @@ from bms_estimator.fleet.server import serve as serving
 from bms_estimator.fleet.server_config import CLUSTER_PORT, Accounts
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, drained
 from bms_estimator.settings.fleet import FleetSettings
 from bms_estimator.settings.pack import DeviceName
 from bms_estimator.settings.page import parse_listen

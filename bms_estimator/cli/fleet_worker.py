@@ -14,8 +14,8 @@ from bms_estimator.cli.fleet_server import SERVER, Ca, Creds, Server
 from bms_estimator.fleet.warm_up import load_fleet_kernels
 from bms_estimator.fleet.worker import CHECKPOINT_S, Options, work
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.interrupt import starting, stop_on_signal
-from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import starting, stop_on_signal
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 

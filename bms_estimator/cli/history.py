@@ -15,7 +15,7 @@ from bms_estimator.cli.captures import Force, check_out
 from bms_estimator.cli.decimal_option import whole
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.state_folder import state_folder
+from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.store.minute import MINUTE_S, Minute
 from bms_estimator.store.reading import HistoryFile, PastEvent

@@ -15,8 +15,8 @@ from rich.text import Text
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.cli.pack import load_pack, with_sensor
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
-from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import stop_on_signal, until_first_ends
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources import Source
 from bms_estimator.sources.kinds import open_reports

@@ -16,12 +16,12 @@ from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.cli.pack import load_pack, with_broker, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.service.interrupt import starting
-from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import starting
+from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.reload import Reload, ask_all, reload_on_hangup
 from bms_estimator.service.serve import serve
 from bms_estimator.service.several import serve_several
-from bms_estimator.service.state_folder import state_folder
 from bms_estimator.service.warm_up import load_kernels
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks.console_sink import ConsoleSink

@@ -11,8 +11,8 @@ import typer
 from bms_estimator.cli.keys import keys
 from bms_estimator.cli.pack import with_broker
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.interrupt import stop_on_signal
-from bms_estimator.service.logs import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.pack import MqttSettings, Settings, load_settings
 from bms_estimator.sinks.console import LiveView
 from bms_estimator.sinks.console_scene import Lost

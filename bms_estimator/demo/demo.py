@@ -11,7 +11,7 @@ from bms_estimator.demo.totals import Totals
 from bms_estimator.demo.truth import Truth
 from bms_estimator.model.cell import load_cell
 from bms_estimator.page.sink import Pages
-from bms_estimator.service.interrupt import stop_on_signal
+from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.service.serve import serve
 from bms_estimator.settings.pack import (
     MqttSettings,

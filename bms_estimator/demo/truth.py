@@ -2,9 +2,7 @@
 
 from collections import deque
 
-from bms_estimator.simulation.simulated_pack import SimulatedPack
-from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources.protocol import (
+from bms_estimator.protocols.firmware.messages import (
     DELIMITER,
     MODULUS,
     MessageType,
@@ -12,6 +10,8 @@ from bms_estimator.sources.protocol import (
     SampleMessage,
     unseal,
 )
+from bms_estimator.simulation.simulated_pack import SimulatedPack
+from bms_estimator.simulation.virtual_converter import Reading
 
 TAIL_BYTES = 256
 """The end of what came holds a whole sample's frame, whatever else is there."""

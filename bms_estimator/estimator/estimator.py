@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator.records import estimator_settings
+from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.kalman_filter.hypotheses import tell
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, keep

@@ -21,8 +21,8 @@ from bms_estimator.fleet import claims
 from bms_estimator.fleet.claims import ACCOUNT, BEARERS, OPERATOR, Key, Role, Tenant
 from bms_estimator.fleet.server_config import Accounts
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.private_file import NotOursError, read_private, write_private
 from bms_estimator.settings.fleet import TenantSettings
-from bms_estimator.store.private_file import NotOursError, read_private, write_private
 
 CLAIMS = "claims.json"
 _LONGEST_KEY, _LONGEST_CLAIMS = 200, 64 << 20

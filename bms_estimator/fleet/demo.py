@@ -24,10 +24,10 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.fleet import subjects
-from bms_estimator.fleet.child import ends_with_us
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.child_process import ends_with_us
 
 LOOPBACK = "127.0.0.1"
 SPEED = 10.0

@@ -23,6 +23,7 @@ from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import EdgeHealth
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
@@ -31,7 +32,6 @@ from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connect, Connection, Hello
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.link import Link
-from bms_estimator.sinks.pauses import FIRST_DELAY_S
 from bms_estimator.sinks.refusals import Refusals
 from bms_estimator.store.database import RETRY_S, Database
 

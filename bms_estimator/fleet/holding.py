@@ -29,7 +29,7 @@ from bms_estimator.fleet.partition import Partition, Table, Taken
 from bms_estimator.fleet.reasons import reason
 from bms_estimator.fleet.stored import stored
 from bms_estimator.fleet.stream_reader import StreamError
-from bms_estimator.fleet.tasks import until_first_ends
+from bms_estimator.process.tasks import until_first_ends
 
 RETRY_S = 0.5
 """Between two attempts at what the server does not do now [s]."""

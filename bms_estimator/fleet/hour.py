@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
-from bms_estimator.estimator.learned import current_offset, relative_capacity, relative_series_resistance
+from bms_estimator.estimator.identified_parameters import current_offset, relative_capacity, relative_series_resistance
 from bms_estimator.fleet.block import Block
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, OF_HOUR, add_rows

@@ -19,8 +19,8 @@ from bms_estimator.fleet.pack_row import PackKind
 from bms_estimator.fleet.page_view import FleetView
 from bms_estimator.fleet.stream_reader import StreamError, read_stream
 from bms_estimator.fleet.streams import partitions_of
-from bms_estimator.fleet.tasks import end
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.tasks import end
 
 TABLE_S = 2.0
 """Between two looks for what has changed in the table of packs, or before it is tried again [s]."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.identify import identify
 from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.estimator.learned import learned_cell
+from bms_estimator.estimator.identified_parameters import learned_cell
 from bms_estimator.fleet.pack_row import PackKind, cell_of, settings_of
 from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.cell import CellModel

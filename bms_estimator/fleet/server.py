@@ -23,15 +23,15 @@ from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
 from bms_estimator.fleet import credentials
-from bms_estimator.fleet.child import ends_with_us
 from bms_estimator.fleet.claims import Role
 from bms_estimator.fleet.connection import part
 from bms_estimator.fleet.server_config import LET_IN_S, Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.fleet.streams import NoAnswerError, make_streams
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.child_process import ends_with_us
+from bms_estimator.process.credential import credential
+from bms_estimator.process.private_file import write_private
 from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSettings, reachable
-from bms_estimator.sinks.credential import credential
-from bms_estimator.store.private_file import write_private
 
 log = structlog.get_logger(__name__)
 

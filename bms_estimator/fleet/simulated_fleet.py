@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.fleet.block import Block, encode
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.model.cell import CellModel, load_cell

@@ -23,9 +23,9 @@ from bms_estimator.fleet.membership import Members
 from bms_estimator.fleet.pack_bucket import PackBucket
 from bms_estimator.fleet.reasons import reason
 from bms_estimator.fleet.streams import partitions_of
-from bms_estimator.fleet.tasks import end, until_first_ends
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.notify import Notifier
+from bms_estimator.process.systemd import Notifier
+from bms_estimator.process.tasks import end, until_first_ends
 
 CHECKPOINT_S = 300.0
 """Between two checkpoints of a partition, unless told otherwise [s]."""

@@ -11,8 +11,8 @@ from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.credential import credential
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.sinks.credential import credential
 
 SHORTEST_TOKEN = 16
 """Letters of a token, at least: `openssl rand -hex 16` makes 32."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.store.disk_thread import DiskThread
+from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.store.minute import MINUTE_S
 from bms_estimator.store.reading import HistoryFile
 

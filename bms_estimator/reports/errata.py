@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from bms_estimator.estimator.lemma import Condition, lemma_conditions
+from bms_estimator.estimator.stability_conditions import Condition, lemma_conditions
 from bms_estimator.kernels.cell_model.chen_mora import emf
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell

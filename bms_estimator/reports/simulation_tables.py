@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator.lemma import lemma_conditions
+from bms_estimator.estimator.stability_conditions import lemma_conditions
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed

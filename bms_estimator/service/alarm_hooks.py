@@ -12,12 +12,12 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, HookHealth
+from bms_estimator.process.backoff import Pauses
+from bms_estimator.protocols.firmware.messages import Relay
 from bms_estimator.service.hook_process import StartError, environment, run
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sinks.pauses import Pauses
 from bms_estimator.snapshot.alarms import Change
-from bms_estimator.sources.protocol import Relay
 
 WAITING = 100
 """So many alarms wait for a program that takes its time; then the oldest goes."""

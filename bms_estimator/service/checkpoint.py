@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from bms_estimator.model.cell import ChenMoraOcv
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.payloads import Totals
-from bms_estimator.service.moment import Moment, moment
+from bms_estimator.process.boot_clock import Moment, moment
+from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.private_file import NotOursError, read_private, write_private
 from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.totals import new_totals
-from bms_estimator.store.disk_thread import DiskThread
-from bms_estimator.store.private_file import NotOursError, read_private, write_private
 
 FORMAT = 7
 """Raise it when a field of an old name gets another meaning, and tell ``_MIGRATIONS`` how to read those before."""

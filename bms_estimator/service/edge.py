@@ -7,10 +7,10 @@ import structlog
 
 from bms_estimator.fleet.edge import Edge
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.alone import alone
-from bms_estimator.service.interrupt import stop_on_signal, until_first_ends
-from bms_estimator.service.logs import set_level
-from bms_estimator.service.notify import Notifier
+from bms_estimator.process.instance_lock import alone
+from bms_estimator.process.log_setup import set_level
+from bms_estimator.process.signals import stop_on_signal, until_first_ends
+from bms_estimator.process.systemd import Notifier
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources import Source
 from bms_estimator.sources.board_memory import BoardMemory

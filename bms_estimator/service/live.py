@@ -19,14 +19,14 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.process.signals import until_first_ends
+from bms_estimator.process.stderr_writer import stderr
+from bms_estimator.process.systemd import Notifier
 from bms_estimator.service.alarm_hooks import Hooks
 from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Ledger
-from bms_estimator.service.interrupt import until_first_ends
-from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
 from bms_estimator.service.resume import resume
 from bms_estimator.service.saving import Saving
-from bms_estimator.service.stderr import stderr
 from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.requests import Requests, number

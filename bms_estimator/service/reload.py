@@ -8,8 +8,8 @@ from typing import Any
 import structlog
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.settings.pack import Settings
-from bms_estimator.store.disk_thread import DiskThread
 
 HUNG_S = 10.0
 """Settings that cannot be read in so long are left as they are [s]."""

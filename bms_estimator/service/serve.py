@@ -9,18 +9,18 @@ from pathlib import Path
 import structlog
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.plausible import implausible
+from bms_estimator.estimator.settings_plausibility import implausible
 from bms_estimator.fleet.edge import Edge
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.page.sink import Pages, PageSink
+from bms_estimator.process.instance_lock import alone
+from bms_estimator.process.log_setup import set_level
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.systemd import Notifier
 from bms_estimator.service.alarm_hooks import Hooks, Say, relay_of
-from bms_estimator.service.alone import alone
 from bms_estimator.service.checkpoint import CheckpointFile
-from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import run_live
-from bms_estimator.service.logs import set_level
-from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload
 from bms_estimator.settings.alarm_limits import out_of_range, watched
 from bms_estimator.settings.pack import Settings

@@ -8,11 +8,11 @@ from structlog.contextvars import bind_contextvars
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.page.sink import Pages
-from bms_estimator.service.interrupt import stop_on_signal
-from bms_estimator.service.notify import Notifier
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.process.systemd import Notifier
 from bms_estimator.service.reload import Reload
 from bms_estimator.service.serve import serve
-from bms_estimator.service.state_folder import state_folder
 from bms_estimator.settings.pack import Settings
 
 

@@ -6,13 +6,13 @@ import numpy as np
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.live import new_estimator
 from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.flow import Flow, Meter
 from bms_estimator.snapshot.parameters import parameter_report
 from bms_estimator.snapshot.remaining import remaining_charge
 from bms_estimator.snapshot.window import Window
-from bms_estimator.sources.frames import FrameDecoder
 
 CELL = "chen_mora"
 """Any: kernels are the same for all."""

@@ -89,7 +89,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
         _node("jbd-bms-ble"),
     ),
     # ESPHome's own daly_bms with the names of its documentation: every 20 s there; the sign is the frame's
-    # (esphome/components/daly_bms/daly_bms.cpp), which is that of sources/dialects/daly.py
+    # (esphome/components/daly_bms/daly_bms.cpp), which is that of protocols/devices/daly.py
     "esphome-daly": Profile(
         _esphome("battery_voltage", "battery_current", "max_temperature", "cell_{cell}_voltage") | {"interval_s": 20.0},
         DISCHARGE,

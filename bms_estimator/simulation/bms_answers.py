@@ -1,11 +1,11 @@
-"""What a BMS answers to each question, by protocol: the other side of ``sources.dialects``."""
+"""What a BMS answers to each question, by protocol: the other side of ``protocols.devices``."""
 
 import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from bms_estimator.sources.dialects import daly, jbd, jk
+from bms_estimator.protocols.devices import daly, jbd, jk
 
 NAME = b"SIMULATED"
 PACK = 1

@@ -8,7 +8,7 @@ import random
 from collections.abc import Callable, Iterator
 from enum import StrEnum
 
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, r_s
 from bms_estimator.model.cell import CellModel
 from bms_estimator.simulation.virtual_converter import Reading

@@ -17,15 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
 from typing import Literal, Self
 
-from bms_estimator.simulation.virtual_converter import (
-    FULL_SCALE,
-    BoardParts,
-    Reading,
-    VirtualConverter,
-    aux_readings_of,
-    window_of,
-)
-from bms_estimator.sources.protocol import (
+from bms_estimator.protocols.firmware.messages import (
     DELIMITER,
     LEAST_BANDGAP_V,
     LEAST_DIVIDER,
@@ -49,6 +41,14 @@ from bms_estimator.sources.protocol import (
     ResetCause,
     SampleMessage,
     unseal,
+)
+from bms_estimator.simulation.virtual_converter import (
+    FULL_SCALE,
+    BoardParts,
+    Reading,
+    VirtualConverter,
+    aux_readings_of,
+    window_of,
 )
 
 Signal = Callable[[float], Reading] | Iterable[Reading]

@@ -4,10 +4,10 @@ import asyncio
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
+from bms_estimator.process.backoff import Pauses
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.connection import Connection
 from bms_estimator.sinks.messages import Message
-from bms_estimator.sinks.pauses import Pauses
 from bms_estimator.sinks.refusals import Refusals
 from bms_estimator.store.outbox import Outbox, Waiting
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.credential import credential
 from bms_estimator.settings.pack import MqttSettings
-from bms_estimator.sinks.credential import credential
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 

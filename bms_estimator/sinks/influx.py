@@ -20,11 +20,11 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.process.backoff import FIRST_DELAY_S, Pauses
+from bms_estimator.process.credential import credential
+from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.settings.exports import InfluxSettings
-from bms_estimator.sinks.credential import credential
 from bms_estimator.sinks.line_protocol import lines
-from bms_estimator.sinks.pauses import FIRST_DELAY_S, Pauses
-from bms_estimator.store.disk_thread import DiskThread
 
 MOST_WAITING = 10_000
 """Lines that wait for a server that is away, hours of states at one a second; then the oldest goes."""

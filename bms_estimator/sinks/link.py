@@ -6,10 +6,10 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import structlog
 
+from bms_estimator.process.backoff import FIRST_DELAY_S, Pauses
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.brokers import Broker
 from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError
-from bms_estimator.sinks.pauses import FIRST_DELAY_S, Pauses
 
 LASTING_S = 10.0
 """A connection that ends sooner is taken as an attempt that failed [s]."""

@@ -14,6 +14,7 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.pack import MqttSettings
@@ -25,7 +26,6 @@ from bms_estimator.sinks.connection import Connect, Connection, Hello, Received
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.link import Link
 from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY, Message, Messages, Sent
-from bms_estimator.sinks.pauses import FIRST_DELAY_S
 from bms_estimator.sinks.refusals import Refusals
 from bms_estimator.sinks.requests import MOST_SHOWN, Requests
 from bms_estimator.store.outbox import Outbox

@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import structlog
 
+from bms_estimator.process.backoff import Pauses
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.connection import Refusal
 from bms_estimator.sinks.messages import Message
-from bms_estimator.sinks.pauses import Pauses
 
 log = structlog.get_logger(__name__)
 

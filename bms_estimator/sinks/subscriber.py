@@ -9,13 +9,13 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.clock import Clock
+from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.brokers import brokers, check
 from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.link import Link
-from bms_estimator.sinks.pauses import FIRST_DELAY_S
 from bms_estimator.sinks.published import Device, Heard, Published
 
 MOST_WAITING = 2000

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.learned import (
+from bms_estimator.estimator.identified_parameters import (
     Learned,
     current_offset,
     fitted_parameter,

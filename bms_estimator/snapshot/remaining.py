@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.learned import present_resistance, relative_capacity
+from bms_estimator.estimator.identified_parameters import present_resistance, relative_capacity
 from bms_estimator.kernels.cell_model import chen_mora
 
 LONGEST_H = 1000.0

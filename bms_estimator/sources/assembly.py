@@ -5,10 +5,10 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from bms_estimator.protocols.base.report_line import report_line
 from bms_estimator.settings.mqtt_source import MqttSource, Place
 from bms_estimator.sources.payload import MOST_CELLS, NoNumberError, cell_pattern, many, one
 from bms_estimator.sources.publisher_conflict import MIN_JUMPS, PublisherConflict
-from bms_estimator.sources.report_line import report_line
 
 NEEDED = ("voltage", "current")
 

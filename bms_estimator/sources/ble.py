@@ -7,10 +7,10 @@ from statistics import fmean
 from typing import Any
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.reports import Bringer
-from bms_estimator.sources.text_line import Reading
 
 NEEDED_PYTHON = 0x030C0000
 """3.12, as aiobmsble needs it."""

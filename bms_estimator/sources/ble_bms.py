@@ -12,9 +12,9 @@ from bleak import AdvertisementData, BleakScanner, BLEDevice
 from bleak.exc import BleakError
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.report_line import CONNECTED, report_line
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.sources.ble import reading_of
-from bms_estimator.sources.report_line import CONNECTED, report_line
 from bms_estimator.sources.reports import Bringer, NothingComesError
 
 SCAN_S = 15.0

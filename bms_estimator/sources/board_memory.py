@@ -7,7 +7,7 @@ from pathlib import Path
 
 import structlog
 
-from bms_estimator.store.private_file import NotOursError, read_private, write_private
+from bms_estimator.process.private_file import NotOursError, read_private, write_private
 
 REMEMBERED = ("serial", "divider", "volts_per_ampere", "bandgap_v")
 """Of what a board says of itself."""

@@ -11,10 +11,10 @@ from typing import Any
 import can
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.report_line import CONNECTED, report_line
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.can_map import CanMap
-from bms_estimator.sources.report_line import CONNECTED, report_line
 from bms_estimator.sources.reports import Bringer, NothingComesError
 
 LISTEN_S = 0.2

@@ -11,8 +11,8 @@ from cantools.database import DecodeError
 from cantools.database.can import Database, Message
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.can_source import CanSource, Signal
-from bms_estimator.sources.text_line import Reading
 
 DECIMALS = 5
 """Of V, A and degC: 5234 times 0.01 is 52.34."""

@@ -10,8 +10,8 @@ from threading import Thread
 
 import structlog
 
+from bms_estimator.protocols.base.device_protocol import Dialect
 from bms_estimator.sources.board_memory import NO_BOARD, REMEMBERED, BoardMemory
-from bms_estimator.sources.dialects import Dialect
 from bms_estimator.sources.line import Read
 
 HELD_READS = 4096

@@ -6,12 +6,12 @@ from collections.abc import AsyncGenerator, Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.protocols.base.report_line import CONNECTED, report_line
 from bms_estimator.settings.linux_source import LinuxSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.report_line import CONNECTED, report_line
 from bms_estimator.sources.reports import SILENT_PERIODS, Bringer, NothingComesError
 from bms_estimator.sources.sysfs import SYS, Channel, JunkError, find_channel, find_chip, read_number
-from bms_estimator.store.disk_thread import DiskThread
 
 LEAST_INTERVAL_S = 0.1
 """Chips update as often as each 2 ms, which nobody needs [s]."""

@@ -5,8 +5,8 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
+from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.modbus_source import MOST_WORDS, ModbusSource, Register
-from bms_estimator.sources.text_line import Reading
 
 GAP_WORDS = 8
 """So many registers that nobody wants are read along, so that what lies around them is of one moment."""

@@ -10,6 +10,7 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.report_line import CONNECTED
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import MqttSettings, Settings
 from bms_estimator.sinks.brokers import brokers, check
@@ -17,7 +18,6 @@ from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError
 from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sources.assembly import Assembly
-from bms_estimator.sources.report_line import CONNECTED
 from bms_estimator.sources.reports import Bringer, NothingComesError
 
 MOST_WAITING = 2000

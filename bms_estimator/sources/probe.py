@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self, TypeVar
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.protocols.devices.text import TextDialect
+from bms_estimator.protocols.firmware.frame_decoder import FrameFault
+from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command
+from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardDialect
+from bms_estimator.protocols.registry import DIALECTS
 from bms_estimator.settings.pack import SensorSettings
-from bms_estimator.sources.dialects import Dialect
-from bms_estimator.sources.dialects.board import ASK_AGAIN_S, BoardDialect
-from bms_estimator.sources.dialects.table import DIALECTS
-from bms_estimator.sources.dialects.text import TextDialect
-from bms_estimator.sources.frames import FrameFault
 from bms_estimator.sources.ports import NoPortError, open_port
-from bms_estimator.sources.protocol import BAUD, Hello, set_rate_command
 
 if TYPE_CHECKING:
     import serial

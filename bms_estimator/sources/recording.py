@@ -9,8 +9,8 @@ from typing import Self
 
 import structlog
 
+from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
-from bms_estimator.store.disk_thread import DiskThread
 
 SYNC_S = 5.0
 """The disk has all but the last seconds, even when the power fails [s]."""

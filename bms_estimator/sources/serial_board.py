@@ -12,16 +12,16 @@ import structlog
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.protocols.base.device_protocol import Command, Dialect
+from bms_estimator.protocols.firmware.messages import Relay
+from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.sources import Pulse, Tap
 from bms_estimator.sources.board_memory import BoardMemory
-from bms_estimator.sources.dialects import Command, Dialect
-from bms_estimator.sources.dialects.table import make_dialect
 from bms_estimator.sources.doorkeeper import Doorkeeper, OtherBoardError
 from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.line import FIRST_RETRY_S, Line, Read
 from bms_estimator.sources.ports import NoPortError, open_port
-from bms_estimator.sources.protocol import Relay
 from bms_estimator.sources.whereabouts import HELD_S, LEFT_S, Whereabouts
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 
 import structlog
 
-from bms_estimator.store.disk_thread import DiskThread
+from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.store.tables import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
 
 HANG_S = 10.0

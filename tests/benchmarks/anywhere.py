@@ -28,7 +28,7 @@ from rich.table import Table
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import filter_settings
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock

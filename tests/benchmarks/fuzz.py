@@ -37,6 +37,15 @@ from serial.tools.list_ports_common import ListPortInfo
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
+from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.protocols.devices import daly, jbd, jk
+from bms_estimator.protocols.devices.junctek import JunctekDialect
+from bms_estimator.protocols.devices.pylontech import PylontechDialect
+from bms_estimator.protocols.devices.text import TextDialect
+from bms_estimator.protocols.devices.vedirect import VeDirectDialect
+from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
+from bms_estimator.protocols.firmware.protocol import BoardDialect
+from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.settings.pack import SensorSettings, Settings, load_settings
 from bms_estimator.sinks import Delivery, console_line
@@ -46,15 +55,7 @@ from bms_estimator.sinks.published import Published
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.curve import read_curve
-from bms_estimator.sources.dialects import Dialect, daly, jbd, jk
-from bms_estimator.sources.dialects.board import BoardDialect
-from bms_estimator.sources.dialects.junctek import JunctekDialect
-from bms_estimator.sources.dialects.pylontech import PylontechDialect
-from bms_estimator.sources.dialects.table import make_dialect
-from bms_estimator.sources.dialects.text import TextDialect
-from bms_estimator.sources.dialects.vedirect import VeDirectDialect
 from bms_estimator.sources.ports import NoPortError, may_be_board, resolve_port
-from bms_estimator.sources.protocol import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
 from bms_estimator.sources.raw_capture import MAGIC
 from bms_estimator.sources.replay import load_capture
 

@@ -5,7 +5,7 @@ import pybamm
 import pybop
 
 from bms_estimator.calibration.relaxation import soc_by_counting
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 

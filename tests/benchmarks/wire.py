@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.numba_cache import njit
-from bms_estimator.sources.protocol import PROTOCOL_VERSION, Hello
-from bms_estimator.sources.wire.framing import MESSAGE_SAMPLE, SAMPLE_BYTES, SAMPLE_FRAME_BYTES, crc16
+from bms_estimator.protocols.firmware.framing import MESSAGE_SAMPLE, SAMPLE_BYTES, SAMPLE_FRAME_BYTES, crc16
+from bms_estimator.protocols.firmware.messages import PROTOCOL_VERSION, Hello
 
 REFERENCE_V, FULL_SCALE, DIVIDER, VOLTS_PER_AMPERE, BANDGAP_V = 5.0, 1024, 5.0, 0.1, 1.1
 CONVERSIONS = 16

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.signal import lfilter
 
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, simulate_cell
 from bms_estimator.model.cell import ELEMENTS, CellModel, Ladder, load_cell
 from bms_estimator.model.sample import SAMPLE

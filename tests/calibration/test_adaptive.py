@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.calibration.adaptive import adaptive_run
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, r_s
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import Bounds, load_cell

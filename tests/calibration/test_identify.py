@@ -10,7 +10,7 @@ from bms_estimator.calibration.ladder_voltage import hats
 from bms_estimator.calibration.load import whole_load
 from bms_estimator.calibration.replays import interval_score
 from bms_estimator.calibration.validate import validate
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.columns import Columns

@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.calibration.ocv import fit_chen_mora
 from bms_estimator.calibration.ocv_points import pooled
 from bms_estimator.calibration.relaxation import relaxation_test, soc_by_counting, without_glitches
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.validate import validate
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.columns import Columns

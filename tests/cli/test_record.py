@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.cli.main import main
-from bms_estimator.sources.frames import FrameDecoder
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.sources.raw_capture import MAGIC, read_capture, read_header
 from bms_estimator.sources.wire.capture_records import RECORD_OVERHEAD_BYTES
 from tests.command_line import PROGRAM

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.cli.main import main
-from bms_estimator.sources.frames import FrameDecoder
-from bms_estimator.sources.protocol import set_rate_command
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+from bms_estimator.protocols.firmware.messages import set_rate_command
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 

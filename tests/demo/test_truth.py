@@ -6,8 +6,8 @@ import pytest
 
 from bms_estimator.demo.truth import Truth
 from bms_estimator.model.cell import load_cell
+from bms_estimator.protocols.firmware.messages import MODULUS, SampleMessage
 from bms_estimator.simulation.simulated_pack import SimulatedPack, constant
-from bms_estimator.sources.protocol import MODULUS, SampleMessage
 
 LOAD_A, START_SOC, STEP_S = 0.275, 0.9, 0.02
 FALL_PER_S = 1.0 / 3600.0

@@ -25,7 +25,7 @@ PROGRAM = f"""{PYTHON}    'from bms_estimator.cli import main; main()' "$@"
 """
 CLOCK = f"""{PYTHON}    '
 import ctypes
-from bms_estimator.service.moment import synchronised
+from bms_estimator.process.boot_clock import synchronised
 print("clock", ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)), synchronised(), flush=True)
 '
 """

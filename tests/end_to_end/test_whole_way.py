@@ -13,12 +13,12 @@ import pytest
 
 from bms_estimator.cli.pack import load_pack
 from bms_estimator.model.cell import load_cell
+from bms_estimator.protocols.firmware.messages import ResetCause
 from bms_estimator.service.checkpoint import CheckpointFile, fields
 from bms_estimator.service.live import new_estimator
 from bms_estimator.simulation.simulated_pack import SimulatedPack, pulses
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
 from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources.protocol import ResetCause
 from bms_estimator.sources.replay import RawCapture
 from tests.command_line import PROGRAM
 from tests.mosquitto import Broker, Listener

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock

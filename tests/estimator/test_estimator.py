@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import VERDICTS
-from bms_estimator.estimator.lemma import failed, lemma_conditions
+from bms_estimator.estimator.stability_conditions import failed, lemma_conditions
 from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.cell import load_cell, shipped_cells
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus

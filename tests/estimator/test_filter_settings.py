@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator import Estimator
 from bms_estimator.estimator.filter_settings import BEYOND_BRANCHES, BRANCHES_STD, SOC_GRID, ladder_of_branches
-from bms_estimator.estimator.learned import present_elements
+from bms_estimator.estimator.identified_parameters import present_elements
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, RESISTANCES, STRONG_J, WEAK_J, arrhenius
 from bms_estimator.model.cell import Ladder, TableOcv, load_cell

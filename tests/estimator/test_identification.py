@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.learned import fitted_parameter, present_elements
+from bms_estimator.estimator.identified_parameters import fitted_parameter, present_elements
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.identifier import hand_over
 from bms_estimator.kernels.kalman_filter.element_map import CAPACITANCES, ELEMENTS

@@ -6,14 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Self
 
-from bms_estimator.sources.protocol import (
-    Ack,
-    Hello,
-    MessageType,
-    ProtocolError,
-    SampleMessage,
-    unseal,
-)
+from bms_estimator.protocols.firmware.messages import Ack, Hello, MessageType, ProtocolError, SampleMessage, unseal
 from tests.patience import LONG_S
 
 

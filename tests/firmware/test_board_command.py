@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.cli.main import main
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+from bms_estimator.protocols.firmware.messages import hello_command, set_bandgap_command
 from bms_estimator.sources import probe
-from bms_estimator.sources.frames import FrameDecoder
-from bms_estimator.sources.protocol import hello_command, set_bandgap_command
 from tests.firmware.host import Host
 from tests.patience import LONG_S
 from tests.simavr_board import SimavrBoard, write_readings

@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleStatus
-from bms_estimator.settings.pack import SensorSettings
-from bms_estimator.simulation.virtual_converter import aux_readings_of, window_of
-from bms_estimator.sources.frames import FrameDecoder
-from bms_estimator.sources.protocol import (
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+from bms_estimator.protocols.firmware.messages import (
     PROTOCOL_VERSION,
     AckResult,
     BoardStatus,
@@ -34,6 +32,8 @@ from bms_estimator.sources.protocol import (
     set_serial_command,
     zero_current_command,
 )
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.simulation.virtual_converter import aux_readings_of, window_of
 from bms_estimator.sources.serial_board import SerialBoard
 from tests.firmware.host import Host
 from tests.simavr_board import FIRMWARE, SimavrBoard, write_readings

@@ -48,9 +48,7 @@ def test_every_kernel_takes_njit_from_the_cache() -> None:
 def crc16_with_cache_in(folder: Path) -> str:
     """Have another process compile a kernel, and check what it says. Returns what was written on stderr."""
     homes = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), str(folder))
-    script = (
-        "import numpy; from bms_estimator.sources.wire.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
-    )
+    script = "import numpy; from bms_estimator.protocols.firmware.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, env=os.environ | homes, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert (done.returncode, done.stdout) == (0, "33984\n"), done.stderr

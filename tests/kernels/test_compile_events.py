@@ -4,7 +4,7 @@ from bms_estimator.cli.compiling import compiling_shown
 from bms_estimator.kernels.cell_model import margins
 from bms_estimator.kernels.compile_events import compiling_told
 from bms_estimator.numba_cache import njit
-from bms_estimator.sources.wire import scaling
+from bms_estimator.protocols.firmware import scaling
 
 
 def fresh():

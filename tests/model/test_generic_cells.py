@@ -7,8 +7,8 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.lemma import failed
-from bms_estimator.estimator.plausible import implausible
+from bms_estimator.estimator.settings_plausibility import implausible
+from bms_estimator.estimator.stability_conditions import failed
 from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.cell import TableOcv, generic_cells, load_cell, shipped_cells
 from bms_estimator.model.errors import UserError

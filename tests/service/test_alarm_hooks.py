@@ -15,6 +15,7 @@ from structlog.testing import capture_logs
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, HookHealth
+from bms_estimator.protocols.firmware.messages import Relay
 from bms_estimator.service import alarm_hooks
 from bms_estimator.service.alarm_hooks import Hooks, unusable
 from bms_estimator.service.serve import serve
@@ -23,7 +24,6 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.snapshot.alarms import Change
-from bms_estimator.sources.protocol import Relay
 from tests.collector import Collector
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S

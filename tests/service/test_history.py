@@ -13,10 +13,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.payloads import Totals
+from bms_estimator.process.boot_clock import Moment
 from bms_estimator.service import saving
 from bms_estimator.service.checkpoint import FORMAT, LATER, CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator, run_live
-from bms_estimator.service.moment import Moment
 from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.totals import gap_lengths

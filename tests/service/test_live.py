@@ -17,8 +17,8 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
+from bms_estimator.process.systemd import Notifier
 from bms_estimator.service.live import LAG_STEP_S, new_estimator, run_live
-from bms_estimator.service.notify import Notifier
 from bms_estimator.settings.pack import IdentifierSettings, PackSettings, PublishSettings, SensorSettings, Settings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.requests import Requests

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.cell import load_cell
+from bms_estimator.process.boot_clock import Moment, moment, synchronised
 from bms_estimator.service.checkpoint import CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator
-from bms_estimator.service.moment import Moment, moment, synchronised
 from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.totals import new_totals
 

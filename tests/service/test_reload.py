@@ -12,10 +12,10 @@ from structlog.testing import capture_logs
 
 from bms_estimator.cli.main import main
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.systemd import Notifier
 from bms_estimator.service.checkpoint import CheckpointFile
-from bms_estimator.service.interrupt import stop_on_signal
 from bms_estimator.service.live import run_live
-from bms_estimator.service.notify import Notifier
 from bms_estimator.service.reload import Reload, reload_on_hangup
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks import Delivery

@@ -9,10 +9,10 @@ from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.reload import Reload
 from bms_estimator.service.serve import serve
 from bms_estimator.service.several import serve_several
-from bms_estimator.service.state_folder import state_folder
 from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
 from tests.patience import LONG_S
 

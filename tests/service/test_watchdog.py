@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.process.systemd import Notifier
 from bms_estimator.service.live import run_live
-from bms_estimator.service.notify import Notifier
 from bms_estimator.service.serve import recording_health
 from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.snapshot import publisher

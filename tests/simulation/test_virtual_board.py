@@ -11,12 +11,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
-from bms_estimator.settings.pack import SensorSettings
-from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
-from bms_estimator.simulation.virtual_converter import BoardParts, Reading, window_of
-from bms_estimator.sources.dialects.table import make_dialect
-from bms_estimator.sources.frames import FrameCounters, FrameDecoder
-from bms_estimator.sources.protocol import (
+from bms_estimator.protocols.firmware.frame_decoder import FrameCounters, FrameDecoder
+from bms_estimator.protocols.firmware.messages import (
     AckResult,
     Channels,
     MessageType,
@@ -34,6 +30,10 @@ from bms_estimator.sources.protocol import (
     unseal,
     zero_current_command,
 )
+from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
+from bms_estimator.simulation.virtual_converter import BoardParts, Reading, window_of
 from tests.patience import LONG_S
 
 STEADY = Reading(2.5, 22.2, 25.0)

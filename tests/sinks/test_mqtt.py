@@ -13,6 +13,7 @@ from aiomqtt import ProtocolVersion
 from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
+from bms_estimator.process.backoff import LONGEST_DELAY_S
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import CORRECTION_S
@@ -24,7 +25,6 @@ from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING, Inbox
 from bms_estimator.sinks.link import Link
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sinks.mqtt import MqttSink
-from bms_estimator.sinks.pauses import LONGEST_DELAY_S
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener

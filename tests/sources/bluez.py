@@ -14,7 +14,7 @@ from typing import Any
 from dbus_fast import Message, MessageType, Variant
 from dbus_fast.aio import MessageBus
 
-from tests.sources.bms_frames import JBD_DISCHARGING
+from tests.protocols.bms_frames import JBD_DISCHARGING
 
 ADDRESS, NAME = "A5:C2:37:00:00:00", "DP04S007L4S100A"
 ADAPTER = "/org/bluez/hci0"

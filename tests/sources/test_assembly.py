@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bms_estimator.protocols.devices.text import TextDialect
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.assembly import Assembly
-from bms_estimator.sources.dialects.text import TextDialect
 from bms_estimator.sources.payload import MOST_CELLS, NoNumberError, many, one
 
 Messages = list[tuple[str, str]]

@@ -7,10 +7,10 @@ import pytest
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.ble import NEEDED_PYTHON, reading_of
 from bms_estimator.sources.kinds import open_reports
-from bms_estimator.sources.text_line import Reading
 
 
 class Sensor:

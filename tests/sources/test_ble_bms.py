@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.report_line import CONNECTED
 from bms_estimator.settings.ble_source import BleSource
-from bms_estimator.sources.report_line import CONNECTED
 from bms_estimator.sources.reports import Bringer, NothingComesError
 from tests.patience import LONG_S
 

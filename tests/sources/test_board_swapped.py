@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+from bms_estimator.protocols.firmware.framing import LONGEST_DOUBT_S
+from bms_estimator.protocols.firmware.messages import Hello, hello_command
+from bms_estimator.protocols.firmware.protocol import BoardDialect
 from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import BoardParts, Reading
-from bms_estimator.sources.dialects.board import BoardDialect
 from bms_estimator.sources.doorkeeper import HELD_READS, Doorkeeper, OtherBoardError
-from bms_estimator.sources.frames import FrameDecoder
-from bms_estimator.sources.protocol import Hello, hello_command
 from bms_estimator.sources.serial_board import SerialBoard
-from bms_estimator.sources.wire.framing import LONGEST_DOUBT_S
 from tests.serial_line import Line
 from tests.sources.test_pinned_board import until
 

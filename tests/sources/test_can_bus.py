@@ -11,11 +11,11 @@ import can
 import pytest
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.report_line import CONNECTED
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.can_bus import BUS_OFF, CanBringer
 from bms_estimator.sources.kinds import open_reports
-from bms_estimator.sources.report_line import CONNECTED
 from bms_estimator.sources.reports import NothingComesError
 from tests.patience import LONG_S
 from tests.serial_line import Line

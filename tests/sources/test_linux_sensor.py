@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
+from bms_estimator.protocols.base.reading import Reading, read_line
+from bms_estimator.protocols.base.report_line import CONNECTED
 from bms_estimator.settings.linux_source import LinuxSource
 from bms_estimator.sources.linux_sensor import LinuxSensor
-from bms_estimator.sources.report_line import CONNECTED
 from bms_estimator.sources.reports import NothingComesError
-from bms_estimator.sources.text_line import Reading, read_line
 from tests.patience import LONG_S
 from tests.sources.sysfs_folder import hwmon, iio
 

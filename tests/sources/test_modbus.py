@@ -10,11 +10,11 @@ import pytest
 from pymodbus import FramerType
 from pymodbus.constants import ExcCodes
 
+from bms_estimator.protocols.base.report_line import CONNECTED
 from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.kinds import open_reports
 from bms_estimator.sources.modbus import ModbusBringer
-from bms_estimator.sources.report_line import CONNECTED
 from bms_estimator.sources.reports import NothingComesError
 from tests.free_port import free_port
 from tests.patience import LONG_S

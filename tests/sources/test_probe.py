@@ -6,13 +6,13 @@ import tty
 
 import pytest
 
+from bms_estimator.protocols.devices import daly, jbd, jk, junctek
+from bms_estimator.protocols.devices.pylontech import PylontechDialect
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources import ports, probe
-from bms_estimator.sources.dialects import daly, jbd, jk, junctek
-from bms_estimator.sources.dialects.pylontech import PylontechDialect
 from bms_estimator.sources.probe import Found
 from tests.device_line import on_a_line
 from tests.patience import LONG_S

@@ -9,11 +9,11 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.protocols.base.report_line import CONNECTED, report_line
 from bms_estimator.settings.pack import SensorSettings, Settings
 from bms_estimator.sources.raw_capture import header_of
 from bms_estimator.sources.recording import Recording
 from bms_estimator.sources.replay import RawCapture
-from bms_estimator.sources.report_line import CONNECTED, report_line
 from bms_estimator.sources.reports import Bringer, NothingComesError, Reports
 from tests.patience import LONG_S
 

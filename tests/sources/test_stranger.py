@@ -10,11 +10,11 @@ import pytest
 from serial.tools import list_ports
 
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.protocols.firmware.messages import hello_command
 from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sources import ports
-from bms_estimator.sources.protocol import hello_command
 from bms_estimator.sources.serial_board import SerialBoard
 from tests.patience import LONG_S
 from tests.serial_line import Line, usb_port

@@ -12,13 +12,13 @@ import pytest
 
 from bms_estimator.model.decimal_text import measured, number
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.devices.text import TextDialect
+from bms_estimator.protocols.firmware.messages import Hello, SampleMessage, unseal
+from bms_estimator.protocols.firmware.protocol import BoardDialect
 from bms_estimator.sources.curve import read_curve
-from bms_estimator.sources.dialects.board import BoardDialect
-from bms_estimator.sources.dialects.text import TextDialect
-from bms_estimator.sources.protocol import Hello, SampleMessage, unseal
 from bms_estimator.sources.raw_capture import MAGIC, CaptureHeader, CaptureWriter, read_capture, read_header
 from bms_estimator.sources.replay import Replay, load_capture, open_capture
-from tests.sources.test_decoder_fuzz import HELLO
+from tests.protocols.firmware.test_decoder_fuzz import HELLO
 
 HEAD = "time_s,current_a,voltage_v,temperature_c\n"
 

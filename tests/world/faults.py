@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from bms_estimator.sources.protocol import MODULUS
+from bms_estimator.protocols.firmware.messages import MODULUS
 from tests.world.disk import Arm, PowerCutError
 from tests.world.line import Noise
 from tests.world.loop import KilledError

@@ -19,9 +19,7 @@ import serial
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from bms_estimator.simulation.virtual_board import FIRMWARE
-from bms_estimator.simulation.virtual_converter import FULL_SCALE, BoardParts, Reading, aux_readings_of, window_of
-from bms_estimator.sources.protocol import (
+from bms_estimator.protocols.firmware.messages import (
     DELIMITER,
     MODULUS,
     PROTOCOL_VERSION,
@@ -37,6 +35,8 @@ from bms_estimator.sources.protocol import (
     SampleMessage,
     unseal,
 )
+from bms_estimator.simulation.virtual_board import FIRMWARE
+from bms_estimator.simulation.virtual_converter import FULL_SCALE, BoardParts, Reading, aux_readings_of, window_of
 from tests.world.loop import Timeline
 
 BANDGAP_READINGS = 256

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.sinks.messages import Messages
 from bms_estimator.sources.doorkeeper import Doorkeeper
-from bms_estimator.sources.frames import FrameDecoder
 from bms_estimator.store.queue import Queue
 
 

@@ -19,9 +19,9 @@ from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 from bms_estimator.model import clock
-from bms_estimator.service import moment
+from bms_estimator.process import boot_clock as moment
+from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.snapshot import health
-from bms_estimator.store.disk_thread import DiskThread
 from tests.world.disk import Disk
 from tests.world.threads import Threads
 

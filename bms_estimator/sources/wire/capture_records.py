@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.numba_cache import njit
-from bms_estimator.sources.wire.framing import Bytes, crc16, take
+from bms_estimator.protocols.firmware.framing import Bytes, crc16, take
 
 ARRIVAL_BYTES = 8
 LENGTH_BYTES = 4

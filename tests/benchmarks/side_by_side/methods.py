@@ -17,8 +17,8 @@ from bms_estimator.calibration.prediction import open_circuit, predict
 from bms_estimator.calibration.printed_bounds import printed_bounds
 from bms_estimator.calibration.relaxation import soc_by_counting
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.learned import fitted_parameter
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.identified_parameters import fitted_parameter
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora as kernel
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import TableOcv, load_cell

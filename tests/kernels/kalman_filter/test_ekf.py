@@ -8,7 +8,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import filter_settings
-from bms_estimator.estimator.records import ocv_grid
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
 from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.learned import learned_ocv
+from bms_estimator.estimator.identified_parameters import learned_ocv
 from bms_estimator.kernels.kalman_filter.ocv_correction import forget_curve, learned_v, per_node_v, place
 from bms_estimator.kernels.kalman_filter.records import NODE, NODES, STATES
 from bms_estimator.model.cell import CellModel, load_cell

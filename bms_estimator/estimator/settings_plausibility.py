@@ -1,0 +1,98 @@
+"""Settings that are allowed, but cannot be: a slip of the unit, a count given twice or not at all."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
+from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.settings.pack import Settings
+
+LARGEST_AH = 2000.0
+"""The largest Li-ion cells on sale hold some 1300 Ah [Ah]."""
+CELL_V = 1.5, 4.5
+"""Between these lies the nominal voltage of any Li-ion cell: titanate 2.3 V, NMC 3.7 V [V]."""
+SMALL_AH, MANY = 5.5, 8
+"""A 18650 or 21700 cell holds no more [Ah]; more than so many of them in one row, and nothing beside it, is rare."""
+CONVERTER_STEPS = 1024
+"""Of the firmware's voltage converter: its range in steps."""
+
+
+def implausible(settings: Settings, cell: PackModel) -> list[str]:
+    """One line for each setting that cannot be, with what it may have been meant to be; empty where all may be.
+
+    Args:
+        settings: The pack's.
+        cell: The pack as one object (``CellModel.pack``).
+    """
+    if isinstance(cell, FuelCellModel):
+        found = [_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
+    else:
+        checks = _capacity, _counted_twice, _cell_voltage, _single_row
+        full_v = float(ocv_grid(cell)[0][-1])
+        found = [*(check(settings, cell) for check in checks), _range(settings, full_v, "when full")]
+    return [line for line in found if line]
+
+
+def _no_load_v(cell: FuelCellModel) -> float:
+    """The highest voltage of a stack, at the file's temperature [V]."""
+    voltage_v, _ = polarisation(cell.a, np.zeros(LEARNABLE), np.zeros(1), np.full(1, np.nan))
+    return float(voltage_v[0])
+
+
+def _ignored(settings: Settings, cell: FuelCellModel) -> Iterator[str]:
+    """What the file sets, but a fuel cell has not."""
+    if "law" in settings.observer.model_fields_set and settings.observer.law != "learning":
+        yield f"observer.law = {settings.observer.law!r}: ignored: a fuel cell ({cell.cell.name}) always has 'learning'"
+    if "enabled" in settings.identifier.model_fields_set and settings.identifier.enabled:
+        yield f"identifier.enabled = true: ignored: the identifier is of batteries, {cell.cell.name} is a fuel cell"
+
+
+def _capacity(settings: Settings, cell: CellModel) -> str | None:
+    capacity_ah = cell.cell.capacity_ah / settings.pack.parallel
+    if capacity_ah <= LARGEST_AH:
+        return None
+    section = "cell" if settings.pack.capacity_ah is None else "pack"
+    return f"{section}.capacity_ah = {capacity_ah:g}: no cell holds more than {LARGEST_AH:g} Ah; is it in mAh?"
+
+
+def _counted_twice(settings: Settings, cell: CellModel) -> str | None:
+    series = settings.pack.series
+    within = cell.cell.series_count // series
+    if series == 1 or within == 1:
+        return None
+    return (
+        f"pack.series = {series}: the cell file is of {within} cells in series already (series_count), which makes "
+        f"{cell.cell.series_count}; is the file the whole pack, and series 1?"
+    )
+
+
+def _cell_voltage(_: Settings, cell: CellModel) -> str | None:
+    each_v = cell.cell.nominal_voltage_v / cell.cell.series_count
+    if CELL_V[0] <= each_v <= CELL_V[1]:
+        return None
+    return (
+        f"{cell.cell.nominal_voltage_v:g} V nominal of {cell.cell.series_count} in series: {each_v:.3g} V a cell, but "
+        f"Li-ion cells have {CELL_V[0]:g} to {CELL_V[1]:g} V; is series_count of the cell file right?"
+    )
+
+
+def _single_row(settings: Settings, cell: CellModel) -> str | None:
+    c = cell.cell
+    if settings.pack.parallel > 1 or c.capacity_ah > SMALL_AH or c.series_count <= MANY:
+        return None
+    return f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
+
+
+def _range(settings: Settings, highest_v: float, when: str) -> str | None:
+    sensor = settings.sensor
+    range_v = CONVERTER_STEPS * sensor.voltage_resolution_v
+    if sensor.protocol != "binary" or highest_v <= range_v:
+        return None
+    return (
+        f"sensor.voltage_resolution_v = {sensor.voltage_resolution_v:.4g}: the board's range ends at {range_v:.1f} V, "
+        f"but this pack has {highest_v:.1f} V {when}; it needs another divider, and its resolution here"
+    )

@@ -1,0 +1,1 @@
+"""Device protocols: bytes to readings and samples, no I/O."""

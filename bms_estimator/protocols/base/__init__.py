@@ -1,0 +1,1 @@
+"""Base classes of device protocols, readings and device clocks."""

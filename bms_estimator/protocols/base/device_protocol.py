@@ -1,0 +1,128 @@
+"""What a device says and wants to hear, apart from the line: a device is one file here and a row in ``table``."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
+from bms_estimator.protocols.firmware.messages import Relay
+
+
+@dataclass
+class Command:
+    """What was asked of a device. Who asked may set ``done``: then it is not sent any more."""
+
+    done: bool = False
+    refusal: str | None = None
+    """Why the device does not do it, for people."""
+
+
+class Dialect(ABC):
+    """Bytes with arrival times to samples, and the bytes that are to be sent. Does no I/O, and never raises on bytes.
+
+    All that it yields follows from the calls of ``feed`` alone: a recording of them replays to the same bits.
+    """
+
+    cells: CellBlock = NO_CELLS
+    """Beside the samples that ``feed`` or ``feed_reads`` returned last."""
+    probing: bool = False
+    """Set where nobody knows who is there: ``due`` then sends only what changes nothing in any device."""
+
+    @property
+    @abstractmethod
+    def counters(self) -> Mapping[str, int]:
+        """Since start: ``bytes_received``, ``frames_received`` (samples handed on), and faults by kind."""
+
+    @property
+    @abstractmethod
+    def fault(self) -> str | None:
+        """What is wrong with the line as a whole, for people; None while samples come."""
+
+    @property
+    @abstractmethod
+    def described(self) -> str | None:
+        """Who is there, for people; None until that is known."""
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the device said of itself: ``serial`` where it has a number of its own; empty until it did."""
+        return {}
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the device's clock runs than that of the arrivals [1e-6]; None while or where unknown."""
+        return None
+
+    @property
+    def quiet_s(self) -> float:
+        """So long it may say nothing while all is well [s]."""
+        return 0.0
+
+    @abstractmethod
+    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
+        """Decode one read of the line.
+
+        Args:
+            arrival_s: When it came, on any clock that never steps back [s].
+            data: What came.
+
+        Returns:
+            Samples, shape (n,), n may be 0.
+        """
+
+    def feed_reads(
+        self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
+    ) -> SampleBlock:
+        """Decode many reads of the line, as a ``CaptureBatch`` holds them: the same samples as ``feed`` for each."""
+        blocks, cells = [np.empty(0, dtype=SAMPLE)], list[Sequence[float]]()
+        begin = 0
+        for arrival_s, end in zip(arrivals_s.tolist(), ends.tolist(), strict=True):
+            blocks.append(self.feed(arrival_s, data[begin:end].tobytes()))
+            cells += self.cells.tolist() or [()] * blocks[-1].size
+            begin = end
+        self.cells = cell_block(cells)
+        return np.concatenate(blocks)
+
+    def serial_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for those that tell one
+        """Serial number that the device would have told by the end of ``data``, which is not fed; None: it would tell none there."""
+        return None
+
+    def opened(self) -> None:  # noqa: B027 - most have nothing to forget
+        """The port was opened anew: what comes next may be another device's, or the same one's after a reset."""
+
+    def due(self, now_s: float) -> bytes:  # noqa: ARG002 - for those that ask
+        """What is to be sent now. A device that speaks by itself is sent nothing before it was understood.
+
+        Args:
+            now_s: On the clock of the arrivals [s].
+        """
+        return b""
+
+    def command(self, name: str) -> Command:
+        """Have ``due`` send what makes the device do ``name``, such as ``current_zero``.
+
+        Raises:
+            UserError: It takes no such command.
+        """
+        raise UserError(f"this board takes no commands, nor {name}")
+
+    def relay(self, relay: Relay) -> Command:  # noqa: ARG002 - for those that have one
+        """Have ``due`` send what sets the level of the relay pin.
+
+        Raises:
+            UserError: There is none.
+        """
+        raise UserError("this board has no relay pin")
+
+
+def cell_block(rows: Sequence[Sequence[float]]) -> CellBlock:
+    """Cell voltages of samples that may tell of more or fewer cells [V]."""
+    cells = max(map(len, rows), default=0)
+    if cells == 0:
+        return NO_CELLS
+    return np.array([[*row, *[math.nan] * (cells - len(row))] for row in rows])

@@ -1,0 +1,176 @@
+"""Devices that speak when they are asked, in frames with a checksum: what ``jbd``, ``daly`` and ``jk`` share."""
+
+import math
+import re
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from enum import Enum
+
+from bms_estimator.model.sample import LEAST_C, MOST_C, CurrentSign
+from bms_estimator.protocols.base.reading import Reading
+from bms_estimator.protocols.base.reading_protocol import MeterDialect
+
+PACE_S = 1.0
+"""A round of questions begins so often [s]: as dbus-serialbattery asks them."""
+GAP_S = 0.22
+"""Between two questions: the longest answer, 48 cells of a Daly at 9600 baud, takes so long on the line [s]."""
+UNANSWERED_ROUNDS = 3
+"""After so many the other way of asking is tried, where there is one."""
+NOISE_BYTES = 64
+"""So much without a frame is no single glitch."""
+LONGEST_START = 4
+"""No frame begins with more bytes that are always the same."""
+FAULTS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs")
+FRESH_S = 3.0
+"""What came in an answer of its own, and is older, stands beside no sample [s]."""
+
+
+class Look(Enum):
+    """What stands where a frame might begin, if its length is not known."""
+
+    MORE = "its beginning has not come yet"
+    NOISE = "no frame of this device"
+    LENGTH = "a frame with a length that none has"
+
+
+class AskedDialect(MeterDialect):
+    """Frames to samples, and the questions at their own pace. It takes no commands.
+
+    What is no frame is skipped byte by byte, so that the next whole frame is found wherever it begins; how the bytes are
+    cut into reads changes no value but the times.
+
+    Args:
+        name: Of the device, for people.
+        start: What a frame begins with.
+        current_sign: What the device calls positive; samples are positive on discharge.
+        address: Of several devices on one line, the one that is taken; None: the first that answers.
+    """
+
+    def __init__(
+        self, name: str, start: re.Pattern[bytes], current_sign: CurrentSign, address: int | None = None
+    ) -> None:
+        super().__init__(current_sign, FAULTS)
+        self._name, self._start, self._address = name, start, address
+        self._rest = b""
+        self._answers = 0  # good frames of any kind
+        self._noise = 0  # bytes since the last of them
+        self._due: list[bytes] = []
+        self._asked = b""
+        self._way = self._unanswered = 0
+        self._answers_before = -1  # when the last round began; before the first nothing could be answered
+        self._round_s = self._asked_s = -math.inf
+
+    @property
+    def fault(self) -> str | None:
+        """What came first since the last sample that is no answer."""
+        if self._wrong is None and self._noise > NOISE_BYTES:
+            return f"bytes come that are no answer of a {self._name}: wrong baud rate, or another sensor.protocol?"
+        return self._wrong
+
+    @abstractmethod
+    def _ways(self) -> Sequence[Sequence[bytes]]:
+        """Ways of asking, each the questions of one round: the first that is answered is kept to."""
+
+    @abstractmethod
+    def _look(self, data: bytes, at: int) -> int | Look:
+        """Length of the frame that begins at ``at`` with ``start``, checksum and all [bytes]."""
+
+    @abstractmethod
+    def _is_whole(self, frame: bytes) -> bool:
+        """Whether its checksum is right."""
+
+    @abstractmethod
+    def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
+        """What a whole frame says; None where that is no sample."""
+
+    def opened(self) -> None:
+        """Ask at once, first in the first way. What was decoded stays: a recording does not tell of openings."""
+        self._due, self._way, self._unanswered, self._answers_before = [], 0, 0, -1
+        self._round_s = self._asked_s = -math.inf
+
+    def due(self, now_s: float) -> bytes:
+        """The next question of the round, or nothing while the device has time to answer."""
+        if now_s - self._asked_s < GAP_S:
+            return b""
+        if not self._due:
+            if now_s - self._round_s < PACE_S:
+                return b""
+            self._begin_round(now_s)
+        self._asked_s, self._asked = now_s, self._due.pop(0)
+        return self._asked
+
+    def _begin_round(self, now_s: float) -> None:
+        on_time = now_s - self._round_s < 2.0 * PACE_S
+        self._round_s = self._round_s + PACE_S if on_time else now_s  # asked a little late, it keeps its pace
+        self._unanswered = self._unanswered + 1 if self._answers == self._answers_before else 0
+        self._answers_before = self._answers
+        if self._unanswered > UNANSWERED_ROUNDS:
+            self._way, self._unanswered = self._way + 1, 0
+        ways = self._ways()
+        self._due = list(ways[self._way % len(ways)])
+
+    def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
+        for frame in self._frames(data):
+            self._answers += 1
+            self._noise = 0
+            if (reading := self._take(arrival_s, frame)) is not None:
+                yield reading
+
+    def _frames(self, data: bytes) -> list[bytes]:
+        """Whole frames that end in ``data``; what may become one is kept."""
+        rest = self._rest + data
+        frames, done, waiting = list[bytes](), 0, -1  # all before ``done`` is over, at ``waiting`` a frame has begun
+        at = self._next(rest, 0)
+        while at >= 0:
+            look = self._look(rest, at)
+            if isinstance(look, int) and at + look > len(rest):
+                look = Look.MORE
+            if isinstance(look, int) and self._is_whole(rest[at : at + look]):
+                if waiting >= 0:
+                    self._blame("short_frames", "an answer broke off: interference, or a second master on the line?")
+                self._skip(at - done)
+                done, waiting = at + look, -1
+                frames.append(rest[at:done])
+                at = self._next(rest, done)
+                continue
+            if waiting < 0:  # else it is looked at again when the frame that has begun before it is over
+                if look is Look.MORE:
+                    waiting = at
+                elif look is Look.LENGTH:
+                    self._blame(
+                        "length_errors", "answers come with impossible lengths: interference, or a wrong baud rate?"
+                    )
+                elif look is not Look.NOISE:
+                    self._blame(
+                        "crc_errors", "answers come with wrong checksums: interference, or a second master on the line?"
+                    )
+            at = self._next(rest, at + 1)
+        keep = waiting if waiting >= 0 else max(done, len(rest) - LONGEST_START + 1)
+        self._skip(keep - done)
+        self._rest = rest[keep:]
+        return frames
+
+    def _next(self, data: bytes, at: int) -> int:
+        """Where the next frame might begin; -1: nowhere."""
+        found = self._start.search(data, at)
+        return found.start() if found else -1
+
+    def _skip(self, count: int) -> None:
+        """So many bytes are in no frame."""
+        self._counts["noise_bytes"] += count
+        self._noise += count
+
+    def _is_other(self, address: int) -> bool:
+        """Whether an answer is another pack's; the first one settles which is ours where that was not told."""
+        if self._address is None:
+            self._address = address
+        if address == self._address:
+            return False
+        self._blame("other_packs", f"pack {address} answers, and pack {self._address} is wanted: see sensor.address")
+        return True
+
+    def _mean_c(self, probes_c: Sequence[float]) -> float:
+        """Of the pack, from its probes; one that is not there, or broken, reads beyond what a pack has [degC]."""
+        there = [probe_c for probe_c in probes_c if LEAST_C <= probe_c <= MOST_C]
+        self._counts["implausible"] += len(probes_c) - len(there)
+        return sum(there) / len(there) if there else math.nan

@@ -1,0 +1,108 @@
+"""Devices that tell of the pack reading by reading: what their dialects have in common."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.sample import (
+    LEAST_C,
+    LEAST_CELL_V,
+    MOST_C,
+    MOST_CELL_V,
+    SAMPLE,
+    CurrentSign,
+    SampleBlock,
+    forget_beyond,
+)
+from bms_estimator.protocols.base.device_protocol import Dialect, cell_block
+from bms_estimator.protocols.base.reading import Reading
+
+
+class MeterDialect(Dialect):
+    """Bytes to readings, readings to samples. It takes no commands.
+
+    Readings carry no clock: those of one read share the time since the read before evenly.
+
+    Args:
+        current_sign: What the device calls positive; samples are positive on discharge.
+        faults: Names of its counters of what went wrong.
+    """
+
+    def __init__(self, current_sign: CurrentSign, faults: Iterable[str]) -> None:
+        self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
+        self._counts = dict.fromkeys(("bytes_received", "frames_received", *faults, "implausible"), 0)
+        self._first_s = self._last_s = math.nan
+        self._wrong: str | None = None
+        self._good: Reading | None = None
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Samples and faults since start."""
+        return dict(self._counts)
+
+    @property
+    def fault(self) -> str | None:
+        """What was wrong with the first frame since the last good one."""
+        return self._wrong
+
+    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
+        """Decode one read of the line; ``time_s`` is since the first sample, by arrival."""
+        self._counts["bytes_received"] += len(data)
+        readings = []
+        for reading in self._read(arrival_s, data):
+            readings.append(reading)
+            self._good, self._wrong = reading, None
+        self.cells = cell_block([reading.cells_v for reading in readings])
+        self._counts["implausible"] += forget_beyond(self.cells, LEAST_CELL_V, MOST_CELL_V)
+        block = np.empty(len(readings), dtype=SAMPLE)
+        if readings:
+            self._counts["frames_received"] += len(readings)
+            block["voltage_v"] = [reading.voltage_v for reading in readings]
+            block["current_a"] = [self._sign * reading.current_a + 0.0 for reading in readings]  # no -0
+            block["temperature_c"] = [reading.temperature_c for reading in readings]
+            self._counts["implausible"] += forget_beyond(block["temperature_c"], LEAST_C, MOST_C)
+            block["status"] = 0
+            block["time_s"] = self._times(arrival_s, len(readings))
+        return block
+
+    @abstractmethod
+    def _read(self, arrival_s: float, data: bytes) -> Iterable[Reading]:
+        """What a read of the line says; what is wrong with it goes to ``_blame``."""
+
+    def _blame(self, counter: str, wrong: str) -> None:
+        """Count a fault; the first since the last good reading is told to people."""
+        self._counts[counter] += 1
+        self._wrong = self._wrong or wrong
+
+    def _times(self, arrival_s: float, count: int) -> NDArray[np.float64]:
+        """Times of ``count`` samples that came together, evenly over the time since those before [s]."""
+        if self._counts["frames_received"] == count:
+            self._first_s = self._last_s = arrival_s
+            return np.zeros(count)
+        steps = np.arange(1, count + 1) / count
+        times = self._last_s + (arrival_s - self._last_s) * steps - self._first_s
+        self._last_s = arrival_s
+        return times
+
+
+class Beside:
+    """Cell voltages that came in an answer of their own, for the sample that comes next.
+
+    Args:
+        fresh_s: Older ones stand beside no sample [s].
+    """
+
+    def __init__(self, fresh_s: float) -> None:
+        self._fresh_s = fresh_s
+        self._arrival_s, self._cells_v = -math.inf, tuple[float, ...]()
+
+    def keep(self, arrival_s: float, cells_v: Sequence[float]) -> None:
+        """Those that came now."""
+        self._arrival_s, self._cells_v = arrival_s, tuple(cells_v)
+
+    def at(self, arrival_s: float) -> tuple[float, ...]:
+        """For a sample of this time; none where their answer has not come of late."""
+        return self._cells_v if arrival_s - self._arrival_s < self._fresh_s else ()

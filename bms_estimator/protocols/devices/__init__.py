@@ -1,0 +1,1 @@
+"""Protocols of BMS and meters, one file for each device."""

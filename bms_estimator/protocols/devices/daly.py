@@ -1,0 +1,128 @@
+"""Daly Smart BMS, protocol of the ``A5`` frames: UART or RS485 at 9600 baud.
+
+Question: ``A5 host command 08``, eight zeros, checksum; the host is 40 on RS485 and USB, 80 on UART. Answer: ``A5 01 command 08``,
+eight bytes, checksum, big-endian; cells and probes in several of them with a number first. The checksum is the sum of all
+before it, modulo 256. Current: 0.1 A about 30000, positive on discharge as python-daly-bms, batmon-ha and dbus-serialbattery
+have it; some firmwares have it the other way round (dbus-serialbattery issues 65, 70, 255), then ``sensor.current_sign`` turns it.
+Cells are numbered from frame 1, by Daly's own document from frame 0. Newer boards (H, K, M, S) speak Modbus instead.
+"""
+
+import math
+import re
+import struct
+from collections.abc import Mapping, Sequence
+
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.polled_protocol import FRESH_S, AskedDialect, Look
+from bms_estimator.protocols.base.reading import Reading
+
+PACK, STATUS, CELLS, PROBES = 0x90, 0x94, 0x95, 0x96
+COMMANDS = range(0x90, 0x99)
+START, DATA_BYTES, FRAME_BYTES = 0xA5, 8, 13
+HOSTS = (0x40, 0x80)
+PACKS = range(0x01, 0x40)
+"""Addresses that answers come from."""
+NO_CURRENT = 30000
+ZERO_C = 40
+"""0 degC; 0 is a probe that is not there."""
+CELLS_A_FRAME, PROBES_A_FRAME, MOST_FRAMES = 3, 7, 16
+
+
+def sealed(frame: bytes) -> bytes:
+    """With its checksum."""
+    return frame + bytes((sum(frame) & 0xFF,))
+
+
+def question(host: int, command: int) -> bytes:
+    """Asks for what ``command`` tells; changes nothing."""
+    return sealed(bytes((START, host, command, DATA_BYTES)) + bytes(DATA_BYTES))
+
+
+class DalyDialect(AskedDialect):
+    """The conversation with a Daly BMS: how many cells it has until that is known, then cells, probes, pack in each round.
+
+    Args:
+        current_sign: What it calls positive; by its documentation discharge.
+        address: Of several BMS on one line, the one that is taken; None: the first that answers.
+    """
+
+    def __init__(self, *, current_sign: CurrentSign = "discharge_positive", address: int | None = None) -> None:
+        super().__init__("Daly BMS", re.compile(b"\xa5"), current_sign, address)
+        self._cells: int | None = None
+        self._probes: int | None = None
+        self._told = self._known = False  # whether a sample has come, and since the port was opened the number of cells
+        self._first = 1  # number of the frame with cell 1
+        self._cells_v: dict[int, Sequence[float]] = {}  # by the frame's number
+        self._probes_c: dict[int, Sequence[float]] = {}
+        self._cells_s = self._probes_s = -math.inf
+
+    @property
+    def described(self) -> str | None:
+        """How many cells it has, once that and a sample have come."""
+        return f"Daly BMS, {self._cells} cells" if self._told and self._cells is not None else None
+
+    def opened(self) -> None:
+        """As all; it may be another pack's, with more cells."""
+        super().opened()
+        self._known = False
+
+    def _ways(self) -> Sequence[Sequence[bytes]]:
+        if self.probing:
+            return [[question(host, command) for host in HOSTS for command in (STATUS, CELLS, PACK)]]
+        commands = (CELLS, PROBES, PACK) if self._known else (STATUS, CELLS, PROBES, PACK)
+        return [[question(host, command) for command in commands] for host in HOSTS]
+
+    def _look(self, data: bytes, at: int) -> int | Look:
+        head = data[at + 1 : at + 4]
+        if any(byte not in allowed for byte, allowed in zip(head, (PACKS, COMMANDS), strict=False)):
+            return Look.NOISE
+        if len(head) < 3:
+            return Look.MORE
+        return FRAME_BYTES if head[2] == DATA_BYTES else Look.LENGTH
+
+    def _is_whole(self, frame: bytes) -> bool:
+        return sealed(frame[:-1]) == frame
+
+    def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
+        if self._is_other(frame[1]):
+            return None
+        command, data = frame[2], frame[4:-1]
+        if command == PACK:
+            return self._pack(arrival_s, data)
+        if command == STATUS:
+            self._cells, self._probes, self._known = data[0] or None, data[1], True
+        elif command in (CELLS, PROBES) and data[0] > MOST_FRAMES:
+            self._blame("length_errors", f"a frame with number {data[0]} comes, and there are at most {MOST_FRAMES}")
+        elif command == CELLS:
+            self._first = 0 if data[0] == 0 else self._first
+            self._cells_v[data[0]], self._cells_s = [mv / 1000 for mv in struct.unpack_from(">3H", data, 1)], arrival_s
+        elif command == PROBES:
+            self._probes_c[data[0]], self._probes_s = [c - ZERO_C if c else math.nan for c in data[1:]], arrival_s
+        return None
+
+    def _pack(self, arrival_s: float, data: bytes) -> Reading:
+        decivolts, _, deciamperes, _ = struct.unpack(">4H", data)
+        cells_v = self._joined(self._cells_v, CELLS_A_FRAME, self._cells) if arrival_s - self._cells_s < FRESH_S else []
+        fresh = arrival_s - self._probes_s < FRESH_S
+        probes_c = self._joined(self._probes_c, PROBES_A_FRAME, self._probes) if fresh else []
+        self._cells_v, self._told = {}, True
+        there_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
+        return Reading(decivolts / 10, (deciamperes - NO_CURRENT) / 10, self._mean_c(there_c), tuple(cells_v))
+
+    def _joined(self, frames: Mapping[int, Sequence[float]], each: int, count: int | None) -> list[float]:
+        """Values of all frames in the order of their numbers, NaN where one did not come.
+
+        Args:
+            frames: By their numbers.
+            each: So many values are in one.
+            count: So many values there are; None: not known, zeros behind the last other one are none.
+        """
+        if not frames:
+            return []
+        lost = [math.nan] * each
+        values = [value for number in range(self._first, max(frames) + 1) for value in frames.get(number, lost)]
+        if count is not None:
+            return (values + [math.nan] * count)[:count]
+        while values and not values[-1] > 0.0:
+            values.pop()
+        return values

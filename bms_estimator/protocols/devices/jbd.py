@@ -1,0 +1,95 @@
+"""JBD, also sold as Xiaoxiang, LLT Power, Overkill Solar: UART or RS485 at 9600 baud.
+
+Question: ``DD A5 register 00 checksum 77``. Answer: ``DD register status length data checksum 77``, big-endian. The checksum is
+0x10000 less the sum of what stands before it from the third byte on. Current: 10 mA, positive on charge. By the register
+map of bms-tools ("negative values indicate discharge") and the captures of esphome-jbd-bms and aiobmsble.
+"""
+
+import re
+import struct
+from collections.abc import Sequence
+
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.polled_protocol import FRESH_S, AskedDialect, Look
+from bms_estimator.protocols.base.reading import Reading
+from bms_estimator.protocols.base.reading_protocol import Beside
+
+BASIC, CELLS, NAME = 0x03, 0x04, 0x05
+START, END, READ = 0xDD, 0x77, 0xA5
+REFUSED = 0x80
+"""Status of an answer that has nothing else to say."""
+HEAD, TAIL = 4, 3
+"""Bytes of a frame before and behind its data."""
+LEAST_BASIC, MOST_DATA = 23, 128
+"""Bytes: basic information without a probe; more than 32 cells, or the longest name."""
+ZERO_C = 2731
+"""0 degC [0.1 K]."""
+
+
+def checksum(data: bytes) -> bytes:
+    """Of what stands before it from the third byte on."""
+    return (-sum(data) & 0xFFFF).to_bytes(2, "big")
+
+
+def question(register: int) -> bytes:
+    """Asks for a register; changes nothing."""
+    return bytes((START, READ, register, 0)) + checksum(bytes((register, 0))) + bytes((END,))
+
+
+class JbdDialect(AskedDialect):
+    """The conversation with a JBD BMS: name until it is known, then cells and basic information in each round.
+
+    Args:
+        current_sign: What it calls positive; by its documentation charge.
+    """
+
+    def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
+        super().__init__("JBD BMS", re.compile(b"\xdd"), current_sign)
+        self._beside = Beside(FRESH_S)
+        self._model = ""
+        self._cells: int | None = None
+
+    @property
+    def described(self) -> str | None:
+        """Name and number of cells, once its basic information has come."""
+        return None if self._cells is None else f"JBD BMS {self._model}".rstrip() + f", {self._cells} cells"
+
+    def _ways(self) -> Sequence[Sequence[bytes]]:
+        registers = (CELLS, BASIC) if self._model else (NAME, CELLS, BASIC)
+        return ([question(register) for register in registers],)
+
+    def _look(self, data: bytes, at: int) -> int | Look:
+        if len(data) < at + HEAD:
+            return Look.MORE if len(data) < at + 2 or data[at + 1] in (BASIC, CELLS, NAME) else Look.NOISE
+        _, register, status, length = data[at : at + HEAD]
+        if register not in (BASIC, CELLS, NAME) or status not in (0, REFUSED):
+            return Look.NOISE
+        return HEAD + length + TAIL if length <= MOST_DATA else Look.LENGTH
+
+    def _is_whole(self, frame: bytes) -> bool:
+        return frame[-1] == END and checksum(frame[2:-TAIL]) == frame[-TAIL:-1]
+
+    def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
+        register, status, data = frame[1], frame[2], frame[HEAD:-TAIL]
+        if status == REFUSED:
+            self._blame("refused", f"the BMS refuses to tell register 0x{register:02x}")
+        elif register == NAME:
+            self._model = data.decode("ascii", "replace").strip("\0 ")
+        elif register == CELLS:
+            self._beside.keep(arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])])
+        elif len(data) < LEAST_BASIC:
+            self._blame("length_errors", "its basic information is too short")
+        else:
+            return self._basic(arrival_s, data)
+        return None
+
+    def _basic(self, arrival_s: float, data: bytes) -> Reading:
+        volts, amperes = struct.unpack_from(">Hh", data)
+        self._cells, probes = data[21], data[22]
+        told = data[LEAST_BASIC:][: 2 * probes]
+        return Reading(
+            volts / 100,
+            amperes / 100,
+            self._mean_c([(step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", told[: len(told) & ~1])]),
+            self._beside.at(arrival_s)[: self._cells],
+        )

@@ -1,0 +1,198 @@
+"""JK-BMS (Jikong) over its serial port at 115200 baud: two families of frames, both are taken.
+
+``4E 57`` (B series, port "GPS", TTL, or RS485 by adapter), big-endian: 4E 57, length without these two, terminal, command, source,
+type, registers, record number, 68, checksum: the sum of all before it. Question: "read all". By JK's "BMS-RS485
+communication protocol" 2.5 as in esphome-jk-bms. Current: 10 mA, positive on charge; by version 0 (register C0) 10000 less it,
+by version 1 with the highest bit set on charge.
+
+``55 AA EB 90`` (PB series, RS485-2), little-endian: 300 bytes, the last one the sum of the others, then a Modbus record of eight bytes that begins
+with the pack's address. It comes by itself where the pack is its line's master, else when asked by a Modbus command. Voltage
+1 mV, current 1 mA, positive on charge. By the captures of esphome-jk-bms, jk-bms-passive-bridge and dbus-serialbattery.
+"""
+
+import math
+import re
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.polled_protocol import AskedDialect, Look
+from bms_estimator.protocols.base.reading import Reading
+
+OLD_START, START = b"\x4e\x57", b"\x55\xaa\xeb\x90"
+OLD_HEAD, OLD_TAIL, OLD_MOST = 11, 9, 512
+"""Bytes of an older frame before its registers, behind them, and in all at most."""
+READ_ALL, FROM_BMS, ANSWER, OLD_END = 0x06, 0x00, 0x01, 0x68
+REGISTER_BYTES: Mapping[int, int] = {
+    **dict.fromkeys(range(0x80, 0xC1), 2),
+    **dict.fromkeys((0x85, 0x86, 0x9D, 0xA9, 0xAB, 0xAC, 0xAE, 0xAF, 0xB1, 0xB3, 0xB8, 0xC0), 1),
+    **dict.fromkeys((0x89, 0xAA, 0xB5, 0xB6, 0xB9), 4),
+    0xB2: 10,
+    0xB4: 8,
+    0xB7: 15,
+    0xBA: 24,
+}
+"""Of each register but the cells', which tells its own length."""
+CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOFTWARE, VERSION = 0x79, 0x81, 0x82, 0x83, 0x84, 0xB7, 0xC0
+ABSENT_C = 140
+"""The end of an older frame's scale, -40 degC: what a probe that is not there reads."""
+CHARGING = 0x8000
+
+FRAME_BYTES, RECORD_BYTES = 300, 8
+REALTIME, KINDS = 0x02, (0x01, 0x02, 0x03)
+MODBUS_WRITE, REALTIME_REGISTER = 0x10, 0x1620
+ABSENT_DECI_C = -2000
+LISTEN_S = 10.0
+"""While frames come that were not asked for, another master asks, every 6 s; nothing is asked for so long after them [s]."""
+
+
+def crc16(data: bytes) -> bytes:
+    """Modbus CRC, as it is sent."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc.to_bytes(2, "little")
+
+
+def old_sealed(frame: bytes) -> bytes:
+    """An older frame with its checksum."""
+    return frame + (sum(frame) & 0xFFFF).to_bytes(4, "big")
+
+
+OLD_QUESTION = old_sealed(OLD_START + bytes((0, 19, 0, 0, 0, 0, READ_ALL, 3, 0, 0, 0, 0, 0, 0, OLD_END)))
+"""Read all registers; changes nothing."""
+
+
+def question(address: int) -> bytes:
+    """Have a pack tell its real-time frame: to Modbus a write, which only this BMS takes for a question."""
+    frame = struct.pack(">BBHHBH", address, MODBUS_WRITE, REALTIME_REGISTER, 1, 2, 0)
+    return frame + crc16(frame)
+
+
+class JkDialect(AskedDialect):
+    """The conversation with a JK-BMS.
+
+    Args:
+        current_sign: What it calls positive; by its documentation charge.
+        address: Of several packs on one line, the one that is taken; None: the first that answers.
+    """
+
+    def __init__(self, *, current_sign: CurrentSign = "charge_positive", address: int | None = None) -> None:
+        super().__init__("JK-BMS", re.compile(re.escape(OLD_START) + b"|" + re.escape(START)), current_sign, address)
+        self._told: str | None = None
+        self._overheard_s = -math.inf  # when a newer frame came that was not asked for
+
+    @property
+    def described(self) -> str | None:
+        """Number of cells, and what else the frame tells."""
+        return self._told
+
+    @property
+    def quiet_s(self) -> float:
+        """Where another asks, its answers come at its pace [s]."""
+        return LISTEN_S if math.isfinite(self._overheard_s) else 0.0
+
+    @property
+    def _asked_packs(self) -> Sequence[int]:
+        """Those that are asked in the newer way, in turns."""
+        return (1, 0) if self._address is None else (self._address,)
+
+    def _ways(self) -> Sequence[Sequence[bytes]]:
+        newer = [] if self.probing else [[question(address)] for address in self._asked_packs]
+        return [[OLD_QUESTION], *newer]
+
+    def opened(self) -> None:
+        """As all; who else asks is not known any more."""
+        super().opened()
+        self._overheard_s = -math.inf
+
+    def due(self, now_s: float) -> bytes:
+        """The question, unless another asks and its answers are heard."""
+        return b"" if now_s - self._overheard_s < LISTEN_S else super().due(now_s)
+
+    def _look(self, data: bytes, at: int) -> int | Look:
+        return self._look_old(data, at) if data[at] == OLD_START[0] else self._look_newer(data, at)
+
+    def _look_old(self, data: bytes, at: int) -> int | Look:
+        if len(data) < at + OLD_HEAD:
+            return Look.MORE
+        length = int.from_bytes(data[at + 2 : at + 4], "big") + len(OLD_START)
+        if not OLD_HEAD + OLD_TAIL <= length <= OLD_MOST:
+            return Look.LENGTH
+        command, _, kind = data[at + 8 : at + OLD_HEAD]
+        return length if (command, kind) == (READ_ALL, ANSWER) else Look.NOISE
+
+    def _look_newer(self, data: bytes, at: int) -> int | Look:
+        if len(data) <= at + len(START):
+            return Look.MORE
+        if data[at + len(START)] not in KINDS:
+            return Look.NOISE
+        record = data[at + FRAME_BYTES : at + FRAME_BYTES + RECORD_BYTES]
+        follows = len(record) < RECORD_BYTES or crc16(record[:-2]) == record[-2:]
+        return FRAME_BYTES + RECORD_BYTES if follows else FRAME_BYTES
+
+    def _is_whole(self, frame: bytes) -> bool:
+        if frame.startswith(OLD_START):
+            return frame[-5] == OLD_END and old_sealed(frame[:-4]) == frame
+        return sum(frame[: FRAME_BYTES - 1]) & 0xFF == frame[FRAME_BYTES - 1]
+
+    def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
+        return self._old(frame) if frame.startswith(OLD_START) else self._newer(arrival_s, frame)
+
+    def _old(self, frame: bytes) -> Reading | None:
+        if self._is_other(frame[7]):
+            return None
+        registers = dict(_registers(frame[OLD_HEAD:-OLD_TAIL]))
+        if not {VOLTAGE, CURRENT} <= registers.keys():
+            self._blame("length_errors", "its answer tells no voltage or no current")
+            return None
+        cells_v = [mv / 1000 for _, mv in struct.iter_unpack(">BH", registers.get(CELLS, b""))]
+        self._told = f"JK-BMS, {len(cells_v)} cells"
+        if software := registers.get(SOFTWARE, b"").decode("ascii", "replace").strip("\0 _"):
+            self._told += f", software {software}"
+        raw = _number(registers[CURRENT])
+        if _number(registers.get(VERSION, b"\0")) == 0:
+            current_a = (10000 - raw) / 100
+        else:
+            current_a = (raw & ~CHARGING) / (100 if raw & CHARGING else -100)
+        probes = [_number(registers[code]) for code in (BOX_C, BATTERY_C) if code in registers]
+        probes_c = [float(probe if probe <= 100 else 100 - probe) for probe in probes if probe != ABSENT_C]
+        return Reading(_number(registers[VOLTAGE]) / 100, current_a, self._mean_c(probes_c), tuple(cells_v))
+
+    def _newer(self, arrival_s: float, frame: bytes) -> Reading | None:
+        address = frame[FRAME_BYTES] if len(frame) > FRAME_BYTES else None
+        if address is not None and question(address) != self._asked:
+            self._overheard_s = arrival_s
+        if (address is not None and self._is_other(address)) or frame[4] != REALTIME:
+            return None
+        (there,) = struct.unpack_from("<I", frame, 70)
+        (millivolts,) = struct.unpack_from("<I", frame, 150)
+        (milliamperes,) = struct.unpack_from("<i", frame, 158)
+        cells = struct.unpack_from("<32H", frame, 6)
+        cells_v = [mv / 1000 for i, mv in enumerate(cells) if there >> i & 1]
+        self._told = f"JK-BMS, {len(cells_v)} cells" + ("" if address is None else f", pack {address}")
+        probes_c = [c / 10 for c in struct.unpack_from("<2h", frame, 162) if c != ABSENT_DECI_C]
+        return Reading(millivolts / 1000, milliamperes / 1000, self._mean_c(probes_c), tuple(cells_v))
+
+
+def _registers(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Code and content of each, up to the first that is not known; the protocol's version, which comes last, in any case."""
+    if data[-2:-1] == bytes((VERSION,)):
+        yield VERSION, data[-1:]
+    at = 0
+    while at < len(data):
+        code, at = data[at], at + 1
+        if code == CELLS and at < len(data):
+            length, at = data[at] // 3 * 3, at + 1
+        else:
+            length = REGISTER_BYTES.get(code, 0)
+        content, at = data[at : at + length], at + length
+        if not length or len(content) < length:
+            return
+        yield code, content
+
+
+def _number(content: bytes) -> int:
+    return int.from_bytes(content, "big")

@@ -1,0 +1,129 @@
+"""Boards that print text, as every hobby sketch does: ``text_line`` says what a line may be."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from bms_estimator.model.sample import (
+    LEAST_C,
+    LEAST_CELL_V,
+    MOST_C,
+    MOST_CELL_V,
+    SAMPLE,
+    CurrentSign,
+    SampleBlock,
+    forget_beyond,
+)
+from bms_estimator.protocols.base.device_clock import ToldClock
+from bms_estimator.protocols.base.device_protocol import Dialect, cell_block
+from bms_estimator.protocols.base.reading import PRINTABLE, Reading, read_line
+
+LINE_BYTES = 4096
+"""A longer line is noise: 400 cells of seven characters fit."""
+SHOWN_BYTES = 60
+"""So much of a line that says nothing is shown."""
+
+
+class TextDialect(Dialect):
+    """Lines of a board to samples. It takes no commands.
+
+    Lines that say nothing are counted and skipped. Lines that tell no ``time_s`` share the time since the read before
+    evenly. How the bytes are cut into reads changes no value but these times.
+
+    Args:
+        current_sign: What the board calls positive; samples are positive on discharge.
+    """
+
+    def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
+        self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
+        self._rest = b""
+        self._overlong = False  # the line is too long, its rest is skipped
+        self._in_step = False  # once a line has ended: what came before may be half a line
+        self._clock, self._last_s = ToldClock(), math.nan
+        self._bytes = self._samples = self._errors = self._too_long = self._implausible = 0
+        self._bad: bytes | None = None  # the first line since the last good one that said nothing
+        self._good: Reading | None = None
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Samples and faults since start."""
+        return {
+            "bytes_received": self._bytes,
+            "frames_received": self._samples,
+            "text_errors": self._errors,
+            "length_errors": self._too_long,
+            "implausible": self._implausible,
+            "clock_jumps": self._clock.jumps,
+        }
+
+    @property
+    def fault(self) -> str | None:
+        """The first line that said nothing, as it came."""
+        if self._bad is None:
+            return None
+        shown = repr(self._bad[:SHOWN_BYTES])[1:] + ("..." if len(self._bad) > SHOWN_BYTES else "")
+        if 4 * len(self._bad.translate(None, PRINTABLE)) > len(self._bad):
+            return (
+                f"bytes that are no text come: wrong baud rate, or sensor.protocol should be binary? They begin {shown}"
+            )
+        return f"lines come that do not tell voltage and current; the first: {shown}"
+
+    @property
+    def described(self) -> str | None:
+        """The last line's values, once it was a whole one."""
+        if self._good is None:
+            return None
+        return f"prints text, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
+
+    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
+        """Decode one read of the line; ``time_s`` is since the first sample, as ``ToldClock`` has it."""
+        self._bytes += len(data)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        readings = [reading for line in lines if (reading := self._end_line(line)) is not None]
+        if self._overlong:
+            self._rest = b""
+        elif len(self._rest) > LINE_BYTES:
+            self._begin_overlong(self._rest)
+            self._rest, self._overlong = b"", True
+        self.cells = cell_block([reading.cells_v for reading in readings])
+        self._implausible += forget_beyond(self.cells, LEAST_CELL_V, MOST_CELL_V)
+        block = np.empty(len(readings), dtype=SAMPLE)
+        if readings:
+            self._samples += len(readings)
+            block["voltage_v"] = [reading.voltage_v for reading in readings]
+            block["current_a"] = [self._sign * reading.current_a for reading in readings]
+            block["temperature_c"] = [reading.temperature_c for reading in readings]
+            self._implausible += forget_beyond(block["temperature_c"], LEAST_C, MOST_C)
+            block["status"] = 0
+            block["time_s"] = self._times(arrival_s, readings)
+        return block
+
+    def _times(self, arrival_s: float, readings: Sequence[Reading]) -> list[float]:
+        """Times of samples that came together [s]."""
+        before_s, self._last_s = (arrival_s if math.isnan(self._last_s) else self._last_s), arrival_s
+        steps = np.arange(1, len(readings) + 1) / len(readings)
+        arrivals = (before_s + (arrival_s - before_s) * steps).tolist()
+        return [self._clock.place(at_s, reading.time_s) for at_s, reading in zip(arrivals, readings, strict=True)]
+
+    def _end_line(self, line: bytes) -> Reading | None:
+        """What a line says. Half a line at the start is no fault."""
+        counted, self._in_step = self._in_step, True
+        if self._overlong:  # the end of it
+            self._overlong = False
+            return None
+        if len(line) > LINE_BYTES:
+            self._begin_overlong(line)
+            return None
+        reading = read_line(line)
+        if reading is not None:
+            self._bad = None
+            self._good = reading if counted else None
+        elif counted and line.strip():
+            self._errors += 1
+            self._bad = self._bad or line.rstrip(b"\r")
+        return reading
+
+    def _begin_overlong(self, line: bytes) -> None:
+        self._too_long += 1
+        self._bad = self._bad or line[:LINE_BYTES]

@@ -1,0 +1,85 @@
+"""Battery monitors of Victron Energy, BMV and SmartShunt: the text half of the VE.Direct protocol.
+
+A block each second: lines of CR LF, label, tab and value, the last of them ``Checksum`` with one byte that makes the sum of all
+bytes of the block 0 modulo 256 (Victron's VE.Direct protocol and its FAQ). V in mV, I in mA and positive on charge, T in
+degrees Celsius where there is a sensor. A second block tells of history. HEX messages, ``:`` to the end of the line, may
+stand in between and belong to no checksum.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from math import nan
+
+from bms_estimator.model.decimal_text import number
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.reading import Reading
+from bms_estimator.protocols.base.reading_protocol import MeterDialect
+
+BLOCK_BYTES = 2048
+"""No block is longer: 22 fields of at most 44 bytes each."""
+HEX = re.compile(rb":[0-9A-Fa-f]*\r?\n")
+END = b"Checksum\t"
+
+
+class VeDirectDialect(MeterDialect):
+    """Blocks of a battery monitor to samples. It speaks by itself and is sent nothing.
+
+    Args:
+        current_sign: As the device has it: positive on charge.
+    """
+
+    def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
+        super().__init__(current_sign, ("checksum_errors", "length_errors", "text_errors"))
+        self._rest = b""
+        self._in_step = False  # once a block has ended: what came before may be half a block
+        self._product = ""
+
+    @property
+    def described(self) -> str | None:
+        """Product and the last values."""
+        if self._good is None:
+            return None
+        return f"VE.Direct battery monitor {self._product}, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
+
+    def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - the block carries no time
+        self._rest += data
+        while (at := self._rest.find(END)) >= 0 and len(self._rest) > at + len(END):
+            end = at + len(END) + 1
+            block, self._rest = self._rest[:end], self._rest[end:]
+            counted, self._in_step = self._in_step, True
+            head = HEX.sub(b"", block[:at])
+            if len(head) > BLOCK_BYTES:
+                self._blame("length_errors", "blocks come that are too long for VE.Direct text")
+            elif sum(head) + sum(block[at:]) & 0xFF:
+                if counted:
+                    self._blame("checksum_errors", "VE.Direct blocks come whose checksum is wrong: is the cable long?")
+            elif (reading := self._of(head)) is not None:
+                yield reading
+        if len(self._rest) > BLOCK_BYTES and at < 0:
+            self._rest = self._rest[-len(END) :]
+            self._blame("length_errors", "bytes come that are no VE.Direct text: it has 19200 baud, 8N1")
+
+    def _of(self, head: bytes) -> Reading | None:
+        """What a whole block says; None of history, and of a device that is no battery monitor."""
+        text = head.decode("ascii", "replace")
+        fields = dict(line.split("\t", 1) for line in text.split("\r\n") if "\t" in line)
+        if "V" not in fields:
+            return None
+        self._product = fields.get("BMV") or fields.get("PID", "")
+        if "I" not in fields or not fields.keys() & {"SOC", "CE", "TTG"}:
+            named = f"product {fields['PID']}" if "PID" in fields else "the device"
+            self._blame("text_errors", f"{named} is no battery monitor: the current that it tells is not the battery's")
+            return None
+        return self._measured(fields)
+
+    def _measured(self, fields: Mapping[str, str]) -> Reading | None:
+        try:
+            temperature = fields.get("T", "---")
+            return Reading(
+                1e-3 * number(fields["V"]),
+                1e-3 * number(fields["I"]),
+                nan if temperature == "---" else number(temperature),
+            )
+        except ValueError as error:
+            self._blame("text_errors", f"a VE.Direct block without a voltage or a current: {error}")
+            return None

@@ -1,0 +1,1 @@
+"""Frames of the project's own board: messages, framing, scaling, clock drift, decoder."""

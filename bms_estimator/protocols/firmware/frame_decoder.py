@@ -1,0 +1,245 @@
+"""The binary board's bytes to samples: ``wire.framing`` with its state, its messages and its counters."""
+
+import contextlib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.sample import SAMPLE, CurrentSign, SampleBlock
+from bms_estimator.protocols.base.reading import PRINTABLE
+from bms_estimator.protocols.firmware.clock_drift import clock_ppm
+from bms_estimator.protocols.firmware.framing import DECODER, HELLO_BYTES, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
+from bms_estimator.protocols.firmware.messages import (
+    DELIMITER,
+    Ack,
+    AckResult,
+    Hello,
+    MessageType,
+    ProtocolError,
+    unseal,
+)
+from bms_estimator.protocols.firmware.scaling import SCALING, reference
+
+DEAF_BYTES = 512
+"""So many bytes without one whole frame, and the line itself is at fault: eight of the longest frames."""
+MOST_CLOCK_PPM = 20_000.0
+"""No resonator is so far off: the host slept meanwhile, or the board is a simulated one in a hurry [1e-6]."""
+HELLO_FRAME_BYTES = HELLO_BYTES + 1
+"""Of a hello in COBS, without its delimiter."""
+_MESSAGES = 8
+
+
+class FrameFault(Enum):
+    """What is wrong with the line as a whole; the value says so to people."""
+
+    WRONG_BAUD = "bytes come, but no valid frame among them: wrong baud rate?"
+    TEXT = "the board prints text, not frames: sensor.protocol should be text, --text without a settings file"
+    NEWER_PROTOCOL = "the board speaks another version of the protocol: update this program or the firmware"
+    NO_HELLO = "frames come, but the board has not told its scaling yet"
+
+
+@dataclass(frozen=True)
+class FrameCounters:
+    """What came over the line since start."""
+
+    bytes_received: int = 0
+    frames_received: int = 0
+    """Samples handed on."""
+    frames_lost: int = 0
+    """By gaps in the sequence, whatever became of them."""
+    crc_errors: int = 0
+    cobs_errors: int = 0
+    length_errors: int = 0
+    version_errors: int = 0
+    """Frames of another version of the protocol."""
+    type_errors: int = 0
+    duplicates: int = 0
+    out_of_order: int = 0
+    before_hello: int = 0
+    """Samples that came before their scaling was known, or while another board may have been there."""
+    overruns: int = 0
+    """Samples before which the board had no room on the line."""
+    implausible: int = 0
+    """Temperatures that no pack has: handed on as not measured."""
+    resets: int = 0
+    clock_jumps: int = 0
+    """Samples that came long before their time stamp, so long after the one before as neither arrival nor the samples between
+    say, or after a gap that does not fit the samples lost in it: from then on the board's clock counts anew, by arrival."""
+
+    def as_dict(self) -> dict[str, int]:
+        """By name."""
+        return dict(vars(self))
+
+
+class FrameDecoder:
+    """Bytes of a board to samples.
+
+    All it yields follows from the calls of ``feed`` alone. It never raises on bytes; faults are counted by kind.
+
+    Args:
+        current_sign: What the board calls positive; samples are positive on discharge.
+    """
+
+    def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
+        self._state = np.zeros(1, dtype=DECODER)
+        self._state["boot_id"] = -1
+        self._state["current_sign"] = 1.0 if current_sign == "discharge_positive" else -1.0
+        self._scaling = np.zeros(1, dtype=SCALING)
+        self._samples = np.zeros(256, dtype=SAMPLE)
+        self._messages = np.zeros((_MESSAGES, PACKET_BYTES), dtype=np.uint8)
+        self._hello: Hello | None = None
+        self._acks: list[Ack] = []
+        self._printable = 0
+        self._decode(np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0)  # compiles
+        clock_ppm(self._state[0])  # so does this
+
+    @property
+    def hello(self) -> Hello | None:
+        """The board's last; None before it, after a reset whose hello was lost, and where another board may be there."""
+        return self._hello if self._state["boot_id"][0] >= 0 else None
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the board said of itself, for people; empty before its hello."""
+        hello = self.hello
+        if hello is None:
+            return {}
+        return {
+            "firmware": hello.firmware,
+            "serial": _hexadecimal(hello.serial),
+            "sample_rate_hz": str(hello.rate_hz),
+            "divider": f"{hello.divider_ppm * 1e-6:g}",
+            "volts_per_ampere": f"{hello.current_uv_per_a * 1e-6:g}",
+            "bandgap_v": f"{hello.bandgap_uv * 1e-6:g}",
+        }
+
+    @property
+    def reference_v(self) -> float:
+        """Full range of the board's converter [V]; NaN before it is known."""
+        return float(reference(self._scaling[0]))
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock runs than that of the arrivals [1e-6]; None before a minute has told, and where it cannot be.
+
+        To 0.1. It changes no time stamp.
+        """
+        ppm = clock_ppm(self._state[0])
+        return round(ppm, 1) if abs(ppm) < MOST_CLOCK_PPM else None
+
+    @property
+    def counters(self) -> FrameCounters:
+        """Since start."""
+        counts = self._state[_COUNTERS].item()
+        return FrameCounters(**dict(zip(_COUNTERS, counts, strict=True)))
+
+    @property
+    def heard_at(self) -> int:
+        """``bytes_received`` at the end of the last frame with a right CRC."""
+        return int(self._state["heard_at"][0])
+
+    @property
+    def fault(self) -> FrameFault | None:
+        """What is wrong with the line as a whole; None while frames come."""
+        state = self._state[0]
+        if state["bytes_received"] - state["heard_at"] > DEAF_BYTES:
+            return FrameFault.TEXT if self._printable > DEAF_BYTES else FrameFault.WRONG_BAUD
+        if state["frames_received"] == 0 and state["version_errors"] > 0:
+            return FrameFault.NEWER_PROTOCOL
+        if state["frames_received"] == 0 and state["before_hello"] > 0:
+            return FrameFault.NO_HELLO
+        return None
+
+    def serial_in(self, data: bytes) -> str | None:
+        """Serial number of the last hello that ends in ``data``, which is not fed; empty of a board that has none."""
+        state, found = self._state[0], None
+        begun = state["buffer"][: state["length"]].tobytes()
+        for frame in (begun + data).split(DELIMITER)[:-1]:
+            if len(frame) == HELLO_FRAME_BYTES:
+                with contextlib.suppress(ProtocolError):
+                    found = _hexadecimal(Hello.decode(unseal(frame)).serial)
+        return found
+
+    def forget_hello(self) -> None:
+        """There is none until the next comes; samples keep the scaling of the last."""
+        self._hello = None
+
+    def take_acks(self) -> list[Ack]:
+        """Answers to commands that came since the last call."""
+        acks, self._acks = self._acks, []
+        return acks
+
+    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
+        """Decode one read of the line.
+
+        Args:
+            arrival_s: When it came, on any clock that never steps back [s].
+            data: What came.
+
+        Returns:
+            Samples, shape (n,), n may be 0. ``time_s`` is the board's clock since the first of them, unwrapped;
+            across a reset of the board it goes on by arrival.
+        """
+        block = self.feed_reads(np.array([arrival_s]), np.array([len(data)]), np.frombuffer(data, dtype=np.uint8))
+        if self._state["heard_at"][0] + DEAF_BYTES < self._state["bytes_received"][0]:
+            self._printable = self._printable + len(data) if is_text(data) else 0
+        return block
+
+    def feed_reads(
+        self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
+    ) -> SampleBlock:
+        """Decode many reads of the line at once: the same samples as ``feed`` for each.
+
+        Args:
+            arrivals_s: Shape (reads,): when each came [s].
+            ends: Shape (reads,): where in ``data`` each ends.
+            data: Their bytes, one behind the other.
+
+        Returns:
+            As ``feed``.
+        """
+        room = data.size // SAMPLE_FRAME_BYTES + 2
+        if self._samples.size < room:
+            self._samples = np.zeros(room, dtype=SAMPLE)
+        position = count = 0
+        while position < data.size:
+            position, samples, messages = self._decode(arrivals_s, ends, data, position, count)
+            count += samples
+            for packet in self._messages[:messages]:
+                self._take_message(packet)
+        return self._samples[:count].copy()
+
+    def _decode(
+        self,
+        arrivals_s: NDArray[np.float64],
+        ends: NDArray[np.int64],
+        data: NDArray[np.uint8],
+        position: int,
+        count: int,
+    ) -> tuple[int, int, int]:
+        """``wire.framing.decode`` from ``position`` on, behind the ``count`` samples that are there."""
+        out = self._samples[count:]
+        return decode(data, position, ends, arrivals_s, self._state, self._scaling, out, self._messages)
+
+    def _take_message(self, packet: NDArray[np.uint8]) -> None:
+        if packet[1] == MessageType.HELLO:
+            self._hello = Hello.decode(packet[: 2 + Hello.LAYOUT.size].tobytes())
+        elif packet[3] in _ACK_RESULTS:
+            self._acks.append(Ack.decode(packet[: 2 + Ack.LAYOUT.size].tobytes()))
+            del self._acks[:-_MESSAGES]
+
+
+def _hexadecimal(serial: int) -> str:
+    return f"{serial:08x}" if serial else ""
+
+
+_ACK_RESULTS = frozenset(AckResult)
+_COUNTERS = [field.name for field in fields(FrameCounters) if field.name in (DECODER.names or ())]
+
+
+def is_text(data: bytes) -> bool:
+    """Whether bytes could be printed lines."""
+    return not data.translate(None, PRINTABLE)

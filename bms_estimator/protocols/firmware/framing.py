@@ -1,0 +1,422 @@
+"""From serial bytes to samples: COBS, CRC, sequence and clock (firmware/PROTOCOL.md).
+
+One decoder serves the live line and the replay. All it knows between calls stands in its state, and nothing it does
+depends on how the bytes were cut into calls, except for the arrival time of the byte that ends a frame.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.sample import LEAST_C, MOST_C, SampleStatus
+from bms_estimator.numba_cache import njit
+from bms_estimator.protocols.firmware.clock_drift import CLOCK_WINDOWS, forget_clock, take_arrival
+from bms_estimator.protocols.firmware.messages import MODULUS, PROTOCOL_VERSION, BoardStatus, MessageType
+from bms_estimator.protocols.firmware.scaling import (
+    current,
+    forget_readings,
+    reference,
+    take_bandgap,
+    take_ntc,
+    temperature,
+    voltage,
+)
+
+Bytes = NDArray[np.uint8]
+Records = NDArray[np.void]
+
+MESSAGE_SAMPLE = int(MessageType.SAMPLE)
+MESSAGE_HELLO = int(MessageType.HELLO)
+MESSAGE_ACK = int(MessageType.ACK)
+SAMPLE_BYTES = 24
+HELLO_BYTES = 62
+ACK_BYTES = 10
+PACKET_BYTES = 64
+"""No packet is longer."""
+SAMPLE_FRAME_BYTES = SAMPLE_BYTES + 2
+
+DECODER = np.dtype(
+    [
+        ("buffer", "u1", PACKET_BYTES + 2),  # the frame that has begun, in COBS
+        ("packet", "u1", PACKET_BYTES + 2),  # the frame that has ended, out of COBS
+        ("length", "i8"),  # bytes in the buffer
+        ("overlong", "i8"),  # 1: the frame is too long, its rest is skipped
+        ("in_step", "i8"),  # 1 once a delimiter was seen: what came before may be half a frame
+        ("started", "i8"),  # a sample was taken
+        ("expected", "i8"),  # sequence of the next sample
+        ("boot_id", "i8"),  # of the last hello; -1: none since a reset, or since another board may be there
+        ("serial", "i8"),  # of the last hello
+        ("period_us", "f8"),  # of the last hello: from sample to sample
+        ("doubted_s", "f8"),  # arrival at which boot_id became -1
+        ("withheld", "i8"),  # status bits of samples that were dropped since then
+        ("reset_pending", "i8"),  # a hello told of a reset
+        ("board_us", "i8"),  # of the last sample, 32 bit
+        ("elapsed_us", "i8"),  # board clock since the first sample or the reset
+        ("origin_s", "f8"),  # time at which elapsed_us was 0
+        ("time_s", "f8"),  # of the last sample
+        ("arrival_s", "f8"),  # of the last sample
+        ("least_late_s", "f8"),  # least arrival beyond origin_s and elapsed_us of late
+        ("clock_windows", "i8"),  # for the clock's rate, since the first sample or the reset
+        ("clock_begin_us", "i8"),  # elapsed_us at the begin of the last window
+        ("clock_origin_s", "f8"),  # arrival from which lateness counts
+        ("clock_at_us", "i8", CLOCK_WINDOWS),  # elapsed_us of each window's least late sample
+        ("clock_late_s", "f8", CLOCK_WINDOWS),  # its arrival beyond origin and elapsed_us
+        ("current_sign", "f8"),  # 1 where the board's positive current is a discharge, else -1
+        ("bytes_received", "i8"),
+        ("heard_at", "i8"),  # bytes_received at the end of the last frame with a right CRC
+        ("frames_received", "i8"),  # samples taken
+        ("frames_lost", "i8"),
+        ("cobs_errors", "i8"),
+        ("length_errors", "i8"),
+        ("crc_errors", "i8"),
+        ("version_errors", "i8"),
+        ("type_errors", "i8"),
+        ("duplicates", "i8"),
+        ("out_of_order", "i8"),
+        ("before_hello", "i8"),
+        ("overruns", "i8"),
+        ("resets", "i8"),
+        ("implausible", "i8"),  # temperatures that no pack has
+        ("clock_jumps", "i8"),  # times the board's clock was not believed
+    ],
+    align=True,
+)
+
+_MASK = MODULUS - 1
+_HALF = MODULUS >> 1
+EARLY_S = 2.0
+"""A sample that came so much before the others would have the board's clock wrong [s]."""
+HASTE_S = 0.3
+"""So much more than host and samples say may pass by the board's clock from one sample to the next [s]."""
+SLOWEST = 0.01
+"""No board's clock is slower than the host's by more than this, relative."""
+_REORDER_WINDOW = 64  # a sample further behind comes from a board that counts anew
+_MOST_APART = 0.1  # sequence and clock of one board, relative; beyond this it is another, or has another rate
+LONGEST_DOUBT_S = 5.0
+"""So long samples wait for the hello that tells whose they are; where none comes they are taken as before [s]."""
+_US = 1e-6
+_WRAP_S = MODULUS * _US
+
+_OVERRUN = int(BoardStatus.OVERRUN)
+_SATURATED_OR_OVERRUN = int(BoardStatus.VOLTAGE_SATURATED | BoardStatus.CURRENT_SATURATED | BoardStatus.OVERRUN)
+"""The same bits on the line and in SampleStatus."""
+_AUX_IS_NTC = int(BoardStatus.AUX_IS_NTC)
+_RESET = int(SampleStatus.RESET)
+_GAP = int(SampleStatus.GAP)
+
+
+def _crc_table() -> NDArray[np.uint16]:
+    table = np.zeros(256, dtype=np.uint16)
+    for byte in range(256):
+        crc = byte << 8
+        for _ in range(8):
+            crc = (crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1
+        table[byte] = crc & 0xFFFF
+    return table
+
+
+CRC_TABLE = _crc_table()
+
+
+@njit(cache=True)
+def crc16(data: Bytes, begin: int, end: int) -> int:
+    """CRC-16/CCITT-FALSE of ``data[begin:end]``."""
+    crc = 0xFFFF
+    for i in range(begin, end):
+        crc = ((crc << 8) & 0xFFFF) ^ int(CRC_TABLE[(crc >> 8) ^ int(data[i])])
+    return crc
+
+
+@njit(cache=True)
+def cobs_decode(frame: Bytes, length: int, packet: Bytes) -> int:
+    """Decode ``frame[:length]``, free of zeros, into ``packet``. Returns its length, -1 when it is not COBS."""
+    i = n = 0
+    while i < length:
+        block_end = i + int(frame[i])
+        if block_end > length:
+            return -1
+        i += 1
+        while i < block_end:
+            packet[n] = frame[i]
+            n += 1
+            i += 1
+        if i < length:
+            packet[n] = 0
+            n += 1
+    return n
+
+
+@njit(cache=True)
+def take(packet: Bytes, offset: int, size: int) -> int:
+    """Unsigned little-endian number."""
+    value = 0
+    for i in range(size):
+        value |= int(packet[offset + i]) << (8 * i)
+    return value
+
+
+@njit(cache=True)
+def open_packet(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
+    """Unpack the buffered frame into ``packet``. Returns its message type, 0 when it is bad; faults are counted by kind."""
+    counted = d.in_step  # before the first delimiter half a frame is no fault
+    if d.overlong:
+        d.length_errors += counted
+        return 0
+    packet = d.packet
+    length = cobs_decode(d.buffer, d.length, packet)
+    if length < 0:
+        d.cobs_errors += counted
+        return 0
+    if length < 4:
+        d.length_errors += counted
+        return 0
+    if crc16(packet, 0, length - 2) != take(packet, length - 2, 2):
+        d.crc_errors += counted
+        return 0
+    d.heard_at = d.bytes_received
+    if packet[0] != PROTOCOL_VERSION:
+        d.version_errors += 1
+        return 0
+    kind = int(packet[1])
+    if kind == MESSAGE_SAMPLE:
+        right = SAMPLE_BYTES
+    elif kind == MESSAGE_HELLO:
+        right = HELLO_BYTES
+    elif kind == MESSAGE_ACK:
+        right = ACK_BYTES
+    else:
+        d.type_errors += 1
+        return 0
+    if length != right:
+        d.length_errors += 1
+        return 0
+    return kind
+
+
+@njit(cache=True)
+def take_hello(d: Record, s: Record) -> None:
+    """The board's scaling; and whether the board was reset, or is another one."""
+    p = d.packet
+    boot_id, serial = take(p, 6, 2), take(p, 8, 4)
+    anew = boot_id != d.boot_id or serial != d.serial
+    behind = (take(p, 12, 4) - d.expected) & _MASK >= _HALF
+    if d.started and (behind or (d.boot_id >= 0 and anew)):
+        d.reset_pending = 1
+    if anew:
+        forget_readings(s)
+    d.boot_id, d.serial = boot_id, serial
+    d.period_us = take(p, 22, 4) * 1e-3
+    s.full_scale = float(1 << min(take(p, 26, 1), 24))
+    channels = take(p, 27, 1)
+    s.ntc_fitted = channels & 1
+    s.ratiometric = channels >> 1 & 1
+    s.divider = take(p, 28, 4) * 1e-6
+    s.volts_per_ampere = take(p, 32, 4) * 1e-6
+    s.current_zero = take(p, 36, 4) * 1e-6
+    s.bandgap_v = take(p, 40, 4) * 1e-6
+    if s.bandgap_weight == 0.0 and take(p, 48, 2) > 0:
+        take_bandgap(s, float(take(p, 44, 4)), float(take(p, 48, 2)), take(p, 16, 4))
+    s.ntc_series_ohm = float(take(p, 50, 4))
+    s.ntc_r25_ohm = float(take(p, 54, 4))
+    s.ntc_beta_k = float(take(p, 58, 2))
+    s.known = 1
+
+
+@njit(cache=True)
+def is_early(d: Record, arrival_s: float, time_s: float) -> bool:
+    """Whether a sample of ``time_s`` would have come long before it was taken, by how late those before it came."""
+    return bool(arrival_s - time_s < d.least_late_s - EARLY_S)
+
+
+@njit(cache=True)
+def agree(d: Record, samples: int, step_us: int) -> bool:
+    """Whether one board can have taken so many samples in that time of its clock."""
+    apart_us = abs(samples * d.period_us - step_us)
+    return apart_us <= max(_MOST_APART * step_us, _REORDER_WINDOW * d.period_us)
+
+
+@njit(cache=True)
+def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
+    """Go on by the board's clock. Whole turns of its 32 bits, which only an outage can hide, are told by arrival.
+
+    Returns:
+        Whether the step can be right: a sample may come late, but not before it was taken, and as many samples are lost as fit
+        it. Samples that waited come at once, and no longer apart by the board's clock than one takes. A clock that runs
+        steadily too fast, as a simulated one does, is told by its rate, not here.
+    """
+    step_us = (board_us - d.board_us) & _MASK
+    if lost > 0:
+        turns = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
+        step_us += max(turns, 0) * MODULUS
+    time_s = d.origin_s + (d.elapsed_us + step_us) * _US
+    haste_s = (step_us - (lost + 1) * d.period_us) * _US - (arrival_s - d.arrival_s)
+    if haste_s > HASTE_S or is_early(d, arrival_s, time_s) or (lost > 0 and not agree(d, lost + 1, step_us)):
+        return False
+    d.least_late_s = min(d.least_late_s + SLOWEST * step_us * _US, arrival_s - time_s)
+    d.elapsed_us += step_us
+    d.time_s = time_s
+    return True
+
+
+@njit(cache=True)
+def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
+    """The board counts anew: go on by arrival, and by no less than ``least_s``."""
+    d.origin_s = d.time_s + max(arrival_s - d.arrival_s, least_s)
+    d.time_s = d.origin_s
+    d.elapsed_us = 0
+    d.least_late_s = arrival_s - d.origin_s
+    forget_clock(d)
+
+
+@njit(cache=True)
+def doubt(d: Record, arrival_s: float) -> None:
+    """Another board may have been wired to the open port, with another scaling: only a hello tells."""
+    d.boot_id = -1
+    d.doubted_s = arrival_s
+
+
+@njit(cache=True)
+def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -> int:
+    """Place a sample in the stream. Returns bits of SampleStatus, -1 for a sample to be dropped."""
+    status = 0
+    if not d.started:
+        d.started = 1
+        d.least_late_s = arrival_s - d.origin_s
+    else:
+        ahead = (sequence - d.expected) & _MASK
+        behind = MODULUS - ahead if ahead >= _HALF else 0
+        if d.reset_pending or behind > _REORDER_WINDOW:
+            if not d.reset_pending:
+                doubt(d, arrival_s)  # its hello was lost: the next one is no further reset
+            run_s = board_us * _US  # since its reset
+            if is_early(d, arrival_s, d.time_s + run_s):
+                run_s = 0.0
+                d.clock_jumps += 1
+            restart_clock(d, arrival_s, run_s)
+            d.reset_pending = 0
+            d.resets += 1
+            status = _RESET
+        elif behind == 1:
+            d.duplicates += 1
+            return -1
+        elif behind > 1:
+            d.out_of_order += 1
+            return -1
+        else:
+            if not follow_clock(d, board_us, arrival_s, ahead):
+                restart_clock(d, arrival_s, 0.0)
+                d.clock_jumps += 1
+                doubt(d, arrival_s)
+            d.frames_lost += ahead
+            status = _GAP if ahead else 0
+    d.expected = (sequence + 1) & _MASK
+    d.board_us = board_us
+    d.arrival_s = arrival_s
+    take_arrival(d, arrival_s)
+    return status
+
+
+@njit(cache=True)
+def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
+    """Decode the packet, a sample, into ``out``. Returns 1, or 0 when it is dropped."""
+    p = d.packet
+    if not s.known:
+        d.before_hello += 1
+        return 0
+    place = follow_sequence(d, take(p, 2, 4), take(p, 6, 4), arrival_s)
+    if place < 0:
+        return 0
+    if d.boot_id < 0 and arrival_s - d.doubted_s < LONGEST_DOUBT_S:
+        d.withheld |= place
+        d.before_hello += 1
+        return 0
+    place |= d.withheld
+    d.withheld = 0
+    d.frames_received += 1
+    bits = int(p[21])
+    aux_count = float(p[20])
+    if aux_count > 0.0:
+        if bits & _AUX_IS_NTC:
+            take_ntc(s, float(take(p, 18, 2)), aux_count, d.board_us)
+        else:
+            take_bandgap(s, float(take(p, 18, 2)), aux_count, d.board_us)
+    if bits & _OVERRUN:
+        d.overruns += 1
+    count = float(take(p, 16, 2))
+    reference_v = reference(s)
+    out.time_s = d.time_s
+    out.voltage_v = voltage(s, float(take(p, 10, 3)), count, reference_v)
+    out.current_a = d.current_sign * current(s, float(take(p, 13, 3)), count, reference_v)
+    out.temperature_c = temperature(s)
+    if out.temperature_c < LEAST_C or out.temperature_c > MOST_C:
+        out.temperature_c = math.nan
+        d.implausible += 1
+    out.status = place | (bits & _SATURATED_OR_OVERRUN)
+    return 1
+
+
+@njit(cache=True)
+def decode(
+    data: Bytes,
+    begin: int,
+    ends: NDArray[np.int64],
+    arrivals_s: NDArray[np.float64],
+    decoder: Records,
+    scaling: Records,
+    samples: Records,
+    messages: NDArray[np.uint8],
+) -> tuple[int, int, int]:
+    """Decode ``data[begin:]`` until it ends or an output is full.
+
+    Args:
+        data: Bytes of one or more reads of the line.
+        begin: Where to go on, 0 at first.
+        ends: Shape (reads,): where in ``data`` each read ends, increasing; the last is ``data.size``.
+        arrivals_s: Shape (reads,): when each read came.
+        decoder: Shape (1,), dtype DECODER; updated.
+        scaling: Shape (1,), dtype SCALING; updated.
+        samples: Output, dtype SAMPLE.
+        messages: Output, shape (n, PACKET_BYTES): packets other than samples, whole, filled up with zeros.
+
+    Returns:
+        Where the next call begins, samples written, messages written.
+    """
+    d, s = decoder[0], scaling[0]
+    buffer = d.buffer
+    length = d.length
+    n_samples = n_messages = 0
+    read = np.searchsorted(ends, begin, side="right")
+    i = counted = begin
+    while i < data.size and n_samples < samples.size and n_messages < messages.shape[0]:
+        byte = data[i]
+        i += 1
+        if byte != 0:
+            if length < buffer.size:
+                buffer[length] = byte
+                length += 1
+            else:
+                d.overlong = 1
+            continue
+        d.bytes_received += i - counted
+        counted = i
+        if length > 0:
+            d.length = length
+            kind = open_packet(d)
+            if kind == MESSAGE_SAMPLE:
+                while ends[read] < i:
+                    read += 1
+                n_samples += take_sample(d, s, arrivals_s[read], samples[n_samples])
+            elif kind != 0:
+                if kind == MESSAGE_HELLO:
+                    take_hello(d, s)
+                messages[n_messages, :] = d.packet[:PACKET_BYTES]
+                messages[n_messages, HELLO_BYTES if kind == MESSAGE_HELLO else ACK_BYTES :] = 0
+                n_messages += 1
+        d.in_step = 1
+        d.overlong = 0
+        length = 0
+    d.length = length
+    d.bytes_received += i - counted
+    return i, n_samples, n_messages

@@ -1,0 +1,135 @@
+"""What a printed line says."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bms_estimator.protocols.base.reading import Reading, read_line
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"13.3,2.0",
+        b"13.3 2.0",
+        b"13.3\t2\r",
+        b"13.3;2.0",
+        b"13,3;2,0",
+        b"13,3; 2,0\r",
+        b"V=13.3 I=2",
+        b"V=13.3,I=2.0",
+        b"v:13.3;i:2",
+        b"V=13,3;I=2,0",
+        b"V=13.3V I=2A",
+        b"U = 13.3 V, I = 2000 mA, P = 26.6 W",
+        b"Voltage: 13300 mV  Current: 2.0 A",
+        b"12:30:01 Bus Voltage: 13.3 V Current: 2 A t=17",
+        b'{"voltage":13.3,"current":2}',
+        b' {"name": "pack", "pack_voltage": 13.3, "current_mA": 2e3, "ok": true, "t": 17}\r',
+    ],
+)
+def test_volts_and_amperes_in_whatever_form(line: bytes) -> None:
+    reading = read_line(line)
+    assert reading is not None
+    assert reading[:2] == pytest.approx((13.3, 2.0))
+    assert math.isnan(reading.temperature_c)
+    assert reading.cells_v == ()
+
+
+@pytest.mark.parametrize(
+    "line", [b"6.6,-2,25.5", b"6,6;-2;25,5", b"V=6.6 I=-2 T=25.5C", b'{"volts": 6.6, "amps": -2, "temperature": 25.5}']
+)
+def test_degrees_where_there_are_any(line: bytes) -> None:
+    assert read_line(line) == Reading(6.6, -2.0, 25.5)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"V=6.6 I=2 cells=3.31,3.29", b'{"V": 6.6, "I": 2, "cells": [3.31, 3.29]}', b"cells_mV=3310,3290 V=6.6 I=2"],
+)
+def test_the_voltages_of_single_cells(line: bytes) -> None:
+    reading = read_line(line)
+    assert reading is not None
+    assert reading.cells_v == pytest.approx((3.31, 3.29))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"",
+        b"INA226 found",
+        b"13.3",
+        b"13.3,2.0,25,7",
+        b"V=13.3",
+        b"V=13.3kV I=2",
+        b"V=13.3 V=13.2 I=2",
+        b"V=13.3,2 I=2",
+        b"Bus Voltage: 13.3 V Shunt Voltage: 2 mV Current: 2 A",
+        b'{"voltage": [13.3], "current": [2, 3]}',
+        b'{"voltage": "13.3", "current": 2}',
+        b'{"voltage": 13.3, "current": 2',
+        b'{"voltage": 1' + 400 * b"0" + b', "current": 2}',
+        b'{"a":' + 500 * b"[" + 500 * b"]" + b"}",
+        b"3_9,2.0",
+        b"13.3,2.0,2_5",
+        b"nan,2.0",
+        b"13.3,inf",
+        b"1e999,2.0",
+        "١٣.٣,2".encode(),
+        b"V=3_9 I=2",
+        b"V=13.3.1 I=2",
+        b"V=0x1F I=2",
+        b"V=1e999 I=2",
+        b'{"voltage": NaN, "current": 2}',
+        b'{"voltage": 13.3, "current": -Infinity}',
+        b'{"voltage": 1e999, "current": 2}',
+    ],
+)
+def test_what_does_not_tell_both_says_nothing(line: bytes) -> None:
+    assert read_line(line) is None
+
+
+@pytest.mark.parametrize("line", [b"13.3,2.0,nan", b"13.3 2.0 NaN", b"13.3;2.0;-inf", b"13.3,2.0,ovf"])
+def test_a_word_for_no_temperature_is_none(line: bytes) -> None:
+    reading = read_line(line)
+    assert reading is not None
+    assert math.isnan(reading.temperature_c)
+
+
+def test_half_a_list_of_cells_is_none() -> None:
+    assert read_line(b"V=6.6 I=2 cells=3.31,3_2") == Reading(6.6, 2.0)
+
+
+fragments = st.sampled_from(
+    [
+        b"V",
+        b"I=",
+        b"13.3",
+        b"13,3",
+        b";",
+        b",",
+        b" ",
+        b":",
+        b"=",
+        b"mA",
+        b"cells=",
+        b"{",
+        b'"voltage":',
+        b"[",
+        b"]",
+        b"}",
+        b"e9",
+        b"_",
+        b"nan",
+        b"1e308",
+    ]
+)
+
+
+@given(st.binary(max_size=300) | st.lists(fragments, max_size=40).map(b"".join))
+def test_no_bytes_make_it_raise_or_tell_of_what_is_not_finite(line: bytes) -> None:
+    reading = read_line(line)
+    if reading is not None:
+        assert all(map(math.isfinite, (reading.voltage_v, reading.current_a, *reading.cells_v)))

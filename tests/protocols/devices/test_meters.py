@@ -1,0 +1,307 @@
+"""Battery monitors and batteries that speak their makers' protocols: real frames, damaged ones, and devices on a PTY."""
+
+import asyncio
+import itertools
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.protocols.devices.junctek import ASK, JunctekDialect
+from bms_estimator.protocols.devices.pylontech import PylontechDialect
+from bms_estimator.protocols.devices.vedirect import VeDirectDialect
+from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.simulation.simulated_meter import METERS
+from bms_estimator.simulation.virtual_converter import Reading
+from bms_estimator.sources.serial_board import SerialBoard
+from tests.patience import LONG_S
+
+
+def lines(text: str) -> bytes:
+    return text.replace(" ", "\t").replace("\n", "\r\n").encode("latin-1")
+
+
+# test/bvm702.dump of github.com/karioja/vedirect: a BMV-700 under 7.6 A of load
+BMV_NOW = lines(
+    "\nPID 0x203\nV 12065\nI -7625\nP -92\nCE -65473\nSOC 839\nTTG 942\nAlarm OFF\nRelay OFF\nAR 0\nBMV 700\nFW 0308\nChecksum q"
+)
+BMV_HISTORY = lines(
+    "\nH1 -149322\nH2 -82854\nH3 0\nH4 0\nH5 0\nH6 -5526294\nH7 11733\nH8 16161\nH9 368003\nH10 26\nH11 0\nH12 0\n"
+    "H17 6843\nH18 8527\nChecksum \xbc"
+)
+BMV_NEXT = lines(
+    "\nPID 0x203\nV 12065\nI -7626\nP -92\nCE -65476\nSOC 839\nTTG 942\nAlarm OFF\nRelay OFF\nAR 0\nBMV 700\nFW 0308\nChecksum m"
+)
+# test/test_ved.py of github.com/jblance/mpp-solar: a SmartShunt without load
+SMART_SHUNT = lines(
+    "\nPID 0xA389\nV 12868\nVS -12\nI 0\nP 0\nCE 0\nSOC 1000\nTTG -1\nAlarm OFF\nAR 0\nBMV SmartShunt~500A/50mV\nFW 0405\n"
+    "Checksum K"
+).replace(b"~", b" ")
+# the CUnit test of a VE.Direct parser in C on GitHub (test__parse_block__bmv_001): a BMV-712 with a sensor, charging
+BMV_WARM = lines(
+    "\nPID 0xA381\nV 13043\nT 23\nI 3856\nP 50\nCE 0\nSOC 1000\nTTG -1\nAlarm OFF\nRelay OFF\nAR 0\nBMV 712~Smart\nFW 0403\n"
+    "Checksum \xb5"
+).replace(b"~", b" ")
+HEX = b":7F0ED0071\n"
+
+# the manual of the KH-F, page 29; Potoonite/juntek-rs485 and mysystem32/juntek_kg on GitHub: a KG140F
+KH_CHARGING = b":r50=1,123,1198,1090,7421,2749,437,298,113,0,0,1,69,100,230208,112418,\r\n"
+KG_DISCHARGING = b":r50=1,34,5166,1030,109337,11738441,62100651,48663,125,0,99,0,644,9117,\r\n"
+KG_CHARGING = b":r50=1,220,5366,5410,416983,289634,1427701,88851,128,0,0,1,3,4277,\r\n"
+
+# an US5000 and two US2000 with their console as pylon2mqtt's test and another's notes on GitHub have it
+US5000_PWR = (
+    b"pwr\n\r@\r\r\n"
+    b"Power Volt   Curr   Tempr  Tlow   Tlow.Id  Thigh  Thigh.Id Vlow   Vlow.Id  Vhigh  Vhigh.Id Base.St  Volt.St  "
+    b"Curr.St  Temp.St  Coulomb  Time                 B.V.St   B.T.St  MosTempr M.T.St   SysAlarm.St\r\r\n"
+    b"1     49874  -642   19100  17000  8        17600  0        3324   2        3325   0        Dischg   Normal   "
+    b"Normal   Normal   81%      2025-03-18 05:58:51  Normal   Normal  18200    Normal   Normal  \r\r\n"
+    b"2     -      -      -      -      -      -      -      Absent   -        -        -        -        "
+    b"-                    -        -       \r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
+)
+US2000_PWR = (
+    b"pwr\n\r@\r\r\nPower Volt   Curr   Tempr  Tlow   Thigh  Vlow   Vhigh  Base.St  Volt.St  Curr.St  Temp.St  Coulomb  "
+    b"Time                 B.V.St   B.T.St  \r\r\n"
+    b"1     50691  3806   17000  13000  14000  3378   3381   Charge   Normal   Normal   Normal   89%      "
+    b"2025-12-21 20:53:06  Normal   Normal  \r\r\n"
+    b"2     50673  4087   16000  13000  14000  3377   3380   Charge   Normal   Normal   Normal   89%      "
+    b"2025-12-21 20:53:04  Normal   Normal  \r\r\n"
+    b"3     -      -      -      -      -      -      -      Absent   -        -        -        -        -    "
+    b"                -        -       \r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
+)
+TAIL = b"\r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
+
+
+def bat(battery: int, cells_mv: list[int]) -> bytes:
+    """The answer to ``bat N``, as those notes have that of an US2000."""
+    rows = b"\r\r\n".join(
+        b"%-8d %-8d 4076     14000    Charge       Normal       Normal       Normal        89%%      42586 mAH"
+        % (n, mv)
+        for n, mv in enumerate(cells_mv)
+    )
+    head = b"Battery  Volt     Curr     Tempr    Base State   Volt. State  Curr. State  Temp. State  Coulomb     \r\r\n"
+    return b"bat %d\n\r@\r\r\n" % battery + head + rows + TAIL
+
+
+US2000_CELLS = [3379, 3379, 3379, 3379, 3381, 3378, 3378, 3378, 3380, 3379, 3380, 3380, 3378, 3380, 3380]
+
+DIALECTS: Mapping[str, Callable[[], Dialect]] = {
+    "vedirect": VeDirectDialect,
+    "junctek": JunctekDialect,
+    "pylontech": PylontechDialect,
+}
+
+
+def values(block: SampleBlock) -> list[tuple[float, float]]:
+    return list(zip(block["voltage_v"].round(6).tolist(), block["current_a"].round(6).tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "sent", "told"),
+    [
+        ("vedirect", BMV_NOW, (12.065, 7.625, math.nan)),
+        ("vedirect", SMART_SHUNT, (12.868, 0.0, math.nan)),
+        ("vedirect", BMV_WARM, (13.043, -3.856, 23.0)),
+        ("junctek", KH_CHARGING, (11.98, -10.90, 13.0)),
+        ("junctek", KG_DISCHARGING, (51.66, 10.30, 25.0)),
+        ("junctek", KG_CHARGING, (53.66, -54.10, 28.0)),
+        ("pylontech", US5000_PWR, (49.874, 0.642, 17.3)),
+        ("pylontech", US2000_PWR, (50.682, -7.893, 13.5)),
+    ],
+)
+def test_real_frames_say_what_is_known_of_them(name: str, sent: bytes, told: tuple[float, float, float]) -> None:
+    dialect = make_dialect(SensorSettings.model_validate({"protocol": name}))
+    block = dialect.feed(1.0, sent)
+    assert [block[name].item() for name in ("voltage_v", "current_a", "temperature_c")] == pytest.approx(
+        told, nan_ok=True
+    )
+    assert dialect.fault is None
+    assert dialect.described is not None
+
+
+def test_a_shunt_wired_the_other_way_is_turned_by_the_setting() -> None:
+    sensor = SensorSettings.model_validate({"protocol": "vedirect", "current_sign": "discharge_positive"})
+    assert make_dialect(sensor).feed(1.0, BMV_NOW)["current_a"].item() == pytest.approx(-7.625)
+
+
+def test_a_protocol_brings_its_baud_rate_sign_and_resolution_which_the_file_may_change() -> None:
+    shunt = SensorSettings.model_validate({"protocol": "vedirect"})
+    assert (shunt.baud, shunt.current_sign, shunt.voltage_resolution_v) == (19_200, "charge_positive", 0.01)
+    assert SensorSettings.model_validate({"protocol": "junctek", "baud": 9600}).baud == 9600
+    assert SensorSettings().baud == SensorSettings(protocol="text").baud == 500_000
+
+
+def test_history_and_hex_messages_between_blocks_disturb_none() -> None:
+    dialect = VeDirectDialect()
+    cut_in_two = BMV_NEXT.replace(b"\r\nSOC", HEX + b"\r\nSOC")
+    block = dialect.feed(1.0, BMV_NOW[9:] + BMV_HISTORY + HEX + BMV_NEXT + BMV_HISTORY + cut_in_two)
+    assert values(block) == [(12.065, 7.626)] * 2
+    assert dialect.counters["checksum_errors"] == 0  # the half block at the start is no fault
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "damaged", "counter", "said"),
+    [
+        ("vedirect", BMV_NOW, BMV_NOW.replace(b"7625", b"7635"), "checksum_errors", "checksum is wrong"),
+        ("vedirect", BMV_NOW, bytes(range(128, 256)) * 20, "length_errors", "19200 baud"),
+        ("junctek", KG_CHARGING, KG_CHARGING.replace(b"5410", b"5411"), "checksum_errors", "checksum is wrong"),
+        ("junctek", KG_CHARGING, KG_CHARGING[:30] + b"\r\n", "length_errors", "cut off"),
+        ("junctek", KG_CHARGING, KG_CHARGING.replace(b"=1,", b"=2,"), "other_address", "address 2"),
+        ("junctek", KG_CHARGING, b"\xff\x80\x81\n", "text_errors", "noise"),
+        ("junctek", KG_CHARGING, bytes(range(128, 256)) * 3, "length_errors", "115200 baud"),
+        ("pylontech", US2000_PWR, US2000_PWR.replace(b"50673", b"5o673"), "text_errors", "cannot be read"),
+        ("pylontech", US2000_PWR, US2000_PWR[:500] + b"pylon>", "length_errors", "cut off"),
+        (
+            "pylontech",
+            US2000_PWR,
+            b"pwr\r\nUnknown command 'pwr' - try 'help'\r\npylon>",
+            "text_errors",
+            "does not know",
+        ),
+        ("pylontech", US2000_PWR, bytes(range(128, 256)) * 200, "length_errors", "115200 baud"),
+    ],
+)
+def test_a_damaged_frame_is_counted_and_said_until_a_good_one_comes(
+    name: str, good: bytes, damaged: bytes, counter: str, said: str
+) -> None:
+    dialect = DIALECTS[name]()
+    assert dialect.feed(1.0, good).size == 1
+    assert dialect.feed(2.0, damaged).size == 0
+    assert dialect.counters[counter] == 1
+    assert said in (dialect.fault or "")
+    assert dialect.feed(3.0, b"\n" + good + good).size >= 1
+    assert dialect.fault is None
+
+
+def test_a_charger_is_no_battery_monitor() -> None:
+    body = lines("\nPID 0xA042\nV 12740\nI 800\nVPV 0\nPPV 0\nCS 0\nERR 0\nLOAD ON\nChecksum ")
+    dialect = VeDirectDialect()
+    assert dialect.feed(1.0, body + bytes((-sum(body) & 0xFF,))).size == 0
+    assert "product 0xA042 is no battery monitor" in (dialect.fault or "")
+
+
+def test_cells_of_all_batteries_stand_beside_the_stack_once_all_have_told_them() -> None:
+    dialect = PylontechDialect()
+    dialect.feed(1.0, bat(1, US2000_CELLS) + US2000_PWR)
+    assert dialect.cells.size == 0
+    block = dialect.feed(2.0, bat(2, [mv - 1 for mv in US2000_CELLS]) + US2000_PWR)
+    assert block.size == 1
+    assert dialect.cells.shape == (1, 30)
+    assert dialect.cells[0, [0, 4, 15]].tolist() == pytest.approx([3.379, 3.381, 3.378])
+
+
+def test_a_console_is_asked_for_the_stack_and_then_for_the_cells_of_each_in_turn() -> None:
+    dialect = PylontechDialect()
+    assert [dialect.due(now) for now in (0.0, 0.25)] == [b"pwr\n", b""]
+    dialect.feed(0.3, US2000_PWR)
+    assert dialect.due(0.5) == b"bat 2\n"
+    dialect.feed(0.6, bat(2, US2000_CELLS))
+    assert [dialect.due(now) for now in (0.75, 2.0)] == [b"", b"pwr\n"]
+    assert [dialect.due(now) for now in (6.0, 7.0)] == [b"", b"pwr\n"]  # no answer: again
+
+
+def test_a_junctek_is_asked_once_a_second_and_after_the_port_was_opened_anew() -> None:
+    dialect = JunctekDialect()
+    assert [dialect.due(now) for now in (0.0, 0.5, 1.0)] == [ASK, b"", ASK]
+    dialect.opened()
+    assert dialect.due(1.1) == ASK
+
+
+def test_cells_that_a_console_has_not_told_for_long_stand_beside_no_sample() -> None:
+    dialect = PylontechDialect()
+    dialect.feed(1.0, bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + US2000_PWR)
+    assert dialect.cells.shape == (1, 30)
+    dialect.feed(60.0, bat(1, US2000_CELLS) + US2000_PWR)
+    assert dialect.cells.shape == (1, 30)
+    assert dialect.feed(100.0, US2000_PWR).size == 1
+    assert dialect.cells.size == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("vedirect", BMV_NOW[40:] + BMV_NEXT),
+        ("junctek", KH_CHARGING[20:] + KG_DISCHARGING),
+        ("pylontech", bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + b"\rpyl" + US2000_PWR),
+    ],
+)
+def test_a_port_that_was_opened_anew_changes_no_sample_since_no_recording_tells_of_it(name: str, data: bytes) -> None:
+    reads = [(0.01 * n, data[n : n + 7]) for n in range(0, len(data), 7)]
+    sensor = SensorSettings.model_validate({"protocol": name})
+    live, replayed = make_dialect(sensor), make_dialect(sensor)
+    for arrival_s, read in reads:
+        live.opened()
+        blocks = live.feed(arrival_s, read), replayed.feed(arrival_s, read)
+        assert repr(blocks[0].tolist()) == repr(blocks[1].tolist())  # NaN is no number, and equals none
+        assert live.cells.tolist() == replayed.cells.tolist()
+    assert live.counters == replayed.counters
+    assert live.counters["frames_received"] > 0
+
+
+FRAMES = {
+    "vedirect": [BMV_NOW, BMV_HISTORY, BMV_WARM, HEX],
+    "junctek": [KH_CHARGING, KG_CHARGING, b":R50=1,2,1,\r\n", b":r00=1,217,2140,110,6,\r\n"],
+    "pylontech": [US5000_PWR, US2000_PWR, bat(1, US2000_CELLS), b"\n\rpylon>"],
+}
+pieces = st.sampled_from(sorted(FRAMES)).flatmap(
+    lambda name: st.tuples(
+        st.just(name),
+        st.lists(st.sampled_from(FRAMES[name]) | st.binary(max_size=40), max_size=8).map(b"".join),
+        st.lists(st.integers(0, 8000), max_size=6),
+        st.lists(st.tuples(st.integers(0, 8000), st.integers(0, 255)), max_size=3),
+    )
+)
+
+
+@settings(max_examples=300)
+@given(pieces)
+def test_no_bytes_make_a_dialect_raise_and_cutting_them_changes_no_value(
+    case: tuple[str, bytes, list[int], list[tuple[int, int]]],
+) -> None:
+    name, data, cuts, changes = case
+    damaged = bytearray(data)
+    for at, value in changes:
+        if damaged:
+            damaged[at % len(damaged)] = value
+    whole, cut = DIALECTS[name](), DIALECTS[name]()
+    block, cells = whole.feed(1.0, bytes(damaged)), whole.cells
+    edges = [0, *sorted(min(at, len(damaged)) for at in cuts), len(damaged)]
+    blocks, rows = [], 0
+    for n, (a, b) in enumerate(itertools.pairwise(edges)):
+        blocks.append(cut.feed(1.0 + n, bytes(damaged[a:b])))
+        rows += cut.cells.shape[0]
+        cut.due(1.0 + n)
+    assert values(np.concatenate(blocks)) == values(block)
+    assert rows <= cells.shape[0]
+    assert whole.counters["frames_received"] == block.size
+    assert (whole.fault is None) == (cut.fault is None)
+
+
+@pytest.mark.parametrize(("name", "cells"), [("vedirect", 0), ("junctek", 0), ("pylontech", 15)])
+async def test_a_device_on_a_line_is_heard_and_asked_as_it_wants(name: str, cells: int) -> None:
+    with METERS[name](lambda _: Reading(-3.25, 49.87, 21.0), 1.0) as meter:
+        sensor = SensorSettings.model_validate({"protocol": name, "port": meter.path})
+        running = asyncio.create_task(meter.run())
+        async with asyncio.timeout(LONG_S), SerialBoard(sensor) as source:
+            async for block in source:
+                assert values(block) == [(49.87, -3.25)] * block.size
+                assert set(block["temperature_c"]) == {21.0}
+                if source.cells.shape[1] == cells:
+                    break
+            assert source.message is None
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        assert source.cells.sum() == pytest.approx(49.87 * source.cells.shape[0] * (cells > 0), abs=0.01 * cells)
+
+
+def test_silence_is_no_fault_of_the_dialect() -> None:
+    for make in DIALECTS.values():
+        dialect = make()
+        assert dialect.feed(1.0, b"").size == 0
+        assert (dialect.fault, dialect.described) == (None, None)

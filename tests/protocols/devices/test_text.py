@@ -1,0 +1,94 @@
+"""Boards that print text: however their bytes come, the same is read, and what cannot be read is shown."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bms_estimator.model.sample import NO_CELLS, SampleBlock
+from bms_estimator.protocols.devices.text import LINE_BYTES, TextDialect
+
+lines = (
+    st.binary(max_size=40)
+    | st.integers(0, 2 * LINE_BYTES).map(lambda n: n * b" " + b"3.3,0.1")
+    | st.tuples(st.floats(0, 60), st.floats(-9, 9)).map(lambda vi: b"%.3f,%.3f" % vi)
+    | st.just(b"V=3.3 I=2 cells=3.31,3.29")
+    | st.just(b'{"voltage": 3.4, "current": 1}')
+)
+streams = st.lists(lines, max_size=12).map(b"\n".join)
+cuttings = st.lists(st.integers(0, 8 * LINE_BYTES), max_size=12)
+
+
+def fed(data: bytes, cuts: list[int]) -> tuple[TextDialect, SampleBlock, list[list[float]]]:
+    """The dialect after ``data`` in pieces; its samples; their cells."""
+    dialect = TextDialect()
+    edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
+    blocks, cells = [], []
+    for a, b in itertools.pairwise(edges):
+        blocks.append(dialect.feed(1.0, data[a:b]))
+        cells += [[v for v in row if v == v] for row in dialect.cells.tolist()] or [[]] * blocks[-1].size
+    return dialect, np.concatenate(blocks), cells
+
+
+@settings(max_examples=300)
+@given(streams, cuttings)
+def test_no_bytes_make_it_raise_and_cutting_them_changes_no_value(data: bytes, cuts: list[int]) -> None:
+    dialect, whole, cells = fed(data, [])
+    cut_dialect, cut, cut_cells = fed(data, cuts)
+    for name in ("voltage_v", "current_a", "temperature_c"):
+        assert whole[name].tobytes() == cut[name].tobytes()
+    assert cells == cut_cells
+    assert (dialect.counters, dialect.fault) == (cut_dialect.counters, cut_dialect.fault)
+    assert dialect.counters["frames_received"] == whole.size
+
+
+def test_the_end_of_a_line_that_is_too_long_is_no_line_of_its_own() -> None:
+    data = b"\n" + LINE_BYTES * b"x" + b"3.3,0.1\n3.4,0.2\n"
+    _, block, _ = fed(data, [LINE_BYTES + 1])
+    assert block["voltage_v"].tolist() == [3.4]
+
+
+@pytest.mark.parametrize(
+    ("sent", "shown"),
+    [
+        (b"V=13.3kV I=2\r\n", "the first: 'V=13.3kV I=2'"),
+        (b"\x1b[31mhot\n", "the first: '\\x1b[31mhot'"),
+        (b"INA226 ready\nwaiting\n", "the first: 'INA226 ready'"),
+        (200 * b"x" + b"\n", f"the first: '{60 * 'x'}'..."),
+    ],
+)
+def test_the_first_line_that_says_nothing_is_shown_as_it_came(sent: bytes, shown: str) -> None:
+    dialect, _, _ = fed(b"half\n" + sent, [])
+    assert dialect.fault is not None
+    assert shown in dialect.fault
+    assert "baud" not in dialect.fault
+    dialect.feed(2.0, b"3.3,0.1\n")
+    assert dialect.fault is None
+
+
+def test_bytes_that_are_no_text_are_called_a_wrong_baud_rate() -> None:
+    dialect, _, _ = fed(bytes(range(128, 256)) * (LINE_BYTES // 100), [])
+    assert "wrong baud rate" in (dialect.fault or "")
+
+
+def test_cells_stand_beside_their_samples() -> None:
+    dialect = TextDialect()
+    block = dialect.feed(1.0, b"V=6.6 I=2 cells=3.31,3.29\n6.6,2\nV=6.6 I=2 cells=3.3\n")
+    assert block.size == 3
+    assert dialect.cells.dtype == np.float64
+    np.testing.assert_equal(dialect.cells, [[3.31, 3.29], [np.nan, np.nan], [3.3, np.nan]])
+    assert dialect.feed(2.0, b"6.6,2\n").size == 1
+    assert dialect.cells is NO_CELLS
+
+
+def test_many_reads_at_once_are_the_same_samples_and_cells() -> None:
+    reads = [b"6.6,2,25\nV=6.6 I=2 T=25 ce", b"lls=3.31,3.29\n", b"6.7,2,25\n"]
+    one, many = TextDialect(), TextDialect()
+    blocks = [one.feed(float(i), read) for i, read in enumerate(reads)]
+    data = np.frombuffer(b"".join(reads), dtype=np.uint8)
+    ends = np.cumsum([len(read) for read in reads])
+    block = many.feed_reads(np.arange(3.0), ends, data)
+    np.testing.assert_array_equal(block, np.concatenate(blocks))
+    np.testing.assert_equal(many.cells, [[np.nan, np.nan], [3.31, 3.29], [np.nan, np.nan]])
