@@ -53,7 +53,7 @@ fleet-kills: venv ## workers and servers of a fleet killed 100 times, one node a
 	@$(BIN)/python -m tests.benchmarks.fleet_kills $(ARGS)
 
 nats: apt venv ## a node of a NATS cluster killed in mid-stream, in every part that it can have: a minute
-	CLUSTER=1 $(BIN)/python -m pytest tests/sinks/test_nats.py $(ARGS)
+	CLUSTER=1 $(BIN)/python -m pytest tests/mqtt/test_nats_server.py $(ARGS)
 
 real-home-assistant:
 	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)" || echo "no real Home Assistant here: its tests are skipped"

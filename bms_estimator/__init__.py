@@ -8,7 +8,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bms_estimator.calibration.identify import identify
+    from bms_estimator.calibration.elements.identify import identify
     from bms_estimator.calibration.validate import validate
     from bms_estimator.estimator import Estimator, estimate
     from bms_estimator.model.cell import load_cell

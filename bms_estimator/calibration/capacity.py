@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.capture_checks import GAP_CHARGE, GAP_STEPS
-from bms_estimator.calibration.ocv_points import COLD_V, LONG_REST_S, RELAXED_V, coldness
-from bms_estimator.calibration.relaxation import Rest, find_rests, resting_samples, runs, without_glitches
+from bms_estimator.calibration.cleaning.capture_checks import GAP_CHARGE, GAP_STEPS
+from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, coldness
+from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests, resting_samples, runs, without_glitches
 from bms_estimator.estimator.filter_settings import CURVE_SOC, filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv

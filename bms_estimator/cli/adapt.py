@@ -10,7 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.adapt import Adaptation, adapt
+from bms_estimator.calibration.thesis.adapt import Adaptation, adapt
 from bms_estimator.cli.captures import (
     AsJson,
     CapacityAh,

@@ -18,6 +18,7 @@ from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.guard import guard_of
 from bms_estimator.process.credential import is_for_the_service
 from bms_estimator.service.alarm_hooks import unusable
@@ -26,7 +27,6 @@ from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.settings.pack import MqttSettings, SensorSettings, Settings
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.sinks.brokers import check as check_brokers
 from bms_estimator.sinks.influx import target
 from bms_estimator.sources.kinds import make_bringer
 from bms_estimator.sources.ports import board_ports

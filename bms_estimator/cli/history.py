@@ -17,8 +17,8 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.pack import load_settings
+from bms_estimator.store.history_reader import HistoryFile, PastEvent
 from bms_estimator.store.minute import MINUTE_S, Minute
-from bms_estimator.store.reading import HistoryFile, PastEvent
 
 FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
 

@@ -12,7 +12,7 @@ from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 
-from bms_estimator.calibration.identify import CaptureFit, Identification, identify
+from bms_estimator.calibration.elements.identify import CaptureFit, Identification, identify
 from bms_estimator.cli.captures import (
     OR_FUEL_CELL_HELP,
     AsJson,

@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 
-from bms_estimator.calibration.fuel_cell import KEYS, Floats, FuelCellFit, Source, fit_fuel_cell
+from bms_estimator.calibration.fuel_cell_fit import KEYS, Floats, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.cli.captures import name_of, unlike
 from bms_estimator.kernels.kalman_filter.hypotheses import COLDEST_C, HOTTEST_C
 from bms_estimator.model.cell_file import write_cell

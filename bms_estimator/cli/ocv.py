@@ -15,10 +15,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.generic_parts import curve, ladder_of, most_alike
-from bms_estimator.calibration.ocv import NAMES, ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv_points import Points, max_v, rms_v
-from bms_estimator.calibration.ocv_sources import (
+from bms_estimator.calibration.elements.generic_prior import curve, ladder_of, most_alike
+from bms_estimator.calibration.elements.initial_elements import rest_elements
+from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit, fit_chen_mora
+from bms_estimator.calibration.ocv.points import Points, max_v, rms_v
+from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, without_glitches
+from bms_estimator.calibration.ocv.sources import (
     GivenCurve,
     Recording,
     Sources,
@@ -27,9 +29,7 @@ from bms_estimator.calibration.ocv_sources import (
     has_plateau,
     without_branches,
 )
-from bms_estimator.calibration.ocv_table import NODES, TableFit, fit_table
-from bms_estimator.calibration.relaxation import RelaxationTest, without_glitches
-from bms_estimator.calibration.rest_elements import rest_elements
+from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.cli.captures import AsJson, Force, NewCellFile, SignOfCurrent, check_once, check_out, name_of, unlike
 from bms_estimator.cli.decimal_option import decimal, whole
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C

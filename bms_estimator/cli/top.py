@@ -11,14 +11,14 @@ import typer
 from bms_estimator.cli.keys import keys
 from bms_estimator.cli.pack import with_broker
 from bms_estimator.model.errors import UserError
+from bms_estimator.mqtt.subscriber import Subscriber
+from bms_estimator.mqtt.topic_cache import Heard
 from bms_estimator.process.log_setup import configure_logs, drained
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.pack import MqttSettings, Settings, load_settings
 from bms_estimator.sinks.console import LiveView
 from bms_estimator.sinks.console_scene import Lost
 from bms_estimator.sinks.console_view import LOG_LINES
-from bms_estimator.sinks.published import Heard
-from bms_estimator.sinks.subscriber import Subscriber
 
 TICK_S = 1.0
 """Also when nothing is heard the view is made anew: it says since when that is [s]."""

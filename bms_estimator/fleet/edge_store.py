@@ -21,7 +21,7 @@ from bms_estimator.fleet.gathering import Gathered
 from bms_estimator.fleet.subjects import Awaits
 from bms_estimator.sinks.messages import Message
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.queue import Waiting
+from bms_estimator.store.outbox_queue import Waiting
 
 MOST_WAITING = 500_000
 """Samples that wait in memory for a disk that takes none: 20 MB, five days at a sample a second."""

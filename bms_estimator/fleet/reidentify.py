@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.identify import identify
+from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import learned_cell

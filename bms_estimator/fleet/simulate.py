@@ -19,8 +19,8 @@ from pydantic import ValidationError
 from bms_estimator.fleet.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulated_fleet import SimulatedFleet
 from bms_estimator.fleet.subjects import Awaits, awaits, raw
+from bms_estimator.mqtt.broker_config import brokers, password, tls_context
 from bms_estimator.settings.pack import MqttSettings
-from bms_estimator.sinks.brokers import brokers, password, tls_context
 
 ROUND_S = 0.1
 """From one look at what is due to the next [s]."""

@@ -4,13 +4,13 @@ import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+from bms_estimator.mqtt.subscriber import Subscriber
+from bms_estimator.mqtt.topic_cache import Heard
 from bms_estimator.page.hub import Hub
 from bms_estimator.page.past import Past
 from bms_estimator.page.server import PageServer
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.sinks.published import Heard
-from bms_estimator.sinks.subscriber import Subscriber
 
 
 @contextlib.asynccontextmanager

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.store.history_reader import HistoryFile
 from bms_estimator.store.minute import MINUTE_S
-from bms_estimator.store.reading import HistoryFile
 
 MOST_EVENTS = 50
 FIELDS = (

@@ -8,12 +8,12 @@ from typing import Self
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.topic_cache import parsed
 from bms_estimator.page.hub import Hub
 from bms_estimator.page.past import Past
 from bms_estimator.page.server import PageServer
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.messages import Message, Messages, Sent
-from bms_estimator.sinks.published import parsed
 
 
 class PageSink:

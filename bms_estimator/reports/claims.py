@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.rest_elements import rest_elements
+from bms_estimator.calibration.elements.initial_elements import rest_elements
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports import printed
 from bms_estimator.reports.items import Verdict

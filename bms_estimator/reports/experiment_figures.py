@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.ocv import chen_mora
+from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
 from bms_estimator.reports import printed
 from bms_estimator.reports.experiment import Experiment
 from bms_estimator.reports.items import Figure, Verdict

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bms_estimator.calibration.ocv import average, chen_mora
-from bms_estimator.calibration.ocv_points import max_v, pooled, rms_v
+from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora
+from bms_estimator.calibration.ocv.points import max_v, pooled, rms_v
 from bms_estimator.reports import printed
 from bms_estimator.reports.experiment import Experiment
 from bms_estimator.reports.items import Table, Verdict, number

@@ -15,21 +15,26 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.adaptive import AdaptiveRun, adaptive_run
-from bms_estimator.calibration.ocv import ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv_points import pooled
-from bms_estimator.calibration.ocv_table import TableFit, fit_table
-from bms_estimator.calibration.prediction import Prediction, predict, static_elements
-from bms_estimator.calibration.printed_bounds import printed_bounds
-from bms_estimator.calibration.relaxation import RelaxationTest, relaxation_test, rest_current_a, without_glitches
-from bms_estimator.calibration.series_resistance import (
+from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
+from bms_estimator.calibration.ocv.points import pooled
+from bms_estimator.calibration.ocv.relaxation_test import (
+    RelaxationTest,
+    relaxation_test,
+    rest_current_a,
+    without_glitches,
+)
+from bms_estimator.calibration.ocv.table_fit import TableFit, fit_table
+from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
+from bms_estimator.calibration.thesis.prediction import Prediction, predict, static_elements
+from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
+from bms_estimator.calibration.thesis.series_resistance import (
     SeriesResistance,
     SeriesResistanceFit,
     fit_series_resistance,
     mean_of,
     series_resistance,
 )
-from bms_estimator.calibration.soc_lookup import soc_by_interpolation
+from bms_estimator.calibration.thesis.soc_lookup import soc_by_interpolation
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError

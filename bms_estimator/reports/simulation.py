@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from bms_estimator.calibration.adaptive import AdaptiveRun, adaptive_run
-from bms_estimator.calibration.prediction import Prediction, predict, static_elements
-from bms_estimator.calibration.series_resistance import (
+from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
+from bms_estimator.calibration.thesis.prediction import Prediction, predict, static_elements
+from bms_estimator.calibration.thesis.series_resistance import (
     SeriesResistance,
     SeriesResistanceFit,
     fit_series_resistance,

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.adaptive import AdaptiveRun
-from bms_estimator.calibration.prediction import Prediction
+from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun
+from bms_estimator.calibration.thesis.prediction import Prediction
 from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
 from bms_estimator.reports.items import Figure, Verdict

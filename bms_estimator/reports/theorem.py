@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.adaptive import adaptive_run
+from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import Bounds, CellModel
 from bms_estimator.reports.simulation import (

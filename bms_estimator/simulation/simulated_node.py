@@ -6,13 +6,13 @@ import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Self
 
+from bms_estimator.mqtt.broker_config import brokers
+from bms_estimator.mqtt.connection import Connection, Hello
+from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.simulation.virtual_converter import Reading
 from bms_estimator.sinks import Delivery
-from bms_estimator.sinks.brokers import brokers
-from bms_estimator.sinks.connection import Connection, Hello
-from bms_estimator.sinks.dial import Dial
-from bms_estimator.sinks.link import Link
 from bms_estimator.sinks.messages import Message
 
 INTERVAL_S = 2.0

@@ -14,11 +14,11 @@ from typing import IO, Self, TypeVar, cast
 from rich.console import Console
 from rich.live import Live
 
+from bms_estimator.mqtt.topic_cache import Device, Heard
 from bms_estimator.sinks.console_line import line
 from bms_estimator.sinks.console_scene import Lost, Pack, Scene
 from bms_estimator.sinks.console_view import View
 from bms_estimator.sinks.fields import Fields
-from bms_estimator.sinks.published import Device, Heard
 
 REDRAW_S = 0.25
 """A screen is drawn no more often than this, whatever the publish rate [s]."""

@@ -1,9 +1,9 @@
 """A line for what is heard of a pack, where no screen is: a file or a pipe. Pure."""
 
+from bms_estimator.mqtt.topic_cache import Heard
 from bms_estimator.sinks.console_scene import ALARM
 from bms_estimator.sinks.console_view import band_text
 from bms_estimator.sinks.fields import Fields
-from bms_estimator.sinks.published import Heard
 
 
 def line(heard: Heard, true_soc: float | None = None) -> str | None:

@@ -5,9 +5,9 @@ from typing import Self
 
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.topic_cache import Published
 from bms_estimator.sinks.console import LiveView
 from bms_estimator.sinks.messages import Message, Messages, Sent
-from bms_estimator.sinks.published import Published
 
 BASE_TOPIC = "bms"
 """Nobody sees these topics."""

@@ -14,19 +14,19 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.broker_config import brokers, check
+from bms_estimator.mqtt.connection import Connect, Connection, Hello, Received
+from bms_estimator.mqtt.denied_topics import Refusals
+from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.queue_sender import Backlog
+from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import ECHO_S, Availability
-from bms_estimator.sinks.backlog import Backlog
-from bms_estimator.sinks.brokers import brokers, check
-from bms_estimator.sinks.connection import Connect, Connection, Hello, Received
-from bms_estimator.sinks.dial import Dial
-from bms_estimator.sinks.link import Link
 from bms_estimator.sinks.messages import AVAILABILITY, SENSOR_AVAILABILITY, Message, Messages, Sent
-from bms_estimator.sinks.refusals import Refusals
 from bms_estimator.sinks.requests import MOST_SHOWN, Requests
 from bms_estimator.store.outbox import Outbox
 

@@ -34,8 +34,8 @@ def formula(cell: CellModel) -> Formula | None:
 def _fitted(ocv: TableOcv) -> Formula:
     from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - what fits is loaded only where there is a table
 
-    from bms_estimator.calibration.ocv import fit_chen_mora  # noqa: PLC0415
-    from bms_estimator.calibration.ocv_points import Points, rms_v  # noqa: PLC0415
+    from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora  # noqa: PLC0415
+    from bms_estimator.calibration.ocv.points import Points, rms_v  # noqa: PLC0415
 
     soc = np.linspace(0.0, 1.0, POINTS)
     fit = fit_chen_mora(Points(soc, PchipInterpolator(ocv.soc, ocv.ocv_v)(soc), np.ones(POINTS)))

@@ -17,11 +17,7 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
     Args:
         estimator: Of a battery, after a sample, with R_s by (4.2).
     """
-    from bms_estimator.calibration.series_resistance import (  # noqa: PLC0415 - most packs do not need it
-        LOWEST_SOC,
-        fit_series_resistance,
-        summed,
-    )
+    from bms_estimator.calibration.thesis.series_resistance import LOWEST_SOC, fit_series_resistance, summed  # noqa: PLC0415 - most packs do not need it
 
     record = estimator.record[0]
     sums = record["series_resistance"]

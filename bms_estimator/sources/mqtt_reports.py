@@ -10,12 +10,12 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
+from bms_estimator.mqtt.broker_config import brokers, check
+from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError, Received
+from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.protocols.base.report_line import CONNECTED
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import MqttSettings, Settings
-from bms_estimator.sinks.brokers import brokers, check
-from bms_estimator.sinks.connection import Connect, Connection, Hello, LinkError, Received
-from bms_estimator.sinks.dial import Dial
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sources.assembly import Assembly
 from bms_estimator.sources.reports import Bringer, NothingComesError

@@ -14,7 +14,7 @@ from typing import Any, Self, TypeVar
 import structlog
 
 from bms_estimator.process.disk_thread import DiskThread
-from bms_estimator.store.tables import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
+from bms_estimator.store.migrations import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
 
 HANG_S = 10.0
 """A disk that has not answered by then is taken to hang [s]."""

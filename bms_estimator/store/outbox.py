@@ -10,9 +10,9 @@ from collections import deque
 from typing import Self
 
 from bms_estimator.sinks.messages import Message
-from bms_estimator.store.backlog import Outcome, Work, look
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.queue import PAGE, Queue, Waiting
+from bms_estimator.store.outbox_queue import PAGE, Queue, Waiting
+from bms_estimator.store.outbox_table import Outcome, Work, look
 
 FLUSH_S = 1.0
 """How often what waits is written while the broker is away [s]."""

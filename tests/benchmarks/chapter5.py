@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.ocv_points import pooled
-from bms_estimator.calibration.series_resistance import SeriesResistance, SeriesResistanceFit
+from bms_estimator.calibration.ocv.points import pooled
+from bms_estimator.calibration.thesis.series_resistance import SeriesResistance, SeriesResistanceFit
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.reports import printed

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.calibration.fuel_cell import KEYS, FuelCellFit, Source, fit_fuel_cell
+from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.fuel_cell_settings import MEMORY_S
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop

@@ -37,6 +37,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
+from bms_estimator.mqtt.topic_cache import Published
 from bms_estimator.protocols.base.device_protocol import Dialect
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.junctek import JunctekDialect
@@ -51,7 +52,6 @@ from bms_estimator.settings.pack import SensorSettings, Settings, load_settings
 from bms_estimator.sinks import Delivery, console_line
 from bms_estimator.sinks.console_scene import Scene
 from bms_estimator.sinks.console_view import View
-from bms_estimator.sinks.published import Published
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.sources.board_memory import BoardMemory
 from bms_estimator.sources.curve import read_curve

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.calibration.ocv import chen_mora
+from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.reports.printed import TABLE_1
 

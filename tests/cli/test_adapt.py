@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.calibration import adapt
+from bms_estimator.calibration.thesis import adapt
 from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.cell import load_cell
 from tests.calibration.simulated_load import TRUTH, capture, steps

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from bms_estimator.calibration import identify
+from bms_estimator.calibration.elements import identify
 from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.cell import load_cell
 from tests.calibration.simulated_load import TRUTH, capture, steps

@@ -9,9 +9,9 @@ import pytest
 
 from tests.command_line import PROGRAM
 from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
 from tests.serial_line import Line
-from tests.sinks.certificates import Authority
 
 PASSWORD = "open-sesame-4711"
 PACK = """

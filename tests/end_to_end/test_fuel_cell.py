@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.calibration.fuel_cell import KEYS
+from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.cli.pack import load_pack
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.live import new_estimator

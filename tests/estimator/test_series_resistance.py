@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.adapt_steps import Start, steps_2_and_3
-from bms_estimator.calibration.prediction import predict
-from bms_estimator.calibration.series_resistance import (
+from bms_estimator.calibration.thesis.adapt_steps import Start, steps_2_and_3
+from bms_estimator.calibration.thesis.prediction import predict
+from bms_estimator.calibration.thesis.series_resistance import (
     LOWEST_SOC,
     fit_series_resistance,
     series_resistance,

@@ -12,8 +12,8 @@ from bms_estimator.fleet import connection
 from bms_estimator.fleet.connection import connect, part
 from bms_estimator.fleet.server_config import Tls
 from tests.fleet.engine import running
+from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
-from tests.sinks.certificates import Authority
 
 TOO_MUCH = 16 << 20
 """More than all buffers between us and the server hold."""

@@ -21,8 +21,8 @@ from bms_estimator.settings.edge import EdgeSettings
 from tests.fleet.engine import Engine, running
 from tests.fleet.receiver import Receiver
 from tests.mosquitto import Broker, Listener
+from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S
-from tests.sinks.proxy import Proxy
 
 WALL_S = 1.7e9
 SETTINGS = {"block_s": 60.0, "store_mib": 1.0}

@@ -28,8 +28,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from tests.command_line import run
 from tests.free_port import free_port
+from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
-from tests.sinks.certificates import Authority
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 

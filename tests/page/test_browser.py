@@ -18,10 +18,10 @@ import pytest_asyncio
 from playwright.async_api import Browser
 
 from bms_estimator.model.payloads import Alarm
+from bms_estimator.mqtt.topic_cache import MAX_DEVICES
 from bms_estimator.page.dashboard import dashboard
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.sinks.published import MAX_DEVICES
 from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab

@@ -13,13 +13,13 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.input_faults import Suspect
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.mqtt.topic_cache import Heard, Published
 from bms_estimator.service.live import new_estimator
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.console_line import line
 from bms_estimator.sinks.console_scene import Lost, Pack, Scene
 from bms_estimator.sinks.console_view import View
 from bms_estimator.sinks.messages import Messages, Sent
-from bms_estimator.sinks.published import Heard, Published
 from bms_estimator.snapshot.publisher import Publisher
 from tests.collector import Collector
 from tests.scripted_source import ScriptedSource

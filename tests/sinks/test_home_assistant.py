@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.fuel_cell import KEYS
+from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, Parameter, Snapshot
 from bms_estimator.settings.alarms import ALARMS

@@ -13,23 +13,23 @@ from aiomqtt import ProtocolVersion
 from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
+from bms_estimator.mqtt.broker_config import brokers, check
+from bms_estimator.mqtt.client import PATIENCE, Client
+from bms_estimator.mqtt.connection import Connection, Hello
+from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING, Inbox
+from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.process.backoff import LONGEST_DELAY_S
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.availability import CORRECTION_S
-from bms_estimator.sinks.brokers import brokers, check
-from bms_estimator.sinks.client import PATIENCE, Client
-from bms_estimator.sinks.connection import Connection, Hello
-from bms_estimator.sinks.dial import Dial
-from bms_estimator.sinks.inbox import MOST_BYTES, MOST_WAITING, Inbox
-from bms_estimator.sinks.link import Link
 from bms_estimator.sinks.messages import Message
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S
-from tests.sinks.proxy import Proxy
 from tests.sinks.service import Sink, until
 from tests.sinks.snapshots import ONE, snapshot
 

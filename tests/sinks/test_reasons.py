@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 import structlog
 
+from bms_estimator.mqtt.queue_sender import WINDOW
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks import Delivery
-from bms_estimator.sinks.backlog import WINDOW
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S
-from tests.sinks.proxy import Proxy
 from tests.sinks.service import STATE, Sink, assert_all_in_order, numbers, state, until
 from tests.sinks.snapshots import ONE, snapshot
 

@@ -16,8 +16,8 @@ from bms_estimator.store import database as database_module
 from bms_estimator.store import history as history_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.history import History
+from bms_estimator.store.history_reader import HistoryFile, PastEvent
 from bms_estimator.store.minute import Minute
-from bms_estimator.store.reading import HistoryFile, PastEvent
 from tests.patience import LONG_S
 from tests.sinks.snapshots import ONE
 

@@ -16,7 +16,7 @@ from bms_estimator.sinks.messages import Message
 from bms_estimator.store import outbox as outbox_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
-from bms_estimator.store.queue import MEMORY_MOST
+from bms_estimator.store.outbox_queue import MEMORY_MOST
 from tests.patience import LONG_S
 
 

@@ -16,7 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from bms_estimator.sinks.messages import Message
 from bms_estimator.store import outbox as outbox_module
-from bms_estimator.store import queue as queue_module
+from bms_estimator.store import outbox_queue as queue_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
 

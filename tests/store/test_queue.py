@@ -1,7 +1,7 @@
 """The order of what waits, without a disk."""
 
 from bms_estimator.sinks.messages import Message
-from bms_estimator.store.queue import LOWEST, PAGE, Queue
+from bms_estimator.store.outbox_queue import LOWEST, PAGE, Queue
 
 
 def filled(count: int) -> Queue:

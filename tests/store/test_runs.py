@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.store.runs import Runs
+from bms_estimator.store.number_ranges import Runs
 
 NUMBERS = st.sets(st.integers(-5, 30))
 

@@ -12,7 +12,7 @@ from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.sinks.messages import Messages
 from bms_estimator.sources.doorkeeper import Doorkeeper
-from bms_estimator.store.queue import Queue
+from bms_estimator.store.outbox_queue import Queue
 
 
 @contextlib.contextmanager

@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.adapt_steps import Start, steps_2_and_3
-from bms_estimator.calibration.prediction import open_circuit, predict
-from bms_estimator.calibration.printed_bounds import printed_bounds
-from bms_estimator.calibration.relaxation import soc_by_counting
+from bms_estimator.calibration.ocv.relaxation_test import soc_by_counting
+from bms_estimator.calibration.thesis.adapt_steps import Start, steps_2_and_3
+from bms_estimator.calibration.thesis.prediction import open_circuit, predict
+from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import fitted_parameter
 from bms_estimator.estimator.settings_records import ocv_grid

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
-from bms_estimator.calibration.relaxation import resting_samples, runs
+from bms_estimator.calibration.ocv.relaxation_test import resting_samples, runs
 from tests.benchmarks.pulses import AROUND, pulses
 from tests.benchmarks.side_by_side.trials import Block
 

@@ -1,0 +1,1 @@
+"""Captures without glitches, their rests, and plausibility checks."""

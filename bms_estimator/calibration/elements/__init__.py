@@ -1,0 +1,1 @@
+"""Resistances and capacitances from loads."""

@@ -1,0 +1,451 @@
+"""Identification of a cell from captures: the ladder of the filter, a1..a15 of its two branches, a better OCV.
+
+The fit is that of ``ladder_fit``. Whether it is any good is asked of the estimator itself: replays cut in mid-load, before
+and after. A capture beside which others of about its temperature were given is held back from the fit that it judges.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.cleaning.capture_checks import contradictions, step_resistance, without_excitation
+from bms_estimator.calibration.cleaning.clean_capture import Load, whole_load
+from bms_estimator.calibration.elements import two_branch_fit
+from bms_estimator.calibration.elements.ladder_fit import (
+    EVEN,
+    HELD_PER_KELVIN_V,
+    HELD_V,
+    KELVIN_NODES,
+    KNOWN_PER_KELVIN_V,
+    NOTHING,
+    PER_KELVIN_V,
+    SOC_NODES,
+    TYPICAL_V,
+    LadderFit,
+    Prior,
+    correction_at,
+    fit_ladder,
+    moments,
+)
+from bms_estimator.calibration.elements.replay_score import interval_score
+from bms_estimator.calibration.ocv.overpotential import arrhenius, beside_ocv, hats, overpotential, temperature_of
+from bms_estimator.calibration.ocv.slow_curve import PAIR_V
+from bms_estimator.calibration.ocv.sources import REST_SHARE_STD, has_plateau
+from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.chen_mora import r_s, soc_from_ocv
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, weak_share
+from bms_estimator.model.cell import CellModel, Ladder, TableOcv
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.errors import UserError
+
+Floats = NDArray[np.float64]
+
+SHOWN_SOC = (0.2, 0.5, 0.8)
+"""SOCs at which the resistances are reported."""
+OCV_STEP = 0.01
+"""Nodes of the corrected table: at each such step of SOC."""
+LEAST_SLOPE_V = 1e-3
+"""The corrected table rises at least so steeply, per cell and 1 of SOC [V]."""
+SPAN_K = 10.0
+"""Temperatures that differ by less tell nothing of activation energies and dE/dT [K]."""
+FULL_V, COLD_K = 0.03, 5.0
+"""A rest in the cold, so far from 25 C, tells the SOC no better than this, per cell [V, K]: so near to full it is full."""
+LOWEST_C, HIGHEST_C = -45.0, 85.0
+"""Temperatures of cells [C]."""
+PERCENTILES = (2.0, 98.0)
+"""The temperatures of the captures are known between these."""
+LADDER_STD = 0.1
+"""Resistances of another cell of the same make: two NCR18650 differ by 5 to 8 %, and cells age."""
+TYPICAL_STD = 0.3
+"""A ladder less sure than this was not identified: it does not know its temperatures."""
+MIDDLE_SOC, SHAPE = 0.4, (0.2, 20.0)
+"""Above it is the middle; no part is taken to be smaller or larger than this over what it is there."""
+JUDGED_SOC = 0.1
+"""RMS errors are given above it."""
+COUNT_PASSES = 3
+"""Fits from which the miscount of each capture is found: a knee is not linear."""
+NO_WORSE = 1.05
+"""Scores that differ by less than this factor are the same: four replays do not tell more."""
+
+
+@dataclass(frozen=True)
+class CaptureFit:
+    """What the fit says of one capture.
+
+    Attributes:
+        name: What it is called.
+        samples: How many it had.
+        glitches: How many were left out as glitches.
+        initial_soc: At the first sample, 0..1.
+        temperature_c: Lowest and highest [C]; None without a sensor.
+        miscount: By how much more charge was moved than its samples say, relative; the SOC of the fit has it.
+        voltage_rms_v: What the ladder leaves, each second weighing the same, SOC above 0.1 [V].
+        score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
+        score_after: The same with the identified one.
+        held_back: The capture had no part in the cell of ``score_after``.
+    """
+
+    name: str
+    samples: int
+    glitches: int
+    initial_soc: float
+    temperature_c: tuple[float, float] | None
+    miscount: float
+    voltage_rms_v: float
+    score_before: float
+    score_after: float
+    held_back: bool
+
+
+@dataclass(frozen=True)
+class Identification:
+    """An identified cell.
+
+    Attributes:
+        cell: The cell with its ladder, the elements of its two branches, and perhaps a new open-circuit voltage.
+        elements: SOC -> ``r_s``, ``r_ts``, ``r_tl`` at 25 C -> value, standard error [ohm].
+        captures: In the order given.
+        left_out: Names of captures without excitation.
+        ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0: it is the given one.
+        score_before: Geometric mean over the captures of the interval score with the given cell [%]; NaN when none could judge.
+        score_after: The same with the identified one.
+    """
+
+    cell: CellModel
+    elements: dict[float, dict[str, tuple[float, float]]]
+    captures: tuple[CaptureFit, ...]
+    left_out: tuple[str, ...]
+    ocv_correction_v: float
+    score_before: float
+    score_after: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """One capture with what is known of it beside its samples."""
+
+    load: Load
+    soc: Floats
+    temperature_c: Floats
+    miscount: float = 0.0
+    """By how much more charge was moved than the capture says, relative; ``soc`` counts it."""
+
+    def recounted(self, more: float) -> "Run":
+        """The same with a miscount that is larger by ``more``."""
+        miscount = self.miscount + more
+        moved = (self.soc - self.soc[0]) / (1.0 + self.miscount)
+        return replace(self, soc=self.soc[0] + (1.0 + miscount) * moved, miscount=miscount)
+
+    @property
+    def warm_load(self) -> Load:
+        """``load`` at ``temperature_c``."""
+        return replace(self.load, temperature_c=self.temperature_c)
+
+    @property
+    def mean_c(self) -> float:
+        """Mean temperature [C]."""
+        return float(self.temperature_c.mean())
+
+
+def identify(
+    captures: Sequence[Columns],
+    cell: CellModel,
+    *,
+    refine_ocv: bool = True,
+    initial_soc: float | None = None,
+    temperature_c: float | None = None,
+) -> Identification:
+    """Fit the ladder to captures jointly.
+
+    Args:
+        captures: Raw samples, rows of dtype ``SAMPLE``; each should start from rest.
+        cell: Capacity, limits and OCV; its ladder, if it has one, says what captures of one temperature do not.
+        refine_ocv: Correct the open-circuit voltage as well where that makes the replays better.
+        initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
+        temperature_c: Of captures without a sensor; None: 25 C.
+
+    Raises:
+        UserError: No capture with excitation; one that contradicts the cell: sign of the current, capacity, OCV; a
+            temperature that no cell has; or replays that get worse.
+    """
+    whole = [whole_load(capture.name, capture.rows, cell) for capture in captures]
+    loads = [load for load in whole if not without_excitation(load, cell)]
+    runs = [_run(load, cell, initial_soc, temperature_c) for load in loads or whole]
+    found = [line for run in runs for line in contradictions(run.load, cell, float(run.soc[0]))]
+    found += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
+    if found:
+        raise UserError("\n".join(found))
+    runs = _recounted(runs, cell, refine_ocv=refine_ocv)
+    left_out = tuple(load.name for load in whole if without_excitation(load, cell))
+    candidates = [_Candidate(runs, cell, refine_ocv=refine) for refine in ((False, True) if refine_ocv else (False,))]
+    before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
+    after = [candidate.scores() for candidate in candidates]
+    best = len(after) - 1  # where nothing can be judged
+    if np.isfinite(before).any():
+        judged = [j for j in range(len(runs)) if candidates[0].held_back(j)]
+        kept, own = (_mean(scores[judged] if judged else scores) for scores in (after[0], after[-1]))
+        best = int((NO_WORSE if judged else 1.0) * own < kept)
+    outcome = candidates[best].outcome(before, after[best], left_out)
+    if outcome.score_after > NO_WORSE * outcome.score_before:
+        raise UserError(_worse(outcome))
+    return outcome
+
+
+def initial_soc(load: Load, cell: CellModel) -> float:
+    """SOC at the first sample from the voltage of the first rest; of a first sample under load, with i R_s added."""
+    current_a = 0.0 if load.resting_samples else float(load.current_a[0])
+    return soc_from_ocv(load.start_v + current_a * r_s(0.5, cell.a), *ocv_grid(cell))
+
+
+class _Candidate:
+    """One way to fit the captures: with the OCV refined or kept."""
+
+    def __init__(self, runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> None:
+        self._runs, self._cell, self._refine = runs, cell, refine_ocv
+        steps = [ohm for ohm in (step_resistance(run.load) for run in runs) if ohm is not None]
+        self._scale_ohm = (
+            float(np.median(steps)) if steps else TYPICAL_V * cell.cell.series_count / cell.cell.capacity_ah
+        )
+        grid = np.linspace(0.0, 1.0, ocv_grid(cell)[0].size)
+        self._moments = []
+        for run in runs:
+            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + beside_ocv(cell, run.warm_load, run.soc)
+            self._moments.append(
+                moments(
+                    run.load,
+                    run.soc,
+                    given_v,
+                    np.interp(run.soc, grid, ocv_grid(cell)[1]),
+                    run.temperature_c,
+                    self._scale_ohm,
+                    cell.cell.series_count,
+                    run.miscount,
+                )
+            )
+        self.fit, self.cell = self._fitted(range(len(runs)))
+
+    def miscounts(self) -> list[float]:
+        """Of each capture, beyond that it was counted with: by what more its voltage lies on the fit's."""
+        return [one.miscount(self.fit) for one in self._moments]
+
+    def scores(self) -> Floats:
+        """Of each capture's replays, with a cell that did not see it where there are others like it [%]."""
+        return np.array([interval_score(self._cell_for(j), run.load, run.soc) for j, run in enumerate(self._runs)])
+
+    def held_back(self, j: int) -> bool:
+        """Whether another capture at about the temperature of ``j`` was given."""
+        mean_c = [run.mean_c for run in self._runs]
+        return any(k != j and abs(mean_c[k] - mean_c[j]) < SPAN_K for k in range(len(mean_c)))
+
+    def outcome(self, before: Floats, after: Floats, left_out: tuple[str, ...]) -> Identification:
+        """All there is to say."""
+        fits = tuple(
+            CaptureFit(
+                name=run.load.name,
+                samples=run.load.samples,
+                glitches=run.load.glitches,
+                initial_soc=float(run.soc[0]),
+                temperature_c=_temperature_range([run]) if np.isfinite(run.load.temperature_c).any() else None,
+                miscount=run.miscount,
+                voltage_rms_v=_rms(self.cell, run),
+                score_before=float(before[j]),
+                score_after=float(after[j]),
+                held_back=self.held_back(j),
+            )
+            for j, run in enumerate(self._runs)
+        )
+        change_v = correction_at(np.linspace(0.1, 1.0, 181)) @ self.fit.correction
+        return Identification(
+            cell=self.cell,
+            elements={
+                soc: {name: self.fit.branches(soc, *which) for name, which in two_branch_fit.SECTIONS.items()}
+                for soc in SHOWN_SOC
+            },
+            captures=fits,
+            left_out=left_out,
+            ocv_correction_v=float(np.sqrt(np.mean(change_v**2))) if self._refine else 0.0,
+            score_before=_mean(before),
+            score_after=_mean(after),
+        )
+
+    def _cell_for(self, j: int) -> CellModel:
+        if not self.held_back(j):
+            return self.cell
+        return self._fitted([k for k in range(len(self._runs)) if k != j])[1]
+
+    def _fitted(self, which: Sequence[int]) -> tuple[LadderFit, CellModel]:
+        runs = [self._runs[k] for k in which]
+        low_c, high_c = _temperature_range(runs)
+        known = self._cell.ladder
+        tells = high_c - low_c >= SPAN_K
+        series = self._cell.cell.series_count
+        entropy_v = PER_KELVIN_V if _per_kelvin(self._cell) is None else KNOWN_PER_KELVIN_V
+        prior = Prior(
+            ocv_error_v=_middle_error(self._cell) if self._refine else np.full(EVEN.size, HELD_V),
+            per_kelvin_v=(entropy_v if tells and self._refine else HELD_PER_KELVIN_V) * series,
+            scale_ohm=self._scale_ohm,
+            series=series,
+            shapes=self._shapes(),
+            weak_share=None if tells else weak_share(SOC_NODES) if known is None else _share(known),
+        )
+        fit = fit_ladder([self._moments[k] for k in which], prior)
+        if not tells and known is not None and known.std < TYPICAL_STD:
+            low_c, high_c = min(low_c, known.temperature_c[0]), max(high_c, known.temperature_c[1])
+        ohm, ohm_std = fit.branches(0.5, 0, RESISTANCES)
+        ladder = Ladder(
+            soc=_tuple(SOC_NODES),
+            weak_ohm=tuple(map(_tuple, fit.weak_ohm)),
+            strong_ohm=tuple(map(_tuple, fit.strong_ohm)),
+            std=round(float(np.hypot(LADDER_STD, ohm_std / max(ohm, 1e-9 * self._scale_ohm))), 3),
+            error_v=1.0,
+            temperature_c=(low_c, high_c),
+        )
+        update: dict[str, object] = {"ladder": ladder, "adaptation": {}, **two_branch_fit.sections(ladder)}
+        if self._refine:
+            update["ocv"] = _corrected_ocv(self._cell, fit, entropy=tells)
+        new = self._cell.model_copy(update=update)
+        error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), 1e-5)
+        return fit, new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
+
+    def _shapes(self) -> Floats:
+        """How weak and strong part of each resistance usually go along SOC, at ``SOC_NODES``, over what they are in the middle.
+
+        As an identified ladder; halfway between level and a typical one: cells differ. Level for one with a plateau: the
+        LFP cell that there are captures of is not like the generic one there.
+        """
+        known, grid_v = self._cell.ladder, ocv_grid(self._cell)[0]
+        if known is None or has_plateau(np.linspace(0.0, 1.0, grid_v.size), grid_v, self._cell.cell.series_count):
+            return np.ones((2, RESISTANCES, SOC_NODES.size))
+        rows = _at_nodes(known)
+        middle = rows[:, :, SOC_NODES > MIDDLE_SOC].mean(axis=2, keepdims=True)
+        nothing = middle < NOTHING * self._scale_ohm
+        shapes = np.clip(np.where(nothing, 1.0, rows / np.where(nothing, 1.0, middle)), *SHAPE)
+        return np.asarray(np.sqrt(shapes) if known.std >= TYPICAL_STD else shapes)
+
+
+def _run(load: Load, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
+    if temperature_c is not None:
+        load = replace(load, temperature_c=temperature_of(load, temperature_c))
+    temperature = temperature_of(load)
+    start = initial_soc(load, cell) if soc is None else soc
+    full_v = ocv_grid(cell)[0][-1]
+    cold = abs(float(temperature[0]) - REFERENCE_C) > COLD_K
+    if soc is None and cold and abs(full_v - load.start_v) < FULL_V * cell.cell.series_count:
+        start = 1.0
+    return Run(load, start - load.discharged_ah / cell.cell.capacity_ah, temperature)
+
+
+def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
+    """With the charge that each capture's knees tell it has moved."""
+    for _ in range(COUNT_PASSES):
+        miscounts = _Candidate(runs, cell, refine_ocv=refine_ocv).miscounts()
+        runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
+    return runs
+
+
+def _wrong_temperature(load: Load, temperature_c: float | None) -> list[str]:
+    temperature = temperature_of(load, REFERENCE_C if temperature_c is None else temperature_c)
+    if temperature.min() >= LOWEST_C and temperature.max() <= HIGHEST_C:
+        return []
+    runs = f"temperature_c runs from {temperature.min():.1f} to {temperature.max():.1f}"
+    return [f"{load.name}: {runs}, but cells are between {LOWEST_C:g} and {HIGHEST_C:g} C"]
+
+
+def _temperature_range(runs: list[Run]) -> tuple[float, float]:
+    low_c, high_c = np.percentile(np.concatenate([run.temperature_c for run in runs]), PERCENTILES)
+    return round(float(low_c), 1), round(float(high_c), 1)
+
+
+def _at_nodes(ladder: Ladder) -> Floats:
+    """Its weak and strong part at ``SOC_NODES``, shape (2, RESISTANCES, SOC_NODES.size) [ohm]."""
+    parts = ladder.weak_ohm, ladder.strong_ohm
+    return np.array([[np.interp(SOC_NODES, ladder.soc, ohm) for ohm in part] for part in parts])
+
+
+def _share(ladder: Ladder) -> Floats:
+    """Weak part of each resistance, at ``SOC_NODES``."""
+    weak, strong = _at_nodes(ladder)
+    return np.where(weak + strong > 0.0, weak / np.maximum(weak + strong, 1e-12), weak_share(SOC_NODES))
+
+
+def _ocv_error(cell: CellModel) -> Floats:
+    """Std of the given OCV at ``EVEN`` [V]."""
+    if isinstance(cell.ocv, TableOcv) and cell.ocv.error_v is not None:
+        return np.interp(EVEN, cell.ocv.soc, cell.ocv.error_v)
+    slope_v = np.interp(EVEN, np.linspace(0.0, 1.0, ocv_grid(cell)[1].size), ocv_grid(cell)[1])
+    return np.hypot(CURVE_ERROR_V * cell.cell.series_count, CURVE_ERROR_SOC * slope_v)
+
+
+def _middle_error(cell: CellModel) -> Floats:
+    """The same of the curve alone, at ``EVEN`` [V]: without the least of what is not known of the hysteresis.
+
+    Drives are discharges: they would take what is wrong of the hysteresis for an error of the curve, and charges would find
+    it twice as far away.
+    """
+    error_v = _ocv_error(cell)
+    if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:
+        return error_v
+    hysteresis_v = REST_SHARE_STD * np.interp(EVEN, cell.ocv.soc, cell.ocv.hysteresis_v)
+    return np.sqrt(np.maximum(error_v**2 - hysteresis_v**2, (PAIR_V * cell.cell.series_count) ** 2))
+
+
+def _per_kelvin(cell: CellModel) -> tuple[float, ...] | None:
+    return cell.ocv.per_kelvin_v if isinstance(cell.ocv, TableOcv) else None
+
+
+def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOcv:
+    """The cell's OCV with the correction, as an increasing table; its hysteresis stays, its error too."""
+    given = cell.ocv if isinstance(cell.ocv, TableOcv) else None
+    soc = np.linspace(0.0, 1.0, round(1.0 / OCV_STEP) + 1)
+    grid_v = ocv_grid(cell)[0]
+    slope = LEAST_SLOPE_V * cell.cell.series_count * soc
+    corrected_v = np.interp(soc, np.linspace(0.0, 1.0, grid_v.size), grid_v) + correction_at(soc) @ fit.correction
+    per_kelvin_v = hats(soc, KELVIN_NODES) @ fit.per_kelvin_v if entropy else None
+    if given is not None and given.per_kelvin_v is not None:
+        known_v = np.interp(soc, given.soc, given.per_kelvin_v)
+        per_kelvin_v = known_v if per_kelvin_v is None else per_kelvin_v + known_v
+    hysteresis_v = None if given is None or given.hysteresis_v is None else given.hysteresis_v
+    return TableOcv(
+        form="table",
+        soc=_tuple(soc),
+        ocv_v=_tuple(np.maximum.accumulate(corrected_v - slope) + slope),
+        error_v=_tuple(np.interp(soc, EVEN, _ocv_error(cell))),
+        hysteresis_v=None if hysteresis_v is None or given is None else _tuple(np.interp(soc, given.soc, hysteresis_v)),
+        per_kelvin_v=None if per_kelvin_v is None else _tuple(per_kelvin_v),
+    )
+
+
+def _rms(cell: CellModel, run: Run) -> float:
+    """What the cell leaves of a capture's voltage, as at 25 C, each second weighing the same [V]."""
+    grid_v = ocv_grid(cell)[0]
+    e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
+    error_v = run.load.voltage_v - e_o + overpotential(cell, run.warm_load, run.soc)
+    weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, 60.0)
+    weight *= (run.soc > JUDGED_SOC) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
+    return float(np.sqrt((weight * error_v**2).sum() / max(weight.sum(), 1e-12)))
+
+
+def _mean(scores: Floats) -> float:
+    """Geometric: a capture that every cell file does badly in does not decide alone."""
+    known = scores[np.isfinite(scores)]
+    return float(np.exp(np.log(known).mean())) if known.size else float("nan")
+
+
+def _worse(outcome: Identification) -> str:
+    lines = [
+        f"{c.name}: {c.score_before:.2f} before, {c.score_after:.2f} after"
+        for c in outcome.captures
+        if np.isfinite(c.score_after)
+    ]
+    return (
+        "nothing is written: replays cut in mid-load get worse, their interval score (smaller is better) goes from "
+        f"{outcome.score_before:.2f} to {outcome.score_after:.2f} % of SOC; keep the cell file, or give captures with "
+        f"more of its loads\n" + "\n".join(lines)
+    )
+
+
+def _tuple(values: Floats) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)

@@ -1,0 +1,1 @@
+"""Open-circuit voltage from rests, slow curves and tables."""

@@ -1,0 +1,183 @@
+"""Points of the open-circuit voltage, of one source or of several together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.ocv.relaxation_test import LEAST_POINTS, RelaxationTest
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.model.errors import UserError
+
+Floats = NDArray[np.float64]
+
+RELAXED_V = 0.002
+"""What rests of a warm cell are off as a whole [V]: hours follow after the quarter of an hour that is extrapolated."""
+COLD_V, DOUBLING_K = 0.012, 25.0
+"""What is more of it in the cold [V]: 12 mV at 0 C, 20 mV at -10 C, of rests up to an hour; relaxation slows down by half
+in ``DOUBLING_K``."""
+COLD_OWN = 0.3
+"""Part of it that is not alike in all sources."""
+LONG_REST_S = 3600.0
+"""From this length of rest on the cold part falls with it [s]."""
+AFTER_CHARGE_V = 0.005
+"""Standard deviation that hysteresis gives a rest after charge when its size is not known, per cell in series [V]."""
+LEAST_SPAN = 0.3
+"""SOC that the points must span at least."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of the open-circuit voltage.
+
+    Attributes:
+        soc: Shape (n,), increasing, 0..1.
+        ocv_v: Shape (n,) [V].
+        std_v: Shape (n,), standard deviation of ``ocv_v`` that is each point's own [V].
+        common_v: Shape (n,), standard deviation of what the point's source is off as a whole [V].
+        cold_v: Shape (n,), standard deviation of what cold leaves unrelaxed in all sources alike [V].
+        temperature_c: Shape (n,) [C]; NaN where it is not known.
+        way: Shape (n,), the hysteresis h that it was measured at: -1 after a discharge, 1 after a charge, 0 between.
+        source: Shape (n,), which source each is of, from 0.
+        empty_v: Voltage at SOC 0 as far as it is known [V]; NaN when it is not.
+        full_v: Voltage at SOC 1 as far as it is known [V]; NaN when it is not.
+    """
+
+    soc: Floats
+    ocv_v: Floats
+    std_v: Floats
+    common_v: Floats = field(default_factory=lambda: np.zeros(0))
+    cold_v: Floats = field(default_factory=lambda: np.zeros(0))
+    temperature_c: Floats = field(default_factory=lambda: np.zeros(0))
+    way: Floats = field(default_factory=lambda: np.zeros(0))
+    source: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    empty_v: float = float("nan")
+    full_v: float = float("nan")
+
+    def __post_init__(self) -> None:
+        """Fill what was left out: no common error, no temperature, no hysteresis, one source."""
+        if self.common_v.size == 0:
+            object.__setattr__(self, "common_v", np.zeros(self.soc.size))
+        if self.cold_v.size == 0:
+            object.__setattr__(self, "cold_v", np.zeros(self.soc.size))
+        if self.temperature_c.size == 0:
+            object.__setattr__(self, "temperature_c", np.full(self.soc.size, np.nan))
+        if self.way.size == 0:
+            object.__setattr__(self, "way", np.zeros(self.soc.size))
+        if self.source.size == 0:
+            object.__setattr__(self, "source", np.zeros(self.soc.size, dtype=np.int64))
+
+
+def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
+    """The rests of one test as points.
+
+    Args:
+        test: What ``relaxation_test`` found.
+        series_count: Cells in series, for what is known per cell.
+    """
+    rests = test.rests
+    temperature_c = np.array([rest.temperature_c for rest in rests])
+    duration_s = np.array([rest.duration_s for rest in rests])
+    after_charge = np.array([rest.after_charge for rest in rests])
+    cold_v = COLD_V * coldness(temperature_c) * np.minimum(1.0, LONG_REST_S / np.maximum(duration_s, 1.0))
+    order = np.argsort(test.soc, kind="stable")
+    return Points(
+        soc=test.soc[order],
+        ocv_v=test.ocv_v[order],
+        std_v=np.hypot(test.std_v, AFTER_CHARGE_V * series_count * after_charge)[order],
+        common_v=(series_count * (RELAXED_V + COLD_OWN * cold_v))[order],
+        cold_v=(series_count * cold_v)[order],
+        temperature_c=temperature_c[order],
+        way=-1.0 * ~after_charge[order],  # a charge in between is too short to turn it
+        empty_v=test.empty_v,
+        full_v=test.full_v,
+    )
+
+
+def coldness(temperature_c: Floats) -> Floats:
+    """How much slower a cell is than at 25 C: 0 there, 1 at 0 C; 0 where the temperature is not known."""
+    colder = np.maximum(REFERENCE_C - np.nan_to_num(temperature_c, nan=REFERENCE_C), 0.0)
+    return np.asarray(2.0 ** (colder / DOUBLING_K) - 1.0, dtype=np.float64)
+
+
+def joined(sources: Sequence[Points]) -> Points:
+    """Several sources as one set, in the order of SOC, numbered as they come."""
+    soc = np.concatenate([one.soc for one in sources])
+    order = np.argsort(soc, kind="stable")
+
+    def column(name: str) -> Floats:
+        return np.asarray(np.concatenate([getattr(one, name) for one in sources])[order])
+
+    return Points(
+        soc=soc[order],
+        ocv_v=column("ocv_v"),
+        std_v=column("std_v"),
+        common_v=column("common_v"),
+        cold_v=column("cold_v"),
+        temperature_c=column("temperature_c"),
+        way=column("way"),
+        source=np.repeat(np.arange(len(sources)), [one.soc.size for one in sources])[order],
+        empty_v=_mean([one.empty_v for one in sources]),
+        full_v=_mean([one.full_v for one in sources]),
+    )
+
+
+def pooled(tests: Sequence[RelaxationTest]) -> Points:
+    """The points of several tests as one set, in the order of SOC."""
+    return joined([points_of(test) for test in tests])
+
+
+def with_ends(points: Points, empty_std_v: float, full_std_v: float) -> Points:
+    """``empty_v`` and ``full_v`` as points, where they are known and lie outside the others."""
+    ends = [(0.0, points.empty_v, empty_std_v), (1.0, points.full_v, full_std_v)]
+    known = [end for end in ends if np.isfinite(end[1]) and not points.soc[0] <= end[0] <= points.soc[-1]]
+    for soc, ocv_v, std_v in known:
+        at = 0 if soc == 0.0 else points.soc.size
+        nearest = min(at, points.soc.size - 1)
+        points = replace(
+            points,
+            soc=np.insert(points.soc, at, soc),
+            ocv_v=np.insert(points.ocv_v, at, ocv_v),
+            std_v=np.insert(points.std_v, at, std_v),
+            common_v=np.insert(points.common_v, at, points.common_v[nearest]),
+            cold_v=np.insert(points.cold_v, at, points.cold_v[nearest]),
+            temperature_c=np.insert(points.temperature_c, at, points.temperature_c[nearest]),
+            way=np.insert(points.way, at, points.way[nearest]),
+            source=np.insert(points.source, at, points.source[nearest]),
+        )
+    return points
+
+
+def check_points(points: Points) -> None:
+    """Enough points over enough SOC.
+
+    Raises:
+        UserError: There are not.
+    """
+    if points.soc.size < LEAST_POINTS:
+        raise UserError(
+            f"{points.soc.size} points of the open-circuit voltage; (2.10) has {LEAST_POINTS} parameters and needs at "
+            f"least {LEAST_POINTS} points"
+        )
+    span = float(points.soc[-1] - points.soc[0])
+    if span < LEAST_SPAN:
+        raise UserError(
+            f"points span SOC {points.soc[0]:.2f} to {points.soc[-1]:.2f} only: discharge over at least {LEAST_SPAN} of "
+            "the capacity, best until empty"
+        )
+
+
+def rms_v(residual_v: Floats) -> float:
+    """Root mean square [V]."""
+    return float(np.sqrt(np.mean(residual_v**2)))
+
+
+def max_v(residual_v: Floats) -> float:
+    """Largest magnitude [V]."""
+    return float(np.abs(residual_v).max())
+
+
+def _mean(values: list[float]) -> float:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")

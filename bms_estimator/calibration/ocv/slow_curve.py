@@ -1,0 +1,285 @@
+"""Slow curves: discharges and charges at a small constant current, and what they say of the open-circuit voltage.
+
+Halfway between the discharge and the charge of one cell lies its open-circuit voltage; half of what they differ by, less
+the ohmic part, is its hysteresis. A discharge without its charge gives the curve but for what hides in half of that.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, median_filter
+
+from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
+from bms_estimator.calibration.ocv.relaxation_test import SOC_SLACK, mean_temperature_c, resting_samples, runs
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+
+Floats = NDArray[np.float64]
+
+LEAST_S = 7.0 * 3600.0
+"""A slow curve takes at least so long [s]: a whole one at C/7. At C/10 half of the difference is some 20 mV."""
+SAME_CURRENT = 0.05
+"""A current is constant within this part of it, and a standard deviation of its noise."""
+SMOOTH_SAMPLES = 31
+"""Its median over so many samples counts: faults are not seen, noise is a fifth."""
+NOISE_OF_STEP = 1.05
+"""Standard deviation of white noise over the median step between its samples."""
+WHOLE_FALL = 0.01
+"""A discharge is whole when its voltage falls by this part in the last hundredth of its charge: it ends at empty."""
+PAIR_K, PAIR_CURRENT = 5.0, 0.3
+"""A discharge and a charge are a pair within this difference of temperature [K] and, relative, of current."""
+MISSING = 0.1
+"""SOC that a charge may lack of what its discharge gave: more is no whole charge, or its current is wrong."""
+GRID = np.unique(
+    np.round(np.r_[np.arange(0, 0.1, 0.005), np.arange(0.1, 0.95, 0.01), np.arange(0.95, 1.0, 0.005), 1], 4)
+)
+"""SOCs at which a slow curve is taken."""
+EVEN, HYSTERESIS_WIDTH = np.linspace(0.0, 1.0, 201), 0.01
+"""Hysteresis is smoothed over this SOC: a knee that lies at another SOC in charge is none."""
+ENDS = (0.03, 0.98)
+"""Outside hysteresis is taken to be as it is there: the branches turn around."""
+POINT_V, POINT_SOC = 1e-3, 0.002
+"""Standard deviations of one point of a slow curve: of its voltage, per cell in series [V], and of its SOC."""
+PAIR_V, PAIR_PART = 1.5e-3, 0.1
+"""What the mean of a pair is off as a whole: so much per cell in series [V], and this part of the half difference."""
+ALONE_PART = 0.5
+"""The same where one of the two is missing: the difference is then that of the middle."""
+TURN = 0.03
+"""SOC within which a charge that ends early, at its highest voltage, is not the mean's other half."""
+LONE_V = 0.01
+"""What a lone branch is off, with the ohmic part taken out, per cell in series [V]."""
+COLD_PART = 0.25
+"""Part of what cold leaves unrelaxed in a rest that is left in the mean of a pair; a lone branch has all of it."""
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One slow discharge or charge.
+
+    Attributes:
+        name: Of its capture.
+        charge: Which of the two.
+        ah: Shape (n,), charge moved since its start, increasing [Ah].
+        voltage_v: Shape (n,) [V].
+        current_a: Mean magnitude [A].
+        temperature_c: Mean [C]; NaN without a sensor.
+        before_ah: What the capture discharged before it [Ah].
+        start_v: Voltage of the rest before it [V]; NaN when there is none.
+        step_v: What the voltage jumped by at the end of it that is at full [V]; NaN when no rest is there.
+        whole: A discharge down to empty.
+    """
+
+    name: str
+    charge: bool
+    ah: Floats
+    voltage_v: Floats
+    current_a: float
+    temperature_c: float
+    before_ah: float
+    start_v: float
+    step_v: float
+    whole: bool
+
+    def label(self, capacity_ah: float) -> str:
+        """Such as C/20 discharge."""
+        return f"C/{capacity_ah / self.current_a:.0f} {'charge' if self.charge else 'discharge'}"
+
+
+@dataclass(frozen=True)
+class SlowCurve:
+    """What a pair, or a lone branch, says of the open-circuit voltage.
+
+    Attributes:
+        branches: One, or discharge and charge.
+        points: On a grid of SOC.
+        hysteresis_v: At ``GRID`` [V]; None of a lone branch.
+        notes: What is to be known of it, one line each.
+    """
+
+    branches: tuple[Branch, ...]
+    points: Points
+    hysteresis_v: Floats | None
+    notes: tuple[str, ...]
+
+
+def slow_branches(good: SampleBlock, name: str) -> list[Branch]:
+    """The slow discharges and charges of a capture without glitches; none: it is of another kind.
+
+    Raises:
+        UserError: The voltage goes the other way than the current.
+    """
+    moved_ah = np.r_[0.0, np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"]))] / 3600.0
+    if good.size < 2 or np.ptp(moved_ah) == 0.0:
+        return []
+    smooth = good.copy()
+    smooth["current_a"] = median_filter(good["current_a"], SMOOTH_SAMPLES, mode="nearest")
+    noise_a = NOISE_OF_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
+    resting = resting_samples(smooth, float(np.ptp(moved_ah)))
+    found = []
+    for first, last in runs(~resting):
+        current_a = smooth["current_a"][first:last]
+        middle_a = float(np.median(current_a))
+        for a, b in runs(np.abs(current_a - middle_a) <= SAME_CURRENT * abs(middle_a) + noise_a):
+            if good["time_s"][first + b - 1] - good["time_s"][first + a] >= LEAST_S:
+                found.append(_branch(good, moved_ah, resting, first + a, first + b, name))
+    return found
+
+
+def _branch(
+    good: SampleBlock, moved_ah: Floats, resting: NDArray[np.bool_], first: int, last: int, name: str
+) -> Branch:
+    part = good[first:last]
+    charge = bool(np.median(part["current_a"]) < 0.0)
+    ah = np.abs(moved_ah[first:last] - moved_ah[first])
+    voltage_v = part["voltage_v"].astype(np.float64)
+    if charge != (voltage_v[-1] > voltage_v[0]):
+        raise UserError(
+            f"{name}: current has the wrong sign: {'charge' if charge else 'discharge'} from {part['time_s'][0]:.0f} s on "
+            f"while the voltage went from {voltage_v[0]:.3f} to {voltage_v[-1]:.3f} V; discharge must be positive "
+            "(--current-sign)"
+        )
+    jump_v = float("nan")
+    if charge and last < good.size and resting[last]:
+        jump_v = voltage_v[-1] - float(good["voltage_v"][last])
+    elif not charge and first > 0 and resting[first - 1]:
+        jump_v = float(good["voltage_v"][first - 1]) - voltage_v[0]
+    late_v = float(np.interp(0.99 * ah[-1], ah, voltage_v)) - voltage_v[-1]
+    return Branch(
+        name=name,
+        charge=charge,
+        ah=ah,
+        voltage_v=voltage_v,
+        current_a=float(np.abs(part["current_a"]).mean()),
+        temperature_c=mean_temperature_c(part),
+        before_ah=float(moved_ah[first]),
+        start_v=float(good["voltage_v"][first - 1]) if first > 0 and resting[first - 1] else float("nan"),
+        step_v=max(jump_v, 0.0),
+        whole=not charge and late_v > WHOLE_FALL * float(np.median(voltage_v)),
+    )
+
+
+def measured_capacity_ah(branches: Sequence[Branch]) -> float:
+    """Charge of the whole slow discharge nearest to 25 C [Ah]; NaN when there is none."""
+    whole = [branch for branch in branches if branch.whole and branch.before_ah < 0.01 * branch.ah[-1]]
+    if not whole:
+        return float("nan")
+    return float(min(whole, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0)).ah[-1])
+
+
+def slow_curves(
+    branches: Sequence[Branch], capacity_ah: float, *, initial_soc: float = 1.0, series_count: int = 1
+) -> list[SlowCurve]:
+    """Pairs, and what is left of the branches alone.
+
+    Args:
+        branches: Of all captures.
+        capacity_ah: Capacity that SOC is counted against [Ah].
+        initial_soc: SOC at the first sample of each capture, 0..1.
+        series_count: Cells in series, for what is known per cell.
+
+    Raises:
+        UserError: A discharge takes more than there is.
+    """
+    charges = [branch for branch in branches if branch.charge]
+    found = []
+    for discharge in (branch for branch in branches if not branch.charge):
+        start = min(initial_soc - discharge.before_ah / capacity_ah, 1.0)  # a charge before it may have filled it
+        soc = start - discharge.ah / capacity_ah
+        if soc[-1] < -SOC_SLACK:
+            raise UserError(
+                f"{discharge.name}: SOC runs from {soc[0]:.3f} to {soc[-1]:.3f}, outside 0..1: {discharge.ah[-1]:.3f} Ah were "
+                f"drawn, more than a capacity of {capacity_ah:g} Ah holds; give the right capacity or initial SOC"
+            )
+        charge = next((one for one in charges if _are_pair(discharge, one)), None)
+        if charge is None:
+            found.append(_lone(discharge, soc, series_count, ()))
+            continue
+        charges.remove(charge)
+        up = soc[-1] + charge.ah / capacity_ah
+        if up[-1] < 1.0 - MISSING:
+            lacking = (
+                f"its charge {charge.name} left out: {charge.ah[-1]:.3f} Ah went in after {discharge.ah[-1]:.3f} Ah had "
+                "come out, so it is not whole or its current is wrong"
+            )
+            found.append(_lone(discharge, soc, series_count, (lacking,)))
+            continue
+        if up[-1] > 1.0:
+            up = soc[-1] + (1.0 - soc[-1]) * charge.ah / charge.ah[-1]
+        found.append(_pair(discharge, soc, charge, up, series_count))
+    return found + [
+        _lone(charge, 1.0 - (charge.ah[-1] - charge.ah) / capacity_ah, series_count, ("taken to end full",))
+        for charge in charges
+    ]
+
+
+def _are_pair(discharge: Branch, charge: Branch) -> bool:
+    warmer = charge.temperature_c - discharge.temperature_c
+    near = np.isnan(warmer) or abs(warmer) <= PAIR_K
+    return bool(near) and abs(charge.current_a / discharge.current_a - 1.0) <= PAIR_CURRENT
+
+
+def _pair(down: Branch, soc: Floats, up: Branch, up_soc: Floats, series_count: int) -> SlowCurve:
+    """The mean of the two; where one is missing the other, off by half of what they differ by in the middle."""
+    low, high = max(soc[-1], up_soc[0]), min(soc[0], up_soc[-1])
+    high = high if high > ENDS[1] else high - TURN  # a charge that ends early rises before it ends
+    both = GRID[(low <= GRID) & (high >= GRID)]
+    differ_v = 0.5 * (_at(both, up_soc, up.voltage_v) - _at(both, soc, down.voltage_v))
+    middle_v = float(np.median(differ_v))
+    half_v = np.where((low <= GRID) & (high >= GRID), np.interp(GRID, both, differ_v), middle_v)
+    grid = GRID[(min(soc[-1], up_soc[0]) <= GRID) & (max(soc[0], up_soc[-1]) >= GRID)]
+    half = np.interp(grid, GRID, half_v)
+    known = (grid >= soc[-1]) & (grid <= soc[0])
+    ocv_v = np.where(known, _at(grid, soc, down.voltage_v) + half, _at(grid, up_soc, up.voltage_v) - half)
+    steps = [branch.step_v for branch in (down, up) if np.isfinite(branch.step_v)]
+    ohmic_v = float(np.mean(steps)) if steps else 0.0
+    points = _points(grid, ocv_v, PAIR_V * series_count, COLD_PART, down.temperature_c, series_count)
+    alone = (grid < low) | (grid > high)
+    return SlowCurve(
+        branches=(down, up),
+        points=replace(points, common_v=points.common_v + np.where(alone, ALONE_PART, PAIR_PART) * np.abs(half)),
+        hysteresis_v=_smooth(half_v - ohmic_v),
+        notes=() if steps else ("hysteresis with its ohmic part",),
+    )
+
+
+def _lone(branch: Branch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
+    grid = GRID[(soc.min() <= GRID) & (soc.max() >= GRID)]
+    sign = -1.0 if branch.charge else 1.0
+    ohmic_v = float(np.nan_to_num(branch.step_v))
+    ocv_v = _at(grid, soc, branch.voltage_v) + sign * ohmic_v
+    common_v = LONE_V * series_count + 0.5 * ohmic_v
+    points = replace(
+        _points(grid, ocv_v, common_v, 1.0, branch.temperature_c, series_count), way=-sign * np.ones(grid.size)
+    )
+    return SlowCurve((branch,), points, None, notes)
+
+
+def _at(grid: Floats, soc: Floats, voltage_v: Floats) -> Floats:
+    """Voltage of a branch at SOCs [V]."""
+    order = np.argsort(soc, kind="stable")
+    return np.asarray(np.interp(grid, soc[order], voltage_v[order]))
+
+
+def _points(
+    grid: Floats, ocv_v: Floats, common_v: float, cold_part: float, temperature_c: float, series_count: int
+) -> Points:
+    std_v = np.hypot(POINT_V * series_count, POINT_SOC * np.gradient(ocv_v, grid))
+    everywhere = np.ones(grid.size)
+    cold_v = cold_part * COLD_V * series_count * coldness(temperature_c * everywhere)
+    return Points(
+        soc=grid,
+        ocv_v=ocv_v,
+        std_v=std_v,
+        common_v=common_v * everywhere,
+        cold_v=cold_v,
+        temperature_c=temperature_c * everywhere,
+    )
+
+
+def _smooth(hysteresis_v: Floats) -> Floats:
+    """Hysteresis at ``GRID``, not below 0, without the turns at the ends."""
+    inside = np.clip(np.interp(np.clip(EVEN, *ENDS), GRID, hysteresis_v), 0.0, None)
+    smooth = gaussian_filter1d(inside, HYSTERESIS_WIDTH / (EVEN[1] - EVEN[0]), mode="nearest")
+    return np.asarray(np.interp(GRID, EVEN, smooth))

@@ -1,0 +1,261 @@
+"""The table of open-circuit voltage: one smooth curve through points of several sources, with its error.
+
+One linear Gaussian model over all points (a smoothing spline with random effects; Wahba 1990, Rasmussen and Williams
+2006, chapter 2):
+
+    v = f(SOC) + (T - 25 C) u(SOC) + c(T) w(SOC) + f'(SOC) (s + q (1 - SOC)) + d(SOC) + noise
+
+f is a cubic spline that bends no more than cells do; u is dE/dT; w is what cold cells have not relaxed, alike in all
+sources and hardly to be told from u, so that they share what is seen as their sizes are; s, q are each source's errors of
+its first SOC and of its capacity; d is what a source is off as a whole. All but f are pulled to 0 by what is known of
+their size beforehand. The curve's standard deviation is that of the model: wide in gaps.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, PchipInterpolator
+from scipy.optimize import lsq_linear
+
+from bms_estimator.calibration.ocv.overpotential import hats
+from bms_estimator.calibration.ocv.points import Points, check_points, rms_v, with_ends
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.model.cell import TableOcv
+
+Floats = NDArray[np.float64]
+
+KNOTS: Floats = np.unique(
+    np.r_[np.arange(0.0, 0.06, 0.015), np.arange(0.06, 0.25, 0.03), np.arange(0.25, 0.96, 0.045), 0.97, 0.985, 0.993, 1]
+)
+"""Of the spline: finer than this a curve of a layered oxide has no shape at rest, only the points' errors."""
+NODES: Floats = np.unique(
+    np.round(np.r_[np.arange(0.0, 0.1, 0.01), np.arange(0.1, 0.96, 0.02), np.arange(0.96, 1.001, 0.01)], 4)
+)
+"""SOCs of the table."""
+BEND_V, BEND_REACH = 2.0, 0.12
+"""Standard deviation of d2V/dSOC2 before any point is seen [V], and within which SOC a curve may change its slope by all
+of it: what is steep bends more."""
+EMPTY_SLOPE_V, EMPTY_REACH = 60.0, 0.02
+"""Every curve may be so steep at empty, and how far that reaches in SOC [V]."""
+FIRST_SLOPE_V = 0.8
+"""Slope that the first pass assumes [V]."""
+BEND_LENGTH = 0.05
+"""SOC over which one bend has nothing to do with the next."""
+LEAST_SLOPE_V = 1e-3
+"""Least slope of the curve, per cell of 4 V and 1 of SOC: monotone means invertible [V]."""
+CELL_V = 4.0
+"""Of the cell that the voltages above are for [V]."""
+TEMPERATURE_SPAN_C = 10.0
+"""Sources that differ by less say nothing of dE/dT [K]."""
+ENTROPY_V_PER_K, ENTROPY_NODES = 3.5e-4, np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
+"""Size of dE/dT before anything is measured [V/K]: 0.1 to 0.5 mV/K in published entropy profiles; where it may bend."""
+DEVIATION_NODES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
+"""Where what a source is off as a whole may change."""
+ROUGH = 0.7
+"""Part of it that changes faster: of each point on its own."""
+SOC_STD, CAPACITY_STD = 0.004, 0.01
+"""Standard deviations of a source's first SOC and of its capacity, relative: charging ends differ, cells age."""
+EMPTY_STD_V, FULL_STD_V = 0.05, 0.005
+"""What is known of the voltages at SOC 0 and 1 when no rest tells them, per cell [V]."""
+STEEPEST_V = 2.0
+"""The slope that turns an error of SOC into one of voltage is no larger: at the ends it is not known well enough [V]."""
+STD_OF_MEDIAN = 1.48
+"""Standard deviation of a normal distribution over the median of its magnitude: a few bad points do not count."""
+PASSES = 4
+"""The slope f' and the size of each source's errors come from the pass before."""
+
+
+@dataclass(frozen=True)
+class TableFit:
+    """A smooth increasing table.
+
+    Attributes:
+        soc: Nodes from 0 to 1.
+        ocv_v: Voltages at the nodes, increasing [V].
+        error_v: Standard deviations of ``ocv_v`` [V].
+        per_kelvin_v: dE/dT at the nodes [V/K]; None where the temperatures of the points do not tell.
+        residual_v: Shape (n,), points less curve [V].
+        deviation_v: Of each source, RMS of what it is off as a whole [V].
+    """
+
+    soc: Floats
+    ocv_v: Floats
+    error_v: Floats
+    per_kelvin_v: Floats | None
+    residual_v: Floats
+    deviation_v: Floats
+
+    def __call__(self, soc: Floats) -> Floats:
+        """E_o(SOC) [V], PCHIP."""
+        return np.asarray(PchipInterpolator(self.soc, self.ocv_v)(soc), dtype=np.float64)
+
+    def error_at(self, soc: Floats) -> Floats:
+        """Standard deviation of E_o(SOC) [V]."""
+        return np.asarray(np.interp(soc, self.soc, self.error_v))
+
+    def table(self, hysteresis_v: Floats | None = None, hysteresis_std_v: Floats | float = 0.0) -> TableOcv:
+        """As the ``[ocv]`` section of a cell file.
+
+        Args:
+            hysteresis_v: At the nodes [V]; None: not known.
+            hysteresis_std_v: Its std there, which adds to the curve's error [V].
+        """
+        return TableOcv(
+            form="table",
+            soc=tuple(self.soc.tolist()),
+            ocv_v=tuple(self.ocv_v.tolist()),
+            error_v=tuple(np.hypot(self.error_v, hysteresis_std_v).tolist()),
+            hysteresis_v=None if hysteresis_v is None else tuple(hysteresis_v.tolist()),
+            per_kelvin_v=None if self.per_kelvin_v is None else tuple(self.per_kelvin_v.tolist()),
+        )
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Rows of the linear model: what the points say, and what is known beforehand.
+
+    Columns: spline coefficients; entropy and cold nodes, if any; then for each source its deviation's nodes, s and q.
+    """
+
+    points: Floats
+    prior: Floats
+    splines: int
+    warmths: int
+
+
+def fit_table(points: Points) -> TableFit:
+    """A smooth increasing curve through points, their sources' common errors taken out.
+
+    Raises:
+        UserError: Too few points, or points that span too little SOC.
+    """
+    check_points(points)
+    cells = float(np.median(points.ocv_v)) / CELL_V
+    given = points
+    points = with_ends(points, EMPTY_STD_V * cells, FULL_STD_V * cells)
+    sources = int(points.source.max()) + 1
+    noise, common = np.ones(sources), 1.0
+    middles = _middles()
+    falling_v = cells * EMPTY_SLOPE_V * np.exp(-middles / EMPTY_REACH)
+    steepness_v: Floats = np.full(middles.size, cells * FIRST_SLOPE_V)
+    slope_v: Floats = np.zeros(points.soc.size)
+    for _ in range(PASSES):
+        bends = _bend_rows(cells * BEND_V + (steepness_v + falling_v) / BEND_REACH)
+        model = _model(points, slope_v, common, bends, cells)
+        std_v = np.hypot(points.std_v, ROUGH * points.common_v) * noise[points.source]
+        x = _solved(model, points, std_v, cells)
+        slope_v = np.clip(_spline(points.soc, 1) @ x[: model.splines], 0.0, STEEPEST_V * cells)
+        steepness_v = _spline(middles, 1) @ x[: model.splines]
+        noise, common = _sizes(points, model, x, common)
+    basis, entropy = _spline(NODES), hats(NODES, ENTROPY_NODES)
+    rows = np.vstack([model.points / std_v[:, None], model.prior])
+    covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)[: model.splines, : model.splines]
+    u = x[model.splines : model.splines + ENTROPY_NODES.size]
+    ocv_v = np.maximum.accumulate(basis @ x[: model.splines] + 1e-9 * NODES)
+    fit = PchipInterpolator(NODES, ocv_v)
+    return TableFit(
+        soc=NODES,
+        ocv_v=ocv_v,
+        error_v=np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance, basis)),
+        per_kelvin_v=entropy @ u if model.warmths else None,
+        residual_v=given.ocv_v - fit(given.soc),
+        deviation_v=_deviations(points, model, x),
+    )
+
+
+def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells: float) -> _Model:
+    """The rows; those of the points are not yet divided by their standard deviations."""
+    spline = _spline(points.soc)
+    warmer = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
+    columns, stds = [spline], [np.zeros(0)]
+    if np.ptp(warmer) >= TEMPERATURE_SPAN_C:
+        by_soc = hats(points.soc, ENTROPY_NODES)
+        columns += [warmer[:, None] * by_soc, points.cold_v[:, None] * by_soc]
+        stds += [np.full(ENTROPY_NODES.size, ENTROPY_V_PER_K * cells), np.ones(ENTROPY_NODES.size)]
+    warmths = sum(one.size for one in stds)
+    for source in range(int(points.source.max()) + 1):
+        own = (points.source == source)[:, None]
+        off_v = common * points.common_v[:, None] * hats(points.soc, DEVIATION_NODES)
+        columns += [own * off_v, own * _shifts(points.soc, slope_v)]
+        stds += [np.ones(DEVIATION_NODES.size), np.array([SOC_STD, CAPACITY_STD])]
+    weights = 1.0 / np.concatenate(stds)
+    prior = np.zeros((bends.shape[0] + weights.size, spline.shape[1] + weights.size))
+    prior[: bends.shape[0], : spline.shape[1]] = bends
+    prior[bends.shape[0] :, spline.shape[1] :] = np.diag(weights)
+    return _Model(np.hstack(columns), prior, spline.shape[1], warmths)
+
+
+def _shifts(soc: Floats, slope_v: Floats) -> Floats:
+    """What an error of the first SOC, and of the capacity, makes of a voltage. Shape (n, 2)."""
+    return np.column_stack([slope_v, slope_v * (1.0 - soc)])
+
+
+def _solved(model: _Model, points: Points, std_v: Floats, cells: float) -> Floats:
+    """The model's coefficients with increasing spline coefficients, which make an increasing spline.
+
+    What a source is off can be told from another only: 0 where there is one.
+    """
+    told = model.splines + model.warmths if points.source.max() == 0 else model.points.shape[1]
+    rows = np.vstack([model.points / std_v[:, None], model.prior])[:, :told]
+    target = np.r_[points.ocv_v / std_v, np.zeros(model.prior.shape[0])]
+    sums = np.tril(np.ones((model.splines, model.splines)))  # coefficients from their increments
+    rows[:, : model.splines] = rows[:, : model.splines] @ sums
+    lowest = np.full(rows.shape[1], -np.inf)
+    lowest[1 : model.splines] = LEAST_SLOPE_V * cells * np.diff(_centres())
+    orthogonal, triangle = np.linalg.qr(rows)
+    increments = lsq_linear(triangle, orthogonal.T @ target, bounds=(lowest, np.inf), method="bvls").x
+    x = np.zeros(model.points.shape[1])
+    x[: model.splines], x[model.splines : told] = sums @ increments[: model.splines], increments[model.splines :]
+    return x
+
+
+def _sizes(points: Points, model: _Model, x: Floats, common: float) -> tuple[Floats, float]:
+    """How much larger than said each source's scatter is, and the sources' common deviations all are; at least 1."""
+    left = (points.ocv_v - model.points @ x) / np.hypot(points.std_v, ROUGH * points.common_v)
+    sources = int(points.source.max()) + 1
+    noise = [max(1.0, STD_OF_MEDIAN * float(np.median(np.abs(left[points.source == k])))) for k in range(sources)]
+    own = x[model.splines + model.warmths :].reshape(sources, -1)[:, : DEVIATION_NODES.size]
+    return np.array(noise), max(1.0, common * float(np.sqrt(np.mean(own**2))))
+
+
+def _deviations(points: Points, model: _Model, x: Floats) -> Floats:
+    """RMS over its points of what each source is off as a whole [V]."""
+    own = model.points[:, model.splines + model.warmths :] @ x[model.splines + model.warmths :]
+    sources = int(points.source.max()) + 1
+    return np.array([rms_v(own[points.source == k]) for k in range(sources)])
+
+
+def _knots() -> Floats:
+    return np.concatenate([np.zeros(3), KNOTS, np.ones(3)])
+
+
+def _centres() -> Floats:
+    """Where each coefficient of the spline acts (Greville abscissae)."""
+    knots = _knots()
+    return np.asarray((knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3.0)
+
+
+def _spline(soc: Floats, derivative: int = 0) -> Floats:
+    """Cubic B-splines, or a derivative of them, at ``soc``. Shape (n, splines)."""
+    knots = _knots()
+    curves = BSpline(knots, np.eye(knots.size - 4), 3)
+    return np.asarray(curves(np.clip(soc, 0.0, 1.0), nu=derivative), dtype=np.float64)
+
+
+def _edges() -> Floats:
+    """Ends of the stretches over which a bend is looked at: a quarter of those between knots."""
+    edges: Floats = np.unique(np.concatenate([np.linspace(a, b, 5) for a, b in itertools.pairwise(KNOTS)]))
+    return edges
+
+
+def _middles() -> Floats:
+    edges = _edges()
+    return np.asarray(0.5 * (edges[1:] + edges[:-1]))
+
+
+def _bend_rows(size_v: Floats) -> Floats:
+    """d2V/dSOC2 of each stretch over its size [V], weighted by the share of ``BEND_LENGTH`` that the stretch is."""
+    weight = np.sqrt(np.diff(_edges()) / BEND_LENGTH) / size_v
+    return np.asarray(_spline(_middles(), 2) * weight[:, None])

@@ -1,0 +1,1 @@
+"""The thesis's own procedures: prediction, averages, adaptive run."""

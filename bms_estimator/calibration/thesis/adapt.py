@@ -1,0 +1,163 @@
+"""The thesis's procedure as a calibration: steps 2 and 3 on captures, then the same judgment as `identify`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.cleaning.capture_checks import contradictions
+from bms_estimator.calibration.cleaning.clean_capture import Load, whole_load
+from bms_estimator.calibration.elements.identify import NO_WORSE, initial_soc
+from bms_estimator.calibration.elements.replay_score import interval_score
+from bms_estimator.calibration.ocv.relaxation_test import without_glitches
+from bms_estimator.calibration.thesis.adapt_steps import AdaptedElements, Start, steps_2_and_3
+from bms_estimator.calibration.thesis.prediction import predict
+from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
+from bms_estimator.calibration.thesis.series_resistance import LOWEST_SOC
+from bms_estimator.estimator.filter_settings import BRANCHES_STD, ROOM_C, SOC_GRID, ladder_of_branches
+from bms_estimator.kernels.cell_model.rc_ladder import weak_share
+from bms_estimator.model.cell import CellModel, Ladder, Resistance
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.errors import UserError
+
+Floats = NDArray[np.float64]
+
+SMALLEST_ERROR_V = 1e-5
+"""Lower limit of the error that is written [V]."""
+
+
+@dataclass(frozen=True)
+class AdaptedCapture:
+    """Figures of one capture.
+
+    Attributes:
+        name: Name of the capture.
+        initial_soc: SOC at the first sample, 0..1.
+        voltage_rms_v: RMS error of the voltage, open loop, above SOC 0.1 [V].
+        score_before: Interval score of replays with the given cell [%]; NaN for a capture that is too short.
+        score_after: Interval score with the adapted cell [%].
+        held_back: The capture had no part in the cell of ``score_after``.
+    """
+
+    name: str
+    initial_soc: float
+    voltage_rms_v: float
+    score_before: float
+    score_after: float
+    held_back: bool
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """An adapted cell.
+
+    Attributes:
+        cell: The cell with a1..a15 and a ladder of its two branches.
+        steps: Result of steps 2 and 3 over all captures.
+        captures: Figures of each capture, in the order given.
+        score_before: Geometric mean of the interval scores with the given cell [%]; NaN when no capture is long enough.
+        score_after: Geometric mean with the adapted cell [%].
+    """
+
+    cell: CellModel
+    steps: AdaptedElements
+    captures: tuple[AdaptedCapture, ...]
+    score_before: float
+    score_after: float
+
+
+def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = None) -> Adaptation:
+    """Estimate a1..a15 as the thesis does.
+
+    Bounds of (3.18) that the cell file does not have are those of Table 10, scaled to the cell's capacity.
+
+    Args:
+        captures: Raw samples, rows of dtype ``SAMPLE``; each starts from rest.
+        cell: Capacity, limits, OCV, and bounds of (3.18) where it has any.
+        soc: SOC 0..1 at the first sample of each capture; None: from its first rest.
+
+    Raises:
+        UserError: A capture contradicts the cell, a1..a15 cannot be estimated, or replays get worse.
+    """
+    loads = [whole_load(capture.name, capture.rows, cell) for capture in captures]
+    socs = [initial_soc(load, cell) if soc is None else soc for load in loads]
+    found = [line for load, start in zip(loads, socs, strict=True) for line in contradictions(load, cell, start)]
+    if found:
+        raise UserError("\n".join(found))
+    starts = [
+        Start(without_glitches(capture.rows, capture.name), start)
+        for capture, start in zip(captures, socs, strict=True)
+    ]
+    steps, adapted = _adapted(cell, starts)
+    judged = tuple(_judged(cell, adapted, loads, starts, j) for j in range(len(starts)))
+    before, after = (_mean([getattr(c, name) for c in judged]) for name in ("score_before", "score_after"))
+    if after > NO_WORSE * before:
+        raise UserError(
+            f"nothing is written: replays started in mid-load get worse, their interval score (smaller is better) goes "
+            f"from {before:.2f} to {after:.2f} % of SOC; use `identify`, or give captures of more currents"
+        )
+    return Adaptation(adapted, steps, judged, before, after)
+
+
+def _adapted(cell: CellModel, starts: Sequence[Start]) -> tuple[AdaptedElements, CellModel]:
+    """Result of steps 2 and 3, and the cell with it."""
+    bounded = cell.model_copy(update={"adaptation": printed_bounds(cell) | cell.adaptation})
+    steps = steps_2_and_3(bounded, starts, LOWEST_SOC)
+    return steps, _with_elements(cell, steps, starts)
+
+
+def _with_elements(cell: CellModel, steps: AdaptedElements, starts: Sequence[Start]) -> CellModel:
+    """The cell with a1..a15, and a ladder of its two branches that carries their errors."""
+    a, update = steps.a, dict[str, object]()
+    for name, first in (("r_ts", 1), ("r_tl", 4), ("c_ts", 7), ("c_tl", 10)):
+        section = getattr(cell, name)
+        keys = tuple(type(section).model_fields)
+        update[name] = section.model_copy(update=dict(zip(keys, a[first : first + 3].tolist(), strict=True)))
+    update["r_s"] = Resistance.model_validate(steps.r_s.element.model_dump())
+    new = cell.model_copy(update=update | {"adaptation": {}, "ladder": None})
+    ohm, weak = ladder_of_branches(new).T, weak_share(SOC_GRID)
+    errors = np.concatenate([predict(new, s.samples, s.soc, lowest_soc=LOWEST_SOC).error_v for s in starts])
+    ladder = Ladder(
+        soc=tuple(SOC_GRID.tolist()),
+        weak_ohm=_rows(weak * ohm),
+        strong_ohm=_rows((1.0 - weak) * ohm),
+        std=BRANCHES_STD,
+        error_v=max(float(np.sqrt(np.mean(errors**2))), SMALLEST_ERROR_V),
+        temperature_c=_temperatures(starts),
+    )
+    return new.model_copy(update={"ladder": ladder})
+
+
+def _judged(cell: CellModel, adapted: CellModel, loads: list[Load], starts: list[Start], j: int) -> AdaptedCapture:
+    """Figures of capture ``j``, by a cell that did not see it where other captures were given."""
+    load, start = loads[j], starts[j]
+    others = [s for k, s in enumerate(starts) if k != j]
+    judge = _adapted(cell, others)[1] if others else adapted
+    soc = start.soc - load.discharged_ah / cell.cell.capacity_ah
+    error_v = predict(adapted, start.samples, start.soc, lowest_soc=LOWEST_SOC).error_v
+    return AdaptedCapture(
+        name=load.name,
+        initial_soc=start.soc,
+        voltage_rms_v=float(np.sqrt(np.mean(error_v**2))),
+        score_before=interval_score(cell, load, soc),
+        score_after=interval_score(judge, load, soc),
+        held_back=bool(others),
+    )
+
+
+def _temperatures(starts: Sequence[Start]) -> tuple[float, float]:
+    """Lowest and highest temperature of the captures, those of a room without a sensor [C]."""
+    temperature_c = np.concatenate([s.samples["temperature_c"] for s in starts])
+    known = temperature_c[np.isfinite(temperature_c)]
+    return (float(known.min()), float(known.max())) if known.size else ROOM_C
+
+
+def _mean(scores: Sequence[float]) -> float:
+    """Geometric mean of the scores that are known; NaN without any."""
+    known = [score for score in scores if np.isfinite(score)]
+    return float(np.exp(np.mean(np.log(known)))) if known else float("nan")
+
+
+def _rows(ohm: Floats) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, ohm.tolist()))

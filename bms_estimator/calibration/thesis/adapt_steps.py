@@ -1,0 +1,88 @@
+"""Steps 2 and 3 of the thesis on captures: Algorithm 1 with (3.19) gives a1..a12, (4.2) gives a13..a15.
+
+Step 1, the open-circuit voltage, is in the cell that is given: `ocv` fits it to rests.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
+from bms_estimator.calibration.thesis.prediction import predict
+from bms_estimator.calibration.thesis.series_resistance import (
+    SeriesResistanceFit,
+    fit_series_resistance,
+    mean_of,
+    series_resistance,
+)
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.settings.pack import ObserverSettings
+
+Floats = NDArray[np.float64]
+
+VOLTAGE_STEP_V = 1e-3
+"""Resolution of the voltage when the capture's is not known [V]."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """A capture without glitches and the SOC that it starts from.
+
+    Attributes:
+        samples: Dtype ``SAMPLE``.
+        soc: SOC at the first sample, 0..1.
+    """
+
+    samples: SampleBlock
+    soc: float
+
+
+@dataclass(frozen=True)
+class AdaptedElements:
+    """Result of steps 2 and 3.
+
+    Attributes:
+        run: Step 2, Algorithm 1 over one capture with the averages (3.19).
+        r_s: Step 3, a13..a15 fitted to (4.2) over all captures.
+    """
+
+    run: AdaptiveRun
+    r_s: SeriesResistanceFit
+
+    @property
+    def a(self) -> Floats:
+        """a1..a15 at index 1..15. Shape (16,)."""
+        a = self.run.average.copy()
+        a[13:16] = self.r_s.a
+        return a
+
+
+def steps_2_and_3(cell: CellModel, captures: Sequence[Start], lowest_soc: float) -> AdaptedElements:
+    """Adapt a1..a12 to the capture of the smallest mean current, then fit a13..a15 to all captures.
+
+    Algorithm 1 asks for a very small current; (4.2) needs several.
+
+    Args:
+        cell: Capacity, open-circuit voltage, and the bounds of (3.18).
+        captures: Captures that start from rest.
+        lowest_soc: SOC below which (4.2) is not evaluated, because the open-circuit voltage is a guess there.
+
+    Raises:
+        UserError: No good sample, no current, or too small a range of SOC for a13..a15.
+    """
+    smallest = min(captures, key=lambda capture: float(np.abs(capture.samples["current_a"]).mean()))
+    observer = Estimator(
+        cell,
+        ObserverSettings(law="improved"),
+        identifier=None,
+        voltage_resolution_v=VOLTAGE_STEP_V,
+        initial_soc=smallest.soc,
+    )
+    run = adaptive_run(observer, smallest.samples)
+    predictions = [predict(cell, c.samples, c.soc, a=run.average, lowest_soc=lowest_soc) for c in captures]
+    curve = mean_of([series_resistance(cell, prediction) for prediction in predictions])
+    return AdaptedElements(run, fit_series_resistance(curve, lowest_soc))

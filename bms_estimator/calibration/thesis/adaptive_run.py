@@ -1,0 +1,171 @@
+"""Step 2: adaptive estimation of a1..a15 over a capture, Algorithm 1 and schemes 1 to 3.
+
+The observer runs over the whole capture; it stops adapting at the stability conditions (Fig. 19). Whether it
+converged, and if not why, is part of what comes out.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.thesis.parameter_average import Settled, averaged, settled
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell_model.margins import crossing, delta
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+
+Floats = NDArray[np.float64]
+
+SNAPSHOTS = 3000
+"""a_i(t) is kept this often over a run, and at each of its first samples."""
+FIRST_SAMPLES = 200
+"""The first samples, over which a_i(t) runs from its initial value to its limit, are all kept."""
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Where a stability condition of Lemma 4.1.1 is met: a dashed line of Fig. 19.
+
+    Attributes:
+        parameter: "a8" or "a11".
+        soc: delta1 or delta2 of the parameters at the end of adaptation.
+        time_s: When SOC got there; None when the capture ends above.
+    """
+
+    parameter: str
+    soc: float
+    time_s: float | None
+
+
+@dataclass(frozen=True)
+class AdaptiveRun:
+    """One run of the observer. Arrays over time have shape (n,), n the number of snapshots.
+
+    Attributes:
+        time_s: Of the snapshots [s].
+        soc: Counted, 0..1.
+        current_a: Positive on discharge [A].
+        voltage_v: y [V].
+        voltage_estimate_v: y^ of the run, time-varying parameters [V].
+        error_v: e (3.15), the largest in magnitude since the snapshot before [V].
+        k: Adaptive gain state (3.13).
+        gain: N(k).
+        a: Shape (n, 16), a1..a15 at index 1..15.
+        window: t_int and t_unst of (3.19).
+        average: Shape (16,), (3.19).
+        crossings: Of a8 and a11.
+        epsilon_v: eps2 of Algorithm 1 [V].
+        lock_losses: How often the observer lost track.
+        outcome: "converged", or why not.
+    """
+
+    time_s: Floats
+    soc: Floats
+    current_a: Floats
+    voltage_v: Floats
+    voltage_estimate_v: Floats
+    error_v: Floats
+    k: Floats
+    gain: Floats
+    a: Floats
+    window: Settled
+    average: Floats
+    crossings: tuple[Crossing, Crossing]
+    epsilon_v: float
+    lock_losses: int
+    outcome: str
+
+    def condition(self, parameter: str) -> Floats:
+        """The bound that a8 (a11) must exceed, over time: right side of the condition in Lemma 4.1.1, Fig. 19."""
+        amplitude, offset = {"a8": (7, 9), "a11": (10, 12)}[parameter]
+        rows = zip(self.soc, self.a[:, offset], self.a[:, amplitude], strict=True)
+        return np.array([crossing(max(soc, 1e-6), low, high) for soc, low, high in rows])
+
+
+def adaptive_run(
+    estimator: Estimator, samples: SampleBlock, *, t_int_s: float | None = None, t_unst_s: float | None = None
+) -> AdaptiveRun:
+    """Run the observer over a capture.
+
+    Args:
+        estimator: Fresh, or with a state to go on from.
+        samples: Dtype ``SAMPLE``.
+        t_int_s: Of (3.19), instead of the one found [s].
+        t_unst_s: As above.
+
+    Raises:
+        UserError: No sample was accepted, or t_int or t_unst lies outside the run.
+    """
+    edges = np.unique(
+        np.r_[
+            np.arange(min(FIRST_SAMPLES, samples.size) + 1),
+            np.geomspace(1, samples.size, FIRST_SAMPLES).astype(int),
+            np.linspace(0, samples.size, min(SNAPSHOTS, samples.size) + 1).astype(int),
+        ]
+    )
+    names = ("time_s", "soc", "current_a", "voltage_v", "voltage_estimate_v", "k", "nussbaum_gain", "stability_margin")
+    columns: dict[str, list[float]] = {name: [] for name in names}
+    error_v, a = [], []
+    for first, last in itertools.pairwise(edges):
+        rows = estimator.run(samples[first:last])
+        if rows.size == 0:
+            continue
+        for name in names:
+            columns[name].append(float(rows[name][-1]))
+        tracking_v = rows["tracking_error_v"]
+        error_v.append(float(tracking_v[int(np.argmax(np.abs(tracking_v)))]))
+        a.append(estimator.state["a"][0].copy())
+    if not a:
+        raise UserError(f"none of {samples.size} samples is within the cell's limits")
+    found = {name: np.array(values) for name, values in columns.items()}
+    error, parameters = np.array(error_v), np.array(a)
+    epsilon_v = float(estimator.settings["epsilon_v"][0])
+    margin = found["stability_margin"] - float(estimator.settings["margin_guard"][0])
+    window = settled(
+        found["time_s"], error, found["voltage_v"], margin, parameters, epsilon_v, t_int_s=t_int_s, t_unst_s=t_unst_s
+    )
+    lock_losses = int(estimator.state["lock_losses"][0])
+    return AdaptiveRun(
+        time_s=found["time_s"],
+        soc=found["soc"],
+        current_a=found["current_a"],
+        voltage_v=found["voltage_v"],
+        voltage_estimate_v=found["voltage_estimate_v"],
+        error_v=error,
+        k=found["k"],
+        gain=found["nussbaum_gain"],
+        a=parameters,
+        window=window,
+        average=averaged(found["time_s"], parameters, window),
+        crossings=(
+            _crossing("a8", parameters[-1], found["soc"], found["time_s"]),
+            _crossing("a11", parameters[-1], found["soc"], found["time_s"]),
+        ),
+        epsilon_v=epsilon_v,
+        lock_losses=lock_losses,
+        outcome=_outcome(window, found["time_s"], error, epsilon_v, lock_losses),
+    )
+
+
+def _crossing(parameter: str, a: Floats, soc: Floats, time_s: Floats) -> Crossing:
+    """Where ``parameter`` meets its condition."""
+    i = int(parameter[1:])
+    at = float(delta(a[i], a[i + 1], a[i - 1]))
+    below = np.flatnonzero(soc <= at)
+    return Crossing(parameter, at, float(time_s[below[0]]) if below.size else None)
+
+
+def _outcome(window: Settled, time_s: Floats, error_v: Floats, epsilon_v: float, lock_losses: int) -> str:
+    """Lines 8 to 14 of Algorithm 1, with |e| (E10)."""
+    inside = (time_s >= window.t_int_s) & (time_s <= window.t_unst_s)
+    if inside.sum() < 2:
+        worst = float(np.abs(error_v[time_s <= window.t_unst_s]).max(initial=0.0))
+        return f"not converged: {window.start_reason}; largest |e| {1e3 * worst:.2f} mV until {window.t_unst_s:.0f} s"
+    share = float((np.abs(error_v[inside]) <= epsilon_v).mean())
+    if share < 0.95:
+        return f"not converged: |e| is within {1e3 * epsilon_v:.2f} mV for {100 * share:.1f} % of the samples only"
+    if lock_losses:
+        return f"not converged: lock was lost {lock_losses} times"
+    return "converged"

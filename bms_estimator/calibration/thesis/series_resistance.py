@@ -1,0 +1,169 @@
+"""Step 3: R_s from the model's other elements by (4.2), and a13..a15 fitted to it, from several currents.
+
+(4.2) is printed with the opposite sign: solving (2.4) for R_s gives i^-1 (E_o - x2 - x3 - y), which is positive.
+x2 and x3 are those of the model with frozen a1..a12: the observer's own settle so that (4.1) meets y, and leave nothing
+for R_s.
+
+(4.2) as printed divides by the current: an error of the open-circuit voltage of 10 mV is 65 mohm at C/20 and 2 mohm at
+1.5C, and a plain mean over currents takes both for the same (E19). Here R_s is least squares on the voltage that is
+missing, i R_s: each value of (4.2) weighs as its current squared.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.thesis.prediction import Prediction, open_circuit
+from bms_estimator.kernels.observer.series_resistance import BINS, SMALLEST_CURRENT_C
+from bms_estimator.model.cell import CellModel, Resistance
+from bms_estimator.model.errors import UserError
+
+Floats = NDArray[np.float64]
+
+LOWEST_SOC = 0.1
+"""(4.2) is not fitted below this SOC: the elements leave their form there."""
+EXPONENTS = np.geomspace(2.0, 200.0, 200)
+"""Exponents a14 tried."""
+TINY = 1e-300
+"""Lower limit of the determinant of the normal equations; avoids division by zero."""
+LEAST_BINS = 5
+"""Minimum number of bins for a fit of three parameters."""
+
+
+@dataclass(frozen=True)
+class SeriesResistance:
+    """R_s over SOC, one value for each of ``BINS`` that holds data. All arrays have shape (n,).
+
+    Attributes:
+        soc: Mean SOC of the bin's samples, 0..1.
+        r_s_ohm: (4.2) over the bin, by least squares on the voltage [ohm].
+        weight: Mean of the current squared over the bin, summed over the loads [A^2].
+    """
+
+    soc: Floats
+    r_s_ohm: Floats
+    weight: Floats
+
+
+@dataclass(frozen=True)
+class SeriesResistanceFit:
+    """a13..a15 of (2.9).
+
+    Attributes:
+        a: a13 [ohm], a14, a15 [ohm].
+        std: Their standard errors; NaN for one at its bound.
+        rms_ohm: Of the residual, weighted as the fit is [ohm].
+    """
+
+    a: Floats
+    std: Floats
+    rms_ohm: float
+
+    def __call__(self, soc: Floats) -> Floats:
+        """R_s(SOC) [ohm], (2.9)."""
+        return np.asarray(self.a[0] * np.exp(-self.a[1] * soc) + self.a[2], dtype=np.float64)
+
+    @property
+    def element(self) -> Resistance:
+        """As the ``[r_s]`` section of a cell file, whose values must be above 0."""
+        a13, a14, a15 = (max(float(a), 1e-9) for a in self.a)
+        return Resistance(amplitude_ohm=a13, exponent=a14, offset_ohm=a15)
+
+
+def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
+    """R_s by (4.2) wherever current flows.
+
+    Args:
+        cell: Whose open-circuit voltage holds.
+        run: A capture with the x2 + x3 that frozen a1..a12 give under its current.
+
+    Raises:
+        UserError: No current flows.
+    """
+    flowing = np.abs(run.current_a) > SMALLEST_CURRENT_C * cell.cell.capacity_ah
+    if not flowing.any():
+        raise UserError(
+            f"R_s by (4.2) needs a current: none above {SMALLEST_CURRENT_C * cell.cell.capacity_ah:.3f} A, the largest is "
+            f"{np.abs(run.current_a).max():.3f} A"
+        )
+    missing_v = (open_circuit(cell, run.soc) - run.overpotential_v - run.voltage_v)[flowing]
+    soc, current_a = run.soc[flowing], run.current_a[flowing]
+    bins = _bins(soc)
+    count = np.bincount(bins)
+    used = np.flatnonzero(count)
+    squares = np.bincount(bins, current_a**2)[used]
+    return SeriesResistance(
+        soc=np.bincount(bins, soc)[used] / count[used],
+        r_s_ohm=np.bincount(bins, current_a * missing_v)[used] / squares,  # (4.2), with the sign of (2.4)
+        weight=squares / count[used],
+    )
+
+
+def mean_of(curves: Sequence[SeriesResistance]) -> SeriesResistance:
+    """The mean over several currents, each with its weight, where at least one has data: Fig. 22 and 31."""
+    soc, r_s, weight = (np.concatenate([getattr(c, name) for c in curves]) for name in ("soc", "r_s_ohm", "weight"))
+    bins = _bins(soc)
+    total: Floats = np.bincount(bins, weight).astype(np.float64)
+    used = np.flatnonzero(total)
+    return SeriesResistance(
+        soc=np.bincount(bins, weight * soc)[used] / total[used],
+        r_s_ohm=np.bincount(bins, weight * r_s)[used] / total[used],
+        weight=total[used],
+    )
+
+
+def _bins(soc: Floats) -> NDArray[np.int64]:
+    return np.clip((soc * BINS).astype(np.int64), 0, BINS - 1)
+
+
+def summed(record: np.void) -> SeriesResistance:
+    """Return the curve from the sums of an estimator; SOC is the middle of each bin.
+
+    Args:
+        record: Record of dtype ESTIMATOR_STATE.
+    """
+    sums = record["series_resistance"]
+    used = np.flatnonzero(sums["square_a2"] > 0.0)
+    squares = sums["square_a2"][used]
+    return SeriesResistance((used + 0.5) / BINS, sums["product_va"][used] / squares, squares / sums["samples"][used])
+
+
+def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> SeriesResistanceFit:
+    """Fit (2.9) by non-negative weighted linear least squares for each of ``EXPONENTS``; the best fit is returned.
+
+    Raises:
+        UserError: Too few bins of SOC with data.
+    """
+    used = curve.soc >= lowest_soc
+    soc, r_s = curve.soc[used], curve.r_s_ohm[used]
+    if soc.size < LEAST_BINS:
+        raise UserError(f"R_s is known in {soc.size} steps of SOC, at least {LEAST_BINS} are needed for a13..a15")
+    weight = curve.weight[used] / curve.weight[used].mean()
+    a13, exponent, a15 = _best(soc, r_s, weight)
+    a, root = np.array([a13, exponent, a15]), np.sqrt(weight)
+    norm = float(np.linalg.norm(root * (r_s - a13 * np.exp(-exponent * soc) - a15)))
+    decay = np.exp(-exponent * soc)
+    jacobian = root[:, None] * np.column_stack([decay, -a13 * soc * decay, np.ones_like(soc)])
+    free = np.array([a13 > 0.0, a13 > 0.0 and EXPONENTS[0] < exponent < EXPONENTS[-1], a15 > 0.0])
+    std = np.full(3, np.nan)
+    variance = norm**2 / max(soc.size - int(free.sum()), 1)
+    std[free] = np.sqrt(np.diag(np.linalg.pinv(jacobian[:, free].T @ jacobian[:, free])) * variance)
+    return SeriesResistanceFit(a=a, std=std, rms_ohm=norm / float(np.sqrt(soc.size)))
+
+
+def _best(soc: Floats, r_s: Floats, weight: Floats) -> tuple[float, float, float]:
+    """Return a13 >= 0, a14 and a15 >= 0 with the smallest weighted sum of squares, by normal equations."""
+    decay = np.exp(-EXPONENTS[:, None] * soc)
+    dd, d1, dr = decay**2 @ weight, decay @ weight, decay @ (weight * r_s)
+    one, r1 = weight.sum(), (weight * r_s).sum()
+    determinant = np.maximum(dd * one - d1**2, TINY)
+    inside = (dr * one - d1 * r1) / determinant, (dd * r1 - d1 * dr) / determinant
+    flat = np.zeros_like(dd), np.full_like(dd, max(r1 / one, 0.0))
+    falling = np.maximum(dr / dd, 0.0), np.zeros_like(dd)
+    a13, a15 = (np.stack(parts) for parts in zip(inside, flat, falling, strict=True))
+    cost = a13**2 * dd + 2.0 * a13 * a15 * d1 + a15**2 * one - 2.0 * (a13 * dr + a15 * r1)
+    cost[(a13 < 0.0) | (a15 < 0.0)] = np.inf
+    edge, j = np.unravel_index(np.argmin(cost), cost.shape)
+    return float(a13[edge, j]), float(EXPONENTS[j]), float(a15[edge, j])

@@ -1,0 +1,1 @@
+"""MQTT client: connect, negotiate, reconnect, queue, subscribe. It knows no payload."""

@@ -1,0 +1,269 @@
+"""The real connection: aiomqtt and paho, and what they say in words of ours."""
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import AsyncIterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import aiomqtt
+import structlog
+from aiomqtt import ProtocolVersion
+from paho.mqtt.client import DisconnectFlags, error_string
+from paho.mqtt.enums import MQTTErrorCode
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from bms_estimator.mqtt.connection import Hello, LinkError, Received, Refusal
+from bms_estimator.mqtt.reason_codes import UNSUPPORTED_VERSION, is_final, words
+from bms_estimator.mqtt.receive_queue import Inbox
+from bms_estimator.sinks.messages import Message
+
+PARTING_S = 1.0
+"""A connection that broke cannot be ended in good order [s]."""
+NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+"""Small messages go at once."""
+HEAD_BYTES = 16
+"""What a published message has beside topic and payload, at most."""
+SOCKET_BROKE = "failed to receive on socket: "
+"""How paho's line of an error of the socket begins."""
+TLS_ALERT = "[SSL: "
+"""How the text of an error begins that TLS itself has a name for: the broker told us what it does not like."""
+
+log = structlog.get_logger(__name__)
+
+
+class _ToLog(logging.Handler):
+    """What paho and aiomqtt have to say goes where all lines go; why a socket broke the link says."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        said = record.getMessage()
+        if not said.startswith(SOCKET_BROKE):
+            log.warning("mqtt client", said=said)
+
+
+_logger = logging.getLogger(__name__)
+_logger.setLevel(logging.WARNING)
+_logger.propagate = False
+_logger.addHandler(_ToLog())
+
+
+class Patience(NamedTuple):
+    """How long silence is borne."""
+
+    connected_s: float = 10.0
+    """Name server, TCP, TLS and the broker's answer together may take so long [s]."""
+    keepalive_s: int = 10
+    """After so long a silence the broker is asked for a sign of life, for which it has as long again. One that lost us
+    without a word publishes the will after one and a half times this [s]."""
+    acknowledged_s: float = 15.0
+    """A broker that lives but takes longer for a message is lost; NATS takes 10 s to find a new leader [s]."""
+
+
+PATIENCE = Patience()
+
+
+class ClosedError(aiomqtt.MqttError):
+    """The broker has closed the connection in place of an answer to CONNECT."""
+
+
+class Client(aiomqtt.Client):
+    """A connection of one version of MQTT.
+
+    Args:
+        arguments: Address, name, password and TLS for aiomqtt.
+        protocol: Which MQTT.
+        hello: How it begins.
+        patience: When it is taken as lost.
+    """
+
+    def __init__(self, arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello, patience: Patience) -> None:
+        limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
+        limit.MaximumPacketSize = hello.most_bytes
+        self._is_5 = protocol is ProtocolVersion.V5
+        super().__init__(
+            **arguments,
+            protocol=protocol,
+            properties=limit if self._is_5 else None,
+            identifier=hello.identifier,
+            will=aiomqtt.Will(*hello.will) if hello.will else None,
+            keepalive=patience.keepalive_s,
+            max_queued_incoming_messages=hello.most_waiting,
+            queue_type=partial(Inbox, hello.lose, hello.most_bytes),  # type: ignore[arg-type]  # it is only called
+            socket_options=[NO_DELAY],
+            logger=_logger,
+        )
+        self._acknowledged_s = patience.acknowledged_s
+        self._client.on_log = self._on_log
+        self.protocol = "MQTT 5" if self._is_5 else "MQTT 3.1.1"
+        self._answers: dict[int, asyncio.Future[Refusal | None]] = {}
+        self._in_flight = asyncio.Semaphore(self._client.max_inflight_messages)
+        self._most_bytes: int | None = None
+        self._abandoned = False
+        self._why = "the connection broke"
+
+    async def publish(self, message: Message) -> Refusal | None:  # type: ignore[override]
+        """As ``Connection`` has it."""
+        if self._most_bytes is not None and HEAD_BYTES + len(message.topic) + len(message.payload) > self._most_bytes:
+            # it would end the connection
+            return Refusal(f"longer than the {self._most_bytes} bytes that the broker takes", for_now=False)
+        async with self._in_flight:
+            info = self._client.publish(*message)
+            if info.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
+                raise LinkError(f"a message cannot be sent: {error_string(info.rc)}")
+            answer: asyncio.Future[Refusal | None] = asyncio.get_running_loop().create_future()
+            self._answers[info.mid] = answer
+            try:
+                await asyncio.wait([answer], timeout=self._acknowledged_s)
+                if not answer.done():  # it may be, though the time is up: both came while the process stood still
+                    raise LinkError(f"the broker has not acknowledged a message for {self._acknowledged_s:g} s")
+                return answer.result()
+            finally:
+                self._answers.pop(info.mid, None)
+
+    async def subscribe(self, requests: str | None, others: Sequence[str]) -> dict[str, str]:  # type: ignore[override]
+        """As ``Connection`` has it."""
+        topics = [*([requests] if requests else []), *others]
+        if self._is_5:
+            wanted: Any = [(topic, SubscribeOptions(qos=0, retainAsPublished=topic == requests)) for topic in topics]
+        else:
+            wanted = [(topic, 0) for topic in topics]
+        try:
+            answers = await super().subscribe(wanted)
+        except aiomqtt.MqttError as error:
+            raise LinkError(f"no subscription: {error}") from None
+        return {
+            topic: words(answer)
+            for topic, answer in zip(topics, answers, strict=False)
+            if isinstance(answer, ReasonCode) and answer.is_failure
+        }
+
+    async def receive(self) -> Received:
+        """As ``Connection`` has it."""
+        try:
+            message = await anext(self.messages)
+        except aiomqtt.MqttError:
+            raise LinkError(self._why) from None
+        return Received(message.topic.value, bytes(message.payload), bool(message.retain))
+
+    def abandon(self) -> None:
+        """Give up an attempt to connect, though the broker may still answer."""
+        self._abandoned = True
+        self._client.disconnect()
+
+    def break_off(self) -> None:
+        """Close the line without a word: once the broker has read what is on it, it publishes the will."""
+        line: Any = self._client.socket()  # of a protocol of paho's, which leaves out what all sockets have
+        if line is not None:
+            with contextlib.suppress(OSError):
+                line.shutdown(socket.SHUT_RDWR)
+
+    async def part(self) -> None:
+        """End the connection, in good order where that is possible."""
+        with contextlib.suppress(TimeoutError, aiomqtt.MqttError):
+            async with asyncio.timeout(PARTING_S):
+                await self.__aexit__(None, None, None)
+        if self._disconnected.done() and not self._disconnected.cancelled():
+            self._disconnected.exception()  # else asyncio prints that nobody has looked at it
+
+    def _on_connect(
+        self, client: Any, userdata: Any, flags: Any, reason_code: ReasonCode, properties: Properties | None = None
+    ) -> None:
+        if self._abandoned:
+            client.disconnect()
+            return
+        most = getattr(properties, "ReceiveMaximum", None)
+        if most is not None and most < client.max_inflight_messages:
+            self._in_flight = asyncio.Semaphore(most)
+        self._most_bytes = getattr(properties, "MaximumPacketSize", None)
+        super()._on_connect(client, userdata, flags, reason_code, properties)
+
+    def _on_disconnect(
+        self,
+        client: Any,
+        userdata: Any,
+        flags: DisconnectFlags,
+        reason_code: ReasonCode,
+        properties: Properties | None = None,
+    ) -> None:
+        if flags.is_disconnect_packet_from_server:
+            self._why = words(reason_code)
+        elif reason_code == "Keep alive timeout":
+            self._why = "the broker gave no sign of life"
+        if self._abandoned:
+            return
+        if not self._connected.done():
+            self._connected.set_exception(ClosedError(self._why))
+        if self._connected.cancelled():  # nobody waits any more; the base would ask it for its exception
+            return
+        super()._on_disconnect(client, userdata, flags, reason_code, properties)
+
+    def _on_log(self, client: Any, userdata: Any, level: int, said: str) -> None:  # noqa: ARG002
+        if said.startswith(SOCKET_BROKE):
+            self._why = said.removeprefix(SOCKET_BROKE)
+
+    def _on_socket_open(self, client: Any, userdata: Any, sock: Any) -> None:
+        """As the base has it; a socket that nobody waits for any more is shut: the loop that would watch it may be about to end."""
+        if self._abandoned:
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
+        else:
+            super()._on_socket_open(client, userdata, sock)
+
+    def _on_socket_register_write(self, client: Any, userdata: Any, sock: socket.socket) -> None:  # noqa: ARG002
+        """As the base has it, which may watch a socket that was closed meanwhile, or another of its number."""
+
+        def watch() -> None:
+            if sock.fileno() >= 0:
+                self._loop.add_writer(sock, client.loop_write)
+
+        self._loop.call_soon_threadsafe(watch)
+
+    def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Any) -> None:  # noqa: ARG002
+        answer = self._answers.get(mid)
+        if answer is not None and not answer.done():
+            answer.set_result(
+                Refusal(words(reason_code), not is_final(reason_code)) if reason_code.is_failure else None
+            )
+
+
+@contextlib.asynccontextmanager
+async def connected(
+    arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello, patience: Patience
+) -> AsyncIterator[Client]:
+    """A connection while the context lasts; whoever leaves it by an exception has the broker publish the will.
+
+    Raises:
+        aiomqtt.MqttError: The broker cannot be reached, or refuses.
+    """
+    client = Client(arguments, protocol, hello, patience)
+    try:
+        await client.__aenter__()
+    except BaseException:
+        client.abandon()
+        raise
+    try:
+        yield client
+    except BaseException:
+        client.break_off()
+        raise
+    finally:
+        await client.part()
+
+
+def refusal(error: aiomqtt.MqttError) -> str:
+    """Why there is no connection."""
+    if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
+        return words(error.rc)
+    return str(error)
+
+
+def may_know_3_1_1(error: aiomqtt.MqttError) -> bool:
+    """Whether what refused MQTT 5 so may be a broker of the older one."""
+    if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
+        return error.rc.value == UNSUPPORTED_VERSION
+    return isinstance(error, ClosedError) and not str(error).startswith(TLS_ALERT)

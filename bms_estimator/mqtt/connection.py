@@ -1,0 +1,78 @@
+"""What a connection to a broker must be able to do. ``client`` has the real one."""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractAsyncContextManager
+from typing import NamedTuple, Protocol
+
+from bms_estimator.mqtt.broker_config import Broker
+from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING
+from bms_estimator.sinks.messages import Message
+
+
+class LinkError(Exception):
+    """The broker cannot be reached, refuses the connection, or the connection is lost; the message says why."""
+
+
+class Received(NamedTuple):
+    """A message that came."""
+
+    topic: str
+    payload: bytes
+    retain: bool
+
+
+class Refusal(NamedTuple):
+    """The broker's no to a message."""
+
+    why: str
+    for_now: bool
+    """It may take the same message later."""
+
+
+class Hello(NamedTuple):
+    """How each connection of a client begins."""
+
+    identifier: str
+    """The same at each: the broker ends an older one that it still holds, and its will comes first."""
+    will: Message | None
+    """None of who only reads."""
+    lose: Callable[[str, str], None]
+    """Hears kind (``too_long``, ``overflow``) and topic of each message that came and was thrown away."""
+    most_waiting: int = MOST_WAITING
+    """Messages that wait to be read; more are lost."""
+    most_bytes: int = MOST_BYTES
+    """Of a message; longer ones are kept back by an MQTT 5 broker, and thrown away else."""
+
+
+class Connection(Protocol):
+    """A connection while it lasts; every method raises LinkError when it is lost."""
+
+    protocol: str
+    """For people: which MQTT is spoken."""
+
+    async def subscribe(self, requests: str | None, others: Sequence[str]) -> dict[str, str]:
+        """Ask for messages at QoS 0.
+
+        Args:
+            requests: What is retained there must say so though it comes live, as far as the protocol can; None: nowhere.
+            others: Further topics.
+
+        Returns:
+            The topics that the broker refuses, and why.
+        """
+
+    async def publish(self, message: Message) -> Refusal | None:
+        """Hand over a message and wait until the broker has acknowledged it.
+
+        What is published by several tasks goes out in the order in which they called.
+
+        Returns:
+            The broker's refusal, where it does and says so.
+        """
+
+    async def receive(self) -> Received:
+        """Wait for the next message."""
+
+
+Connect = Callable[[Broker, Hello], AbstractAsyncContextManager[Connection]]
+"""Connects to a broker; entering raises LinkError, and within a bounded time."""

@@ -1,0 +1,84 @@
+"""Topics that the broker denies, for good or for now."""
+
+import asyncio
+from collections.abc import Callable
+
+import structlog
+
+from bms_estimator.mqtt.connection import Refusal
+from bms_estimator.process.backoff import Pauses
+from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.messages import Message
+
+log = structlog.get_logger(__name__)
+
+
+class Refusals:
+    """Names what is denied in log and health, and has what is retained said again when it was refused for now.
+
+    Args:
+        delivery: The topics are named there.
+        say_again: Has all that is retained said once more.
+        first_delay_s: From a refusal for now to that; doubles with each time [s].
+    """
+
+    def __init__(self, delivery: Delivery, say_again: Callable[[], object], first_delay_s: float) -> None:
+        self._delivery, self._say_again, self._pauses = delivery, say_again, Pauses(first_delay_s)
+        self._said: set[str] = set()  # one line of the log for each topic and connection
+        self._denied: dict[str, None] = {}  # in the order in which it was found out
+        self._for_now: dict[str, None] = {}
+        self._again: asyncio.TimerHandle | None = None
+
+    def begin(self) -> None:
+        """A new connection, which has denied nothing yet."""
+        self.end()
+        for of_the_last in (self._said, self._denied, self._for_now):
+            of_the_last.clear()
+        self._show()
+        self._pauses.reset()
+
+    def end(self) -> None:
+        """Nothing is said again."""
+        if self._again is not None:
+            self._again.cancel()
+            self._again = None
+
+    def deny(self, topic: str, why: str) -> None:
+        """A topic is denied."""
+        self._denied[topic] = None
+        self._say("broker refuses a topic; see its access list", topic, why)
+
+    def allow(self, topic: str) -> None:
+        """It was not."""
+        self._denied.pop(topic, None)
+        self._show()
+
+    def answered(self, message: Message, refusal: Refusal | None) -> None:
+        """The broker has taken a message, or refused it."""
+        if refusal is not None and refusal.for_now:
+            self._for_now[message.topic] = None
+            self._say("broker refuses a topic for now; it is tried again", message.topic, refusal.why)
+            if message.retain and self._again is None:
+                self._again = asyncio.get_running_loop().call_later(self._pauses.next_s(), self._due)
+            return
+        if message.topic in self._for_now:
+            del self._for_now[message.topic]
+            self._show()
+            if not self._for_now:
+                self._pauses.reset()
+        if refusal is not None:
+            self.deny(message.topic, f"not allowed to write it: {refusal.why}")
+
+    def _due(self) -> None:
+        self._again = None
+        self._say_again()
+
+    def _say(self, event: str, topic: str, why: str) -> None:
+        """In log and health."""
+        self._show()
+        if topic not in self._said:
+            self._said.add(topic)
+            log.warning(event, topic=topic, reason=why)
+
+    def _show(self) -> None:
+        self._delivery.refused_topics = list(self._denied | self._for_now)

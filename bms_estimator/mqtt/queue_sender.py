@@ -1,0 +1,151 @@
+"""What must reach the broker, sent oldest first, several messages on their way at a time."""
+
+import asyncio
+from collections.abc import Iterable, Sequence
+from typing import Protocol
+
+from bms_estimator.mqtt.connection import Connection
+from bms_estimator.mqtt.denied_topics import Refusals
+from bms_estimator.process.backoff import Pauses
+from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.messages import Message
+from bms_estimator.store.outbox import Outbox, Waiting
+
+WINDOW = 16
+"""Messages on their way to a broker that has not acknowledged them: below the 20 that brokers allow, so that the live
+topics find room beside them."""
+
+
+class Numbered(Protocol):
+    """Messages in order, each with a number, as ``Outbox`` keeps them.
+
+    Attributes:
+        connected: Whether there is a broker; whoever sends says so.
+    """
+
+    connected: bool
+
+    @property
+    def waiting(self) -> int:
+        """Messages that the broker has not acknowledged."""
+
+    @property
+    def dropped(self) -> int:
+        """Messages that found no room, since start."""
+
+    async def take(self, most: int) -> Sequence[Waiting]:
+        """Wait until there is a message, and hand out up to ``most`` of the oldest that were not since ``rewind``."""
+
+    def sent(self, number: int) -> None:
+        """The broker has acknowledged a message."""
+
+    def rewind(self) -> None:
+        """A connection is lost: hand out again, in order, what was not acknowledged."""
+
+
+class Sending:
+    """Empties what keeps messages in order.
+
+    Args:
+        outbox: What keeps them.
+        delivery: It is counted there what waits and what never arrives.
+        refusals: Hears how the broker answers.
+        first_delay_s: Before what is refused for now is tried again; doubles with each time [s].
+    """
+
+    def __init__(self, outbox: Numbered, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
+        self._outbox, self._delivery, self._refusals = outbox, delivery, refusals
+        self._pauses = Pauses(first_delay_s)
+        self._refused = 0
+        self._moved = asyncio.Event()
+
+    async def send(self, connection: Connection) -> None:
+        """Send what is there and what comes, until the connection is lost.
+
+        Raises:
+            LinkError: It is, alone or in a group.
+        """
+        self._outbox.connected = True
+        self._pauses.reset()
+        try:
+            while True:
+                await self._stream(connection)
+                await self._try_oldest(connection)
+        finally:
+            self._outbox.connected = False
+            self._outbox.rewind()
+
+    async def emptied(self) -> None:
+        """Wait until the broker has all of it."""
+        while self._outbox.waiting:
+            self._moved.clear()
+            await self._moved.wait()
+
+    async def _stream(self, connection: Connection) -> None:
+        """Send until the broker refuses one for now; then none is on its way any more, nor handed out."""
+        room = asyncio.Semaphore(WINDOW)
+
+        async def carry(waiting: Waiting) -> None:
+            if not await self._carry(connection, waiting):
+                feeding.cancel()
+            room.release()
+
+        async def feed() -> None:
+            while True:
+                for waiting in await self._outbox.take(WINDOW):
+                    await room.acquire()
+                    on_their_way.create_task(carry(waiting))  # tasks begin in the order in which they are made
+
+        async with asyncio.TaskGroup() as on_their_way:
+            feeding = on_their_way.create_task(feed())
+        self._outbox.rewind()
+
+    async def _try_oldest(self, connection: Connection) -> None:
+        """Try the oldest alone, so that nothing overtakes it, until the broker takes one or refuses it for good."""
+        while True:
+            await asyncio.sleep(self._pauses.next_s())
+            for oldest in await self._outbox.take(1):
+                if await self._carry(connection, oldest):
+                    self._pauses.reset()
+                    return
+            self._outbox.rewind()
+
+    async def _carry(self, connection: Connection, waiting: Waiting) -> bool:
+        """Send one message; False: to be tried again.
+
+        What is refused for good is counted and given up: else it would hold up all the rest.
+        """
+        refusal = await connection.publish(waiting.message)
+        self._refusals.answered(waiting.message, refusal)
+        if refusal is not None and refusal.for_now:
+            return False
+        self._refused += refusal is not None
+        self._outbox.sent(waiting.number)
+        self._count()
+        self._moved.set()
+        return True
+
+    def _count(self) -> None:
+        self._delivery.drops = self._outbox.dropped + self._refused
+        self._delivery.waiting = self._outbox.waiting
+
+
+class Backlog(Sending):
+    """Fills and empties an outbox.
+
+    Args:
+        outbox: The outbox.
+        delivery: As ``Sending`` has it.
+        refusals: As ``Sending`` has it.
+        first_delay_s: As ``Sending`` has it [s].
+    """
+
+    def __init__(self, outbox: Outbox, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
+        super().__init__(outbox, delivery, refusals, first_delay_s)
+        self._filled = outbox
+
+    def put(self, messages: Iterable[Message]) -> None:
+        """Keep messages until the broker has them; returns at once."""
+        for message in messages:
+            self._filled.put(message)
+        self._count()

@@ -1,0 +1,151 @@
+"""A subscriber to all devices of a broker: it keeps what each published last, stays connected, and says when it is not."""
+
+import asyncio
+import contextlib
+import secrets
+from collections.abc import Callable, Mapping
+from typing import Self
+
+import structlog
+
+from bms_estimator.model.clock import Clock
+from bms_estimator.mqtt.broker_config import brokers, check
+from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError
+from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.reconnect_loop import Link
+from bms_estimator.mqtt.topic_cache import Device, Heard, Published
+from bms_estimator.process.backoff import FIRST_DELAY_S
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.sinks import Delivery
+
+MOST_WAITING = 2000
+"""Messages that wait to be read: a broker sends all that is retained at once, some twenty of each device."""
+MOST_BYTES = 65_536
+"""Nothing of ours is longer: ``schema`` is a quarter of it."""
+REASONS = {"too_long": f"longer than {MOST_BYTES} bytes", "overflow": "faster than they are read"}
+LOG_S = 60.0
+"""Minimum time between two log lines on dropped messages [s]."""
+CLOSING_S = 3.0
+"""How long parting from the broker may take [s]."""
+
+
+log = structlog.get_logger(__name__)
+
+
+class Subscriber:
+    """Hears ``<base_topic>/#`` while the context lasts.
+
+    Args:
+        settings: The brokers, and what opens their doors.
+        heard: Called with each message of a device, once it is kept.
+        linked: Called when the broker was reached, and when it is lost; ``lost_since`` says which.
+        connect: Makes a connection; over TCP when left out.
+        left_out: Called with the name of a device that is not stored, because there are too many.
+        clock: The clocks.
+        first_delay_s: Before a lost broker is tried once more; then longer, as ``Pauses`` has it [s].
+
+    Raises:
+        UserError: A URL or a file of ``settings`` cannot be used.
+    """
+
+    def __init__(
+        self,
+        settings: MqttSettings,
+        heard: Callable[[Heard], None] = lambda _: None,
+        linked: Callable[[], None] = lambda: None,
+        *,
+        connect: Connect | None = None,
+        left_out: Callable[[str], object] = str,
+        clock: Clock | None = None,
+        first_delay_s: float = FIRST_DELAY_S,
+    ) -> None:
+        check(settings)
+        self._heard, self._linked, self._clock = heard, linked, clock or Clock()
+        self._topic = f"{settings.base_topic}/#"
+        self._published = Published(settings.base_topic, left_out)
+        self._delivery = Delivery()
+        self._lost_since: float | None = self._clock.wall()
+        hello = Hello(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
+        connect = connect or Dial(settings)
+        self._link = Link(brokers(settings), hello, connect, self._serve, self._delivery, first_delay_s)
+        self._task: asyncio.Task[None] | None = None
+        self._loss_logged_s: float | None = None
+        self.lost_messages = 0
+        """That were too long, or came faster than they were read."""
+
+    @property
+    def devices(self) -> Mapping[str, Device]:
+        """What each published last, by name, in the order in which they were heard first."""
+        return self._published.devices
+
+    @property
+    def hidden(self) -> int:
+        """Number of devices that publish but are not stored, because there are too many."""
+        return self._published.hidden
+
+    @property
+    def lost_since(self) -> float | None:
+        """Since when there is no broker, seconds since 1970; None while there is one.
+
+        Raises:
+            Exception: A callback's, which has ended the work: let it be seen.
+        """
+        if self._task is not None and self._task.done() and not self._task.cancelled():
+            self._task.result()
+        return self._lost_since
+
+    @property
+    def trouble(self) -> str | None:
+        """Why a broker was lost or could not be reached last; None: it never was."""
+        return self._delivery.trouble
+
+    async def __aenter__(self) -> Self:
+        """Start reaching for the broker."""
+        self._task = asyncio.create_task(self._link.run(), name="subscriber")
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        """Part from the broker.
+
+        Raises:
+            Exception: A callback's, if it ended the work.
+        """
+        if self._task is None:
+            return
+        self._link.closing.set()
+        done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
+        if not done:
+            self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._task
+
+    async def _serve(self, connection: Connection) -> None:
+        """Hear until the connection is lost or the subscriber closes."""
+        for topic, why in (await connection.subscribe(self._topic, [])).items():
+            raise LinkError(f"not allowed to read {topic}: {why}")
+        self._say_link(None)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                hearing = tasks.create_task(self._hear(connection))
+                await self._link.closing.wait()
+                hearing.cancel()
+        finally:
+            self._say_link(self._clock.wall())
+
+    async def _hear(self, connection: Connection) -> None:
+        while True:
+            message = await connection.receive()
+            heard = self._published.take(message.topic, message.payload, self._clock.wall())
+            if heard is not None:
+                self._heard(heard)
+
+    def _say_link(self, lost_since: float | None) -> None:
+        self._lost_since = lost_since
+        self._linked()
+
+    def _lose(self, kind: str, topic: str) -> None:
+        self.lost_messages += 1
+        now_s = self._clock.monotonic()
+        if self._loss_logged_s is None or now_s >= self._loss_logged_s + LOG_S:
+            self._loss_logged_s = now_s
+            log.warning("messages are dropped", reason=REASONS[kind], topic=topic, dropped=self.lost_messages)

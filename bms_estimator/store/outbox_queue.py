@@ -1,0 +1,198 @@
+"""The order of what waits for the broker, in memory and on disk. Pure: no disk, no clock, no task.
+
+From the oldest to the newest a message is on its way (``handed``), ready to be handed out, on disk alone
+(``stored``), or in the tail of what came last. While the broker takes what comes, nothing goes beyond ready.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import NamedTuple
+
+from bms_estimator.sinks.messages import Message
+from bms_estimator.store.number_ranges import Runs
+
+MEMORY_MOST = 4096
+"""Messages of the tail: some megabytes, and an hour of states for a disk that cannot be written."""
+PAGE = 1000
+"""Messages that are ready; the next ones are read from disk once half of them are gone."""
+
+
+LOWEST = -(1 << 62)
+"""Below all numbers, here and on disk."""
+
+
+class Waiting(NamedTuple):
+    """A message on its way to the broker."""
+
+    number: int
+    """Rises by one with each message."""
+    message: Message
+
+
+@dataclass
+class Queue:
+    """Messages in order.
+
+    Attributes:
+        most: So many are kept; of more the oldest that is not on its way is dropped.
+        dropped: Messages that found no room.
+        next: The number of the next message.
+        handed: On their way, not yet acknowledged.
+        stale: Whether something may be on disk that is not kept any more.
+        sure: Whether it is known what is on disk; if not, what is in memory is written again.
+        stored: What is on disk alone.
+        passing: Hand out what came last though older ones are on disk, which cannot be read.
+    """
+
+    most: int
+    dropped: int = 0
+    next: int = 0
+    handed: dict[int, Waiting] = field(default_factory=dict)
+    stale: bool = False
+    sure: bool = True
+    passing: bool = False
+    stored: Runs = field(default_factory=Runs)
+    _ready: deque[Waiting] = field(default_factory=deque)
+    _tail: deque[Waiting] = field(default_factory=deque)
+    _written: set[int] = field(default_factory=set)  # in memory, and on disk as well
+
+    @property
+    def waiting(self) -> int:
+        """Messages that are not acknowledged."""
+        return len(self.handed) + len(self._ready) + len(self.stored) + len(self._tail)
+
+    @property
+    def oldest(self) -> int | None:
+        """The lowest number that waits."""
+        if self.stored and not self.handed and not self._ready:
+            return self.stored.first
+        return next((waiting.number for waiting in self._in_memory()), None)
+
+    @property
+    def can_hand_out(self) -> bool:
+        """Whether ``hand_out`` gives something."""
+        return bool(self._ready or (self._tail and (self.passing or not self.stored)))
+
+    @property
+    def hungry(self) -> bool:
+        """Whether it is time to read from disk."""
+        return bool(self.stored) and len(self._ready) < PAGE // 2
+
+    def put(self, message: Message) -> None:
+        """Take the newest message."""
+        self._tail.append(Waiting(self.next, message))
+        self.next += 1
+        if self.waiting > self.most:
+            self._drop_oldest()
+        if len(self._tail) > MEMORY_MOST:
+            self._forget(self._tail.popleft().number)
+            self.dropped += 1
+
+    def hand_out(self, most: int) -> list[Waiting]:
+        """Up to ``most`` of the oldest."""
+        taken: list[Waiting] = []
+        while len(taken) < most and self.can_hand_out:
+            taken.append((self._ready or self._tail).popleft())
+        self.handed |= {waiting.number: waiting for waiting in taken}
+        return taken
+
+    def sent(self, number: int) -> None:
+        """A message is acknowledged."""
+        if self.handed.pop(number, None):
+            self._forget(number)
+
+    def rewind(self) -> None:
+        """Nothing is on its way any more."""
+        self._ready.extendleft(reversed(self.handed.values()))
+        self.handed.clear()
+
+    def unwritten(self) -> list[Waiting]:
+        """What is in memory alone."""
+        return [waiting for waiting in self._in_memory() if not self.sure or waiting.number not in self._written]
+
+    def writing(self, rows: Iterable[Waiting]) -> None:
+        """From now on these may be on disk."""
+        self._written.update(waiting.number for waiting in rows)
+
+    def wrote(self) -> None:
+        """What was to be written is on disk: of the tail, memory keeps what is ready."""
+        while self._tail and self._tail[0].number in self._written:
+            newest = self._tail.popleft()
+            if not self.stored and len(self._ready) < PAGE:
+                self._ready.append(newest)
+            else:
+                self._written.discard(newest.number)
+                self.stored.add(newest.number)
+
+    def loaded(self, rows: Iterable[Waiting], end: int) -> None:
+        """Of what is on disk alone these were read; all that is before ``end`` and not among them is lost."""
+        wanted = self.stored.take_before(end)
+        read = {waiting.number: waiting for waiting in rows if waiting.number in wanted}  # some were dropped meanwhile
+        self._ready.extend(read.values())
+        self._written.update(read)
+        self._lose(len(wanted) - len(read))
+
+    def found(self, runs: Runs) -> int:
+        """An earlier run left messages on disk: they go before all that was not handed out.
+
+        Args:
+            runs: Their numbers on disk.
+
+        Returns:
+            What makes numbers on disk of ours.
+        """
+        first = self._tail[0].number if self._tail else self.next
+        if not runs:
+            return -first
+        span = runs.end - runs.first
+        self._tail = deque(Waiting(waiting.number + span, waiting.message) for waiting in self._tail)
+        self.next += span
+        self.stored = runs.moved(first - runs.first)
+        for _ in range(self.waiting - self.most):
+            self._drop_oldest()
+        return runs.first - first
+
+    def left(self, runs: Runs) -> None:
+        """So much of what was on disk alone is still there."""
+        before = len(self.stored)
+        self.stored = self.stored.both(runs)
+        self._lose(before - len(self.stored))
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """What is not kept: from each number to before the other. It never comes to be kept again."""
+        kept = [range(waiting.number, waiting.number + 1) for waiting in self._in_memory()]
+        gaps, begin = [], LOWEST
+        for run in sorted([*kept, *self.stored], key=lambda run: run.start):
+            if begin < run.start:
+                gaps.append((begin, run.start))
+            begin = run.stop
+        return [*gaps, (begin, self.next)] if begin < self.next else gaps
+
+    def _in_memory(self) -> Iterator[Waiting]:
+        return chain(self.handed.values(), self._ready, self._tail)
+
+    def _forget(self, number: int) -> None:
+        """What may be on disk need not be any more."""
+        if number in self._written:
+            self._written.discard(number)
+            self.stale = True
+
+    def _lose(self, count: int) -> None:
+        """What was on disk alone cannot be read: what may be there of it need not be any more."""
+        if count:
+            self.dropped += count
+            self.stale = True
+
+    def _drop_oldest(self) -> None:
+        if self._ready:
+            self._forget(self._ready.popleft().number)
+        elif self.stored:
+            self.stored.pop()
+            self.stale = True
+        elif self._tail:
+            self._forget(self._tail.popleft().number)
+        else:
+            return
+        self.dropped += 1

@@ -1,0 +1,370 @@
+import numpy as np
+import pytest
+from scipy.stats import gmean
+
+from bms_estimator.calibration.cleaning.capture_checks import contradictions
+from bms_estimator.calibration.cleaning.clean_capture import whole_load
+from bms_estimator.calibration.elements import identify as module
+from bms_estimator.calibration.elements import two_branch_fit
+from bms_estimator.calibration.elements.identify import identify, initial_soc
+from bms_estimator.calibration.elements.replay_score import interval_score
+from bms_estimator.calibration.ocv.overpotential import hats
+from bms_estimator.calibration.validate import validate
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts
+from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.replay import load_capture
+from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps, wrong_start
+
+WARM_C, COLD_C = 25.0, -5.0
+OHM = {"r_s": 28e-3, "r_ts": 24e-3, "r_tl": 24e-3}
+"""Of ``LADDER`` at SOC 0.5 and 25 C."""
+
+
+@pytest.fixture(scope="module")
+def warm():
+    return Columns(ladder_capture(steps(), WARM_C), "warm")
+
+
+@pytest.fixture(scope="module")
+def cold():
+    return Columns(ladder_capture(steps(3), COLD_C), "cold")
+
+
+@pytest.fixture(scope="module")
+def identified(warm, cold):
+    return identify([warm, cold], wrong_start())
+
+
+def errors_mv(cell, samples):
+    return 1e3 * validate(Columns(samples, "other"), cell).above.voltage_rms_v
+
+
+def test_resistances_are_found_at_25_c(identified):
+    for name, ohm in OHM.items():
+        value, std = identified.elements[0.5][name]
+        assert value == pytest.approx(ohm, rel=0.05 if name == "r_s" else 0.15)
+        assert abs(value - ohm) < 2.0 * std < 0.6 * ohm
+
+
+def test_captures_at_two_temperatures_tell_of_those_between(identified, warm):
+    between = ladder_capture(steps(7), 10.0)
+    assert identified.cell.ladder.temperature_c == (COLD_C, WARM_C)
+    assert errors_mv(identified.cell, between) < 6.0
+    from_warm = identify([warm], wrong_start()).cell
+    assert from_warm.ladder.temperature_c == (WARM_C, WARM_C)
+    assert errors_mv(from_warm, between) > 1.5 * errors_mv(identified.cell, between)
+
+
+def test_at_one_temperature_the_parts_are_shared_as_in_the_file_given(identified, warm):
+    found = identify([warm], identified.cell).cell.ladder
+    ladders = found, identified.cell.ladder
+    weak, strong = (np.array([getattr(x, part) for x in ladders]) for part in ("weak_ohm", "strong_ohm"))
+    there = (weak + strong > 1e-9).all(axis=0)
+    assert there.mean() > 0.8
+    share, known = (weak / (weak + strong + 1e-15))[:, there]
+    assert share == pytest.approx(known, abs=1e-6)
+    assert np.ptp(known) > 0.2
+    assert (weak + strong).sum(axis=1)[0, 2:] == pytest.approx((weak + strong).sum(axis=1)[1, 2:], rel=0.1)
+    assert found.temperature_c == (COLD_C, WARM_C)
+
+
+def growth(ladder):
+    """Of the sum of all resistances, from SOC 0.65 to 0."""
+    ohm = (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).sum(axis=0)
+    return ohm[0] / np.interp(0.65, ladder.soc, ohm)
+
+
+def test_towards_empty_resistances_go_between_level_and_as_in_the_file_where_no_capture_was(warm):
+    above = Columns(warm.rows[: int(np.argmax(np.cumsum(warm.rows["current_a"]) > 0.6 * 3600.0 * 3.0))], "above")
+    found = {}
+    for name, times in (("level", 1.0), ("growing", 4.0)):
+        rows = ((0.004 * times, 0.004, 0.004),) * 7
+        parts = {"soc": (0.0, 0.3, 1.0), "weak_ohm": rows, "strong_ohm": rows, "std": 0.6}
+        given = TRUTH.model_copy(update={"ladder": LADDER.model_copy(update=parts)})
+        once = identify([above], given, refine_ocv=False).cell
+        found[name] = growth(once.ladder)
+        again = growth(identify([above], once, refine_ocv=False).cell.ladder)
+        assert again == pytest.approx(found[name], rel=0.1)  # what was identified does not wear away
+    assert 1.5 * found["level"] < found["growing"] < 3.0
+
+
+def test_a_capture_that_tells_little_makes_a_ladder_that_says_so(warm):
+    short = Columns(warm.rows[:700], "short")
+    stds = [identify([capture], wrong_start(), refine_ocv=False).cell.ladder.std for capture in (warm, short)]
+    assert module.LADDER_STD < stds[0] < 1.3 * module.LADDER_STD < 1.5 * stds[0] < stds[1]
+
+
+def test_the_two_branches_of_the_file_are_those_of_the_ladder(identified):
+    ladder, a = identified.cell.ladder, identified.cell.a
+    for soc in (0.35, 0.5, 0.9):
+        rows = np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)
+        ohm = rows @ hats(np.array([soc]), np.array(ladder.soc))[0]
+        assert r_s(soc, a) == pytest.approx(ohm[0], rel=0.1)
+        assert r_ts(soc, a) == pytest.approx(ohm[1:4].sum(), rel=0.1)
+        assert r_tl(soc, a) == pytest.approx(ohm[4:].sum(), rel=0.1)
+        assert 1.0 < r_ts(soc, a) * c_ts(soc, a) < 30.0
+        assert 120.0 < r_tl(soc, a) * c_tl(soc, a) < 2000.0
+
+
+def test_capacitances_of_a_flat_ladder_are_positive_down_to_empty():
+    flat = LADDER.model_copy(update={"weak_ohm": ((0.02,) * 3,) * 7, "strong_ohm": ((0.0,) * 3,) * 7})
+    made = two_branch_fit.sections(flat)
+    assert made["r_s"].offset_ohm == pytest.approx(0.02, rel=1e-3)
+    for name in ("c_ts", "c_tl"):
+        assert 0.0 < made[name].amplitude_farad < made[name].offset_farad
+
+
+def test_branches_that_a_slow_capture_does_not_tell_are_written_all_the_same():
+    """Samples a minute apart leave those of seconds at nothing."""
+    untold = LADDER.model_copy(
+        update={"weak_ohm": tuple((0.0 if 0 < k < 4 else 0.02,) * 3 for k in range(7)), "strong_ohm": ((0.0,) * 3,) * 7}
+    )
+    made = two_branch_fit.sections(untold)
+    assert 0.0 < made["r_ts"].offset_ohm < 1e-3 * made["r_tl"].offset_ohm
+    assert 1.0 < made["r_ts"].offset_ohm * made["c_ts"].offset_farad < 30.0
+
+
+def test_captures_of_about_one_temperature_judge_cells_that_did_not_see_them(warm, cold):
+    other = Columns(ladder_capture(steps(5), WARM_C + 3.0), "other")
+    found = identify([warm, cold, other], wrong_start())
+    assert [c.held_back for c in found.captures] == [True, False, True]
+    assert found.score_after < found.score_before
+    for mean, of_each in (
+        (found.score_before, [c.score_before for c in found.captures]),
+        (found.score_after, [c.score_after for c in found.captures]),
+    ):
+        assert mean == pytest.approx(gmean(of_each))
+
+
+def test_what_makes_replays_worse_is_refused_with_their_scores(warm, monkeypatch):
+    given = wrong_start()
+    monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell is given else 5.25)
+    with pytest.raises(UserError, match=r"^nothing is written: .* from 1\.50 to 5\.25 % of SOC") as caught:
+        identify([warm], given)
+    assert "warm: 1.50 before, 5.25 after" in str(caught.value)
+
+
+def test_the_ocv_is_kept_where_that_makes_replays_better(warm, monkeypatch):
+    given = wrong_start()
+    monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell.ocv is given.ocv else 5.25)
+    found = identify([warm], given)
+    assert found.cell.ocv == given.ocv
+    assert found.ocv_correction_v == 0.0
+
+
+def test_captures_too_short_for_a_replay_are_identified_all_the_same():
+    found = identify([Columns(ladder_capture(steps()[:1200], WARM_C), "short")], wrong_start())
+    assert np.isnan(found.score_before)
+    assert np.isnan(found.captures[0].score_after)
+
+
+def test_the_score_is_worse_for_a_band_that_is_wrong():
+    load = whole_load("steps", capture(steps()), TRUTH)
+    soc = 0.98 - load.discharged_ah / TRUTH.cell.capacity_ah
+    good = interval_score(TRUTH, load, soc)
+    assert 0.0 < good < 10.0
+    assert interval_score(TRUTH, load, np.clip(soc + 0.2, 0.0, 1.0)) > 3.0 * good
+
+
+def test_a_wrong_ocv_is_corrected(warm):
+    soc = np.linspace(0.0, 1.0, 101)
+    true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
+    wrong_v = true_v + 6e-3 * np.sin(2.0 * np.pi * soc)
+    wrong = TableOcv(form="table", soc=tuple(soc), ocv_v=tuple(wrong_v), error_v=(6e-3,) * soc.size)
+    found = identify([warm], TRUTH.model_copy(update={"ocv": wrong}), initial_soc=0.98).cell.ocv
+    middle = (soc > 0.15) & (soc < 0.95)
+    left_v = np.interp(soc, found.soc, found.ocv_v) - true_v
+    assert np.sqrt(np.mean(left_v[middle] ** 2)) < 0.8 * np.sqrt(np.mean((wrong_v - true_v)[middle] ** 2))
+    assert (np.diff(found.ocv_v) > 0.0).all()
+
+
+def test_what_may_be_hysteresis_is_no_error_of_the_curve(warm):
+    """The middle of two branches 25 mV to both sides: a drive that lies elsewhere by 8 mV tells nothing of the other branch."""
+    soc = np.linspace(0.0, 1.0, 101)
+    true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
+    moved_v = {}
+    for name, hysteresis_v in (("branches", 0.025), ("one", None)):
+        middle_v = true_v + 8e-3 + (hysteresis_v or 0.0)
+        told = TableOcv(
+            form="table",
+            soc=tuple(soc),
+            ocv_v=tuple(middle_v),
+            error_v=(8e-3,) * soc.size,
+            hysteresis_v=None if hysteresis_v is None else (hysteresis_v,) * soc.size,
+        )
+        found = identify([warm], TRUTH.model_copy(update={"ocv": told}), initial_soc=0.98).cell.ocv
+        moved_v[name] = np.mean((np.interp(soc, found.soc, found.ocv_v) - middle_v)[20:90])
+        assert found.hysteresis_v is None or found.hysteresis_v[0] == hysteresis_v
+    assert abs(moved_v["branches"]) < 0.5 * abs(moved_v["one"])
+
+
+def test_charge_that_the_rows_of_a_capture_miss_is_found(warm):
+    lacking = warm.rows.copy()
+    lacking["current_a"] *= 0.98
+    found = {
+        name: identify([Columns(rows, name)], wrong_start(), refine_ocv=False).captures[0].miscount
+        for name, rows in (("whole", warm.rows), ("lacking", lacking))
+    }
+    assert abs(found["whole"]) < 0.001
+    assert 0.005 < found["lacking"] < 0.02  # two per cent, pulled to nothing: it is five of its std
+
+
+def test_ocv_and_its_growth_with_temperature_are_kept_when_asked(warm, cold):
+    found = identify([warm, cold], wrong_start(), refine_ocv=False)
+    assert found.cell.ocv == wrong_start().ocv
+    assert found.ocv_correction_v == 0.0
+
+
+def test_a_pack_is_identified_as_well_as_a_cell():
+    pack = TRUTH.pack(6, 2)
+    samples = capture(2.0 * steps(), cell=pack, noise_v=3e-3)
+    found = identify([Columns(samples, "pack")], wrong_start().pack(6, 2))
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(3.0 * r_s(0.5, TRUTH.a), rel=0.03)
+    assert errors_mv(found.cell, samples) < 36.0
+
+
+def test_glitches_do_no_harm(warm):
+    samples = warm.rows.copy()
+    rng = np.random.default_rng(5)
+    places = rng.choice(np.arange(100, samples.size - 100), 60, replace=False)
+    samples["voltage_v"][places[:20]] = 0.0
+    samples["voltage_v"][places[20:35]] = 3.0
+    samples["voltage_v"][places[35:45]] = np.nan
+    resting = places[45:][samples["current_a"][places[45:]] == 0.0]
+    samples["current_a"][resting] = 4.6
+    samples["time_s"][50:52] = samples["time_s"][49]
+    found, clean = (identify([Columns(rows, "glitches")], wrong_start()) for rows in (samples, warm.rows))
+    assert found.captures[0].glitches >= 45
+    for name in OHM:
+        assert found.elements[0.5][name][0] == pytest.approx(clean.elements[0.5][name][0], rel=0.05)
+
+
+def test_a_gap_at_rest_is_stepped_over():
+    samples = ladder_capture(np.r_[steps()[:6000], np.zeros(3600), steps()[6000:]], WARM_C)
+    found = identify([Columns(np.delete(samples, np.s_[6060:9540]), "gap")], wrong_start())
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(OHM["r_s"], rel=0.05)
+
+
+def test_captures_that_tell_nothing_of_resistances_are_left_out(warm):
+    slow = Columns(capture(constant(0.15, 20_000)), "slow")
+    found = identify([slow, warm], wrong_start())
+    assert found.left_out == ("slow",)
+    assert [c.name for c in found.captures] == ["warm"]
+
+
+def test_without_a_sensor_the_temperature_is_as_told(cold):
+    samples = cold.rows.copy()
+    samples["temperature_c"] = np.nan
+    told = identify([Columns(samples, "cold")], wrong_start(), temperature_c=COLD_C)
+    assert told.cell.ladder.temperature_c == (COLD_C, COLD_C)
+    assert told.captures[0].temperature_c == (COLD_C, COLD_C)
+    assert told.elements[0.5]["r_s"][0] < identify([Columns(samples, "cold")], wrong_start()).elements[0.5]["r_s"][0]
+    with pytest.raises(
+        UserError, match=r"^cold: temperature_c runs from 298.0 to 298.0, but cells are between -45 and 85"
+    ):
+        identify([Columns(samples, "cold")], wrong_start(), temperature_c=298.0)
+
+
+def test_the_first_soc_can_be_given_and_a_cold_rest_near_full_is_full():
+    samples = ladder_capture(steps(), COLD_C, soc=1.0)
+    samples["voltage_v"] -= 0.015
+    assert identify([Columns(samples, "cold")], wrong_start()).captures[0].initial_soc == 1.0
+    assert identify([Columns(samples, "cold")], wrong_start(), initial_soc=0.99).captures[0].initial_soc == 0.99
+
+
+def with_capacity(capacity_ah):
+    cell = TRUTH.cell.model_copy(update={"capacity_ah": capacity_ah})
+    return TRUTH.model_copy(update={"cell": cell})
+
+
+def flipped(samples):
+    samples["current_a"] *= -1.0
+    return samples
+
+
+def with_gap(samples):
+    loaded = int(np.flatnonzero(samples["current_a"] > 0.4)[4000])
+    samples["time_s"][loaded:] += 3600.0
+    return samples
+
+
+def stuck(samples, first):
+    samples["voltage_v"][first:] = samples["voltage_v"][first]
+    return samples
+
+
+def in_hours(samples):
+    samples["time_s"] /= 3600.0
+    return samples
+
+
+@pytest.mark.parametrize(
+    ("samples", "cell", "words"),
+    [
+        (capture(np.zeros(4000)), TRUTH, ["no excitation", "0.0000 A", "1.11 h"]),
+        (flipped(capture(steps())), TRUTH, ["sign is wrong", "mV per ampere"]),
+        (flipped(capture(constant())), TRUTH, ["sign is wrong", "Ah drawn while the voltage went from"]),
+        (capture(steps()), with_capacity(2.0), ["outside 0..1", "capacity of 2 Ah"]),
+        (capture(steps()), with_capacity(5.0), ["charge and voltage disagree", "capacity of 5 Ah"]),
+        (stuck(capture(steps()), 0), TRUTH, ["the voltage does not move", "no old value was repeated"]),
+        (stuck(capture(steps()), 2000), TRUTH, ["the voltage moves by 0.000 mV per ampere"]),
+        (in_hours(capture(steps())[:9000]), TRUTH, ["it lasts 2.5 s", "is time_s in seconds?"]),
+        (with_gap(capture(steps())), TRUTH, ["a gap of 3601 s", "A: the charge drawn in it is unknown"]),
+        (capture(steps()), load_cell("thunder_power_6s"), ["lie within the cell's limits", "is it this cell's?"]),
+    ],
+    ids=[
+        "rest",
+        "sign, steps",
+        "sign, constant",
+        "capacity too small",
+        "capacity too large",
+        "dead",
+        "stuck",
+        "hours",
+        "gap",
+        "another cell",
+    ],
+)
+def test_bad_input_is_named_with_its_numbers(samples, cell, words):
+    with pytest.raises(UserError) as caught:
+        identify([Columns(samples, "bad.csv")], cell)
+    assert str(caught.value).startswith("bad.csv: ")
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_a_good_capture_contradicts_nothing_but_an_soc_that_it_does_not_start_at():
+    load = whole_load("good", capture(steps()), TRUTH)
+    start = initial_soc(load, TRUTH)
+    assert contradictions(load, TRUTH, start) == []
+    (line,) = contradictions(load, TRUTH, start - 0.4)
+    assert "outside 0..1" in line
+
+
+def test_a_capture_that_stays_empty_tells_nothing_of_resistances():
+    current_a = np.tile(np.r_[np.full(20, 2.0), np.full(20, -2.0)], 50)
+    with pytest.raises(UserError, match=r"near.csv: no sample between SOC 0.02 and 1.01"):
+        identify([Columns(capture(current_a, soc=0.5), "near.csv")], TRUTH, initial_soc=0.0)
+
+
+def test_real_cell_from_its_relaxation_test_predicts_random_steps(shared_data):
+    folder = shared_data / "ncr18650"
+    found = identify([load_capture(folder / "cell5_relaxation_c2.csv.gz")], TRUTH)
+    errors = validate(load_capture(folder / "cell5_random_steps.csv.gz"), found.cell).above
+    assert errors.voltage_rms_v <= 12e-3
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(84.4e-3, rel=0.1)  # median of dV/dI at its steps
+
+
+def test_a_real_cell_is_identified_from_a_wrong_start_and_predicts_another_load(data):
+    """Nissan Leaf: pulses and rests, then cycles at 1C which the fit never saw."""
+    leaf = load_cell("leaf")
+    table = leaf.model_dump() | {"ladder": None}
+    for name in ("r_s", "r_ts", "r_tl"):
+        table[name] |= {key: 2.0 * table[name][key] for key in ("amplitude_ohm", "offset_ohm")}
+    found = identify([load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")], type(leaf).model_validate(table))
+    assert found.elements[0.5]["r_s"][0] == pytest.approx(1.57e-3, rel=0.1)  # median of dV/dI at its steps
+    assert found.captures[0].voltage_rms_v < 5e-3
+    assert found.score_after < found.score_before
+    assert validate(load_capture(data / "leaf" / "cc_1c.csv.gz"), found.cell).above.voltage_rms_v < 25e-3

@@ -1,0 +1,103 @@
+"""(2.10) through points whose curve is known."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora, fit_chen_mora
+from bms_estimator.calibration.ocv.points import Points, max_v, pooled, rms_v
+from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
+from bms_estimator.calibration.ocv.table_fit import fit_table
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports.printed import TABLE_1, TABLE_8
+from tests.calibration.simulated_load import TRUTH
+from tests.calibration.simulated_relaxation import relaxation
+
+GRID = np.linspace(0.0, 1.0, 501)
+
+
+def points(soc, ocv_v, std_v=1e-3, **ends):
+    soc = np.asarray(soc, dtype=float)
+    return Points(soc, np.asarray(ocv_v, dtype=float), np.full(soc.size, std_v), **ends)
+
+
+@pytest.mark.parametrize("a", [TABLE_1, TABLE_8], ids=["Table 1", "Table 8"])
+def test_exact_points_give_the_parameters_back(a):
+    soc = np.linspace(0.005, 1.0, 60)
+    fit = fit_chen_mora(points(soc, chen_mora(np.array(a), soc)))
+    assert fit.a == pytest.approx(a, rel=1e-4)
+    assert max_v(fit.residual_v) < 1e-7
+
+
+def test_shipped_cell_is_the_same_curve():
+    ocv = load_cell("chen_mora").ocv
+    assert ocv.a == pytest.approx(TABLE_1)
+    x = 0.37
+    by_hand = -1.031 * np.exp(-35.0 * x) + 3.685 + 0.2156 * x - 0.1178 * x**2 + 0.3201 * x**3
+    assert chen_mora(np.array(TABLE_1), np.array([x]))[0] == pytest.approx(by_hand, rel=1e-15)
+
+
+def test_standard_errors_are_those_of_the_scatter():
+    """Forty noisy sets: the fits scatter as each says it does."""
+    rng, soc = np.random.default_rng(0), np.linspace(0.01, 1.0, 80)
+    exact = chen_mora(np.array(TABLE_1), soc)
+    fits = [fit_chen_mora(points(soc, exact + 1e-3 * rng.standard_normal(soc.size))) for _ in range(40)]
+    scatter = np.std([fit.a for fit in fits], axis=0, ddof=1)
+    claimed = np.mean([fit.std for fit in fits], axis=0)
+    assert scatter == pytest.approx(claimed, rel=0.4)
+    assert np.mean([rms_v(fit.residual_v) for fit in fits]) == pytest.approx(1e-3, rel=0.1)
+
+
+def test_points_that_end_on_their_way_down_leave_a_curve_above_0_v():
+    """Nothing below SOC 0.07 says how large the exponential grows: its amplitude is held by the highest point."""
+    soc = np.linspace(0.07, 1.0, 19)
+    ocv_v = 3.2 + 0.1 * soc
+    ocv_v[0] -= 0.15
+    fit = fit_chen_mora(points(soc, ocv_v))
+    assert fit.a[0] <= ocv_v.max()
+    assert fit(np.array([0.0]))[0] > -0.1
+
+
+def test_a_parameter_at_its_bound_has_no_standard_error():
+    soc = np.linspace(0.0, 1.0, 40)
+    fit = fit_chen_mora(points(soc, 3.5 + 0.6 * soc))  # no exponential in it
+    assert np.isnan(fit.std[0])
+    assert np.isfinite(fit.std[2:]).all()
+    assert max_v(fit.residual_v) < 1e-5
+
+
+def test_joint_fit_of_several_runs_beats_the_mean_of_their_parameters():
+    """(5.1)-(5.2) average parameters that lean on each other."""
+    rng, exact = np.random.default_rng(4), np.array(TABLE_1)
+    runs = []
+    for count in (9, 10, 12):
+        soc = np.linspace(0.2 / count, 1.0, count)
+        runs.append(points(soc, chen_mora(exact, soc) + 2e-3 * rng.standard_normal(count)))
+    fits = [fit_chen_mora(run) for run in runs]
+    mean = average(fits)
+    assert mean == pytest.approx(sum(fit.a for fit in fits) / 3)  # (5.1), (5.2)
+    order = np.argsort(np.concatenate([run.soc for run in runs]))
+    joint = fit_chen_mora(
+        points(np.concatenate([run.soc for run in runs])[order], np.concatenate([run.ocv_v for run in runs])[order])
+    )
+    inside = GRID[GRID > 0.05]
+    true_v = chen_mora(exact, inside)
+    assert rms_v(joint(inside) - true_v) < rms_v(chen_mora(mean, inside) - true_v)
+    assert rms_v(joint(inside) - true_v) < 2e-3
+
+
+def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
+    tests = [relaxation_test(relaxation(rounds=10, seed=seed), TRUTH.cell.capacity_ah, name="mine") for seed in (0, 1)]
+    both = pooled(tests)
+    assert both.soc.size == len(tests[0].rests) + len(tests[1].rests)
+    assert (np.diff(both.soc) >= 0.0).all()
+    assert both.full_v == pytest.approx(0.5 * (tests[0].full_v + tests[1].full_v))
+    assert np.isnan(both.empty_v)  # neither runs empty
+
+
+@pytest.mark.parametrize("fit", [fit_chen_mora, fit_table])
+def test_too_few_points_or_too_small_a_span_are_refused_with_their_numbers(fit):
+    with pytest.raises(UserError, match=r"5 points of the open-circuit voltage; \(2.10\) has 6 parameters"):
+        fit(points(np.linspace(0.0, 1.0, 5), np.linspace(3.4, 4.1, 5)))
+    with pytest.raises(UserError, match=r"points span SOC 0.50 to 0.70 only"):
+        fit(points(np.linspace(0.5, 0.7, 12), np.linspace(3.4, 4.1, 12)))

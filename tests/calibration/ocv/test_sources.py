@@ -1,0 +1,238 @@
+"""What captures are found to be, and what they say together."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.ocv.slow_curve import GRID
+from bms_estimator.calibration.ocv.sources import (
+    PLATEAU_SHARE,
+    REST_SHARE_STD,
+    USUAL_STD,
+    GivenCurve,
+    Recording,
+    amid_usual_hysteresis,
+    find_sources,
+    without_branches,
+)
+from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.replay import load_capture
+from tests.calibration.simulated_load import TRUTH, capture
+from tests.calibration.simulated_relaxation import relaxation, schedule
+from tests.calibration.simulated_slow import CAPACITY_AH, CURRENT_A, hysteresis_v, slow, true_v
+
+INSIDE = (NODES > 0.1) & (NODES < 0.95)
+
+
+def of(*samples, curves=(), capacity_ah=None, **options):
+    recordings = [Recording(f"run{i}", one) for i, one in enumerate(samples)]
+    return find_sources(recordings, curves, capacity_ah=capacity_ah, **options)
+
+
+def off_v(found):
+    return (fit_table(found.points).ocv_v - true_v(NODES))[INSIDE]
+
+
+@pytest.mark.parametrize("files", [1, 2])
+def test_a_pair_gives_mean_hysteresis_and_capacity(files):
+    """In one file or two."""
+    found = of(slow((1.0, -1.0))) if files == 1 else of(slow((1.0,)), slow((-1.0,)))
+    (source,) = found.sources
+    assert source.kind.startswith("C/20 discharge and charge, 2.99")
+    assert found.capacity_ah == found.measured_ah == pytest.approx(CAPACITY_AH, rel=2e-3)
+    assert np.abs(off_v(found)).max() < 2e-3
+    assert found.hysteresis_v[INSIDE] == pytest.approx(
+        0.7 * hysteresis_v(NODES[INSIDE]), abs=2e-3
+    )  # the rest polarisation
+
+
+@pytest.mark.parametrize("noise_a", [0.01, 0.04])
+def test_a_noisy_current_sensor_and_a_charge_before_the_discharge(noise_a):
+    samples = slow((-1.0, 1.0))
+    samples["current_a"] += noise_a * np.random.default_rng(1).standard_normal(samples.size)
+    samples["current_a"][[700, 4000]] = 0.5
+    found = of(samples)
+    assert found.sources[0].kind.startswith("C/20 discharge and charge")
+    assert found.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-2)
+    assert np.abs(off_v(found)).max() < 3e-3
+
+
+def test_a_lone_discharge_is_off_by_its_hysteresis_and_knows_it():
+    found = of(slow((1.0,)))
+    fit = fit_table(found.points)
+    assert found.sources[0].kind.startswith("C/20 discharge, 2.99")
+    assert found.hysteresis_v is None
+    assert np.median(off_v(found)) < -5e-3
+    assert (np.abs(off_v(found)) < 2.5 * fit.error_v[INSIDE]).all()
+
+
+@pytest.mark.parametrize(("direction", "lifted"), [(1.0, 1.0), (-1.0, -1.0)])
+def test_a_lone_branch_is_brought_to_the_middle_of_what_is_usual(direction, lifted):
+    found, usual_v = of(slow((direction,)), capacity_ah=CAPACITY_AH), hysteresis_v(NODES)
+    moved = amid_usual_hysteresis(found, usual_v)
+    plain, points = found.points, moved.points
+    assert points.ocv_v - plain.ocv_v == pytest.approx(lifted * hysteresis_v(plain.soc), abs=1e-4)
+    assert (points.common_v > plain.common_v).all()
+    assert moved.hysteresis_v == pytest.approx(usual_v)
+    assert moved.hysteresis_std_v == pytest.approx(USUAL_STD * usual_v)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize("rested", [True, False])
+def test_what_branches_take_of_a_lone_curve_is_taken_out(direction, rested):
+    """With the ohmic drop where no jump to or from a rest has told it."""
+    samples, ladder = slow((direction,)), load_cell("nca", CAPACITY_AH).ladder
+    found = of(samples if rested else samples[samples["current_a"] != 0.0], capacity_ah=CAPACITY_AH)
+    plain, (source,) = found.points, without_branches(found, ladder).sources
+    rows = [row for part in (ladder.weak_ohm, ladder.strong_ohm) for row in part[int(rested) :]]
+    drop_v = CURRENT_A * sum(np.interp(plain.soc, ladder.soc, row) for row in rows)
+    assert source.points.ocv_v - plain.ocv_v == pytest.approx(direction * drop_v, rel=1e-3)
+    assert source.points.common_v == pytest.approx(np.hypot(plain.common_v, ladder.std * drop_v), rel=1e-3)
+    assert source.notes[-1].startswith(f"{1e3 * drop_v.mean():.0f} mV")
+
+
+def test_a_cold_lone_curve_is_further_from_rest():
+    samples, ladder = slow((1.0,)), load_cell("nca", CAPACITY_AH).ladder
+    lifted_v = []
+    for temperature_c in (25.0, 0.0):
+        samples["temperature_c"] = temperature_c
+        found = of(samples)
+        lifted_v.append((without_branches(found, ladder).points.ocv_v - found.points.ocv_v).mean())
+    assert 1.5 < lifted_v[1] / lifted_v[0] < 5.0
+
+
+def test_pairs_rests_and_given_curves_have_nothing_to_take_out():
+    soc, ladder = np.linspace(0.0, 1.0, 101), load_cell("nca", CAPACITY_AH).ladder
+    found = of(slow((1.0, -1.0)), relaxation(), curves=[GivenCurve("book", soc, true_v(soc), None)])
+    assert without_branches(found, ladder) == found
+
+
+def test_rests_after_a_discharge_and_a_curve_given_without_hysteresis_are_brought_there_too():
+    soc = np.linspace(0.0, 1.0, 101)
+    found = of(relaxation(), curves=[GivenCurve("book", soc, true_v(soc), None)], capacity_ah=TRUTH.cell.capacity_ah)
+    moved = amid_usual_hysteresis(found, np.full(NODES.size, 0.01))
+    for before, after in zip(found.sources, moved.sources, strict=True):
+        assert after.points.ocv_v - before.points.ocv_v == pytest.approx(0.01)
+        assert after.points.std_v == pytest.approx(before.points.std_v)
+
+
+def test_a_charge_that_lacks_much_of_what_came_out_is_left_out_and_said():
+    found = of(slow((1.0,)), slow((-1.0,), part=0.85))
+    assert found.hysteresis_v is None
+    assert len(found.sources) == 1
+    assert "charge run1 left out: 2.5" in found.sources[0].notes[0]
+
+
+def test_a_slow_curve_of_an_older_cell_is_counted_against_its_own_capacity():
+    found = of(slow((1.0, -1.0), capacity_ah=2.7), capacity_ah=CAPACITY_AH)
+    assert found.capacity_ah == CAPACITY_AH
+    assert found.measured_ah == pytest.approx(2.7, rel=2e-3)
+    assert "counted against its own 2.69" in found.sources[0].notes[0]
+    assert np.abs(off_v(found)).max() < 2e-3
+
+
+def test_a_given_curve_and_its_hysteresis():
+    soc = np.linspace(0.0, 1.0, 101)
+    found = of(curves=[GivenCurve("book", soc, true_v(soc), hysteresis_v(soc))], capacity_ah=5.0)
+    assert [source.kind for source in found.sources] == ["given curve, 101 points"]
+    assert np.abs(off_v(found)).max() < 2e-3
+    assert found.hysteresis_v == pytest.approx(hysteresis_v(NODES), abs=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_rests_tell_how_much_of_the_hysteresis_they_keep_and_are_moved_by_it(share):
+    soc, rests = np.linspace(0.0, 1.0, 101), relaxation()
+    plain = of(rests, capacity_ah=TRUTH.cell.capacity_ah).points
+    book = GivenCurve("book", soc, fit_table(plain)(soc) + share * 0.02, np.full(soc.size, 0.02))
+    found = of(rests, curves=[book], capacity_ah=TRUTH.cell.capacity_ah)
+    moved = found.points.ocv_v[found.points.source == 1]
+    assert moved == pytest.approx(plain.ocv_v + share * 0.02, abs=1e-3)
+    assert found.hysteresis_v == pytest.approx(np.full(NODES.size, share * 0.02), abs=1e-3)
+    assert f"rests keep {found.hysteresis_v[0] / 0.02:.2f} of its hysteresis" in found.sources[0].notes
+
+
+def test_a_capture_that_starts_lower_is_aligned_by_its_first_rest():
+    full, lower = relaxation(), capture(schedule(rounds=12), soc=0.93)
+    found = of(full, lower, capacity_ah=TRUTH.cell.capacity_ah)
+    assert [test.start_soc for test in found.tests] == [1.0, pytest.approx(0.93, abs=5e-3)]
+    assert found.sources[1].notes == (f"starts at SOC {found.tests[1].start_soc:.3f}",)
+    alone = of(lower, capacity_ah=TRUTH.cell.capacity_ah, initial_soc=0.93)
+    assert alone.tests[0].start_soc == 0.93
+
+
+def test_charge_within_a_test_is_counted_and_its_rests_are_less_certain():
+    """Regeneration: some rounds of the test put charge back."""
+    current_a = schedule(rounds=17)
+    is_load = current_a > 0.0
+    current_a[is_load & (np.cumsum(np.diff(is_load, prepend=False) & is_load) % 5 == 4)] *= -0.5
+    test = of(capture(current_a, soc=1.0), capacity_ah=TRUTH.cell.capacity_ah)
+    points, rests = test.points, test.tests[0].rests
+    charged = np.array([rest.after_charge for rest in rests])
+    assert 2 <= charged.sum() < 5
+    grid = np.linspace(points.soc[0], 0.95, 50)
+    plain = fit_table(of(relaxation(), capacity_ah=TRUTH.cell.capacity_ah).points)
+    assert fit_table(points)(grid) == pytest.approx(plain(grid), abs=4e-3)
+    by_soc = charged[np.argsort(test.tests[0].soc, kind="stable")]
+    assert points.std_v[by_soc].min() > np.median(points.std_v[~by_soc])
+
+
+def test_entropy_from_pairs_at_several_temperatures():
+    per_kelvin_v = 3e-4
+    runs = [slow((1.0, -1.0), temperature_c=t, off_v=per_kelvin_v * (t - 25.0)) for t in (10.0, 25.0, 45.0)]
+    fit = fit_table(of(*runs).points)
+    assert fit.per_kelvin_v is not None
+    assert np.median(fit.per_kelvin_v) == pytest.approx(per_kelvin_v, rel=0.3)
+    assert np.abs((fit.ocv_v - true_v(NODES))[INSIDE]).max() < 3e-3
+
+
+@pytest.mark.parametrize(
+    ("samples", "capacity_ah", "message"),
+    [
+        (relaxation, None, "--capacity-ah: not given, and no capture is a slow discharge"),
+        (lambda: slow((1.0,), part=0.7), None, "--capacity-ah: not given"),
+        (lambda: slow((1.0,), part=0.7), 1.8, "SOC runs from 1.000 to -0.16"),
+        (lambda: capture(np.full(7200, 1.5), soc=1.0), 3.0, "no rests in 1.94 h"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_numbers(samples, capacity_ah, message):
+    with pytest.raises(UserError, match=message):
+        of(samples(), capacity_ah=capacity_ah)
+
+
+def test_a_slow_discharge_of_the_wrong_sign_is_refused():
+    samples = slow((1.0,))
+    samples["current_a"] *= -1.0
+    with pytest.raises(UserError, match=r"wrong sign: charge from 3600 s on .*--current-sign"):
+        of(samples)
+
+
+def test_lfp_pairs_at_three_temperatures(shared_data):
+    folder = shared_data / "a123"
+    names = [f"c30_{way}_{at}.csv.gz" for at in ("p25", "p05", "n15") for way in ("dis", "chg")]
+    found = find_sources([Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=None)
+    assert found.capacity_ah == pytest.approx(2.06, abs=0.005)
+    assert [round(source.temperature_c) for source in found.sources] == [25, 5, -15]
+    half_v = np.interp(NODES, GRID, found.sources[0].hysteresis_v)
+    assert 0.005 < half_v[INSIDE].min() < half_v[INSIDE].max() < 0.03
+    assert found.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v)
+    assert found.hysteresis_std_v == pytest.approx(REST_SHARE_STD * half_v)
+    fit = fit_table(found.points)
+    warm = found.sources[0].points
+    plateau = (warm.soc > 0.15) & (warm.soc < 0.95)
+    assert np.abs(fit(warm.soc) - warm.ocv_v)[plateau].max() < 3e-3
+
+
+def test_the_hysteresis_of_a_cold_pair_is_brought_to_25_c(shared_data):
+    folder, mean_v = shared_data / "a123", {}
+    for at in ("p25", "n15"):
+        names = [f"c30_{way}_{at}.csv.gz" for way in ("dis", "chg")]
+        found = find_sources(
+            [Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=2.06
+        )
+        size = arrhenius(HYSTERESIS_J, found.sources[0].temperature_c)
+        half_v = np.interp(NODES, GRID, found.sources[0].hysteresis_v)
+        assert found.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v / size)
+        mean_v[at] = found.hysteresis_v[INSIDE].mean()
+    assert 0.7 < mean_v["n15"] / mean_v["p25"] < 1.8

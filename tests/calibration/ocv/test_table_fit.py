@@ -1,0 +1,128 @@
+"""The smooth table through points whose curve, errors and entropy are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import PchipInterpolator
+
+from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
+from bms_estimator.calibration.ocv.points import Points, joined, max_v, rms_v
+from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
+from bms_estimator.reports.printed import TABLE_1
+
+GRID = np.linspace(0.0, 1.0, 401)
+
+
+def true_v(soc):
+    return chen_mora(np.array(TABLE_1), soc)
+
+
+def source(soc, *, noise_v=0.0, off_v=0.0, std_v=1e-3, common_v=2e-3, temperature_c=np.nan, seed=0):
+    """Points of one capture of the cell of Table 1."""
+    ocv_v = true_v(soc) + off_v + noise_v * np.random.default_rng(seed).standard_normal(soc.size)
+    everywhere = np.ones(soc.size)
+    return Points(
+        soc, ocv_v, std_v * everywhere, common_v=common_v * everywhere, temperature_c=temperature_c * everywhere
+    )
+
+
+def slope_v(fit, soc):
+    """As the estimator's kernels take it."""
+    return PchipInterpolator(fit.soc, fit.ocv_v).derivative()(soc)
+
+
+@pytest.mark.parametrize(("noise_v", "within_v"), [(0.0, 1.5e-3), (3e-3, 4e-3)])
+def test_table_is_increasing_and_near_the_true_curve(noise_v, within_v):
+    fit = fit_table(source(np.linspace(0.02, 0.99, 40), noise_v=noise_v, std_v=noise_v + 5e-4, common_v=5e-4))
+    assert (fit.soc[0], fit.soc[-1]) == (0.0, 1.0)
+    assert (np.diff(fit.ocv_v) > 0.0).all()
+    assert (np.diff(fit(GRID)) > 0.0).all()
+    inside = (GRID > 0.15) & (GRID < 0.98)
+    assert max_v(fit(GRID[inside]) - true_v(GRID[inside])) < within_v
+    assert rms_v(fit.residual_v) < 5e-4 + 1.2 * noise_v
+
+
+def test_slopes_between_clustered_noisy_points_are_those_of_the_curve():
+    """Points 0.004 apart that are 3 mV off each: a line through them has slopes of volts."""
+    soc = np.concatenate([z + np.array([0.0, 0.004, 0.008, 0.02]) for z in np.arange(0.05, 0.95, 0.05)])
+    points = source(soc, noise_v=3e-3, std_v=5e-4, common_v=2e-3)
+    assert np.abs(np.diff(points.ocv_v) / np.diff(soc)).max() > 1.5
+    inside = GRID[(GRID > 0.15) & (GRID < 0.9)]
+    true_slope_v = (true_v(inside + 1e-4) - true_v(inside - 1e-4)) / 2e-4
+    assert slope_v(fit_table(points), inside) == pytest.approx(true_slope_v, abs=0.15)
+
+
+def test_a_falling_stretch_is_levelled():
+    soc = np.linspace(0.0, 1.0, 41)
+    points = Points(soc, 3.4 + 0.7 * soc - 0.2 * ((soc > 0.4) & (soc < 0.6)), np.full(soc.size, 1e-3))
+    fit = fit_table(points)
+    assert (np.diff(fit.ocv_v) > 0.0).all()
+    assert (slope_v(fit, GRID) >= 0.0).all()
+
+
+def test_the_curves_error_is_what_the_fits_scatter_by():
+    soc = np.linspace(0.05, 0.98, 30)
+    fits = [fit_table(source(soc, noise_v=2e-3, std_v=2e-3, common_v=1e-4, seed=seed)) for seed in range(40)]
+    inside = (NODES > 0.15) & (NODES < 0.95)
+    off = np.array([(fit.ocv_v - true_v(NODES)) / fit.error_v for fit in fits])[:, inside]
+    assert 0.3 < np.sqrt(np.mean(off**2)) < 1.1
+
+
+def test_error_grows_in_a_gap_beyond_the_points_and_with_disagreement():
+    soc = np.linspace(0.1, 0.98, 45)
+    whole = fit_table(source(soc))
+    gap = fit_table(source(soc[(soc < 0.4) | (soc > 0.7)]))
+    middle = int(np.argmin(np.abs(NODES - 0.56)))
+    assert gap.error_v[middle] > 1.5 * whole.error_v[middle]
+    assert whole.error_v[0] > 5.0 * whole.error_v[middle]
+    agree = fit_table(joined([source(soc), source(soc)]))
+    disagree = fit_table(joined([source(soc, off_v=0.015), source(soc, off_v=-0.015)]))
+    assert disagree.error_v[middle] > 1.5 * agree.error_v[middle]
+    assert disagree.deviation_v == pytest.approx([0.015, 0.015], rel=0.5)
+
+
+def test_the_surer_source_decides():
+    soc = np.linspace(0.05, 0.98, 45)
+    fit = fit_table(joined([source(soc, common_v=1e-3), source(soc, off_v=0.02, common_v=0.02)]))
+    inside = (NODES > 0.15) & (NODES < 0.95)
+    assert max_v((fit.ocv_v - true_v(NODES))[inside]) < 2e-3
+
+
+def test_ends_are_reached_by_what_is_known_of_them_else_on_the_line():
+    soc = np.linspace(0.1, 0.9, 33)
+    points = Points(soc, 3.4 + 0.7 * soc, np.full(soc.size, 1e-3))
+    line = fit_table(points)
+    assert line.ocv_v[[0, -1]] == pytest.approx([3.4, 4.1], abs=2e-3)
+    known = fit_table(replace(points, empty_v=3.0, full_v=4.2))
+    assert known.ocv_v[[0, -1]] == pytest.approx([3.0, 4.2], abs=0.02)
+    assert known.error_v[0] < line.error_v[0]
+
+
+@pytest.mark.parametrize("per_kelvin_v", [3e-4, -2e-4])
+def test_entropy_is_found_between_temperatures_and_pulled_to_nothing(per_kelvin_v):
+    soc = np.linspace(0.05, 0.98, 45)
+    warm = [source(soc, off_v=per_kelvin_v * (t - 25.0), temperature_c=t, common_v=5e-4) for t in (15.0, 25.0, 45.0)]
+    found = fit_table(joined(warm)).per_kelvin_v
+    assert found is not None
+    assert found[10:-10] == pytest.approx(np.full(NODES.size - 20, per_kelvin_v), rel=0.25)
+    cold = source(soc, off_v=-30.0 * per_kelvin_v, temperature_c=-5.0, common_v=4e-3)
+    cold = replace(cold, cold_v=np.full(soc.size, 0.016))
+    less = fit_table(joined([warm[1], cold])).per_kelvin_v
+    assert less is not None
+    assert (np.abs(less[10:-10]) < 0.6 * abs(per_kelvin_v)).all()  # as likely, the cold cell had not relaxed
+
+
+@pytest.mark.parametrize("temperatures_c", [(25.0, 30.0), (np.nan, np.nan)])
+def test_no_entropy_without_a_span_of_temperatures(temperatures_c):
+    soc = np.linspace(0.05, 0.98, 45)
+    fit = fit_table(joined([source(soc, temperature_c=t) for t in temperatures_c]))
+    assert fit.per_kelvin_v is None
+    assert fit.table().per_kelvin_v is None
+
+
+def test_cells_in_series_scale():
+    soc = np.linspace(0.05, 0.98, 45)
+    one = source(soc, noise_v=1e-3)
+    six = replace(one, ocv_v=6.0 * one.ocv_v, std_v=6.0 * one.std_v, common_v=6.0 * one.common_v)
+    assert fit_table(six).ocv_v == pytest.approx(6.0 * fit_table(one).ocv_v, rel=2e-3)

@@ -1,0 +1,182 @@
+"""Schemes 1 to 3 and the improved method through the estimator, and Algorithm 1 over a whole discharge."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.chen_mora import ocv, r_s
+from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.model.cell import Bounds, load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports.simulation import discharge, with_bounds
+from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
+
+CELL = load_cell("chen_mora")
+SMALL = [1, 3, 6, 13, 15]
+LARGE = [i for i in range(1, 16) if i not in SMALL]
+DISTURBED_V, DISTURBED = 0.3, 500
+"""The voltage is off by so much for so many samples: e, and with it the drive of (3.16), is far from zero."""
+
+
+def settings(law, **others):
+    """The printed law: no dead zone, no fresh start of k, no watch for lock."""
+    printed = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "lock_error_v": 100.0}
+    return ObserverSettings.model_validate(printed | others)
+
+
+@pytest.fixture(scope="module")
+def disturbed():
+    """Half a minute at 1C and 100 Hz, its first seconds with an error of the voltage."""
+    samples = discharge(CELL, 0.275, 0.01)[:3000]
+    samples["voltage_v"][:DISTURBED] -= DISTURBED_V
+    return samples
+
+
+def moved(law, samples, cell=CELL):
+    """Change of a1..a15 at index 1..15, and of k: the integral of e^2 over the run (3.13)."""
+    estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
+    estimator.run(samples)
+    change = estimator.state["a"][0] - estimator.settings["a_initial"][0]
+    return change, float(estimator.state["k"][0] - estimator.settings["k0"][0])
+
+
+@pytest.mark.parametrize("every", [1, 10, 100])
+def test_scheme_1_moves_every_parameter_by_the_integral_of_the_squared_error_that_k_grows_by(disturbed, every):
+    """(3.16) and (3.13) integrate the same e^2, at 100, 10 and 1 Hz."""
+    change, integral = moved("scheme-1", disturbed[::every])
+    assert integral > 1e-3
+    assert change[1:] == pytest.approx(np.full(15, integral), rel=1e-6)
+
+
+def test_scheme_2_draws_the_small_parameters_back(disturbed):
+    change, integral = moved("scheme-2", disturbed)
+    assert change[LARGE] == pytest.approx(np.full(10, integral), rel=1e-6)
+    assert np.abs(change[SMALL]).max() < 1e-3 * integral
+    while_disturbed, _ = moved("scheme-2", disturbed[:3])
+    assert (while_disturbed[SMALL] > 1e-4).all()  # drawn back, not held
+    assert while_disturbed[1] == pytest.approx(while_disturbed[3], rel=1e-9)
+
+
+def test_scheme_2_holds_what_lies_below_its_epsilon(disturbed):
+    estimator = Estimator(
+        CELL, settings("scheme-2", scheme_2_epsilon=7.0, scheme_2_lambda=50.0), initial_soc=1.0, identifier=None
+    )
+    assert estimator.settings["rate"][0, [1, 3, 4, 6, 13, 15]].tolist() == [50.0] * 6
+    assert estimator.settings["rate"][0, [2, 5, 7, 14]].tolist() == [0.0] * 4
+
+
+@pytest.mark.parametrize(("law", "last"), [("scheme-3", 15), ("improved", 12)])
+@pytest.mark.parametrize("factor", [0.05, 1.0, 40.0])
+def test_bounded_laws_go_to_their_limits_from_anywhere(disturbed, law, last, factor):
+    """(3.18): the limit of Lemma 4.1.3 once the error is gone."""
+    bounds = {
+        i: CELL.bounds(i).model_copy(update={"initial": factor * CELL.bounds(i).limit}) for i in range(1, last + 1)
+    }
+    cell = with_bounds(CELL, bounds)
+    estimator = Estimator(cell, settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
+    estimator.run(disturbed)
+    found = estimator.state["a"][0]
+    assert found[1 : last + 1] == pytest.approx([bounds[i].limit for i in range(1, last + 1)], rel=1e-4)
+    assert found[last + 1 : 16] == pytest.approx(CELL.a[last + 1 : 16], rel=1e-15)  # a13..a15 come from (4.2)
+
+
+def test_scheme_3_goes_to_the_limits_of_table_4(disturbed):
+    table_4 = {1: (0.30, 0.25), 3: (0.045, 0.03), 6: (0.05, 0.04), 13: (0.15, 0.1), 15: (0.07, 0.04)}
+    bounds = {i: Bounds(upper=u, lower=low, weight_upper=100.0, weight_lower=1.0) for i, (u, low) in table_4.items()}
+    estimator = Estimator(
+        with_bounds(CELL, bounds), settings("scheme-3"), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+    )
+    estimator.run(disturbed)
+    limits = [0.2995050, 0.0448515, 0.0499010, 0.1495050, 0.0697030]
+    assert estimator.state["a"][0, SMALL] == pytest.approx(limits, rel=1e-4)
+
+
+@pytest.mark.parametrize("law", ["scheme-1", "scheme-2", "scheme-3", "improved"])
+def test_output_equation_of_each_law(law):
+    """(3.14) with its loop through u = -N e closed for the schemes, (4.1) for the improved method."""
+    samples = discharge(CELL, 0.275, 0.01)[:40]
+    samples["voltage_v"] -= 0.1
+    estimator = Estimator(CELL, settings(law, k0=0.3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
+    for time_s, current_a, voltage_v, *_ in samples.tolist():
+        state = estimator.state[0].copy()
+        estimator.step(time_s, current_a, voltage_v)
+    now = estimator.state[0]
+    drop_free_v = ocv(now["soc"], *ocv_grid(CELL)) - now["v_ts"] - now["v_tl"]  # (4.1)
+    e = voltage_v - now["voltage_estimate_v"]  # (3.15)
+    assert abs(e) > 1e-5
+    ohm = 0.0 if law == "improved" else r_s(now["soc"], state["a"])
+    u = -state["gain"] * e
+    assert now["voltage_estimate_v"] == pytest.approx(drop_free_v - u * ohm, abs=1e-9)  # (3.14)
+
+
+@pytest.fixture(scope="module")
+def converged():
+    """Algorithm 1 at C/10, 1 Hz."""
+    samples = discharge(CELL, 0.0275, 1.0)
+    estimator = Estimator(
+        CELL, settings("improved", epsilon_v=1e-3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+    )
+    return adaptive_run(estimator, samples)
+
+
+def test_algorithm_1_converges_and_stops_at_the_stability_conditions(converged):
+    run = converged
+    assert run.outcome == "converged"
+    assert run.average[1:13] == pytest.approx([CELL.bounds(i).limit for i in range(1, 13)], rel=1e-3)
+    a = run.average
+    expected = [delta(a[8], a[9], a[7]), delta(a[11], a[12], a[10])]
+    assert [crossing.parameter for crossing in run.crossings] == ["a8", "a11"]
+    assert [crossing.soc for crossing in run.crossings] == pytest.approx(expected, rel=1e-3)
+    for crossing in run.crossings:
+        assert crossing.time_s == pytest.approx((1.0 - crossing.soc) * 36_000.0, abs=30.0)
+    assert run.window.t_unst_s <= run.crossings[1].time_s
+    stopped = run.soc < run.crossings[1].soc
+    assert stopped.any()
+    assert np.ptp(run.a[stopped], axis=0).max() == 0.0
+
+
+def test_conditions_of_figure_19_meet_their_parameters_at_the_crossings(converged):
+    run = converged
+    for crossing in run.crossings:
+        above = run.soc > 1.02 * crossing.soc
+        below = run.soc < 0.98 * crossing.soc
+        own = run.a[:, int(crossing.parameter[1:])]
+        settled = above & (run.time_s > 60.0)
+        condition = run.condition(crossing.parameter)
+        assert (own[settled] > condition[settled]).all()
+        assert (own[below] < condition[below]).all()
+
+
+def test_algorithm_1_says_why_it_did_not_converge():
+    samples = discharge(CELL, 0.0275, 10.0)
+    noisy = samples.copy()
+    noisy["voltage_v"] += 0.02 * np.random.default_rng(3).standard_normal(noisy.size)
+
+    def outcome(block, **others):
+        estimator = Estimator(
+            CELL, settings("improved", **others), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
+        )
+        return adaptive_run(estimator, block).outcome
+
+    assert outcome(noisy, epsilon_v=1e-3).startswith("not converged: the error never settles within 1.00 mV")
+    assert outcome(noisy[:2], epsilon_v=1e-3).startswith("not converged")
+    assert outcome(noisy, epsilon_v=0.2) == "converged"
+
+
+def test_error_of_a_run_is_that_of_the_observer_while_the_identifier_runs_too():
+    samples = discharge(CELL, 0.055, 1.0)[:150]  # every sample is a snapshot
+    once, again = (
+        Estimator(CELL, settings("improved"), identifier=IdentifierSettings(), initial_soc=0.9) for _ in range(2)
+    )
+    trace = again.run(samples)
+    assert np.abs(trace["tracking_error_v"] - trace["innovation_v"]).max() > 1e-3
+    assert adaptive_run(once, samples).error_v.tolist() == trace["tracking_error_v"].tolist()  # (3.15)
+
+
+def test_a_capture_outside_the_limits_is_refused():
+    samples = discharge(CELL, 0.0275, 100.0)
+    samples["voltage_v"] = 0.0
+    with pytest.raises(UserError, match=f"none of {samples.size} samples is within the cell's limits"):
+        adaptive_run(Estimator(CELL, initial_soc=1.0, identifier=None), samples)

@@ -1,0 +1,134 @@
+"""Means over the settled part of a run (3.19), with t_int and t_unst found or given."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
+from bms_estimator.calibration.thesis.parameter_average import Settled, averaged, settled
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports.simulation import discharge
+from bms_estimator.settings.pack import ObserverSettings
+
+CELL = load_cell("chen_mora")
+SETTINGS = ObserverSettings.model_validate({"dead_zone_v": 0.0, "rearm_gain": None, "epsilon_v": 1e-3})
+TIME_S = np.arange(0.0, 1000.0)
+
+
+def run(samples, **given):
+    estimator = Estimator(CELL, SETTINGS, voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
+    return adaptive_run(estimator, samples, **given)
+
+
+def find(error_v=None, voltage_v=None, margin=None, a=None, **given):
+    """``settled`` on a thousand seconds in which nothing happens but what is given."""
+    return settled(
+        TIME_S,
+        np.zeros(TIME_S.size) if error_v is None else error_v,
+        np.linspace(4.2, 3.6, TIME_S.size) if voltage_v is None else voltage_v,
+        np.ones(TIME_S.size) if margin is None else margin,
+        np.ones((TIME_S.size, 16)) if a is None else a,
+        1e-3,
+        **given,
+    )
+
+
+@pytest.fixture(scope="module")
+def samples():
+    """A simulated discharge at C/5, 10 Hz."""
+    return discharge(CELL, 0.055, 0.1)
+
+
+def test_a_simulated_discharge_is_averaged_from_where_it_settles_to_where_it_turns_unstable(samples):
+    found = run(samples)
+    window = found.window
+    assert 0.0 < window.t_int_s < 60.0  # a1 to a12 start far from their limits
+    assert window.start_reason == "99 % of the errors from here on are within 1.00 mV"
+    assert window.end_reason == "knee of the voltage"
+    assert 0.9 * samples["time_s"][-1] < window.t_unst_s < found.crossings[1].time_s
+    limits = [CELL.bounds(i).limit for i in range(1, 13)]
+    assert found.average[1:13] == pytest.approx(limits, rel=1e-4)
+
+
+def test_override_of_both_ends():
+    """From the first sample on the mean holds the way from a_i(t0): limit + (a_i(t0) - limit) / (rate t), by (4.5)."""
+    found = run(discharge(CELL, 0.055, 0.01)[:50_000], t_int_s=0.0, t_unst_s=400.0)
+    assert found.window == Settled(0.0, 400.0, "given", "given")
+    for i in (1, 3, 4, 6, 8, 12):
+        bounds = CELL.bounds(i)
+        way = (bounds.initial - bounds.limit) / (bounds.rate * 400.0)
+        assert found.average[i] - bounds.limit == pytest.approx(way, rel=0.15)  # trapezoids at 100 Hz
+
+
+def test_override_of_one_end_leaves_the_other_found(samples):
+    automatic = run(samples).window
+    later = run(samples, t_int_s=1000.0).window
+    assert (later.t_int_s, later.start_reason) == (1000.0, "given")
+    assert (later.t_unst_s, later.end_reason) == (automatic.t_unst_s, automatic.end_reason)
+    earlier = run(samples, t_unst_s=5000.0).window
+    assert (earlier.t_unst_s, earlier.end_reason) == (5000.0, "given")
+    assert earlier.t_int_s == pytest.approx(automatic.t_int_s, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"t_unst_s": -1.0}, "t_unst = -1 s: must lie within 0 to 999 s of the run"),
+        ({"t_unst_s": 2000.0}, "t_unst = 2000 s: must lie within 0 to 999 s of the run"),
+        ({"t_int_s": -5.0}, "t_int = -5 s: must lie within 0 to 999 s of the run"),
+        ({"t_int_s": float("nan")}, "t_int = nan s: must lie within 0 to 999 s of the run"),
+        ({"t_int_s": 500.0, "t_unst_s": 400.0}, "t_int = 500 s: must lie within 0 to 400 s of the run"),
+    ],
+)
+def test_override_outside_the_run_is_refused(given, message):
+    with pytest.raises(UserError, match=message):
+        find(**given)
+
+
+def test_t_int_is_where_the_error_has_settled():
+    window = find(error_v=np.where(TIME_S < 120.0, 5e-3, 2e-4))
+    assert window.t_int_s == pytest.approx(112.0, abs=9.0)  # one sample in a hundred may still be beyond
+    assert "99 % of the errors from here on are within 1.00 mV" in window.start_reason
+    spikes = np.where((TIME_S < 50.0) | (TIME_S % 300.0 == 299.0), 5e-3, 0.0)
+    assert 40.0 <= find(error_v=spikes).t_int_s <= 50.0
+
+
+def test_t_int_waits_for_the_parameters():
+    a = np.ones((TIME_S.size, 16))
+    a[:, 4] += 10.0 * np.exp(-TIME_S / 20.0)
+    window = find(a=a)
+    assert window.t_int_s == pytest.approx(20.0 * np.log(1e4), abs=1.5)  # within 0.1 % of the median
+    assert "every a_i is within 0.1 % of its median" in window.start_reason
+
+
+def test_an_error_that_never_settles():
+    window = find(error_v=np.full(TIME_S.size, 0.0123))
+    assert window.start_reason == "the error never settles within 1.00 mV"
+    assert window.t_int_s == TIME_S[-1]
+
+
+def test_t_unst_is_the_first_of_margin_knee_and_end():
+    assert (find().t_unst_s, find().end_reason) == (TIME_S[-1], "end of the run")
+    margin = np.where(TIME_S >= 900.0, -1e-3, 0.1)
+    assert (find(margin=margin).t_unst_s, find(margin=margin).end_reason) == (900.0, "SOC reached max(delta1, delta2)")
+    knee = np.linspace(4.2, 3.6, TIME_S.size) - np.maximum(TIME_S - 800.0, 0.0) * 0.01
+    window = find(voltage_v=knee, margin=margin)
+    assert window.end_reason == "knee of the voltage"
+    assert window.t_unst_s == pytest.approx(800.0, abs=12.0)
+    dip = np.linspace(4.2, 3.6, TIME_S.size) - np.where((TIME_S > 500.0) & (TIME_S < 520.0), 0.3, 0.0)
+    assert find(voltage_v=dip).end_reason == "end of the run"  # a load that comes and goes is no knee
+
+
+def test_mean_over_uneven_steps_is_the_integral():
+    time_s = np.cumsum(np.random.default_rng(1).uniform(0.01, 2.0, 5000))
+    a = np.tile(time_s[:, None], (1, 16))  # a_i(t) = t, whose mean is the middle
+    inside = time_s[(time_s >= 500.0) & (time_s <= 2000.0)]
+    found = averaged(time_s, a, Settled(500.0, 2000.0, "given", "given"))
+    assert found == pytest.approx(np.full(16, 0.5 * (inside[0] + inside[-1])), rel=1e-9)
+
+
+def test_mean_over_nothing_is_the_last_value():
+    a = np.tile(TIME_S[:, None], (1, 16))
+    assert averaged(TIME_S, a, Settled(5000.0, 6000.0, "given", "given"))[1] == TIME_S[-1]
+    assert averaged(TIME_S, a, Settled(10.0, 10.5, "given", "given"))[1] == 10.0

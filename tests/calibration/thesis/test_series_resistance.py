@@ -1,0 +1,120 @@
+"""Step 3: R_s by (4.2) and its curve (2.9) on a cell that is known."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.thesis.prediction import predict
+from bms_estimator.calibration.thesis.series_resistance import (
+    SeriesResistance,
+    fit_series_resistance,
+    mean_of,
+    series_resistance,
+)
+from bms_estimator.kernels.cell_model.chen_mora import r_s
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports.simulation import discharge
+from tests.calibration.simulated_load import TRUTH, capture, constant, steps
+
+CELL = load_cell("chen_mora")
+CURRENTS_A = (0.1, 0.275, 0.55)
+SOC = np.linspace(0.05, 0.99, 200)
+
+
+def true_ohm(soc, cell=CELL):
+    return np.array([r_s(x, cell.a) for x in soc])
+
+
+def curve(current_a, noise_v=0.0):
+    """R_s by (4.2) from one constant load, a1..a12 known."""
+    samples = discharge(CELL, current_a, 1.0)
+    samples["voltage_v"] += noise_v * np.random.default_rng(1).standard_normal(samples.size)
+    return series_resistance(CELL, predict(CELL, samples, 1.0, lowest_soc=0.02))
+
+
+@pytest.fixture(scope="module")
+def curves():
+    return [curve(current_a, noise_v=0.5e-3) for current_a in CURRENTS_A]
+
+
+def test_equation_4_2_gives_the_true_resistance_at_every_current():
+    for current_a in CURRENTS_A:
+        found = curve(current_a)
+        assert found.soc.size > 95
+        inside = found.soc > 0.05
+        assert found.r_s_ohm[inside] == pytest.approx(true_ohm(found.soc)[inside], rel=0.01)
+
+
+def test_fit_to_several_noisy_currents_is_within_2_percent(curves):
+    fit = fit_series_resistance(mean_of(curves), 0.05)
+    assert fit(SOC) == pytest.approx(true_ohm(SOC), rel=0.02)
+    assert fit.a == pytest.approx(CELL.a[13:16], rel=0.05)
+    assert np.isfinite(fit.std).all()
+    assert fit.std[2] < 0.01 * fit.a[2]
+    assert fit.rms_ohm < 1e-3
+    assert fit.element.a == pytest.approx(tuple(fit.a))
+
+
+def test_steps_with_rests_serve_as_well():
+    """Another cell, 1 Hz, half a millivolt of noise: only the samples under load count."""
+    samples = capture(steps(3), soc=0.98)
+    run = predict(TRUTH, samples, 0.98, lowest_soc=0.05)
+    found = series_resistance(TRUTH, run)
+    assert found.r_s_ohm == pytest.approx(true_ohm(found.soc, TRUTH), rel=0.03)  # a bin may hold a few samples only
+    fit = fit_series_resistance(found)
+    soc = np.linspace(found.soc.min(), 0.95, 50)
+    assert fit(soc) == pytest.approx(true_ohm(soc, TRUTH), rel=0.02)
+
+
+def test_mean_over_the_currents_weighs_each_by_its_square_where_any_has_data():
+    first = SeriesResistance(np.array([0.205, 0.305, 0.405]), np.full(3, 1.0), np.full(3, 3.0))
+    second = SeriesResistance(np.array([0.305, 0.405, 0.505]), np.full(3, 3.0), np.full(3, 1.0))
+    both = mean_of([first, second])
+    assert both.soc == pytest.approx([0.205, 0.305, 0.405, 0.505])
+    assert both.r_s_ohm == pytest.approx([1.0, 1.5, 1.5, 3.0])
+    assert both.weight == pytest.approx([3.0, 4.0, 4.0, 1.0])
+
+
+def test_an_error_of_the_open_circuit_voltage_counts_by_the_current_that_it_is_divided_by():
+    """10 mV are 65 mohm at C/20 of a cell of 3 Ah (E19): beside 1.5 A they move R_s by their share of the squares."""
+    cell = TRUTH.model_copy(
+        update={"ocv": TRUTH.ocv.model_copy(update={"ocv_v": tuple(v + 0.01 for v in TRUTH.ocv.ocv_v)})}
+    )
+    runs = [
+        predict(TRUTH, capture(constant(amps, seconds), soc=0.9, noise_v=0.0), 0.9, lowest_soc=0.3)
+        for amps, seconds in ((0.153, 40_000), (1.5, 5_000))
+    ]
+    slow, fast = (series_resistance(cell, run) for run in runs)
+    slow_off, fast_off = (curve.r_s_ohm - true_ohm(curve.soc, TRUTH) for curve in (slow, fast))
+    assert np.median(slow_off) == pytest.approx(0.01 / 0.153, rel=0.01)
+    assert np.median(fast_off) == pytest.approx(0.01 / 1.5, rel=0.01)
+    both = mean_of([slow, fast])
+    expected = (0.153 * 0.01 + 1.5 * 0.01) / (0.153**2 + 1.5**2)
+    assert np.median(both.r_s_ohm - true_ohm(both.soc, TRUTH)) == pytest.approx(expected, rel=0.01)
+
+
+def test_what_the_branches_have_wrong_goes_into_r_s():
+    """On a slow load only the sum of the resistances counts (Table 6)."""
+    a = np.array(CELL.a)
+    a[3] += 0.02  # R_ts too high by 20 mohm
+    samples = discharge(CELL, 0.1, 1.0)
+    found = series_resistance(CELL, predict(CELL, samples, 1.0, a=a, lowest_soc=0.1))
+    settled = (found.soc > 0.2) & (found.soc < 0.9)
+    assert found.r_s_ohm[settled] == pytest.approx(true_ohm(found.soc)[settled] - 0.02, abs=5e-4)
+
+
+def test_a_flat_resistance_has_no_rise_and_says_so():
+    soc = np.linspace(0.05, 0.95, 60)
+    fit = fit_series_resistance(SeriesResistance(soc, np.full(60, 0.08), np.ones(60)))
+    assert fit(soc) == pytest.approx(np.full(60, 0.08), rel=1e-6)
+    assert fit.a[0] == pytest.approx(0.0, abs=1e-6)
+    assert fit.element.amplitude_ohm > 0.0
+
+
+def test_no_current_and_too_little_soc_are_refused_with_their_numbers():
+    resting = capture(np.full(600, 0.001))
+    with pytest.raises(UserError, match=r"none above 0\.060 A, the largest is 0\.001 A"):
+        series_resistance(TRUTH, predict(TRUTH, resting, 0.98))
+    short = capture(constant(1.0, 300))
+    with pytest.raises(UserError, match=r"known in 4 steps of SOC, at least 5 are needed"):
+        fit_series_resistance(series_resistance(TRUTH, predict(TRUTH, short, 0.98)))

@@ -1,0 +1,135 @@
+"""A broker that asks for our certificate, and what is said of certificates that cannot be used."""
+
+import shutil
+import ssl
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import pytest
+import structlog
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.mqtt.broker_config import check, tls_context
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.mqtt import MqttSink
+from bms_estimator.sinks.requests import Requests
+from bms_estimator.store.outbox import Outbox
+from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mqtt.certificates import Authority, openssl
+from tests.sinks.service import STATE, until
+from tests.sinks.snapshots import ONE
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With ca, server, pack and somebody of another authority."""
+    folder = tmp_path_factory.mktemp("certificates")
+    authority = Authority(folder)
+    authority.vouch_for("server")
+    authority.vouch_for("pack")
+    Authority(folder, "other-ca").vouch_for("stranger")
+    return folder
+
+
+@pytest.fixture
+def strict_broker(folder: Path, tmp_path: Path) -> Iterator[Broker]:
+    """Lets in whom its authority vouches for; the name in the certificate is the user's."""
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    broker = Broker(
+        tmp_path,
+        f"cafile {folder / 'ca.crt'}\ncertfile {folder / 'server.crt'}\nkeyfile {folder / 'server.key'}\n"
+        "require_certificate true\nuse_identity_as_username true",
+    ).start()
+    yield broker
+    broker.stop()
+
+
+def settings(broker: Broker, folder: Path, name: str | None) -> MqttSettings:
+    own = {"cert_file": folder / f"{name}.crt", "key_file": folder / f"{name}.key"} if name else {}
+    return MqttSettings(url=f"mqtts://127.0.0.1:{broker.port}", ca_file=folder / "ca.crt", **own)
+
+
+def sink(settings: MqttSettings) -> MqttSink:
+    delivery = Delivery()
+    return MqttSink(settings, "pack", Requests(delivery), delivery, Outbox(None, most=4), first_delay_s=0.1)
+
+
+async def test_our_certificate_opens_the_broker(strict_broker: Broker, folder: Path) -> None:
+    tls = aiomqtt.TLSParameters(*(str(folder / name) for name in ("ca.crt", "pack.crt", "pack.key")))
+    async with (
+        Listener(strict_broker, tls_params=tls) as live,
+        sink(settings(strict_broker, folder, "pack")) as mqtt,
+    ):
+        mqtt.publish(ONE)
+        await live.wait(STATE)
+
+
+@pytest.mark.parametrize(("name", "why"), [(None, "certificate required"), ("stranger", "unknown ca")])
+async def test_who_has_no_certificate_of_the_broker_s_authority_is_told_so(
+    strict_broker: Broker, folder: Path, name: str | None, why: str
+) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with sink(settings(strict_broker, folder, name)):
+            # a broker that closes before CONNECT is written takes its reason along; the next attempt hears it
+            await until(lambda: [line for line in logs if why in line.get("reason", "")])
+    assert {line["event"] for line in logs} == {"broker not reachable"}
+
+
+async def test_a_certificate_that_is_replaced_is_used_without_a_restart(
+    strict_broker: Broker, folder: Path, tmp_path: Path
+) -> None:
+    own = tmp_path / "own"
+    own.mkdir()
+    for kind in ("crt", "key"):
+        shutil.copy(folder / f"stranger.{kind}", own / f"pack.{kind}")
+    shutil.copy(folder / "ca.crt", own)
+    with structlog.testing.capture_logs() as logs:
+        async with sink(settings(strict_broker, own, "pack")):
+            await until(lambda: [line for line in logs if line["event"] == "broker not reachable"])
+            for kind in ("crt", "key"):
+                shutil.copy(folder / f"pack.{kind}", own / f"pack.{kind}")
+            await until(lambda: [line for line in logs if line["event"] == "broker connected"])
+
+
+def test_nothing_older_than_tls_1_2_is_spoken(folder: Path) -> None:
+    assert tls_context(MqttSettings(url="mqtts://host")).minimum_version is ssl.TLSVersion.TLSv1_2
+
+
+def test_an_own_key_that_every_user_may_read_is_warned_of(folder: Path, tmp_path: Path) -> None:
+    key = tmp_path / "open.key"
+    shutil.copy(folder / "pack.key", key)
+    given = MqttSettings(url="mqtts://host", cert_file=folder / "pack.crt", key_file=key)
+    assert check(given) == []
+    key.chmod(0o644)
+    [warning] = check(given)
+    assert f"mqtt.key_file = {key}: every user" in warning
+
+
+def test_a_key_is_found_among_the_credentials_of_the_unit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(folder))
+    assert check(MqttSettings(url="mqtts://host", cert_file=Path("pack.crt"), key_file=Path("pack.key"))) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"key_file": "stranger.key"}, r"mqtt\.key_file = .*stranger\.key: is not the key of mqtt\.cert_file = .*pack\.crt$"),
+        ({"cert_file": "none.crt"}, r"mqtt\.cert_file = .*none\.crt: cannot be read: No such file or directory$"),
+        ({"key_file": "none.key"}, r"mqtt\.key_file = .*none\.key: cannot be read: No such file or directory$"),
+        ({"cert_file": "pack.key"}, r"mqtt\.cert_file = .*pack\.key.*: no certificate in PEM with its key"),
+        ({"key_file": "pack.crt"}, r"mqtt\.key_file = .*pack\.crt: no certificate in PEM with its key"),
+        ({"key_file": "locked.key"}, r"mqtt\.key_file.*encrypted"),
+        ({"cert_file": None}, r"mqtt\.key_file = .*: of no use without mqtt\.cert_file$"),
+        ({"url": "mqtt://host"}, r"mqtt\.cert_file = .*: of no use without TLS: mqtt\.url must be mqtts://"),
+    ],
+)  # fmt: skip
+def test_certificates_that_cannot_be_used_are_named(folder: Path, changes: dict[str, Any], said: str) -> None:
+    openssl("ec", "-in", folder / "pack.key", "-aes128", "-passout", "pass:word", "-out", folder / "locked.key")
+    given = {"url": "mqtts://host", "cert_file": "pack.crt", "key_file": "pack.key"} | changes
+    files = {key: folder / str(name) for key, name in given.items() if key != "url" and name is not None}
+    with pytest.raises(UserError, match=said):
+        check(MqttSettings(url=given["url"], **files))

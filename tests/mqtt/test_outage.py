@@ -1,0 +1,206 @@
+"""Brokers that go, stand still or fall silent: no state is lost, none comes out of order, and another broker serves."""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import structlog
+
+from bms_estimator.mqtt.client import Patience
+from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.settings.pack import MqttSettings
+from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mqtt.proxy import Proxy, read_packet
+from tests.patience import LONG_S
+from tests.sinks.service import STATE, Sink, assert_all_in_order, numbers, state, until
+from tests.sinks.snapshots import ONE
+
+SOON = Patience(connected_s=1.0, keepalive_s=1, acknowledged_s=1.0)
+"""A busy machine may take a broker for lost that is not: then it is found again."""
+
+
+def dial(url: str | tuple[str, ...], patience: Patience = SOON) -> dict[str, Any]:
+    return {"connect": Dial(MqttSettings(url=url), patience), "most_kept": 10_000}
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Iterator[Broker]:
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    (tmp_path / "other").mkdir()
+    broker = Broker(tmp_path / "other").start()
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])
+async def network(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[Proxy]:
+    async with Proxy(broker.port, knows_5=request.param == "MQTT 5") as proxy:
+        yield proxy
+
+
+async def test_states_of_an_outage_arrive_afterwards_in_order(broker: Broker, network: Proxy) -> None:
+    async with Listener(broker) as live, Sink(network.url, most_kept=10_000) as sink:
+        for number in range(1000):
+            sink.mqtt.publish(state(number))
+            if number % 300 == 250:
+                await until(lambda: numbers(live))  # it is in the middle of them
+                network.leave()
+                live_before = len(numbers(live))
+            if number % 300 == 280:
+                network.away = False
+                await until(lambda: len(numbers(live)) > live_before)  # noqa: B023 - at once
+        await until(lambda: sink.delivery.waiting == 0)
+        await until(lambda: numbers(live)[-1] == 999)
+    assert_all_in_order(numbers(live), 1000)
+    assert sink.delivery.drops == 0
+
+
+async def test_live_topics_do_not_wait_for_a_backlog(broker: Broker, network: Proxy) -> None:
+    network.leave()
+    async with Listener(broker) as live, Sink(network.url, most_kept=10_000) as sink:
+        for number in range(2000):
+            sink.mqtt.publish(state(number))
+        network.away = False
+        await until(lambda: len(live.all(STATE)) == 2000)
+    topics = [topic for topic, _, _ in live.messages]
+    for topic in ("availability", "info", "health", "parameters", "home_assistant"):
+        assert STATE in topics[topics.index(f"bms/pack/{topic}") + 1000 :], topic
+
+
+async def test_what_waits_at_the_end_is_handed_over_before_offline(broker: Broker) -> None:
+    async with Listener(broker) as live:
+        async with Sink(broker.url, most_kept=10_000) as sink:
+            await live.wait("bms/pack/availability")
+            for number in range(300):
+                sink.mqtt.publish(state(number))
+        await live.wait("bms/pack/availability", lambda p: p == b"offline")
+    assert numbers(live) == list(range(300))
+
+
+async def test_a_line_that_falls_silent_is_given_up_for_the_next_broker(broker: Broker, other: Broker) -> None:
+    async with Proxy(broker.port) as silent, Listener(broker) as first, Listener(other) as second:
+        urls = (silent.url, other.url)
+        with structlog.testing.capture_logs() as logs:
+            async with Sink(urls, **dial(urls)) as sink:
+                for number in range(10):
+                    sink.mqtt.publish(state(number))
+                await first.wait_json(STATE, lambda s: s["frames_received"] == 9)
+                await until(lambda: sink.delivery.waiting == 0)
+                silent.swallows = True
+                for number in range(10, 30):
+                    sink.mqtt.publish(state(number))
+                await second.wait_json(STATE, lambda s: s["frames_received"] == 29)
+                async with Listener(other) as late:
+                    assert await late.wait("bms/pack/availability") == b"online"
+                # what the first broker says of us there
+                assert await first.wait("bms/pack/availability", lambda p: p == b"offline")
+    assert_all_in_order(numbers(first) + numbers(second), 30)
+    assert [line["url"] for line in logs if line["event"] == "broker connected"][:2] == [silent.url, other.url]
+    assert [line["url"] for line in logs if line["event"] == "broker lost"][:1] == [silent.url]
+
+
+async def test_a_line_that_falls_silent_while_nothing_is_to_be_said_is_found_out(broker: Broker) -> None:
+    async with Proxy(broker.port) as silent, Listener(broker) as live:
+        with structlog.testing.capture_logs() as logs:
+            async with Sink(silent.url, **dial(silent.url, Patience(keepalive_s=1))) as sink:
+                await live.wait("bms/pack/schema")
+                silent.swallows = True
+                await until(lambda: any(line["event"] == "broker lost" for line in logs))
+                silent.swallows = False
+                before = len(live.messages)
+                sink.mqtt.publish(ONE)
+                await live.wait(STATE, skip=before)
+                async with Listener(broker) as late:
+                    assert await late.wait("bms/pack/availability") == b"online"
+    assert next(line["reason"] for line in logs if line["event"] == "broker lost") == "the broker gave no sign of life"
+
+
+async def test_a_broker_is_told_to_expect_a_sign_of_life_each_10_s() -> None:
+    """One that hears none says our will after one and a half times that."""
+    first = asyncio.get_running_loop().create_future()
+
+    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        packet = await read_packet(reader)
+        if not first.done():
+            first.set_result(packet)
+        writer.close()
+
+    server = await asyncio.start_server(accept, "127.0.0.1", 0)
+    async with server, Sink(f"mqtt://127.0.0.1:{server.sockets[0].getsockname()[1]}"):
+        _, behind = (await asyncio.wait_for(first, LONG_S)).split(b"MQTT", 1)
+    assert int.from_bytes(behind[2:4]) == 10  # after version and flags
+
+
+async def test_a_broker_that_stands_still_gets_its_states_when_it_goes_on(broker: Broker) -> None:
+    async with Listener(broker) as live, Sink(broker.url, **dial(broker.url)) as sink:
+        with structlog.testing.capture_logs() as logs:
+            for number in range(10):
+                sink.mqtt.publish(state(number))
+            await live.wait_json(STATE, lambda s: s["frames_received"] == 9)
+            broker.freeze()
+            for number in range(10, 100):
+                sink.mqtt.publish(state(number))
+            await until(lambda: any(line["event"] == "broker not reachable" for line in logs))
+            broker.thaw()
+            await live.wait_json(STATE, lambda s: s["frames_received"] == 99)
+            await until(lambda: sink.delivery.waiting == 0)
+            async with Listener(broker) as late:
+                await late.wait("bms/pack/availability", lambda p: p == b"online")
+    assert_all_in_order(numbers(live), 100)
+    assert any("no answer within" in line.get("reason", "") for line in logs)
+
+
+async def test_a_broker_that_accepts_and_says_nothing_is_passed_over(broker: Broker, other: Broker) -> None:
+    urls = (broker.url, other.url)
+    broker.freeze()
+    with structlog.testing.capture_logs() as logs:
+        async with Listener(other) as live, Sink(urls, **dial(urls)):
+            assert await live.wait("bms/pack/availability") == b"online"
+    broker.thaw()
+    said = [(line["event"], line["url"]) for line in logs if "url" in line]
+    assert said[:2] == [("broker not reachable", broker.url), ("broker connected", other.url)]
+
+
+async def test_an_attempt_that_was_given_up_does_not_end_the_connection_that_came_after(
+    broker: Broker, caplog: pytest.LogCaptureFixture
+) -> None:
+    broker.freeze()
+    with structlog.testing.capture_logs() as logs:
+        async with Sink(broker.url, **dial(broker.url)) as sink:
+            await until(lambda: any(line["event"] == "broker not reachable" for line in logs))
+            broker.thaw()
+            async with Listener(broker) as live:
+                await until(lambda: any(line["event"] == "broker connected" for line in logs))
+                for number in range(20):
+                    sink.mqtt.publish(state(number))
+                await live.wait_json(STATE, lambda s: s["frames_received"] == 19)
+                await until(lambda: sink.delivery.waiting == 0)
+    assert not [line for line in logs if line["event"] == "broker lost"]
+    assert not [record for record in caplog.records if record.name == "asyncio"], "nothing is left that fails later"
+
+
+@pytest.fixture
+def deaf_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Takes all but states."""
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    (tmp_path / "acl").write_text(f"topic deny {STATE}\ntopic readwrite #\n")
+    broker = Broker(tmp_path, f"allow_anonymous true\nacl_file {tmp_path / 'acl'}").start()
+    yield broker
+    broker.stop()
+
+
+async def test_states_that_the_broker_refuses_are_named_counted_and_stop_nothing(deaf_broker: Broker) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Listener(deaf_broker) as live, Sink(deaf_broker.url, most_kept=1000) as sink:
+            for number in range(100):
+                sink.mqtt.publish(state(number))
+            await until(lambda: sink.delivery.waiting == 0)
+            await live.wait("bms/pack/health")
+    assert (sink.delivery.drops, sink.delivery.refused_topics, live.all(STATE)) == (100, [STATE], [])
+    warnings = [line for line in logs if line["log_level"] == "warning"]
+    assert [line["topic"] for line in warnings] == [STATE]
+    assert "Not authorized" in warnings[0]["reason"]
