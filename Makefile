@@ -65,7 +65,7 @@ home-assistant: apt venv ## tests with the real Home Assistant, which is made fi
 ble: ## a BMS over Bluetooth, against a simulated BlueZ; its extra needs another Python: make ble PYTHON=python3.12
 	@[ -x $(BLE)/bin/python ] || $(PYTHON) -m venv $(BLE)
 	@$(BLE)/bin/pip install --quiet --disable-pip-version-check -e '.[ble]' pytest pytest-asyncio pytest-timeout
-	$(BLE)/bin/python -m pytest -o addopts= --noconftest -rs tests/sources/test_ble.py tests/sources/test_ble_bms.py $(ARGS)
+	$(BLE)/bin/python -m pytest -o addopts= --noconftest -rs tests/sources/bluetooth/test_source.py tests/sources/bluetooth/test_client.py $(ARGS)
 
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python tests/benchmarks $(ARGS)

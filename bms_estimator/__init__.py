@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from bms_estimator.calibration.validate import validate
     from bms_estimator.estimator import Estimator, estimate
     from bms_estimator.model.cell import load_cell
-    from bms_estimator.sources.replay import load_capture
+    from bms_estimator.sources.captures.replay import load_capture
 
 __all__ = ["Estimator", "__version__", "estimate", "identify", "load_capture", "load_cell", "validate"]
 __version__ = version("bms_estimator")

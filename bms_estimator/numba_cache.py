@@ -39,7 +39,7 @@ COMPILED_IN = (
             "protocols/firmware/framing.py",
             "protocols/firmware/messages.py",
             "protocols/firmware/scaling.py",
-            "sources/wire/capture_records.py",
+            "sources/captures/capture_records.py",
         )
     ),
 )

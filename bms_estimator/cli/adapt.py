@@ -25,7 +25,7 @@ from bms_estimator.cli.captures import (
     write_as_named,
 )
 from bms_estimator.model.cell import load_cell
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 
 
 def adapt_command(

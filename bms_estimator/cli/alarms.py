@@ -26,9 +26,9 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.service.live import new_estimator
 from bms_estimator.settings.pack import Settings
 from bms_estimator.snapshot.alarm_watch import AlarmWatch
-from bms_estimator.snapshot.alarms import Change
-from bms_estimator.sources.replay import Replay, open_capture
-from bms_estimator.sources.standard_input import standard_input
+from bms_estimator.sources.captures.replay import Replay, open_capture
+from bms_estimator.sources.captures.stdin import standard_input
+from bms_estimator.telemetry.alarms import Change
 
 STEP_S = 1.0
 """What the identifier suspects is looked at so often, on the capture's clock [s]."""

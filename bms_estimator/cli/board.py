@@ -25,9 +25,9 @@ from bms_estimator.protocols.firmware.messages import (
     set_serial_command,
 )
 from bms_estimator.settings.pack import Settings, load_settings
-from bms_estimator.sources.board_memory import NO_BOARD, BoardMemory
-from bms_estimator.sources.ports import NoPortError, resolve_port
-from bms_estimator.sources.probe import AskedBoard
+from bms_estimator.sources.serial.device_detection import AskedBoard
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, BoardMemory
+from bms_estimator.sources.serial.port_list import NoPortError, resolve_port
 
 
 def board(

@@ -16,7 +16,7 @@ from bms_estimator.cli.captures import CELL_HELP, AsJson, CapacityAh, SignOfCurr
 from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 
 SHOWN_ANCHORS = 30
 UNITS = 30.0

@@ -28,10 +28,10 @@ from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.settings.pack import MqttSettings, SensorSettings, Settings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.influx import target
-from bms_estimator.sources.kinds import make_bringer
-from bms_estimator.sources.ports import board_ports
-from bms_estimator.sources.probe import Found
-from bms_estimator.sources.probe import probe as who_is_there
+from bms_estimator.sources.factory import make_bringer
+from bms_estimator.sources.serial.device_detection import Found
+from bms_estimator.sources.serial.device_detection import probe as who_is_there
+from bms_estimator.sources.serial.port_list import board_ports
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check and show a pack's settings.")
 

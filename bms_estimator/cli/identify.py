@@ -30,7 +30,7 @@ from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.identify_fuel_cell import identify_fuel_cell
 from bms_estimator.model.cell import is_fuel_cell, load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 
 
 def identify_command(

@@ -21,8 +21,8 @@ from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.sources.curve import read_polarisation
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.curves import read_polarisation
+from bms_estimator.sources.captures.replay import load_capture
 
 DIGITS = 4
 FEWEST = 3

@@ -36,8 +36,8 @@ from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.curve import read_curve
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.curves import read_curve
+from bms_estimator.sources.captures.replay import load_capture
 
 CELL_VOLTAGE_V = 3.7
 """Of one Li-ion cell in the middle of its discharge: tells how many are in series [V]."""

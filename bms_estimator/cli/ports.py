@@ -10,8 +10,8 @@ from rich.table import Table
 from serial.tools import list_ports
 
 from bms_estimator.cli.decimal_option import whole
-from bms_estimator.sources.ports import holder, stable_names
-from bms_estimator.sources.probe import probe as ask
+from bms_estimator.sources.serial.device_detection import probe as ask
+from bms_estimator.sources.serial.port_list import holder, stable_names
 
 
 def ports(

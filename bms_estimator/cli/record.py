@@ -18,11 +18,11 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs, drained
 from bms_estimator.process.signals import stop_on_signal, until_first_ends
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources import Source
-from bms_estimator.sources.kinds import open_reports
-from bms_estimator.sources.raw_capture import header_of
-from bms_estimator.sources.recording import Recording
-from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.source import Source
 
 REDRAW_S = 0.25
 

@@ -31,12 +31,12 @@ from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
 from bms_estimator.sinks.table import TableSink, table_sink
-from bms_estimator.snapshot.health import dropped_text
-from bms_estimator.snapshot.impossible import impossible_sample
 from bms_estimator.snapshot.publisher import Publisher
-from bms_estimator.sources.replay import RawCapture, Replay, open_capture
-from bms_estimator.sources.standard_input import standard_input
+from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
+from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.store.outbox import Outbox
+from bms_estimator.telemetry.health import dropped_text
+from bms_estimator.telemetry.impossible import impossible_sample
 
 MANY = 0.01
 """Part of the samples that is more than a glitch now and then."""

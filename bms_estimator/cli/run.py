@@ -26,8 +26,8 @@ from bms_estimator.service.warm_up import load_kernels
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks.console_sink import ConsoleSink
 from bms_estimator.sinks.console_view import LOG_LINES
-from bms_estimator.sources.raw_capture import header_of
-from bms_estimator.sources.recording import Recording
+from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.recorder import Recording
 
 
 def run(

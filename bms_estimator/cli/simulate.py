@@ -15,9 +15,9 @@ from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.process.signals import stop_on_signal, until_first_ends
 from bms_estimator.settings.pack import MqttSettings, Settings
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
+from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
-from bms_estimator.simulation.simulated_node import SimulatedNode
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 

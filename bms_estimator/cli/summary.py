@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters
-from bms_estimator.snapshot.health import sample_counters, suspicions
-from bms_estimator.snapshot.topics import finite
+from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
+from bms_estimator.telemetry.health import sample_counters, suspicions
+from bms_estimator.telemetry.state import finite
 
 
 @dataclass(frozen=True)

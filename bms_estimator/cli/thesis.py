@@ -19,11 +19,11 @@ from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.cli.pack import TABLE_RESOLUTION_V
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports import items
+from bms_estimator.reports import report_items
 from bms_estimator.reports.experiment import Recorded
 from bms_estimator.reports.html import LONG_CELL, write
-from bms_estimator.reports.thesis import Report, build
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.reports.thesis_report import Report, build
+from bms_estimator.sources.captures.replay import load_capture
 
 WIDE = 160
 """A table of the thesis is not squeezed into fewer columns."""
@@ -89,8 +89,8 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
 def _show(console: Console, report: Report) -> None:
     """What was asked for, in the terminal."""
     for item in report.items:
-        if isinstance(item, items.Table):
-            shown = Table(title=f"{items.name(item)}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)
+        if isinstance(item, report_items.Table):
+            shown = Table(title=f"{report_items.name(item)}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)
             for column, cells in zip(item.columns, zip(*item.rows, strict=True), strict=True):
                 text = max(map(len, cells)) > LONG_CELL
                 shown.add_column(textwrap.fill(column, 12), justify="left" if text else "right", no_wrap=not text)
@@ -99,4 +99,4 @@ def _show(console: Console, report: Report) -> None:
             Console(width=max(console.width, WIDE)).print(shown)
         else:
             console.print(f"Figure {item.key}  {item.title}", highlight=False)
-        console.print(f"{items.label(item)}: {item.reason}", highlight=False)
+        console.print(f"{report_items.label(item)}: {item.reason}", highlight=False)

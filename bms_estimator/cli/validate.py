@@ -15,7 +15,7 @@ from bms_estimator.calibration.validate import Errors, Validation, validate
 from bms_estimator.cli.captures import AsJson, CapacityAh, CellName, SignOfCurrent
 from bms_estimator.cli.decimal_option import decimal
 from bms_estimator.model.cell import load_cell
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 
 
 def validate_command(

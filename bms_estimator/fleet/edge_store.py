@@ -34,7 +34,7 @@ log = structlog.get_logger(__name__)
 
 
 class EdgeStore:
-    """Keeps blocks in order until a worker has them, as ``sinks.backlog.Numbered``.
+    """Keeps blocks in order until a worker has them, as ``mqtt.queue_sender.Numbered``.
 
     Args:
         database: With ``EDGE_TABLES``, synced at each transaction; opened and closed by who made it.

@@ -13,7 +13,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.service.checkpoint import pack_identity
 from bms_estimator.settings.pack import PackSettings, Settings
-from bms_estimator.snapshot.flow import Flow, Meter
+from bms_estimator.telemetry.charge_energy import Flow, Meter
 
 MOST_TYPES = 256
 """Of so many the settings are kept, 40 kB each; those of more are made again and again, 50 ms each."""

@@ -19,11 +19,11 @@ from bms_estimator.model.payloads import Report
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.service.checkpoint import fields, without_observer
 from bms_estimator.service.resume import resume
-from bms_estimator.snapshot.flow import Flow
-from bms_estimator.snapshot.parameters import parameter_report
-from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.topics import estimate_report
-from bms_estimator.snapshot.window import Window
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.state import estimate_report
 
 LAST_WALL_S = 2.0**34
 """No wall clock shows a later time: the year 2514 [s since 1970]."""

@@ -6,12 +6,12 @@ from bms_estimator.estimator.stability_conditions import Condition, lemma_condit
 from bms_estimator.kernels.cell_model.chen_mora import emf
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.reports import printed, printed_pack
-from bms_estimator.reports.items import Table, Verdict, number
+from bms_estimator.reports import printed_pack, printed_values
 from bms_estimator.reports.quasi_steady import quasi_steady
-from bms_estimator.reports.simulated_pack import pack
+from bms_estimator.reports.report_items import Table, Verdict, number
+from bms_estimator.reports.simulated_experiment import pack
 from bms_estimator.reports.simulation import ALPHA, CURRENT_A, Simulation, mean_error_percent
-from bms_estimator.reports.theorem import C_RATES, PRODUCTS, measure
+from bms_estimator.reports.theorem_4_1_2 import C_RATES, PRODUCTS, measure
 
 SMALLEST_CURRENT_A = 1e-4
 """Near enough to the theorem's infinitesimal current."""
@@ -60,10 +60,10 @@ def table(s: Simulation) -> Table:
 def _first(s: Simulation) -> list[Erratum]:
     """E1 to E14."""
     true, estimated = s.cell.a, s.printed_a
-    a8, inferred_a8 = printed.BOUNDS[8], _weights(printed.A8_WEIGHTS)
+    a8, inferred_a8 = printed_values.BOUNDS[8], _weights(printed_values.A8_WEIGHTS)
     e6 = next(c for c in lemma_conditions(load_cell("chen_mora")) if not c.holds)
-    relative = {i: 100.0 * abs(row[1] / row[2] - 1.0) for i, row in printed.TABLE_5.items()}
-    r_s = [f"{100.0 * abs(row[1] / row[0] - 1.0):.1f}" for row in printed.TABLE_6.values()]
+    relative = {i: 100.0 * abs(row[1] / row[2] - 1.0) for i, row in printed_values.TABLE_5.items()}
+    r_s = [f"{100.0 * abs(row[1] / row[0] - 1.0):.1f}" for row in printed_values.TABLE_6.values()]
     products = [f"{mean_error_percent(name, estimated, true):.1f}" for name in PRODUCTS]
     fast, slow = ([m.tracking_v for m in measure() if m.c_rate == rate] for rate in (max(C_RATES), min(C_RATES)))
     deltas = [
@@ -83,10 +83,10 @@ def _first(s: Simulation) -> list[Erratum]:
             "Tables 5, 10, a8",
             f"weights {_weights(a8[2:])}",
             f"{inferred_a8}: the limit of the printed ones is {(a8[2] * a8[0] + a8[3] * a8[1]) / (a8[2] + a8[3]):.2f}, printed "
-            f"are {printed.TABLE_5[8][1]:.2f} and {printed.TABLE_10[8][1]:.2f}, that of {inferred_a8} is "
-            f"{printed.bounds('5', 8).limit:.2f}",
+            f"are {printed_values.TABLE_5[8][1]:.2f} and {printed_values.TABLE_10[8][1]:.2f}, that of {inferred_a8} is "
+            f"{printed_values.bounds('5', 8).limit:.2f}",
         ),
-        Erratum("Table 10, a5", f"{printed.TABLE_10[5][1]:g}", f"{printed.bounds('10', 5).limit:g}"),
+        Erratum("Table 10, a5", f"{printed_values.TABLE_10[5][1]:g}", f"{printed_values.bounds('10', 5).limit:g}"),
         Erratum(
             "Table 5",
             "conditions of Lemma 4.1.1 followed",
@@ -100,7 +100,7 @@ def _first(s: Simulation) -> list[Erratum]:
         Erratum("Table 6, errors", "fractions and a value", f"{r_s[0]}, {r_s[1]}, {r_s[2]} %"),
         Erratum(
             "Table 7",
-            f"products right to {printed.TABLE_7[PRODUCTS[0]]:.2f} and {printed.TABLE_7[PRODUCTS[1]]:.3f} %",
+            f"products right to {printed_values.TABLE_7[PRODUCTS[0]]:.2f} and {printed_values.TABLE_7[PRODUCTS[1]]:.3f} %",
             f"{products[0]} and {products[1]} %, from Table 5's own values",
         ),
         Erratum("Algorithm 1", "a1, a2, a3 at t0; e < eps2", "x1, x2, x3; abs(e) < eps2"),
@@ -165,15 +165,15 @@ def _theory(s: Simulation) -> list[Erratum]:
 def _experiments(s: Simulation) -> list[Erratum]:
     """E20 to E26."""
     currents = printed_pack.current_errors_percent()
-    ohm = " / ".join(f"{printed.RESISTORS_OHM[load]:g}" for load in BY_OHM)
+    ohm = " / ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in BY_OHM)
     off = " / ".join(f"{currents[load]:.1f}" for load in BY_OHM)
     six, small = load_cell("thunder_power_6s").cell, s.cell.cell
     parallel = six.capacity_ah / small.capacity_ah
-    inferred = printed.INFERRED_WEIGHTS["10"]
+    inferred = printed_values.INFERRED_WEIGHTS["10"]
     return [
         Erratum(
             "5.1",
-            f"0-{printed.SENSOR_RANGE_V:g} V sensor",
+            f"0-{printed_values.SENSOR_RANGE_V:g} V sensor",
             f"cannot measure {emf(1.0, printed_pack.A):.2f} V: saturated above SOC {printed_pack.saturated_above_soc():.3f} (Table 8)",
         ),
         Erratum(
@@ -195,18 +195,20 @@ def _experiments(s: Simulation) -> list[Erratum]:
         ),
         Erratum(
             "Tables 5, 10, weights",
-            f"a7 {_weights(printed.BOUNDS[7][2:])}; Table 10 a4 {_weights(printed.BOUNDS[4][2:])}",
-            f"a7 in the ratio of {_weights(inferred[7])} in both, which in Table 10 gives {printed.mean_from_start('10', 7):.2f} "
-            f"({printed.TABLE_10[7][1]:.2f}) and in Table 5, as {_weights(printed.INFERRED_WEIGHTS['5'][7])}, "
-            f"{printed.mean_from_start('5', 7):.4f} ({printed.TABLE_5[7][1]:.4f}); a4 {_weights(inferred[4])}: "
-            f"{printed.mean_from_start('10', 4):.4f} ({printed.TABLE_10[4][1]:.4f}); inferred, as E4",
+            f"a7 {_weights(printed_values.BOUNDS[7][2:])}; Table 10 a4 {_weights(printed_values.BOUNDS[4][2:])}",
+            f"a7 in the ratio of {_weights(inferred[7])} in both, which in Table 10 gives {printed_values.mean_from_start('10', 7):.2f} "
+            f"({printed_values.TABLE_10[7][1]:.2f}) and in Table 5, as {_weights(printed_values.INFERRED_WEIGHTS['5'][7])}, "
+            f"{printed_values.mean_from_start('5', 7):.4f} ({printed_values.TABLE_5[7][1]:.4f}); a4 {_weights(inferred[4])}: "
+            f"{printed_values.mean_from_start('10', 4):.4f} ({printed_values.TABLE_10[4][1]:.4f}); inferred, as E4",
         ),
         Erratum(
             "Tables 2, 3",
             "starts at the desired values, errors of 0 %",
             f"a family of starts fits both tables: e(0) = {_starts(s)}; the start is the "
             "rounded truth ("
-            + ", ".join(f"a{i} {100.0 * (printed.CHEN_MORA_ROUNDED[i - 1] / s.cell.a[i] - 1.0):.0f} %" for i in (13, 6))
+            + ", ".join(
+                f"a{i} {100.0 * (printed_values.CHEN_MORA_ROUNDED[i - 1] / s.cell.a[i] - 1.0):.0f} %" for i in (13, 6)
+            )
             + "): 0 % is an artefact",
         ),
         Erratum(
@@ -220,14 +222,18 @@ def _experiments(s: Simulation) -> list[Erratum]:
 def _second_audit(s: Simulation) -> list[Erratum]:
     """E27 to E33."""
     held = quasi_steady(s.cell, CURRENT_A)
-    steps, largest, usual = printed.TABLE_11["constant steps"], printed.MAX_CONSTANT_STEPS, printed.USUAL_STEPS
-    capacity_ah, bulb_a = load_cell("thunder_power_6s").cell.capacity_ah, printed.CURRENTS_A["50 W bulb"]
+    steps, largest, usual = (
+        printed_values.TABLE_11["constant steps"],
+        printed_values.MAX_CONSTANT_STEPS,
+        printed_values.USUAL_STEPS,
+    )
+    capacity_ah, bulb_a = load_cell("thunder_power_6s").cell.capacity_ah, printed_values.CURRENTS_A["50 W bulb"]
     bulb_v = printed_pack.mean_voltage_v(bulb_a)
     offset_a, gain = printed_pack.current_sensor()
     differences_a = printed_pack.current_differences_a()
     off = ", ".join(f"{1e3 * differences_a[load]:.0f}" for load in BY_OHM)
-    rates = {i: printed.implied_rates(i) for i in printed.INFERRED_WEIGHTS["5"]}
-    above = {i: printed.TABLE_10[i][1] - printed.bounds("10", i).limit for i in (10, 12)}
+    rates = {i: printed_values.implied_rates(i) for i in printed_values.INFERRED_WEIGHTS["5"]}
+    above = {i: printed_values.TABLE_10[i][1] - printed_values.bounds("10", i).limit for i in (10, 12)}
     return [
         Erratum(
             "(3.14)",
@@ -244,13 +250,13 @@ def _second_audit(s: Simulation) -> list[Erratum]:
         ),
         Erratum(
             "5.2",
-            f"runs of {printed.RUN_HOURS[0]:g} to {printed.RUN_HOURS[1]:g} hours",
+            f"runs of {printed_values.RUN_HOURS[0]:g} to {printed_values.RUN_HOURS[1]:g} hours",
             f"the bulb's {bulb_a:g} A empties {capacity_ah:g} Ah in {capacity_ah / bulb_a:.1f} h; the relaxation test at 50 Ω, "
-            f"loaded half of the time, takes {2.0 * capacity_ah / printed.CURRENTS_A['50 ohm']:.1f} h",
+            f"loaded half of the time, takes {2.0 * capacity_ah / printed_values.CURRENTS_A['50 ohm']:.1f} h",
         ),
         Erratum(
             "5.2.1",
-            f"{printed.BULB_W:g} W DC bulb",
+            f"{printed_values.BULB_W:g} W DC bulb",
             f"{bulb_a:g} A at the pack's mean of {bulb_v:.1f} V are {bulb_a * bulb_v:.0f} W and {bulb_v / bulb_a:.2f} Ω, as of the two "
             "12 V bulbs of 5.1 in series",
         ),
@@ -258,25 +264,27 @@ def _second_audit(s: Simulation) -> list[Erratum]:
             "5.2.1",
             "currents of the loads (E21)",
             f"their differences from Ohm's law, {off} mA at "
-            + ", ".join(f"{printed.RESISTORS_OHM[load]:g}" for load in BY_OHM)
+            + ", ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in BY_OHM)
             + f" Ω, are an offset of {1e3 * offset_a:.0f} mA and {100.0 * gain:.1f} % of the current: plausibly the sensor's, and then "
             "the counted charge is short as well",
         ),
         Erratum(
             "Table 5, weights",
-            "rates of a7, a8, a10, a11, a12: " + ", ".join(f"{sum(printed.BOUNDS[i][2:]):g}" for i in rates) + " /s",
+            "rates of a7, a8, a10, a11, a12: "
+            + ", ".join(f"{sum(printed_values.BOUNDS[i][2:]):g}" for i in rates)
+            + " /s",
             "the printed digits imply "
             + ", ".join(f"{low:.0f} to {high:.0f}" for low, high in rates.values())
             + " /s; "
-            + "; ".join(_weights(pair) for pair in printed.INFERRED_WEIGHTS["5"].values())
-            + f" give every digit. The {_weights(printed.A8_WEIGHTS)} of E4 has the ratio only",
+            + "; ".join(_weights(pair) for pair in printed_values.INFERRED_WEIGHTS["5"].values())
+            + f" give every digit. The {_weights(printed_values.A8_WEIGHTS)} of E4 has the ratio only",
         ),
         Erratum(
             "5.2.2",
             "does not depend on initial conditions",
             "the printed "
             + " and ".join(
-                f"a{i} lies {by:.1f} above its limit after a start at {printed.initial('10', i):.1e}"
+                f"a{i} lies {by:.1f} above its limit after a start at {printed_values.initial('10', i):.1e}"
                 for i, by in above.items()
             ),
         ),

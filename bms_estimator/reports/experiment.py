@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.reports.claims import claim
-from bms_estimator.reports.items import Verdict
-from bms_estimator.reports.protocol import Capture, Protocol, kind_of
-from bms_estimator.reports.simulated_pack import SensorChain, captures, experiments, pack
+from bms_estimator.reports.procedure import Capture, Protocol, kind_of
+from bms_estimator.reports.report_items import Verdict
+from bms_estimator.reports.simulated_experiment import SensorChain, captures, experiments, pack
+from bms_estimator.reports.thesis_claims import claim
 
 Floats = NDArray[np.float64]
 

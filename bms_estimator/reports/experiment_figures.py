@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
-from bms_estimator.reports import printed
+from bms_estimator.reports import printed_values
 from bms_estimator.reports.experiment import Experiment
-from bms_estimator.reports.items import Figure, Verdict
-from bms_estimator.reports.plot import COLOURS, FAINT, plot, thin
-from bms_estimator.reports.protocol import Kind, Protocol
+from bms_estimator.reports.procedure import Kind, Protocol
+from bms_estimator.reports.report_items import Figure, Verdict
 from bms_estimator.reports.simulation import SOC_GRID
 from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot, products_plot
+from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
 
 Floats = NDArray[np.float64]
 
@@ -37,7 +37,9 @@ def figure_26(experiment: Experiment) -> Figure:
         for colour, test in zip(np.resize(COLOURS, len(p.tests)), p.tests, strict=True):
             axes[0].errorbar(test.soc, test.ocv_v, 2.0 * test.std_v, fmt="o", ms=3, color=colour, label=test.name)
         if experiment.recorded is None:
-            axes[0].plot(grid, chen_mora(np.array(printed.TABLE_8), grid), ":", linewidth=2.4, label="(2.10), Table 8")
+            axes[0].plot(
+                grid, chen_mora(np.array(printed_values.TABLE_8), grid), ":", linewidth=2.4, label="(2.10), Table 8"
+            )
         axes[0].plot(grid, p.joint_fit(grid), color="black", linewidth=1.0, label="(2.10), joint fit")
         axes[0].plot(grid, p.table(grid), color=FAINT, linewidth=1.0, label="table")
         axes[0].set(xlabel="SOC", ylabel="E_o [V]")
@@ -213,7 +215,7 @@ def figure_33(experiment: Experiment) -> Figure:
     """Constant loads, errors."""
     p = experiment.protocol
     svg = _grid(_constant(p), _errors(p), "33")
-    reason = f"{_largest(p, _constant(p))} Printed: at most {printed.MAX_CONSTANT:g} %."
+    reason = f"{_largest(p, _constant(p))} Printed: at most {printed_values.MAX_CONSTANT:g} %."
     return _figure("33", "Constant loads: error", svg, experiment, reason, claims=("constant loads, largest",))
 
 
@@ -249,7 +251,7 @@ def figure_37(experiment: Experiment) -> Figure:
 def figure_38(experiment: Experiment) -> Figure:
     """Errors of the steps."""
     p = experiment.protocol
-    reason = f"{_largest(p, _steps(p))} Printed: at most {printed.MAX_STEPS:g} %."
+    reason = f"{_largest(p, _steps(p))} Printed: at most {printed_values.MAX_STEPS:g} %."
     svg = _grid(_steps(p), _errors(p), "38")
     return _figure("38", "Steps: error", svg, experiment, reason, claims=("steps, largest",))
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora
 from bms_estimator.calibration.ocv.points import max_v, pooled, rms_v
-from bms_estimator.reports import printed
+from bms_estimator.reports import printed_values
 from bms_estimator.reports.experiment import Experiment
-from bms_estimator.reports.items import Table, Verdict, number
-from bms_estimator.reports.protocol import KNEE_SOC, STATIC_SOC
+from bms_estimator.reports.procedure import KNEE_SOC, STATIC_SOC
+from bms_estimator.reports.report_items import Table, Verdict, number
 
 
 def table_8(experiment: Experiment) -> Table:
@@ -23,7 +23,7 @@ def table_8(experiment: Experiment) -> Table:
     columns += ["mean (5.1)-(5.2)", "joint fit", "± std"]
     rows = []
     for j in range(6):
-        row = [f"a{16 + j}", number(printed.TABLE_8[j], 5)]
+        row = [f"a{16 + j}", number(printed_values.TABLE_8[j], 5)]
         row += [] if truth is None else [number(float(truth[16 + j]), 5)]
         row += [number(float(fit.a[j]), 5) for fit in protocol.single_fits] if len(protocol.tests) > 1 else []
         row += [number(float(mean[j]), 5), number(float(joint.a[j]), 5), number(float(joint.std[j]), 2)]
@@ -53,7 +53,7 @@ def table_9(experiment: Experiment) -> Table:
     columns = ("parameter", "printed", *(() if truth is None else ("true",)), "recomputed", "± std")
     rows = []
     for j in range(3):
-        row = [f"a{13 + j}", number(printed.TABLE_9[j])]
+        row = [f"a{13 + j}", number(printed_values.TABLE_9[j])]
         row += [] if truth is None else [number(float(truth[13 + j]))]
         meaningless = j == 1 and fit.a[0] == 0.0
         rows.append((*row, "-" if meaningless else number(float(fit.a[j])), number(float(fit.std[j]), 2)))
@@ -73,13 +73,15 @@ def table_10(experiment: Experiment) -> Table:
     """a1 to a12."""
     protocol, truth, run = experiment.protocol, experiment.truth, experiment.protocol.adaptive
     printed_bounds = experiment.recorded is None
-    over = {i: (printed.TABLE_10[i][1] - printed.bounds("10", i).limit, _over_limit(i)) for i in (8, 10, 12)}
+    over = {
+        i: (printed_values.TABLE_10[i][1] - printed_values.bounds("10", i).limit, _over_limit(i)) for i in (8, 10, 12)
+    }
     columns: tuple[str, ...] = ("parameter", "bounds", "λx, λy", "initial")
     columns += ("printed", "recomputed", "limit of Lemma 4.1.3")
     columns += ("mean from t0 over 10 h",) if printed_bounds else ()
     columns += () if truth is None else ("true",)
     rows = []
-    for i, (_, estimate) in printed.TABLE_10.items():
+    for i, (_, estimate) in printed_values.TABLE_10.items():
         b = protocol.cell.bounds(i)
         row: tuple[str, ...] = (
             f"a{i}",
@@ -91,14 +93,14 @@ def table_10(experiment: Experiment) -> Table:
             number(b.limit, 6),
         )
         if printed_bounds:
-            row += (number(printed.mean_from_start("10", i), 6),)
+            row += (number(printed_values.mean_from_start("10", i), 6),)
         rows.append(row if truth is None else (*row, number(float(truth[i]))))
     w = run.window
     corrected = (
         "Weights of a8 as E4, of a4 and a7 as E24, inferred from the printed estimates; printed a5 = 30 contradicts its bounds "
         "and weights, which give 150 (E5). The run gives the limits, which are not what is printed; the other eleven printed "
-        f"estimates follow to {printed.worst_mean_percent():.1f} % from bounds, weights and initial values alone, without any data, as a mean over the first "
-        f"10 h: {printed.FREE_PARAMETERS['10']} free parameters, this time and two weights each of a4, a7 and a8. The fit is a "
+        f"estimates follow to {printed_values.worst_mean_percent():.1f} % from bounds, weights and initial values alone, without any data, as a mean over the first "
+        f"10 h: {printed_values.FREE_PARAMETERS['10']} free parameters, this time and two weights each of a4, a7 and a8. The fit is a "
         "loose one: of what the estimates lie above their limits it gives "
         + ", ".join(f"a{i} {number(by, 3)} where {number(above, 3)} is printed" for i, (above, by) in over.items())
         + ". "
@@ -113,13 +115,13 @@ def table_10(experiment: Experiment) -> Table:
         Verdict.FITTED if printed_bounds else Verdict.NO_DATA,
         f"{corrected}Run on {protocol.smallest.name}: {run.outcome}; t_int = {w.t_int_s:.1f} s ({w.start_reason}), "
         f"t_unst = {w.t_unst_s:.0f} s ({w.end_reason}). The estimates are the limits of the bounds, on any data (E3).",
-        free=printed.FREE_PARAMETERS["10"] if printed_bounds else 0,
+        free=printed_values.FREE_PARAMETERS["10"] if printed_bounds else 0,
     )
 
 
 def _over_limit(index: int) -> float:
     """Mean from the first sample on of Table 10's parameter less its limit."""
-    return printed.mean_from_start("10", index) - printed.bounds("10", index).limit
+    return printed_values.mean_from_start("10", index) - printed_values.bounds("10", index).limit
 
 
 def table_11(experiment: Experiment) -> Table:
@@ -137,7 +139,7 @@ def table_11(experiment: Experiment) -> Table:
             name,
             number(float(run.current_a[flowing].mean()), 3),
             "validation" if name in validating else "step 2",
-            number(printed.TABLE_11[name]) if name in printed.TABLE_11 else "-",
+            number(printed_values.TABLE_11[name]) if name in printed_values.TABLE_11 else "-",
             number(run.mean_percent, 3),
             number(run.max_percent, 3),
             number(1e3 * rms_v(run.error_v), 3),
@@ -176,7 +178,7 @@ def table_13(experiment: Experiment) -> Table:
     rows = tuple(
         (
             f"estimated {kind} model",
-            number(printed.TABLE_13[kind]),
+            number(printed_values.TABLE_13[kind]),
             number(float(np.mean(values)), 3),
             number(max(values), 3),
         )

@@ -4,8 +4,8 @@ from html import escape
 from pathlib import Path
 
 from bms_estimator import __version__
-from bms_estimator.reports.items import Figure, Item, Table, Verdict, label, name
-from bms_estimator.reports.thesis import Report
+from bms_estimator.reports.report_items import Figure, Item, Table, Verdict, label, name
+from bms_estimator.reports.thesis_report import Report
 
 BADGE = {
     Verdict.FITTED: "fitted",

@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports import printed
-from bms_estimator.reports.items import Figure, Verdict
-from bms_estimator.reports.plot import plot
+from bms_estimator.reports import printed_values
+from bms_estimator.reports.report_items import Figure, Verdict
 from bms_estimator.reports.simulation import element, mean_error_percent
 from bms_estimator.reports.simulation_figures import NO_VALUES, condition_plot, elements_plot, products_plot
-from bms_estimator.reports.theorem import PRODUCTS
+from bms_estimator.reports.svg_plot import plot
+from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
 Floats = NDArray[np.float64]
 
-A = printed.tables_8_to_10()
+A = printed_values.tables_8_to_10()
 EMPTY_SOC = 0.02
 """A discharge through a resistor ends here, above delta2."""
 GRID = np.linspace(EMPTY_SOC, 1.0, 9801)
@@ -57,12 +57,15 @@ def mean_voltage_v(current_a: float) -> float:
 
 def current_differences_a() -> dict[str, float]:
     """Each printed current less that of Ohm's law [A]."""
-    return {load: printed.CURRENTS_A[load] - mean_current_a(ohm) for load, ohm in printed.RESISTORS_OHM.items()}
+    return {
+        load: printed_values.CURRENTS_A[load] - mean_current_a(ohm)
+        for load, ohm in printed_values.RESISTORS_OHM.items()
+    }
 
 
 def current_sensor() -> tuple[float, float]:
     """Offset [A] and gain error of a current sensor that would explain these differences, by least squares."""
-    true_a = np.array([mean_current_a(ohm) for ohm in printed.RESISTORS_OHM.values()])
+    true_a = np.array([mean_current_a(ohm) for ohm in printed_values.RESISTORS_OHM.values()])
     gain, offset_a = np.polyfit(true_a, list(current_differences_a().values()), 1)
     return float(offset_a), float(gain)
 
@@ -70,15 +73,15 @@ def current_sensor() -> tuple[float, float]:
 def current_errors_percent() -> dict[str, float]:
     """How far each printed current is from Ohm's law [%]."""
     return {
-        load: 100.0 * (printed.CURRENTS_A[load] / mean_current_a(ohm) - 1.0)
-        for load, ohm in printed.RESISTORS_OHM.items()
+        load: 100.0 * (printed_values.CURRENTS_A[load] / mean_current_a(ohm) - 1.0)
+        for load, ohm in printed_values.RESISTORS_OHM.items()
     }
 
 
 def saturated_above_soc() -> float:
     """SOC whose E_o of Table 8 is the end of the voltage sensor's range."""
     e_o = np.array([emf(x, A) for x in GRID])
-    return float(np.interp(printed.SENSOR_RANGE_V, e_o, GRID))
+    return float(np.interp(printed_values.SENSOR_RANGE_V, e_o, GRID))
 
 
 def figure_28() -> Figure:

@@ -24,7 +24,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.model.cell import Bounds, CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.reports import printed
+from bms_estimator.reports import printed_values
 from bms_estimator.settings.pack import ObserverSettings
 
 Floats = NDArray[np.float64]
@@ -121,7 +121,7 @@ def with_bounds(cell: CellModel, bounds: dict[int, Bounds]) -> CellModel:
 
 def table_5_cell() -> CellModel:
     """The cell of Chen and Mora with what (3.18) runs with for Table 5."""
-    return with_bounds(load_cell("chen_mora"), {i: printed.bounds("5", i) for i in printed.BOUNDS})
+    return with_bounds(load_cell("chen_mora"), {i: printed_values.bounds("5", i) for i in printed_values.BOUNDS})
 
 
 class Simulation:
@@ -144,14 +144,14 @@ class Simulation:
         settings = observer_settings(law, lambda_, alpha)
         estimator = Estimator(self.cell, settings, identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0)
         record = estimator.settings[0]
-        record["a_initial"][1:] = printed.CHEN_MORA_ROUNDED
-        record["target"][1:] = printed.CHEN_MORA_ROUNDED
+        record["a_initial"][1:] = printed_values.CHEN_MORA_ROUNDED
+        record["target"][1:] = printed_values.CHEN_MORA_ROUNDED
         if law == "scheme-2":
-            record["rate"][1:] = [100.0 if i in printed.SMALL else 0.0 for i in range(1, 16)]
+            record["rate"][1:] = [100.0 if i in printed_values.SMALL else 0.0 for i in range(1, 16)]
         if law == "scheme-3":
             record["rate"][1:] = 0.0
-            for i, (upper, lower, *_) in printed.TABLE_4.items():
-                x, y = printed.TABLE_4_WEIGHTS
+            for i, (upper, lower, *_) in printed_values.TABLE_4.items():
+                x, y = printed_values.TABLE_4_WEIGHTS
                 record["rate"][i] = x + y
                 record["target"][i] = (x * upper + y * lower) / (x + y)
         return estimator
@@ -194,18 +194,18 @@ class Simulation:
         return self._fit_start(ALPHA, -1.4, 9.0), self._fit_start(OTHER_ALPHA, 1.4, 17.0)
 
     def _fit_start(self, alpha: float, near_v: float, near_lambda: float) -> OneStart:
-        shifts = {"scheme-1": printed.TABLE_2_SHIFT, "scheme-2": printed.TABLE_3_SHIFT}
+        shifts = {"scheme-1": printed_values.TABLE_2_SHIFT, "scheme-2": printed_values.TABLE_3_SHIFT}
 
         def off(unknown: Floats) -> list[float]:
             runs = (self._started(law, unknown[0], unknown[1], alpha) for law in shifts)
             return [
-                float(run.average[2] - printed.CHEN_MORA_ROUNDED[1]) / shift - 1.0
+                float(run.average[2] - printed_values.CHEN_MORA_ROUNDED[1]) / shift - 1.0
                 for run, shift in zip(runs, shifts.values(), strict=True)
             ]
 
         start_v, lambda_ = least_squares(off, (near_v, near_lambda), xtol=1e-3).x
         runs = [self._started(law, start_v, lambda_, alpha) for law in shifts]
-        ohmic_v, loop = CURRENT_A * r_s(1.0, self.cell.a), 1.0 + r_s(1.0, np.r_[0.0, printed.CHEN_MORA_ROUNDED])
+        ohmic_v, loop = CURRENT_A * r_s(1.0, self.cell.a), 1.0 + r_s(1.0, np.r_[0.0, printed_values.CHEN_MORA_ROUNDED])
         error_v = (start_v - ohmic_v) / loop  # (3.15) with (3.14), N(0) = 1
         return OneStart(float(start_v), float(error_v), float(lambda_), alpha, runs[0], runs[1])
 
@@ -232,7 +232,7 @@ class Simulation:
     @cached_property
     def printed_a(self) -> Floats:
         """a1..a15 as Tables 5 and 6 print them, shape (16,)."""
-        return printed.tables_5_and_6()
+        return printed_values.tables_5_and_6()
 
     @cached_property
     def r_s_curves(self) -> dict[float, SeriesResistance]:

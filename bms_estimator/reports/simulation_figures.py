@@ -10,8 +10,7 @@ from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun
 from bms_estimator.calibration.thesis.prediction import Prediction
 from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
-from bms_estimator.reports.items import Figure, Verdict
-from bms_estimator.reports.plot import COLOURS, FAINT, plot, thin
+from bms_estimator.reports.report_items import Figure, Verdict
 from bms_estimator.reports.simulation import (
     FINAL_SOC,
     SOC_GRID,
@@ -20,7 +19,8 @@ from bms_estimator.reports.simulation import (
     element,
     mean_error_percent,
 )
-from bms_estimator.reports.theorem import PRODUCTS
+from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
+from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
 Floats = NDArray[np.float64]
 

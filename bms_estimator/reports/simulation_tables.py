@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.stability_conditions import lemma_conditions
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports import printed
-from bms_estimator.reports.items import Table, Verdict, number, percent
+from bms_estimator.reports import printed_values
+from bms_estimator.reports.report_items import Table, Verdict, number, percent
 from bms_estimator.reports.simulation import (
     CURRENT_A,
     FINAL_SOC,
@@ -21,7 +21,7 @@ from bms_estimator.reports.simulation import (
     Simulation,
     mean_error_percent,
 )
-from bms_estimator.reports.theorem import measure
+from bms_estimator.reports.theorem_4_1_2 import measure
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def table_1(_: Simulation) -> Table:
         "1",
         "a16 to a21 for the simulations",
         ("parameter", "printed", "used"),
-        tuple((f"a{16 + j}", number(a), number(a)) for j, a in enumerate(printed.TABLE_1)),
+        tuple((f"a{16 + j}", number(a), number(a)) for j, a in enumerate(printed_values.TABLE_1)),
         Verdict.GIVEN,
         "Input of the simulations, taken as printed.",
     )
@@ -44,7 +44,7 @@ def table_2(simulation: Simulation) -> Table:
         simulation,
         "2",
         "Scheme 1 (3.16): a1 to a15",
-        (printed.TABLE_2, printed.TABLE_2_ERROR),
+        (printed_values.TABLE_2, printed_values.TABLE_2_ERROR),
         simulation.scheme_1.average,
         simulation.one_start.scheme_1.average,
         "By (3.16) all fifteen parameters move by the same integral of e², here as in print.",
@@ -53,12 +53,12 @@ def table_2(simulation: Simulation) -> Table:
 
 def table_3(simulation: Simulation) -> Table:
     """Scheme 2."""
-    true = {i: f"{100.0 * (printed.CHEN_MORA_ROUNDED[i - 1] / simulation.cell.a[i] - 1.0):.0f}" for i in (13, 6)}
+    true = {i: f"{100.0 * (printed_values.CHEN_MORA_ROUNDED[i - 1] / simulation.cell.a[i] - 1.0):.0f}" for i in (13, 6)}
     return _scheme_table(
         simulation,
         "3",
         "Scheme 2 (3.17): a1 to a15",
-        (printed.TABLE_3, printed.TABLE_3_ERROR),
+        (printed_values.TABLE_3, printed_values.TABLE_3_ERROR),
         simulation.scheme_2.average,
         simulation.one_start.scheme_2.average,
         "a1, a3, a6, a13, a15 are drawn back to where they started, the others move by the same integral of e², here as "
@@ -77,7 +77,7 @@ def _scheme_table(
     reason: str,
 ) -> Table:
     rows = []
-    for i, (start, estimate, error) in enumerate(zip(printed.CHEN_MORA_ROUNDED, *print_, strict=True), 1):
+    for i, (start, estimate, error) in enumerate(zip(printed_values.CHEN_MORA_ROUNDED, *print_, strict=True), 1):
         again, true = float(started[i]), float(simulation.cell.a[i])
         rows.append(
             (
@@ -92,7 +92,7 @@ def _scheme_table(
                 percent(again, true),
             )
         )
-    moved = float(plain[2]) - printed.CHEN_MORA_ROUNDED[1]
+    moved = float(plain[2]) - printed_values.CHEN_MORA_ROUNDED[1]
     fitted = simulation.one_start
     return Table(
         key,
@@ -120,9 +120,9 @@ def _scheme_table(
 
 def table_4(simulation: Simulation) -> Table:
     """Scheme 3."""
-    x, y = printed.TABLE_4_WEIGHTS
+    x, y = printed_values.TABLE_4_WEIGHTS
     rows = []
-    for i, (upper, lower, estimate, desired, error) in printed.TABLE_4.items():
+    for i, (upper, lower, estimate, desired, error) in printed_values.TABLE_4.items():
         limit = (x * upper + y * lower) / (x + y)
         true = float(simulation.cell.a[i])
         rows.append(
@@ -166,12 +166,12 @@ def table_4(simulation: Simulation) -> Table:
 def table_5(simulation: Simulation) -> Table:
     """The improved method."""
     rows = []
-    for i, (initial, estimate, desired, error) in printed.TABLE_5.items():
-        upper, lower, x, y = printed.BOUNDS[i]
+    for i, (initial, estimate, desired, error) in printed_values.TABLE_5.items():
+        upper, lower, x, y = printed_values.BOUNDS[i]
         again = float(simulation.improved.average[i])
-        b = printed.bounds("5", i)
-        inferred = f" ({b.weight_upper:g}, {b.weight_lower:g})" if i in printed.INFERRED_WEIGHTS["5"] else ""
-        decimals = printed.DECIMALS_5[i]
+        b = printed_values.bounds("5", i)
+        inferred = f" ({b.weight_upper:g}, {b.weight_lower:g})" if i in printed_values.INFERRED_WEIGHTS["5"] else ""
+        decimals = printed_values.DECIMALS_5[i]
         rows.append(
             (
                 f"a{i}",
@@ -181,7 +181,7 @@ def table_5(simulation: Simulation) -> Table:
                 f"{estimate:.{decimals}f}",
                 number(again, 6),
                 number(b.limit, 6),
-                f"{printed.mean_from_start('5', i):.{decimals}f}",
+                f"{printed_values.mean_from_start('5', i):.{decimals}f}",
                 number(desired),
                 number(error),
                 percent(again, desired),
@@ -198,7 +198,10 @@ def table_5(simulation: Simulation) -> Table:
         f"{number(float(delta(p[8], p[9], p[7])), 4)} and {number(float(delta(p[11], p[12], p[10])), 5)}"
         for p in (simulation.cell.a, simulation.printed_a, simulation.improved.average)
     ]
-    a6 = [f"{x:.4f}" for x in (simulation.improved.average[6], printed.TABLE_5[6][1], printed.mean_from_start("5", 6))]
+    a6 = [
+        f"{x:.4f}"
+        for x in (simulation.improved.average[6], printed_values.TABLE_5[6][1], printed_values.mean_from_start("5", 6))
+    ]
     return Table(
         "5",
         "The improved method: a1 to a12",
@@ -210,7 +213,7 @@ def table_5(simulation: Simulation) -> Table:
             "printed",
             "recomputed",
             "limit of Lemma 4.1.3",
-            f"mean from t0 over {printed.START_MEAN_S['5']:g} s",
+            f"mean from t0 over {printed_values.START_MEAN_S['5']:g} s",
             "desired",
             "printed error %",
             "recomputed error %",
@@ -219,13 +222,13 @@ def table_5(simulation: Simulation) -> Table:
         Verdict.FITTED,
         f"The run gives the Lemma 4.1.3 limits, weighted means of the bounds whatever the data say (E3): a6 = {a6[0]}, printed "
         f"{a6[1]}. A closed form gives every printed digit: the way from the initial value to the limit, averaged from the very "
-        f"first sample on, over {printed.START_MEAN_S['5']:g} s ({a6[2]}), with other weights of a7, a8, a10, a11, a12 than are "
-        f"printed (E32). Its {printed.FREE_PARAMETERS['5']} free parameters are the time, the rates of these five, and the ratio "
+        f"first sample on, over {printed_values.START_MEAN_S['5']:g} s ({a6[2]}), with other weights of a7, a8, a10, a11, a12 than are "
+        f"printed (E32). Its {printed_values.FREE_PARAMETERS['5']} free parameters are the time, the rates of these five, and the ratio "
         "of the weights of a7 and a8 (E24, E4); twelve numbers fitted with so many are no proof. Errors "
         f"are of the desired value (E7). The conditions of Lemma 4.1.1 do not all hold (E6): with the {failing}. delta1 and "
         f"delta2 (E13): {deltas[0]} from the desired values, {deltas[1]} from the printed estimates, {deltas[2]} from the "
         f"recomputed ones. The run is at {SMALL_CURRENT_A} A.",
-        free=printed.FREE_PARAMETERS["5"],
+        free=printed_values.FREE_PARAMETERS["5"],
     )
 
 
@@ -233,7 +236,7 @@ def table_6(simulation: Simulation) -> Table:
     """R_s."""
     fit = simulation.r_s_fit
     rows = []
-    for j, (i, (desired, estimate, error)) in enumerate(printed.TABLE_6.items()):
+    for j, (i, (desired, estimate, error)) in enumerate(printed_values.TABLE_6.items()):
         rows.append(
             (
                 f"a{i}",
@@ -265,7 +268,7 @@ def table_6(simulation: Simulation) -> Table:
         "(E_o - x2 - x3 - y)/i. And x2, x3 must be those of the frozen model: with the observer's own, which settle so "
         "that (4.1) meets y, R_s is zero. So computed, R_s takes up what R_ts + R_tl have wrong, and its fit is no "
         f"estimate of the cell's own R_s. From Table 5's own estimates a15 is {plateaus} mΩ at {currents} A, and "
-        f"{1e3 * printed.TABLE_6[15][1]:.1f} is printed. The printed error column mixes fractions and a value (E8).",
+        f"{1e3 * printed_values.TABLE_6[15][1]:.1f} is printed. The printed error column mixes fractions and a value (E8).",
     )
 
 
@@ -279,7 +282,7 @@ def table_7(simulation: Simulation) -> Table:
             number(mean_error_percent(name, from_print, true), 3),
             number(mean_error_percent(name, simulation.improved.average, true), 3),
         )
-        for name, error in printed.TABLE_7.items()
+        for name, error in printed_values.TABLE_7.items()
     )
     return Table(
         "7",
@@ -301,7 +304,7 @@ def table_12(simulation: Simulation) -> Table:
     rows = tuple(
         (
             f"estimated {kind} model",
-            number(printed.TABLE_12[kind]),
+            number(printed_values.TABLE_12[kind]),
             *(number(value, 3) for run in found for value in (run.mean_percent, run.max_percent)),
         )
         for kind, found in runs.items()
@@ -332,7 +335,7 @@ def table_12(simulation: Simulation) -> Table:
         f"{dynamic}, static {static} % (down to SOC {LOWEST_SOC:g} {higher[0]} and {higher[1]} %: as good as the same). Plainly "
         "the printed order comes only with a13 to a15 fitted anew. No load up to 4C gives the sizes: at a constant "
         f"{HIGH_CURRENT_A:g} A the dynamic model of Tables 5 and 6 is {simulation.constant_error_percent(HIGH_CURRENT_A):.2f} "
-        f"% off, and {printed.TABLE_12['dynamic']:g} % is printed.",
+        f"% off, and {printed_values.TABLE_12['dynamic']:g} % is printed.",
     )
 
 

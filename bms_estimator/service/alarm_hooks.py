@@ -17,7 +17,7 @@ from bms_estimator.protocols.firmware.messages import Relay
 from bms_estimator.service.hook_process import StartError, environment, run
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.alarms import Change
+from bms_estimator.telemetry.alarms import Change
 
 WAITING = 100
 """So many alarms wait for a program that takes its time; then the oldest goes."""

@@ -28,8 +28,8 @@ from bms_estimator.process.boot_clock import Moment, moment
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.process.private_file import NotOursError, read_private, write_private
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.flow import Flow
-from bms_estimator.snapshot.totals import new_totals
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.lifetime_totals import new_totals
 
 FORMAT = 7
 """Raise it when a field of an old name gets another meaning, and tell ``_MIGRATIONS`` how to read those before."""

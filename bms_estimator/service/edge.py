@@ -12,11 +12,11 @@ from bms_estimator.process.log_setup import set_level
 from bms_estimator.process.signals import stop_on_signal, until_first_ends
 from bms_estimator.process.systemd import Notifier
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources import Source
-from bms_estimator.sources.board_memory import BoardMemory
-from bms_estimator.sources.kinds import open_reports
-from bms_estimator.sources.reports import Reports
-from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.line_source import Reports
+from bms_estimator.sources.serial.known_board_file import BoardMemory
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.source import Source
 
 UNTENDED_S = 30.0
 """A source whose task has not turned for so long hangs [s]."""

@@ -31,8 +31,8 @@ from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.requests import Requests, number
 from bms_estimator.snapshot.publisher import Publisher
-from bms_estimator.snapshot.totals import Tally, new_totals
-from bms_estimator.sources import Pulse, Source
+from bms_estimator.sources.source import Pulse, Source
+from bms_estimator.telemetry.lifetime_totals import Tally, new_totals
 
 LAG_STEP_S = 0.1
 """How often the loop's lag is measured [s]: what blocks it for longer is always seen."""

@@ -9,9 +9,9 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.service.checkpoint import CheckpointFile, Ledger
-from bms_estimator.snapshot.flow import Flow
 from bms_estimator.snapshot.publisher import Publisher
-from bms_estimator.snapshot.totals import Tally
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.lifetime_totals import Tally
 
 SAVED_SOC = 0.002
 """How far the SOC may go from that of the checkpoint: a kill costs no more, beside what moves until the next start."""

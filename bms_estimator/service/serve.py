@@ -28,11 +28,11 @@ from bms_estimator.sinks import Delivery, Sink
 from bms_estimator.sinks.influx import InfluxSink
 from bms_estimator.sinks.mqtt import MqttSink
 from bms_estimator.sinks.requests import Requests
-from bms_estimator.sources import Tap
-from bms_estimator.sources.board_memory import BoardMemory
-from bms_estimator.sources.kinds import open_reports
-from bms_estimator.sources.recording import Recording
-from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.serial.known_board_file import BoardMemory
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.source import Tap
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
 from bms_estimator.store.outbox import Outbox

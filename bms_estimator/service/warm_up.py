@@ -9,10 +9,10 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.live import new_estimator
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.flow import Flow, Meter
-from bms_estimator.snapshot.parameters import parameter_report
-from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.window import Window
+from bms_estimator.telemetry.charge_energy import Flow, Meter
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.remaining_charge import remaining_charge
 
 CELL = "chen_mora"
 """Any: kernels are the same for all."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.simulation.virtual_converter import Reading
+from bms_estimator.simulation.virtual_adc import Reading
 
 READINGS_HZ = 50
 """Of a signal; each reading is held until the next."""

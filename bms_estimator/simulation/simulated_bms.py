@@ -8,7 +8,7 @@ from enum import Enum
 
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS, MOST_CELLS, Measured
 from bms_estimator.simulation.simulated_meter import Signal, SimulatedMeter
-from bms_estimator.simulation.virtual_converter import Reading
+from bms_estimator.simulation.virtual_adc import Reading
 
 HEARD_BYTES = 64
 """No question is longer."""

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Self
 
-from bms_estimator.simulation.virtual_converter import Reading
+from bms_estimator.simulation.virtual_adc import Reading
 
 Signal = Callable[[float], Reading]
 """Readings by time [s], which never steps back."""

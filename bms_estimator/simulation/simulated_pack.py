@@ -11,7 +11,7 @@ from enum import StrEnum
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, r_s
 from bms_estimator.model.cell import CellModel
-from bms_estimator.simulation.virtual_converter import Reading
+from bms_estimator.simulation.virtual_adc import Reading
 
 EMPTY_SOC, FULL_SOC = 0.05, 0.95
 """The load stops at the one and begins again at the other; in between the pack is charged. Above the other no load charges it."""

@@ -42,7 +42,7 @@ from bms_estimator.protocols.firmware.messages import (
     SampleMessage,
     unseal,
 )
-from bms_estimator.simulation.virtual_converter import (
+from bms_estimator.simulation.virtual_adc import (
     FULL_SCALE,
     BoardParts,
     Reading,

@@ -15,10 +15,10 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.alarm_limits import charging_a, silent_limit_s, watched
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.alarm_inputs import Inputs
-from bms_estimator.snapshot.alarms import Alarms, Change, Counts
-from bms_estimator.snapshot.health import sample_counters, suspicions
-from bms_estimator.sources import Source
+from bms_estimator.sources.source import Source
+from bms_estimator.telemetry.alarm_inputs import Inputs
+from bms_estimator.telemetry.alarms import Alarms, Change, Counts
+from bms_estimator.telemetry.health import sample_counters, suspicions
 
 UNUSABLE = "not_finite", "range", "saturated"
 """Kinds of dropped samples that tell of a fault of the sensor."""

@@ -24,18 +24,18 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks import FRESH_PERIODS, Delivery, Sink
 from bms_estimator.snapshot.alarm_watch import AlarmWatch
-from bms_estimator.snapshot.alarms import Change
-from bms_estimator.snapshot.flow import Flow
-from bms_estimator.snapshot.health import dropped_text, health_report, sample_counters
-from bms_estimator.snapshot.impossible import impossible_sample
 from bms_estimator.snapshot.latency import Latency
-from bms_estimator.snapshot.parameters import parameter_report
-from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.rest import Rest
-from bms_estimator.snapshot.topics import estimate_report, info_report
-from bms_estimator.snapshot.totals import Tally, new_totals
-from bms_estimator.snapshot.window import Window, WindowSummary
-from bms_estimator.sources import Pulse, Source
+from bms_estimator.sources.source import Pulse, Source
+from bms_estimator.telemetry.alarms import Change
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.health import dropped_text, health_report, sample_counters
+from bms_estimator.telemetry.impossible import impossible_sample
+from bms_estimator.telemetry.lifetime_totals import Tally, new_totals
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.publish_window import Window, WindowSummary
+from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.rest_detector import Rest
+from bms_estimator.telemetry.state import estimate_report, info_report
 
 log = structlog.get_logger(__name__)
 

@@ -12,8 +12,8 @@ from live import MOSQUITTO, broker, pack_file
 from load import pulses
 from table import Row
 
+from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.simulation.virtual_converter import Reading
 
 MEASURE_S = 60.0
 RATE_HZ = 100

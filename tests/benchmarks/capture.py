@@ -18,7 +18,7 @@ from wire import hello, sample_frames
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.framing import SAMPLE_FRAME_BYTES, crc16
-from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
+from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOURS = (4, 16)

@@ -14,10 +14,10 @@ from bms_estimator.calibration.ocv.points import pooled
 from bms_estimator.calibration.thesis.series_resistance import SeriesResistance, SeriesResistanceFit
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.reports import printed
-from bms_estimator.reports.claims import CLAIMS, claim, products
-from bms_estimator.reports.protocol import KNEE_SOC, Capture, Kind, Protocol
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.reports import printed_values
+from bms_estimator.reports.procedure import KNEE_SOC, Capture, Kind, Protocol
+from bms_estimator.reports.thesis_claims import CLAIMS, claim, products
+from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks.recipes import DATA, LFP, NCR, PF, charge_ah, path_of
 
 WIDTH = 150
@@ -162,10 +162,10 @@ def main() -> None:
 
 def errors(protocols: dict[str, Protocol]) -> Table:
     """Tables 11 and 13."""
-    printed_means = ", ".join(f"{load} {value}" for load, value in printed.TABLE_11.items())
+    printed_means = ", ".join(f"{load} {value}" for load, value in printed_values.TABLE_11.items())
     table = Table(
-        title=f"error of the voltage in %; printed means: {printed_means}; largest {printed.MAX_CONSTANT} (constant), "
-        f"{printed.MAX_STEPS} (steps); static {printed.TABLE_13['static']}, dynamic {printed.TABLE_13['dynamic']}"
+        title=f"error of the voltage in %; printed means: {printed_means}; largest {printed_values.MAX_CONSTANT} (constant), "
+        f"{printed_values.MAX_STEPS} (steps); static {printed_values.TABLE_13['static']}, dynamic {printed_values.TABLE_13['dynamic']}"
     )
     heads = (
         "mean",

@@ -53,11 +53,11 @@ from bms_estimator.sinks import Delivery, console_line
 from bms_estimator.sinks.console_scene import Scene
 from bms_estimator.sinks.console_view import View
 from bms_estimator.sinks.requests import Requests, number
-from bms_estimator.sources.board_memory import BoardMemory
-from bms_estimator.sources.curve import read_curve
-from bms_estimator.sources.ports import NoPortError, may_be_board, resolve_port
-from bms_estimator.sources.raw_capture import MAGIC
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.curves import read_curve
+from bms_estimator.sources.captures.raw_capture import MAGIC
+from bms_estimator.sources.captures.replay import load_capture
+from bms_estimator.sources.serial.known_board_file import BoardMemory
+from bms_estimator.sources.serial.port_list import NoPortError, may_be_board, resolve_port
 
 CORPUS = Path(__file__).parents[1] / "data" / "fuzz"
 LONGEST = 4096

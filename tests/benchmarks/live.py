@@ -18,8 +18,8 @@ from load import CELL, pulses
 from numpy.typing import NDArray
 from table import Row
 
+from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.simulation.virtual_converter import Reading
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.mosquitto import MOSQUITTO, Broker

@@ -14,10 +14,10 @@ from bms_estimator.fleet.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.parameters import parameter_report
-from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.topics import estimate_report
-from bms_estimator.snapshot.window import Window
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.state import estimate_report
 
 PACKS, MINUTES, SAMPLES = 100, 90, 60
 STORE = 480_000 * 3600 * 10**9

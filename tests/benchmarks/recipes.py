@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 
 Floats = NDArray[np.float64]
 

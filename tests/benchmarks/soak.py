@@ -25,8 +25,8 @@ import psutil
 from bms_estimator.model.cell import load_cell
 from bms_estimator.protocols.firmware.messages import ResetCause
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
+from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.simulation.virtual_converter import BoardParts, Reading
 from tests.benchmarks.soak_account import Account, State, judged
 from tests.benchmarks.table import show
 from tests.command_line import PROGRAM

@@ -7,7 +7,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps
 
 END_OF_CHARGE_S = 10_085.5

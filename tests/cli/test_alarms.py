@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.command_line import run
-from tests.snapshot.alarm_captures import Line, record
+from tests.telemetry.alarm_captures import Line, record
 
 
 @pytest.fixture

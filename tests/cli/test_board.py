@@ -9,9 +9,9 @@ import pytest
 from serial.tools import list_ports
 
 from bms_estimator.cli.main import main
+from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.simulation.virtual_converter import BoardParts, Reading
-from bms_estimator.sources import probe
+from bms_estimator.sources.serial import device_detection
 from tests.patience import LONG_S
 from tests.serial_line import usb_port
 
@@ -41,14 +41,14 @@ def virtual(**options):
 @pytest.fixture
 def patient(monkeypatch):
     """For boards that answer."""
-    monkeypatch.setattr(probe, "PATIENCE_S", LONG_S)
-    monkeypatch.setattr(probe, "REFERENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "PATIENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "REFERENCE_S", LONG_S)
 
 
 @pytest.fixture
 def impatient(monkeypatch):
     """For those that never do."""
-    monkeypatch.setattr(probe, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(device_detection, "PATIENCE_S", 0.5)
 
 
 @pytest.mark.usefixtures("patient")
@@ -81,7 +81,7 @@ def test_the_voltage_at_aref_sets_the_bandgap_and_with_it_the_reference(capsys):
 @pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("aref_v", ["3.3", "6", "0", "-5"])
 def test_a_voltage_that_cannot_be_at_aref_changes_nothing(capsys, monkeypatch, aref_v):
-    monkeypatch.setattr(probe, "REFERENCE_SAMPLES", 10)
+    monkeypatch.setattr(device_detection, "REFERENCE_SAMPLES", 10)
     with virtual() as path:
         code, _, err = board(capsys, path, "--aref-v", aref_v, "--serial", "7")
         assert code == 2

@@ -11,7 +11,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.service.checkpoint import CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator
-from bms_estimator.snapshot.totals import new_totals
+from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.command_line import run
 from tests.estimator.anywhere.cases import OXIDE, Case, capture
 

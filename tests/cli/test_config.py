@@ -9,8 +9,8 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.simulation.simulated_bms import SimulatedBms
-from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources.kinds import KINDS
+from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.sources.factory import KINDS
 from tests.command_line import run
 from tests.device_line import on_a_line
 from tests.patience import LONG_S
@@ -66,8 +66,8 @@ def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, cap
 
 @pytest.fixture
 def long_probe(monkeypatch):
-    monkeypatch.setattr("bms_estimator.sources.probe.PATIENCE_S", 0.1)
-    monkeypatch.setattr("bms_estimator.sources.probe.EACH_S", LONG_S)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PATIENCE_S", 0.1)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.EACH_S", LONG_S)
 
 
 def test_init_finds_out_what_is_there_and_sets_it(pack, capsys, long_probe):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.sources.kinds import KINDS
+from bms_estimator.sources.factory import KINDS
 from tests.command_line import run
 
 V, I = "voltage = { id = 1 }", "current = { id = 2 }"  # noqa: E741

@@ -12,8 +12,8 @@ import pytest
 
 from bms_estimator.cli.main import main
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
-from bms_estimator.sources.raw_capture import MAGIC, read_capture, read_header
-from bms_estimator.sources.wire.capture_records import RECORD_OVERHEAD_BYTES
+from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
+from bms_estimator.sources.captures.raw_capture import MAGIC, read_capture, read_header
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 from tests.serial_line import Line

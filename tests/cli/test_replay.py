@@ -16,7 +16,7 @@ from pyarrow import BufferOutputStream, parquet
 from pyarrow.csv import read_csv
 
 from bms_estimator import estimate, load_capture, load_cell
-from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
+from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 from tests.command_line import run
 
 SUMMARY = {

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.settings.pack import load_settings
-from bms_estimator.sources.replay import RawCapture
+from bms_estimator.sources.captures.replay import RawCapture
 from tests.command_line import run
-from tests.sources.sysfs_folder import hwmon
+from tests.sources.linux.sysfs_folder import hwmon
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from bms_estimator.cli.pack import load_pack
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.service.live import new_estimator
 from bms_estimator.service.resume import resume
+from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources.replay import RawCapture
+from bms_estimator.sources.captures.replay import RawCapture
 from tests import mann_stack
 from tests.end_to_end.test_whole_way import program
 from tests.mosquitto import Broker, Listener

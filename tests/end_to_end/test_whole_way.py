@@ -17,9 +17,9 @@ from bms_estimator.protocols.firmware.messages import ResetCause
 from bms_estimator.service.checkpoint import CheckpointFile, fields
 from bms_estimator.service.live import new_estimator
 from bms_estimator.simulation.simulated_pack import SimulatedPack, pulses
+from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
-from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources.replay import RawCapture
+from bms_estimator.sources.captures.replay import RawCapture
 from tests.command_line import PROGRAM
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S

@@ -12,9 +12,9 @@ from bms_estimator.kernels.cell_model.fuel_cell import NAMES
 from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.snapshot.fuel_cell import fuel_cell_parameters
-from bms_estimator.snapshot.parameters import parameter_report
-from bms_estimator.snapshot.remaining import remaining_charge
+from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.remaining_charge import remaining_charge
 from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")

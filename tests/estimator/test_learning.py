@@ -9,11 +9,11 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
-from bms_estimator.snapshot.flow import Flow
-from bms_estimator.snapshot.parameters import parameter_report
-from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.topics import estimate_report
-from bms_estimator.snapshot.window import Window
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.state import estimate_report
 from tests.estimator.random_steps import (
     FIRST_SOC,
     RATED_A,

@@ -11,7 +11,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.kernels.kalman_filter.temperature import COOLS_S, WARMEST_C
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 
 HALF_C = Path(__file__).parents[1] / "data" / "lgm50" / "rate_0p5c_25c.csv.gz"
 

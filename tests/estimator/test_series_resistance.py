@@ -17,7 +17,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.service.checkpoint import fields, without_observer
 from bms_estimator.service.resume import resume
 from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
-from bms_estimator.snapshot.parameters import parameter_report
+from bms_estimator.telemetry.parameters import parameter_report
 from tests.calibration.simulated_load import TRUTH, capture, steps
 
 FIRST_SOC = 0.98

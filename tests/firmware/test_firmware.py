@@ -33,8 +33,8 @@ from bms_estimator.protocols.firmware.messages import (
     zero_current_command,
 )
 from bms_estimator.settings.pack import SensorSettings
-from bms_estimator.simulation.virtual_converter import aux_readings_of, window_of
-from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.simulation.virtual_adc import aux_readings_of, window_of
+from bms_estimator.sources.serial.serial_source import SerialBoard
 from tests.firmware.host import Host
 from tests.simavr_board import FIRMWARE, SimavrBoard, write_readings
 

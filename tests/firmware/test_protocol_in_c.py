@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.simulation.virtual_converter import aux_readings_of, window_of
+from bms_estimator.simulation.virtual_adc import aux_readings_of, window_of
 from tests.simavr_board import FIRMWARE
 
 VECTORS = json.loads((FIRMWARE / "test_vectors.json").read_text())

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from bms_estimator.settings.pack import SensorSettings
-from bms_estimator.simulation.virtual_converter import FULL_SCALE, BoardParts
+from bms_estimator.simulation.virtual_adc import FULL_SCALE, BoardParts
 from tests.simavr_board import FIRMWARE, ROOT
 
 TABLE = (ROOT / "docs" / "wiring.md").read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.fleet.streams import make_streams
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 from tests.command_line import run
 from tests.fleet.engine import running
 from tests.fleet.test_captured import STORE, block, samples

@@ -18,7 +18,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.service.serve import serve
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.health import sample_counters
+from bms_estimator.telemetry.health import sample_counters
 from tests.command_line import PROGRAM, run
 from tests.fleet.engine import Engine, running
 from tests.fleet.receiver import Receiver

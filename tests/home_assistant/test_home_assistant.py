@@ -16,7 +16,7 @@ from bms_estimator.model.payloads import Snapshot
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant import Described, discovery
 from bms_estimator.sinks.messages import Message, Messages, Sent
-from bms_estimator.snapshot.rest import WATCHED_S
+from bms_estimator.telemetry.rest_detector import WATCHED_S
 from tests.home_assistant.conftest import DASHBOARD
 from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant
 from tests.home_assistant.packs import Packs

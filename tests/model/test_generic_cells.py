@@ -13,7 +13,7 @@ from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.cell import TableOcv, generic_cells, load_cell, shipped_cells
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 
 OHM_AH_10_S = {"lfp": 0.045, "nmc": 0.13, "nca": 0.13, "lco": 0.13, "lmo": 0.08, "lto": 0.016}
 """Resistance after ten seconds at half charge [ohm Ah], to a fifth: 100 Ah of LFP have 0.45 mohm."""

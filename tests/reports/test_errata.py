@@ -12,10 +12,10 @@ from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, cell_step, em
 from bms_estimator.kernels.cell_model.margins import crossing
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports import printed, printed_pack
+from bms_estimator.reports import printed_pack, printed_values
 from bms_estimator.reports.errata import errata, ocv_error_ohm
 from bms_estimator.reports.quasi_steady import quasi_steady
-from bms_estimator.reports.simulated_pack import pack, resistance_ohm
+from bms_estimator.reports.simulated_experiment import pack, resistance_ohm
 from bms_estimator.reports.simulation import Simulation, discharge, observer_settings, table_5_cell
 
 CHEN_MORA = load_cell("chen_mora")
@@ -141,13 +141,15 @@ def test_derivative_of_the_overpotential_needs_the_rate_of_soc():
 def test_inferred_weights_of_a7_have_the_same_ratio_in_both_tables():
     """E24: 14 to 13."""
     for table in ("5", "10"):
-        x, y = printed.INFERRED_WEIGHTS[table][7]
+        x, y = printed_values.INFERRED_WEIGHTS[table][7]
         assert x / y == 14.0 / 13.0
 
 
 def test_bounds_of_table_5_and_10_differ_in_a4_only():
     differing = [
-        i for i in printed.BOUNDS if printed.bounds("5", i).limit != pytest.approx(printed.bounds("10", i).limit)
+        i
+        for i in printed_values.BOUNDS
+        if printed_values.bounds("5", i).limit != pytest.approx(printed_values.bounds("10", i).limit)
     ]
     assert differing == [4]
 
@@ -162,8 +164,8 @@ def shift_of_a2(start, law):
 
     (2.2), (2.3), (3.2), (3.3), (3.12) to (3.14) solved by scipy, with tolerances in place of a fixed step.
     """
-    cell, started = CHEN_MORA.a, np.array(printed.CHEN_MORA_ROUNDED)
-    drawn_back = np.array([100.0 if law == "scheme-2" and i in printed.SMALL else 0.0 for i in range(1, 16)])
+    cell, started = CHEN_MORA.a, np.array(printed_values.CHEN_MORA_ROUNDED)
+    drawn_back = np.array([100.0 if law == "scheme-2" and i in printed_values.SMALL else 0.0 for i in range(1, 16)])
     settings = observer_settings(law, start.lambda_, start.alpha)
     gain = Estimator(CHEN_MORA, settings, identifier=None).settings[0]
 
@@ -191,11 +193,11 @@ def test_fitted_starts_move_the_parameters_as_the_differential_equations_do(simu
     """E25: each fits Tables 2 and 3, whatever the kernel's step; k integrates the e^2 that moves the parameters."""
     start = (simulation.one_start, *simulation.other_starts)[n]
     for law, run, shift in (
-        ("scheme-1", start.scheme_1, printed.TABLE_2_SHIFT),
-        ("scheme-2", start.scheme_2, printed.TABLE_3_SHIFT),
+        ("scheme-1", start.scheme_1, printed_values.TABLE_2_SHIFT),
+        ("scheme-2", start.scheme_2, printed_values.TABLE_3_SHIFT),
     ):
-        assert run.average[2] - printed.CHEN_MORA_ROUNDED[1] == pytest.approx(shift, abs=5e-5)
-        after_a_minute = np.interp(60.0, run.time_s, run.a[:, 2]) - printed.CHEN_MORA_ROUNDED[1]
+        assert run.average[2] - printed_values.CHEN_MORA_ROUNDED[1] == pytest.approx(shift, abs=5e-5)
+        after_a_minute = np.interp(60.0, run.time_s, run.a[:, 2]) - printed_values.CHEN_MORA_ROUNDED[1]
         assert shift_of_a2(start, law) == pytest.approx(after_a_minute, abs=2e-4)
 
 
@@ -245,9 +247,9 @@ def test_current_differences_are_mostly_an_offset():
     """E31: a sensor of this offset and gain leaves less than 3 mA of them."""
     offset_a, gain = printed_pack.current_sensor()
     assert (1e3 * offset_a, 100.0 * gain) == pytest.approx((-39.9, -1.66), abs=0.05)
-    for load, ohm in printed.RESISTORS_OHM.items():
+    for load, ohm in printed_values.RESISTORS_OHM.items():
         true_a = printed_pack.mean_current_a(ohm)
-        assert true_a * (1.0 + gain) + offset_a == pytest.approx(printed.CURRENTS_A[load], abs=0.003)
+        assert true_a * (1.0 + gain) + offset_a == pytest.approx(printed_values.CURRENTS_A[load], abs=0.003)
 
 
 def test_estimates_of_table_10_keep_a_part_of_their_starts(rows):

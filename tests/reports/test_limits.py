@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports import printed
+from bms_estimator.reports import printed_values
 
 TABLE_4 = {1: 0.2995, 3: 0.04485, 6: 0.04990, 13: 0.1495, 15: 0.06970}
 """(100 upper + lower) / 101."""
@@ -40,8 +40,8 @@ def digits(value):
 
 @pytest.mark.parametrize(("index", "expected"), TABLE_4.items())
 def test_limits_of_table_4_to_four_digits(index, expected):
-    upper, lower, *_ = printed.TABLE_4[index]
-    x, y = printed.TABLE_4_WEIGHTS
+    upper, lower, *_ = printed_values.TABLE_4[index]
+    x, y = printed_values.TABLE_4_WEIGHTS
     assert digits((x * upper + y * lower) / (x + y)) == expected
 
 
@@ -49,12 +49,12 @@ def test_limits_of_table_4_to_four_digits(index, expected):
 @pytest.mark.parametrize(("index", "expected"), TABLES_5_AND_10.items())
 def test_limits_of_tables_5_and_10_to_four_digits(cell, index, expected):
     for table in ("5", "10"):
-        assert digits(printed.bounds(table, index).limit) == INFERRED.get((table, index), expected)
+        assert digits(printed_values.bounds(table, index).limit) == INFERRED.get((table, index), expected)
     assert digits(load_cell(cell).bounds(index).limit) == expected
 
 
 def test_printed_weights_of_a8_have_another_limit():
-    upper, lower, x, y = printed.BOUNDS[8]
+    upper, lower, x, y = printed_values.BOUNDS[8]
     assert (upper, lower, x, y) == (30, 1, 50, 10)
     assert digits((x * upper + y * lower) / (x + y)) == 25.17  # E4
 
@@ -62,21 +62,21 @@ def test_printed_weights_of_a8_have_another_limit():
 @pytest.mark.parametrize(("index", "digits"), list(enumerate(TABLE_5.split(), 1)))
 def test_means_from_the_first_sample_on_have_every_digit_of_table_5(index, digits):
     """Bounds, weights and initial values alone, no data (E3), with the weights of E32."""
-    assert printed.TABLE_5[index][1] == float(digits)
+    assert printed_values.TABLE_5[index][1] == float(digits)
     decimals = len(digits.partition(".")[2])
-    assert f"{printed.mean_from_start('5', index):.{decimals}f}" == digits
-    assert printed.DECIMALS_5[index] == decimals
+    assert f"{printed_values.mean_from_start('5', index):.{decimals}f}" == digits
+    assert printed_values.DECIMALS_5[index] == decimals
 
 
 @pytest.mark.parametrize("index", [7, 8, 10, 11, 12])
 def test_printed_weights_do_not_give_the_digits_of_table_5(index):
-    upper, lower, x, y = printed.BOUNDS[index]
+    upper, lower, x, y = printed_values.BOUNDS[index]
     x, y = {7: (70.0, 65.0), 8: (10.0, 20.0)}.get(index, (x, y))  # the right limit, by E24 and E4
     limit = (x * upper + y * lower) / (x + y)
-    mean = limit + (printed.initial("5", index) - limit) / ((x + y) * printed.START_MEAN_S["5"])
-    decimals = printed.DECIMALS_5[index]
-    assert round(mean, decimals) != printed.TABLE_5[index][1]
-    low, high = printed.implied_rates(index)
+    mean = limit + (printed_values.initial("5", index) - limit) / ((x + y) * printed_values.START_MEAN_S["5"])
+    decimals = printed_values.DECIMALS_5[index]
+    assert round(mean, decimals) != printed_values.TABLE_5[index][1]
+    low, high = printed_values.implied_rates(index)
     assert not low <= x + y <= high
 
 
@@ -92,18 +92,18 @@ def test_no_other_weights_up_to_800_give_the_digits_of_a7():
 
 @pytest.mark.parametrize(("index", "estimate"), list(enumerate(TABLE_10, 1)))
 def test_means_from_the_first_sample_on_are_near_table_10(index, estimate):
-    assert printed.mean_from_start("10", index) == pytest.approx(estimate, rel=1e-2 * WORST_PERCENT)
+    assert printed_values.mean_from_start("10", index) == pytest.approx(estimate, rel=1e-2 * WORST_PERCENT)
 
 
 def test_worst_of_the_means_of_table_10():
-    assert printed.worst_mean_percent() == pytest.approx(WORST_PERCENT, abs=0.005)
+    assert printed_values.worst_mean_percent() == pytest.approx(WORST_PERCENT, abs=0.005)
 
 
 def test_free_parameters_are_counted_from_the_inferred_weights():
     """The time, the rate of each inferred pair, and its ratio unless it is the printed one."""
-    for table, pairs in printed.INFERRED_WEIGHTS.items():
-        ratios = [x / y != printed.BOUNDS[i][2] / printed.BOUNDS[i][3] for i, (x, y) in pairs.items()]
-        assert printed.FREE_PARAMETERS[table] == 1 + len(pairs) + sum(ratios)
+    for table, pairs in printed_values.INFERRED_WEIGHTS.items():
+        ratios = [x / y != printed_values.BOUNDS[i][2] / printed_values.BOUNDS[i][3] for i, (x, y) in pairs.items()]
+        assert printed_values.FREE_PARAMETERS[table] == 1 + len(pairs) + sum(ratios)
 
 
 def test_weights_of_e24_give_the_printed_estimates_and_the_printed_weights_do_not():
@@ -112,16 +112,18 @@ def test_weights_of_e24_give_the_printed_estimates_and_the_printed_weights_do_no
         ("10", 7, 760.1875, 760.2266),
         ("10", 4, 6.2583, 6.2585),
     ):
-        assert printed.mean_from_start(table, index) == pytest.approx(mean, rel=1e-5)
+        assert printed_values.mean_from_start(table, index) == pytest.approx(mean, rel=1e-5)
         assert mean == pytest.approx(estimate, rel=1e-4)
-        upper, lower, x, y = printed.BOUNDS[index]
+        upper, lower, x, y = printed_values.BOUNDS[index]
         limit = (x * upper + y * lower) / (x + y)
-        as_printed = limit + (printed.initial(table, index) - limit) / ((x + y) * printed.START_MEAN_S[table])
+        as_printed = limit + (printed_values.initial(table, index) - limit) / (
+            (x + y) * printed_values.START_MEAN_S[table]
+        )
         assert abs(as_printed / estimate - 1.0) > 1e-3
 
 
 def test_deltas_of_e13():
-    true, estimated, pack = load_cell("chen_mora").a, printed.tables_5_and_6(), printed.tables_8_to_10()
+    true, estimated, pack = load_cell("chen_mora").a, printed_values.tables_5_and_6(), printed_values.tables_8_to_10()
     for a, delta_1, delta_2 in (
         (true, 0.005013, 0.011156),
         (estimated, 0.009698, 0.017906),

@@ -21,9 +21,9 @@ from bms_estimator.service.alarm_hooks import Hooks, unusable
 from bms_estimator.service.serve import serve
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
+from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.snapshot.alarms import Change
+from bms_estimator.telemetry.alarms import Change
 from tests.collector import Collector
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S

@@ -16,7 +16,7 @@ from bms_estimator.model.payloads import Health, Snapshot
 from bms_estimator.protocols.firmware.messages import MODULUS, Hello, SampleMessage
 from bms_estimator.service.live import run_live
 from bms_estimator.settings.pack import PackSettings, PublishSettings, SensorSettings, Settings
-from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.sources.serial.serial_source import SerialBoard
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.serial_line import Line

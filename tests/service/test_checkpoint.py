@@ -24,7 +24,7 @@ from bms_estimator.service.checkpoint import FORMAT, KEPT, CheckpointFile, Ledge
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.service.resume import resume
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.totals import new_totals
+from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource

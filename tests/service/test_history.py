@@ -18,8 +18,8 @@ from bms_estimator.service import saving
 from bms_estimator.service.checkpoint import FORMAT, LATER, CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator, run_live
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.flow import Flow
-from bms_estimator.snapshot.totals import gap_lengths
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.lifetime_totals import gap_lengths
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource

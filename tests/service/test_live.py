@@ -22,7 +22,7 @@ from bms_estimator.service.live import LAG_STEP_S, new_estimator, run_live
 from bms_estimator.settings.pack import IdentifierSettings, PackSettings, PublishSettings, SensorSettings, Settings
 from bms_estimator.sinks import Delivery
 from bms_estimator.sinks.requests import Requests
-from bms_estimator.snapshot.rest import WATCHED_S
+from bms_estimator.telemetry.rest_detector import WATCHED_S
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource

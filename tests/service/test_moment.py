@@ -12,7 +12,7 @@ from bms_estimator.process.boot_clock import Moment, moment, synchronised
 from bms_estimator.service.checkpoint import CheckpointFile, Ledger
 from bms_estimator.service.live import new_estimator
 from bms_estimator.settings.pack import Settings
-from bms_estimator.snapshot.totals import new_totals
+from bms_estimator.telemetry.lifetime_totals import new_totals
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()
 SAVED = Moment(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, boot="one")

@@ -13,10 +13,10 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.service.serve import serve
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.kinds import open_reports
-from bms_estimator.sources.raw_capture import header_of
-from bms_estimator.sources.recording import Recording
-from bms_estimator.sources.replay import RawCapture
+from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.captures.replay import RawCapture
+from bms_estimator.sources.factory import open_reports
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S, end

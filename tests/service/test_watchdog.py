@@ -13,11 +13,11 @@ from bms_estimator.service.serve import recording_health
 from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.snapshot import publisher
 from bms_estimator.snapshot.latency import Latency
-from bms_estimator.sources import Pulse
-from bms_estimator.sources.line import Line
-from bms_estimator.sources.raw_capture import header_of
-from bms_estimator.sources.recording import Recording
-from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.serial.serial_port import Line
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.source import Pulse
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource

@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.settings.mqtt_profiles import PROFILES
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.kinds import make_bringer
+from bms_estimator.sources.factory import make_bringer
 
 DOCS = Path(__file__).parents[2] / "docs"
 EXAMPLES = [

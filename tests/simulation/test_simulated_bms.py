@@ -13,11 +13,11 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SPREAD_V, BmsFault, SimulatedBms
-from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources.raw_capture import header_of
-from bms_estimator.sources.recording import Recording
-from bms_estimator.sources.replay import RawCapture
-from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.captures.replay import RawCapture
+from bms_estimator.sources.serial.serial_source import SerialBoard
 from tests.patience import LONG_S
 
 CELLS = 16

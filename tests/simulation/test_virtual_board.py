@@ -32,8 +32,8 @@ from bms_estimator.protocols.firmware.messages import (
 )
 from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.simulation.virtual_adc import BoardParts, Reading, window_of
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
-from bms_estimator.simulation.virtual_converter import BoardParts, Reading, window_of
 from tests.patience import LONG_S
 
 STEADY = Reading(2.5, 22.2, 25.0)

@@ -9,13 +9,13 @@ from bms_estimator.model.payloads import Alarm, LoopHealth, Snapshot
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks import Delivery
-from bms_estimator.snapshot.flow import Flow
-from bms_estimator.snapshot.health import health_report
-from bms_estimator.snapshot.parameters import parameter_report
-from bms_estimator.snapshot.remaining import remaining_charge
-from bms_estimator.snapshot.topics import estimate_report, info_report
-from bms_estimator.snapshot.totals import new_totals
-from bms_estimator.snapshot.window import Window
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.health import health_report
+from bms_estimator.telemetry.lifetime_totals import new_totals
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.state import estimate_report, info_report
 
 NOW = 1_700_000_000.0
 

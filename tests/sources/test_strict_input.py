@@ -15,9 +15,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.devices.text import TextDialect
 from bms_estimator.protocols.firmware.messages import Hello, SampleMessage, unseal
 from bms_estimator.protocols.firmware.protocol import BoardDialect
-from bms_estimator.sources.curve import read_curve
-from bms_estimator.sources.raw_capture import MAGIC, CaptureHeader, CaptureWriter, read_capture, read_header
-from bms_estimator.sources.replay import Replay, load_capture, open_capture
+from bms_estimator.sources.captures.curves import read_curve
+from bms_estimator.sources.captures.raw_capture import MAGIC, CaptureHeader, CaptureWriter, read_capture, read_header
+from bms_estimator.sources.captures.replay import Replay, load_capture, open_capture
 from tests.protocols.firmware.test_decoder_fuzz import HELLO
 
 HEAD = "time_s,current_a,voltage_v,temperature_c\n"

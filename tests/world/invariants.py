@@ -8,7 +8,7 @@ from pydantic_core import from_json
 
 from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.protocols.firmware.messages import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
-from bms_estimator.snapshot.flow import Flow
+from bms_estimator.telemetry.charge_energy import Flow
 from tests.world.broker import Connection, Packet
 
 MOST_STDS = 4.0

@@ -35,8 +35,8 @@ from bms_estimator.protocols.firmware.messages import (
     SampleMessage,
     unseal,
 )
+from bms_estimator.simulation.virtual_adc import FULL_SCALE, BoardParts, Reading, aux_readings_of, window_of
 from bms_estimator.simulation.virtual_board import FIRMWARE
-from bms_estimator.simulation.virtual_converter import FULL_SCALE, BoardParts, Reading, aux_readings_of, window_of
 from tests.world.loop import Timeline
 
 BANDGAP_READINGS = 256

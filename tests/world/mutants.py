@@ -11,7 +11,7 @@ import pytest
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.sinks.messages import Messages
-from bms_estimator.sources.doorkeeper import Doorkeeper
+from bms_estimator.sources.serial.board_check import Doorkeeper
 from bms_estimator.store.outbox_queue import Queue
 
 

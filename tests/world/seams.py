@@ -21,7 +21,7 @@ from typing import Any
 from bms_estimator.model import clock
 from bms_estimator.process import boot_clock as moment
 from bms_estimator.process.disk_thread import DiskThread
-from bms_estimator.snapshot import health
+from bms_estimator.telemetry import health
 from tests.world.disk import Disk
 from tests.world.threads import Threads
 

@@ -28,9 +28,9 @@ from bms_estimator.settings.pack import (
     Settings,
     StateSettings,
 )
-from bms_estimator.simulation.virtual_converter import BoardParts
-from bms_estimator.sources.board_memory import BoardMemory
-from bms_estimator.sources.doorkeeper import HELD_READS, Doorkeeper
+from bms_estimator.simulation.virtual_adc import BoardParts
+from bms_estimator.sources.serial.board_check import HELD_READS, Doorkeeper
+from bms_estimator.sources.serial.known_board_file import BoardMemory
 from tests.world import invariants
 from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError

@@ -6,7 +6,7 @@ import pytest
 from bms_estimator.calibration.elements.generic_prior import RESTS_STD, curve, ladder_of, most_alike
 from bms_estimator.calibration.elements.initial_elements import RestElements
 from bms_estimator.model.cell import load_cell
-from bms_estimator.sources.curve import read_curve
+from bms_estimator.sources.captures.curves import read_curve
 
 SOC = np.linspace(0.0, 1.0, 51)
 

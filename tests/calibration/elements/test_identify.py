@@ -15,7 +15,7 @@ from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps, wrong_start
 
 WARM_C, COLD_C = 25.0, -5.0

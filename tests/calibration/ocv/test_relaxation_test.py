@@ -12,7 +12,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH
 from tests.calibration.simulated_relaxation import BAD, FIRST_REST_S, LOAD_S, REST_S, glitched, relaxation
 

@@ -18,7 +18,7 @@ from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.replay import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture
 from tests.calibration.simulated_relaxation import relaxation, schedule
 from tests.calibration.simulated_slow import CAPACITY_AH, CURRENT_A, hysteresis_v, slow, true_v

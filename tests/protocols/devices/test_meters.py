@@ -18,8 +18,8 @@ from bms_estimator.protocols.devices.vedirect import VeDirectDialect
 from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.simulation.simulated_meter import METERS
-from bms_estimator.simulation.virtual_converter import Reading
-from bms_estimator.sources.serial_board import SerialBoard
+from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.sources.serial.serial_source import SerialBoard
 from tests.patience import LONG_S
 
 

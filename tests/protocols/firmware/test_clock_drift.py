@@ -12,8 +12,8 @@ import pytest
 
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import Hello, SampleMessage, unseal
-from bms_estimator.sources.raw_capture import CaptureHeader, CaptureWriter
-from bms_estimator.sources.replay import RawCapture, Replay
+from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
+from bms_estimator.sources.captures.replay import RawCapture, Replay
 from tests.protocols.firmware.test_decoder_fuzz import HELLO
 
 START_S = 1_700_000_000.0

@@ -1,0 +1,125 @@
+"""A simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5, seen through the simulated sensor chain.
+
+The pack has the open-circuit voltage of Table 8, the R_s of Table 9 and, as Fig. 29 compares with, the R_ts, R_tl, C_ts,
+C_tl of Chen and Mora: they lie within the bounds of Table 10 but not at their Lemma 4.1.3 limits. Loads are the resistors of
+5.1, whose currents are not the printed ones (E21); the bulb is the resistor that draws its printed current. The voltage goes
+through a divider, the current through a +-10 A sensor; noise is half a step either way, rounding comes on top.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.cell_model.chen_mora import cell_step, terminal_voltage
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.reports import printed_values
+from bms_estimator.reports.procedure import Capture, Kind
+
+Floats = NDArray[np.float64]
+
+VOLTAGE_RANGE_V = 30.0
+"""Of the divider. The thesis's 0-25 V sensor would saturate: the curve of Table 8 begins at 25.40 V."""
+CURRENT_RANGE_A = 20.0
+"""From -10 to +10 A."""
+MEAN_VOLTAGE_V = 23.0
+"""Of the pack over a discharge: turns the bulb's mean current into a resistance."""
+QUARTER_HOUR_S = 900.0
+LOWEST_SOC = 0.012
+"""Discharges end here, just above delta2 of the true pack."""
+VARIABLE_STEPS = ((600.0, "12.5 ohm"), (300.0, "50 W bulb"), (900.0, "12.5 ohm"), (420.0, ""), (240.0, "50 W bulb"))
+"""Test protocol 4: seconds, load; the thesis does not print its own."""
+
+
+@dataclass(frozen=True)
+class SensorChain:
+    """Divider, current sensor, converter.
+
+    Attributes:
+        bits: Of the converter: 10 for an Arduino, 16 for the dSpace board of the thesis.
+    """
+
+    bits: int
+
+    @property
+    def voltage_step_v(self) -> float:
+        """One step of the voltage [V]."""
+        return float(VOLTAGE_RANGE_V / 2**self.bits)
+
+    @property
+    def current_step_a(self) -> float:
+        """One step of the current [A]."""
+        return float(CURRENT_RANGE_A / 2**self.bits)
+
+    def read(self, samples: SampleBlock, seed: int) -> SampleBlock:
+        """What the board reports of true samples."""
+        noise = np.random.default_rng(seed)
+        seen = samples.copy()
+        for name, step in (("voltage_v", self.voltage_step_v), ("current_a", self.current_step_a)):
+            jitter = noise.uniform(-0.5, 0.5, samples.size)
+            seen[name] = np.rint(samples[name] / step + jitter) * step
+        return seen
+
+
+def pack() -> CellModel:
+    """The true pack, with what (3.18) runs with for Table 10."""
+    model, chen_mora = load_cell("thunder_power_6s"), load_cell("chen_mora")
+    elements = {name: getattr(chen_mora, name) for name in ("r_ts", "r_tl", "c_ts", "c_tl")}
+    adaptation = {f"a{i}": printed_values.bounds("10", i) for i in printed_values.BOUNDS}
+    named = model.cell.model_copy(update={"name": "simulated 6S pack"})
+    return model.model_copy(update=elements | {"cell": named, "adaptation": adaptation})
+
+
+def resistance_ohm(load: str) -> float:
+    """Of a load; infinite for none."""
+    if not load:
+        return float("inf")
+    return printed_values.RESISTORS_OHM.get(load, MEAN_VOLTAGE_V / printed_values.CURRENTS_A[load])
+
+
+def run_down(cell: CellModel, schedule: list[tuple[float, str]], step_s: float = 1.0) -> SampleBlock:
+    """A full pack under a schedule of (seconds, load) that repeats until the pack is empty, without the sensor."""
+    a, capacity_as = cell.a, cell.cell.capacity_ah * 3600.0
+    state = (1.0, 0.0, 0.0)
+    time_s, currents, voltages = 0.0, [], []
+    ends = np.cumsum([seconds for seconds, _ in schedule])
+    ohms = [resistance_ohm(load) for _, load in schedule]
+    voltage_v = float(terminal_voltage(state, 0.0, a))
+    while True:
+        ohm = ohms[int(np.searchsorted(ends, time_s % ends[-1], side="right"))]
+        current_a = voltage_v / ohm
+        if state[0] - current_a * step_s / capacity_as < LOWEST_SOC:
+            break
+        voltage_v = float(terminal_voltage(state, current_a, a))
+        currents.append(current_a)
+        voltages.append(voltage_v)
+        state = cell_step(state, current_a, step_s, capacity_as, a)
+        time_s += step_s
+    samples = np.zeros(len(currents), dtype=SAMPLE)
+    samples["time_s"] = np.arange(len(currents)) * step_s
+    samples["current_a"], samples["voltage_v"], samples["temperature_c"] = currents, voltages, np.nan
+    return samples
+
+
+def experiments() -> list[Capture]:
+    """The experiments of chapter 5 as they are: relaxation tests, constant loads, steps."""
+    cell = pack()
+    rest, pulse = (QUARTER_HOUR_S, ""), (QUARTER_HOUR_S, "12.5 ohm")
+    found = [
+        Capture(f"relaxation {load}", Kind.RELAXATION, run_down(cell, [(QUARTER_HOUR_S, load), rest]))
+        for load in printed_values.CURRENTS_A
+    ]
+    # the observer runs on the smallest current: at 5 Hz; the others only validate
+    found += [
+        Capture(load, Kind.CONSTANT, run_down(cell, [(QUARTER_HOUR_S, load)], 0.2 if load == "50 ohm" else 1.0))
+        for load in printed_values.CURRENTS_A
+    ]
+    found.append(Capture("constant steps", Kind.STEPS, run_down(cell, [rest, pulse])))
+    found.append(Capture("variable steps", Kind.STEPS, run_down(cell, list(VARIABLE_STEPS))))
+    return found
+
+
+def captures(true: list[Capture], chain: SensorChain) -> list[Capture]:
+    """The experiments as the sensor chain reports them."""
+    return [Capture(c.name, c.kind, chain.read(c.samples, seed)) for seed, c in enumerate(true)]

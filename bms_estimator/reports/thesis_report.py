@@ -1,0 +1,172 @@
+"""The whole thesis: its tables and figures in order, and how each is made."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports import (
+    errata,
+    experiment_figures,
+    experiment_tables,
+    printed_pack,
+    simulation_figures,
+    simulation_tables,
+)
+from bms_estimator.reports.experiment import Experiment, Recorded
+from bms_estimator.reports.report_items import Figure, Item, Verdict
+from bms_estimator.reports.simulation import Simulation
+
+DIAGRAMS = {
+    "1": "Chen and Mora's battery model",
+    "2": "Simulation block diagram for Chen and Mora's model",
+    "11": "Overall architecture",
+    "12": "Simulink model for simulation",
+    "18": "The three steps of the estimation",
+    "24": "Block diagram of the experimental setup",
+    "25": "Photograph of the test bench",
+    "44": "Photograph of a fuel cell",
+    "45": "Voltage of a fuel cell",
+    "46": "Voltage of a fuel cell, estimated",
+    "47": "Simulink diagram of the algorithm",
+    "48": "Simulink diagram of the adaptive model",
+    "49": "Simulink diagram of C_ts",
+    "50": "Simulink diagram of the Mittag-Leffler function",
+}
+"""Figures with nothing to compute."""
+FUEL_CELL = dict.fromkeys(
+    ("45", "46"),
+    "The recording is not published, nor are the equations of its model. The project's own model of a fuel cell, after section "
+    "7.3, is in docs/fuel-cell.md.",
+)
+
+CHAPTERS: dict[str, tuple[str, ...]] = {
+    "2  The model and the Nussbaum gain": ("F1", "F2", "F3", "F4", "F5", "F6", "F7", "F8", "F9", "F10"),
+    "3  Three schemes": ("F11", "T1", "F12", "F13", "F14", "T2", "F15", "T3", "F16", "F17", "T4"),
+    "4  The improved method": ("F18", "F19", "F20", "T5", "F21", "F22", "T6", "F23", "T7", "TTheorem 4.1.2"),
+    "5  Experiments": (
+        "F24",
+        "F25",
+        "F26",
+        "T8",
+        "F27",
+        "F28",
+        "F29",
+        "F30",
+        "T9",
+        "F31",
+        "T10",
+        "F32",
+        "F33",
+        "F34",
+        "F35",
+        "F36",
+        "F37",
+        "F38",
+    ),
+    "6  Comparison": ("F39", "T11", "T12", "F40", "T13"),
+    "7  SOC, faults, fuel cell": ("F41", "F42", "F43", "F44", "F45", "F46"),
+    "A  Simulink models": ("F47", "F48", "F49", "F50"),
+    "Errata": ("TErrata",),
+}
+"""Chapter -> its tables (T) and figures (F) in the order of the thesis."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was made.
+
+    Attributes:
+        on: What chapter 5 was run on.
+        chapters: Chapter and its items.
+    """
+
+    on: str
+    chapters: tuple[tuple[str, tuple[Item, ...]], ...]
+
+    @property
+    def items(self) -> list[Item]:
+        """All of them."""
+        return [item for _, items in self.chapters for item in items]
+
+
+def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Callable[[], Item]]:
+    """Every item's maker by its mark: T5, F19."""
+
+    def of_simulation(make: Callable[[Simulation], Item]) -> Callable[[], Item]:
+        return lambda: make(simulation)
+
+    def of_experiment(make: Callable[[Experiment], Item]) -> Callable[[], Item]:
+        return lambda: make(experiment)
+
+    found: dict[str, Callable[[], Item]] = {}
+    found |= {f"T{key}": of_simulation(make) for key, make in simulation_tables.TABLES.items()}
+    found |= {f"F{key}": of_simulation(make) for key, make in simulation_figures.FIGURES.items()}
+    found |= {f"T{key}": of_experiment(make) for key, make in experiment_tables.TABLES.items()}
+    found |= {f"F{key}": of_experiment(make) for key, make in experiment_figures.FIGURES.items()}
+    if experiment.recorded is None:  # what is printed says these without any recording
+        found |= {f"F{key}": make for key, make in printed_pack.FIGURES.items()}
+    found["TErrata"] = of_simulation(errata.table)
+    found |= {f"F{key}": _diagram(key) for key in DIAGRAMS}
+    return found
+
+
+def _diagram(key: str) -> Callable[[], Item]:
+    verdict = Verdict.NO_DATA if key in FUEL_CELL else Verdict.GIVEN
+    reason = FUEL_CELL.get(key, "A diagram or photograph: there is nothing to compute.")
+    return lambda: Figure(key, DIAGRAMS[key], "", verdict, reason)
+
+
+def build(
+    recorded: Recorded | None = None,
+    *,
+    table: str | None = None,
+    figure: str | None = None,
+    progress: Callable[[str, int, int], None] = lambda _title, _done, _total: None,
+) -> Report:
+    """Recompute the thesis, or one table or figure of it.
+
+    Args:
+        recorded: Real captures for chapter 5; None: the simulated pack.
+        table: Only this one.
+        figure: Only this one.
+        progress: Told what is made next, how many are done, of how many.
+
+    Raises:
+        UserError: No such table or figure, or captures that chapter 5 cannot be run on.
+    """
+    experiment = Experiment(recorded)
+    if recorded is not None:
+        # captures that cannot serve are refused here, not after half a minute of simulations
+        _ = experiment.protocol.r_s_fit
+    builders = _builders(Simulation(), experiment)
+    wanted = _wanted(builders, table, figure)
+    total, done = sum(len(marks) for _, marks in wanted), 0
+    chapters = []
+    for chapter, marks in wanted:
+        items = []
+        for mark in marks:
+            progress(f"{'Table' if mark[0] == 'T' else 'Figure'} {mark[1:]}", done, total)
+            items.append(builders[mark]())
+            done += 1
+        chapters.append((chapter, tuple(items)))
+    progress("done", done, total)
+    return Report(experiment.on, tuple(chapters))
+
+
+def _wanted(
+    builders: dict[str, Callable[[], Item]], table: str | None, figure: str | None
+) -> Sequence[tuple[str, tuple[str, ...]]]:
+    """Chapters and marks of what is asked for."""
+    asked = [f"T{table}"] * (table is not None) + [f"F{figure}"] * (figure is not None)
+    for mark in asked:
+        if mark not in builders:
+            raise UserError(
+                f"the thesis has no {'table' if mark[0] == 'T' else 'figure'} {mark[1:]}: tables are 1 to 13, figures 1 to 50"
+            )
+    if not asked:
+        return list(CHAPTERS.items())
+    return [
+        (chapter, tuple(mark for mark in marks if mark in asked))
+        for chapter, marks in CHAPTERS.items()
+        if set(marks) & set(asked)
+    ]

@@ -1,0 +1,108 @@
+"""A JK-BMS without hardware, as an ESPHome node publishes it by MQTT: the twin of ``source.profile = "esphome-jk"``."""
+
+import asyncio
+import random
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Self
+
+from bms_estimator.mqtt.broker_config import brokers
+from bms_estimator.mqtt.connection import Connection, Hello
+from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.reconnect_loop import Link
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.sinks import Delivery
+from bms_estimator.sinks.messages import Message
+
+INTERVAL_S = 2.0
+"""So often the node asks the BMS [s]."""
+SPREAD_V = 0.004
+"""Standard deviation of the cells among each other [V]."""
+
+
+class SimulatedNode:
+    """Publishes what a pack has at its terminals.
+
+    Args:
+        signal: What the pack has, by time [s].
+        cells: In series.
+        mqtt: The broker.
+        prefix: Name of the node.
+        speed: Its seconds per second.
+        seed: Of what its cells differ by.
+
+    Raises:
+        UserError: The broker's URL cannot be used.
+    """
+
+    def __init__(
+        self,
+        signal: Callable[[float], Reading],
+        *,
+        cells: int,
+        mqtt: MqttSettings,
+        prefix: str = "jk-bms",
+        speed: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        self._signal, self._prefix, self._speed = signal, prefix, speed
+        self._apart_v = _apart(cells, random.Random(seed))
+        self.path = f"{prefix}/sensor/+/state on {', '.join(mqtt.urls)}"
+        self.time_s = 0.0
+        """Of the last reading."""
+        self.samples = 0
+        self._end_s = 0.0
+        will = Message(f"{prefix}/status", b"offline", 1, retain=True)
+        hello = Hello(f"{prefix}-{secrets.token_hex(4)}", will, lambda *_: None)
+        self._link = Link(brokers(mqtt), hello, Dial(mqtt), self._serve, Delivery())
+
+    def __enter__(self) -> Self:
+        """Nothing to open: ``run`` connects."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to close."""
+
+    async def run(self, seconds: float) -> None:
+        """Publish for so long of its time."""
+        self._end_s = seconds
+        await self._link.run()
+
+    async def _serve(self, connection: Connection) -> None:
+        """While the broker is there."""
+        await self._say(connection, {"status": "online"})
+        loop = asyncio.get_running_loop()
+        offset_s = loop.time() - self.time_s / self._speed
+        while self.time_s + INTERVAL_S <= self._end_s:
+            await asyncio.sleep(max(offset_s + (self.time_s + INTERVAL_S) / self._speed - loop.time(), 0.0))
+            self.time_s += INTERVAL_S
+            said = {f"sensor/{self._prefix}_{name}/state": text for name, text in self._states()}
+            await self._say(connection, said)
+            self.samples += 1
+        await self._say(connection, {"status": "offline"})
+        self._link.closing.set()
+
+    async def _say(self, connection: Connection, states: Mapping[str, str]) -> None:
+        """Each on its topic, retained as ESPHome does."""
+        for topic, text in states.items():
+            await connection.publish(Message(f"{self._prefix}/{topic}", text.encode(), 0, retain=True))
+
+    def _states(self) -> Iterator[tuple[str, str]]:
+        """Names as in the examples of esphome-jk-bms, with the decimals of its sensors; the current is positive on charge."""
+        current_a, voltage_v, temperature_c = self._signal(self.time_s)
+        cells_v = [voltage_v / len(self._apart_v) + apart_v for apart_v in self._apart_v]
+        yield "min_cell_voltage", f"{min(cells_v):.3f}"
+        yield "max_cell_voltage", f"{max(cells_v):.3f}"
+        yield from ((f"cell_voltage_{n}", f"{v:.3f}") for n, v in enumerate(cells_v, start=1))
+        yield "total_voltage", f"{voltage_v:.2f}"
+        yield "current", f"{-current_a:.2f}"
+        yield "power", f"{-current_a * voltage_v:.2f}"
+        yield "temperature_sensor_1", f"{temperature_c:.1f}"
+
+
+def _apart(cells: int, dice: random.Random) -> Sequence[float]:
+    """What each cell has more than their mean [V]."""
+    apart_v = [dice.gauss(0.0, SPREAD_V) for _ in range(cells)]
+    mean_v = sum(apart_v) / cells
+    return [v - mean_v for v in apart_v]

@@ -1,0 +1,1 @@
+"""Samples from BMS over Bluetooth LE."""

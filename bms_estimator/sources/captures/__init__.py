@@ -1,0 +1,1 @@
+"""Samples from recorded files: raw captures and tables."""

@@ -1,0 +1,249 @@
+"""A recorded capture as a source: as fast as it goes, or paced by its time stamps."""
+
+import asyncio
+import itertools
+import math
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Protocol, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, CurrentSign, SampleBlock
+from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
+from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, sensor_of
+from bms_estimator.sources.captures.tables import READERS, ByName, Sign, samples_of, table_reader
+
+TICK_S = 0.05
+"""A paced replay hands over what has become due this often [s]."""
+
+
+class Capture(Protocol):
+    """Something recorded. Each iteration reads it from its start."""
+
+    @property
+    def fraction(self) -> float:
+        """How much has been read, 0..1."""
+
+    @property
+    def implausible(self) -> int:
+        """Readings that no pack has, handed on as not measured."""
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Blocks of samples.
+
+        Raises:
+            UserError: The file cannot be read.
+        """
+
+
+class RawCapture:
+    """The samples in the bytes of a raw capture.
+
+    Args:
+        path: What ``CaptureWriter`` wrote.
+        sensor: How to decode; None: as the capture's header says.
+        current_sign: What its current calls positive; None: as ``sensor`` says.
+
+    Attributes:
+        decoder: What the bytes have gone through so far.
+        damaged: The file has no readable record behind those that were read although it has not ended.
+        unread_bytes: So many at its end are no whole record: it was cut off there, or a length is damaged.
+
+    Raises:
+        UserError: No capture, or one of a later version.
+    """
+
+    def __init__(
+        self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
+    ) -> None:
+        recorded = sensor_of(path)
+        told = sensor or recorded
+        if told.protocol != recorded.protocol:
+            raise UserError(
+                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {told.protocol!r}: "
+                "give settings with that protocol, or none"
+            )
+        self.decoder = make_dialect(told.model_copy(update={"current_sign": current_sign or told.current_sign}))
+        self.damaged, self.unread_bytes = False, 0
+        self._path = path
+        self._read, self._size = 0, path.stat().st_size
+
+    @property
+    def fraction(self) -> float:
+        """How much has been read, 0..1; too fast where the file is packed."""
+        return min(self._read / self._size, 1.0)
+
+    @property
+    def implausible(self) -> int:
+        """As the decoder counts them."""
+        return self.decoder.counters["implausible"]
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Blocks of samples, as ``Capture`` says."""
+        for batch in read_capture(self._path):
+            self._read += batch.data.size + RECORD_OVERHEAD_BYTES * batch.ends.size
+            self.damaged, self.unread_bytes = batch.damaged, batch.unread_bytes
+            block = self.decoder.feed_reads(batch.arrivals_s, batch.ends, batch.data)
+            if block.size:
+                yield block
+
+
+class Replay:
+    """Source of the samples of a capture; ends with its last one.
+
+    How the samples are cut into blocks never shows in the estimates.
+
+    Args:
+        capture: What is replayed.
+        speed: Times as fast as it was recorded; None: as fast as it goes.
+        longest_s: As fast as it goes, blocks are cut so that none lasts longer on the samples' clock [s].
+        monotonic: Monotonic clock [s].
+    """
+
+    message: str | None = None
+    """There is always a sample."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        *,
+        speed: float | None = None,
+        longest_s: float = math.inf,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.capture = capture
+        self._decoder = capture.decoder if isinstance(capture, RawCapture) else None
+        self._speed, self._longest_s, self._monotonic = speed, longest_s, monotonic
+        self.samples = 0
+        self.cells: CellBlock = NO_CELLS
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """The decoder's; of a table, how many rows came, and temperatures that are none."""
+        if self._decoder:
+            return self._decoder.counters
+        return {"frames_received": self.samples, "implausible": self.capture.implausible}
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the board said of itself when it was recorded."""
+        return self._decoder.board if self._decoder else {}
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock ran when it was recorded; a table does not tell."""
+        return self._decoder.clock_ppm if self._decoder else None
+
+    async def __aenter__(self) -> Self:
+        """Nothing to open: iterating does."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Nothing to close."""
+
+    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+        """Blocks of samples, none of them empty."""
+        async for block in self._at_once() if self._speed is None else self._paced(self._speed):
+            self.samples += block.size
+            yield block
+
+    async def _at_once(self) -> AsyncIterator[SampleBlock]:
+        for block in self.capture:
+            cells = self._cells()
+            for part in _parts(block["time_s"], self._longest_s):
+                self.cells = cells[part]
+                yield block[part]
+
+    def _cells(self) -> CellBlock:
+        """Beside the capture's last block."""
+        return self._decoder.cells if self._decoder else NO_CELLS
+
+    async def _paced(self, speed: float) -> AsyncIterator[SampleBlock]:
+        """Each sample once its time has come; the first comes at once."""
+        start_s, last_s, elapsed_s = self._monotonic(), math.nan, 0.0
+        for block in self.capture:
+            due_s = elapsed_s + _elapsed(block["time_s"], last_s)
+            first = 0
+            while first < block.size:
+                now_s = speed * (self._monotonic() - start_s)
+                end = int(np.searchsorted(due_s, now_s, side="right"))
+                if end > first:
+                    self.cells = self._cells()[first:end]
+                    yield block[first:end]
+                    first = end
+                else:
+                    await asyncio.sleep(min((due_s[first] - now_s) / speed + TICK_S, 1.0))
+            last_s, elapsed_s = float(block["time_s"][-1]), float(due_s[-1])
+
+
+def _parts(time_s: NDArray[np.float64], longest_s: float) -> Iterator[slice]:
+    """Where a block is cut so that no part lasts longer."""
+    if math.isinf(longest_s):
+        yield slice(None)
+        return
+    number = np.floor(_elapsed(time_s, float(time_s[0])) / longest_s)
+    edges = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), time_s.size]
+    for first, end in itertools.pairwise(edges):
+        yield slice(first, end)
+
+
+def _elapsed(time_s: NDArray[np.float64], last_s: float) -> NDArray[np.float64]:
+    """Time since ``last_s`` [s]; steps back and stamps that are not finite take none."""
+    steps = np.diff(time_s, prepend=last_s)
+    return np.cumsum(np.where(np.isfinite(steps), steps, 0.0).clip(min=0.0))
+
+
+def open_capture(
+    path: Path, sensor: SensorSettings | None = None, *, current_sign: CurrentSign | None = None
+) -> Capture:
+    """A capture: a table by the end of its name, else a raw capture by its first bytes.
+
+    Args:
+        path: The file.
+        sensor: How to decode raw bytes, and what the current of a table calls positive unless its format lays that
+            down; None: as the header of raw bytes says, and discharge.
+        current_sign: What its current calls positive, whatever ``sensor``, header and format say.
+
+    Raises:
+        UserError: No such file, or it is neither.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: {'is a directory' if path.is_dir() else 'no such file'}")
+    table = table_reader(path, Sign(current_sign, sensor.current_sign) if sensor else Sign(current_sign))
+    if table is not None:
+        return table
+    if is_capture(path):
+        return RawCapture(path, sensor, current_sign)
+    raise UserError(f"{path}: neither a raw capture nor a table; the name of a table ends in {', '.join(READERS)}")
+
+
+def load_capture(source: str | Path | ByName, *, current_sign: CurrentSign | None = None) -> Columns:
+    """All samples of a capture in memory.
+
+    Args:
+        source: Path of a raw capture or of a table (CSV, gzipped CSV, Parquet), or a table in memory: a DataFrame, a
+            dict of arrays. A table has our columns or the Battery Data Format's.
+        current_sign: What its current calls positive, ``discharge_positive`` or ``charge_positive``; None: as its
+            format says, else discharge.
+
+    Returns:
+        ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor) and
+        ``status``, bits of ``SampleStatus``.
+
+    Raises:
+        UserError: There is no such file, it cannot be read, or a column is missing; no such sign.
+    """
+    if current_sign not in (None, *get_args(CurrentSign)):
+        raise UserError(f"current_sign = {current_sign!r}: must be one of {', '.join(get_args(CurrentSign))}")
+    if not isinstance(source, str | Path):
+        return Columns(samples_of(source, Sign(current_sign)), "capture")
+    path = Path(source)
+    blocks = [block.copy() for block in open_capture(path, current_sign=current_sign)]
+    return Columns(np.concatenate(blocks) if blocks else np.zeros(0, dtype=SAMPLE), path.name)

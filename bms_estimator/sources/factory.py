@@ -1,0 +1,43 @@
+"""Which source ``[source]`` asks for. A kind is one file here and a row in ``KINDS``; it is imported when it is asked for."""
+
+import importlib
+from collections.abc import Mapping
+
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.line_source import Bringer, Reports
+from bms_estimator.sources.source import Tap
+
+KINDS: Mapping[str, str] = {
+    "mqtt": "mqtt.mqtt_lines",
+    "linux": "linux.linux_sensor",
+    "modbus": "fieldbus.modbus",
+    "can": "fieldbus.can",
+    "ble": "bluetooth.source",
+}
+"""By ``source.kind``: a module of this package whose ``bringer(settings)`` makes what brings the values."""
+
+
+def make_bringer(settings: Settings) -> Bringer | None:
+    """What ``[source]`` asks for; None where the source is a serial line.
+
+    Raises:
+        UserError: A setting cannot be used.
+        ModuleNotFoundError: An optional package is missing.
+    """
+    if settings.source is None:
+        return None
+    module = importlib.import_module(f"{__package__}.{KINDS[settings.source.kind]}")
+    made: Bringer = module.bringer(settings)
+    return made
+
+
+def open_reports(settings: Settings, *, tap: Tap | None = None) -> Reports | None:
+    """The source that ``[source]`` asks for; None where it is a serial line.
+
+    Raises:
+        UserError, ModuleNotFoundError: As ``make_bringer``.
+    """
+    bringer = make_bringer(settings)
+    if bringer is None:
+        return None
+    return Reports(bringer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)

@@ -1,0 +1,1 @@
+"""Samples from Modbus and CAN devices."""

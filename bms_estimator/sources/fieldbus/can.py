@@ -1,0 +1,163 @@
+"""A CAN bus, by any interface that python-can has. It is listened to; nothing is ever sent."""
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import AsyncGenerator, Callable, Mapping
+from typing import Any
+
+import can
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.report_line import CONNECTED, report_line
+from bms_estimator.settings.can_source import CanSource
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.fieldbus.can_signals import CanMap
+from bms_estimator.sources.line_source import Bringer, NothingComesError
+
+LISTEN_S = 0.2
+"""So often the thread looks whether it is to end [s]."""
+CLOSE_S = 5.0
+"""An adapter may take so long to be opened or closed [s]; then it is left alone."""
+BUS_OFF = 0x40
+"""Of the identifier of an error frame: CAN_ERR_BUSOFF of linux/can/error.h."""
+
+Deliver = Callable[[bytes | Exception], None]
+
+
+class CanBringer(Bringer):
+    """Listens to a bus in a thread of its own: most adapters can only be waited for.
+
+    Args:
+        settings: Of the bus.
+
+    Raises:
+        UserError: There is no such interface, or the DBC file does not fit.
+    """
+
+    def __init__(self, settings: CanSource) -> None:
+        if settings.interface not in can.VALID_INTERFACES:
+            known = ", ".join(sorted(can.VALID_INTERFACES))
+            raise UserError(f"source.interface = {settings.interface!r}: python-can has {known}")
+        logging.getLogger("can").setLevel(logging.CRITICAL)  # what it says is said here, once
+        self._settings = settings
+        self._map = CanMap(settings)
+        self._junk = self._error_frames = 0
+        self._is_off = False
+
+    @property
+    def name(self) -> str:
+        """Which bus."""
+        return self._settings.described
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Since start: the map's, ``error_frames``, and ``junk`` that an adapter sent for a frame."""
+        return {**self._map.counters, "error_frames": self._error_frames, "junk": self._junk}
+
+    @property
+    def fault(self) -> str | None:
+        """What does not come."""
+        if self._is_off:
+            return "the controller is bus off: are bitrate, wiring and termination right?"
+        missing = self._map.missing
+        return missing and f"connected, but nothing comes of {missing}: are identifiers, bitrate and wiring right?"
+
+    async def bring(self) -> AsyncGenerator[bytes, None]:
+        """One line for each voltage and current."""
+        loop, stop = asyncio.get_running_loop(), threading.Event()
+        heard: asyncio.Queue[bytes | Exception] = asyncio.Queue()
+
+        def deliver(item: bytes | Exception) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(heard.put_nowait, item)
+
+        thread = threading.Thread(target=self._listen, args=(deliver, stop), name=self.name, daemon=True)
+        thread.start()
+        try:
+            while not isinstance(item := await heard.get(), Exception):
+                yield item
+            raise item
+        finally:
+            stop.set()
+            await asyncio.to_thread(thread.join, CLOSE_S)
+
+    def _listen(self, deliver: Deliver, stop: threading.Event) -> None:
+        """Hand on lines until the bus is lost, and then why. In the thread."""
+        try:
+            bus = self._open()
+            try:
+                deliver(CONNECTED)
+                while not stop.is_set():
+                    self._take(self._next(bus), deliver)
+            finally:
+                with contextlib.suppress(Exception):  # of an adapter that is gone
+                    bus.shutdown()
+        except Exception as error:  # noqa: BLE001 - it belongs to who waits for lines
+            deliver(error)
+
+    def _open(self) -> can.BusABC:
+        """Raises: NothingComesError: It cannot be opened."""
+        settings = self._settings
+        further: dict[str, Any] = {**settings.options}
+        if settings.bitrate is not None:
+            further["bitrate"] = settings.bitrate
+        filters = [
+            {"can_id": place.id, "can_mask": 0x1FFF_FFFF if place.extended else 0x7FF, "extended": place.extended}
+            for place in self._map.places
+        ]
+        try:
+            return can.Bus(
+                interface=settings.interface,
+                channel=settings.channel,
+                can_filters=filters,
+                ignore_config=True,
+                **further,
+            )
+        except Exception as error:  # each interface raises what its library does
+            raise NothingComesError(f"cannot be opened: {error}") from error
+
+    def _next(self, bus: can.BusABC) -> can.Message | None:
+        """The next frame, if one comes soon.
+
+        Raises:
+            NothingComesError: The bus is lost.
+        """
+        try:
+            return bus.recv(LISTEN_S)
+        except ValueError:  # slcan: a line that is no frame
+            self._junk += 1
+            return None
+        except Exception as error:  # as of _open
+            raise NothingComesError(f"lost: {error}") from error
+
+    def _take(self, message: can.Message | None, deliver: Deliver) -> None:
+        if message is None or message.is_remote_frame:
+            return
+        self._is_off = message.is_error_frame and bool(message.arbitration_id & BUS_OFF)
+        if message.is_error_frame:
+            self._error_frames += 1
+        elif message.dlc != len(message.data):  # slcan: a frame that has lost characters
+            self._junk += 1
+        elif (line := self._line(message)) is not None:
+            deliver(line)
+
+    def _line(self, message: can.Message) -> bytes | None:
+        """What is whole with this frame."""
+        data = bytes(message.data)
+        reading = self._map.feed(time.monotonic(), message.arbitration_id, message.is_extended_id, data)
+        return reading and report_line(
+            reading.voltage_v, reading.current_a, temperature_c=reading.temperature_c, cells_v=reading.cells_v
+        )
+
+
+def bringer(settings: Settings) -> CanBringer:
+    """What ``[source]`` asks for.
+
+    Raises:
+        UserError: As ``CanBringer``.
+    """
+    assert isinstance(settings.source, CanSource)  # noqa: S101 - as KINDS has it
+    return CanBringer(settings.source)

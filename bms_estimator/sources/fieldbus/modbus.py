@@ -1,0 +1,201 @@
+"""A Modbus device, over the network or over a serial line: asked for its registers again and again."""
+
+import asyncio
+import logging
+import termios
+from collections.abc import AsyncGenerator, Mapping, Sequence
+
+import structlog
+from pymodbus import FramerType
+from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
+from pymodbus.exceptions import ModbusException
+
+from bms_estimator.protocols.base.report_line import CONNECTED, report_line
+from bms_estimator.settings.modbus_source import ModbusSource
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.fieldbus.modbus_registers import Request, Table, plan, reading_of, split, values_of
+from bms_estimator.sources.line_source import Bringer, NothingComesError
+
+Client = AsyncModbusSerialClient | AsyncModbusTcpClient
+
+NO_SUCH_REGISTER = (1, 2, 3)
+"""Exceptions of the protocol, section 7, that asking again does not mend: illegal function, data address, data value."""
+_EXCEPTIONS = {
+    1: "illegal function: the device has no registers of this table",
+    2: "illegal data address: the device has no such register",
+    3: "illegal data value: the device does not give so many registers",
+    4: "server device failure",
+    5: "acknowledged, but not done yet",
+    6: "server device busy",
+    8: "memory parity error",
+    10: "gateway path unavailable: is source.unit right?",
+    11: "gateway target device failed to respond: is source.unit right?",
+}
+
+log = structlog.get_logger(__name__)
+
+
+class _RefusedError(Exception):
+    """The device answers with an exception: its code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(_EXCEPTIONS.get(code, f"exception {code}"))
+        self.code = code
+
+
+class ModbusBringer(Bringer):
+    """Asks a device for its registers.
+
+    Quantities that a device refuses are found by asking for each by itself: without voltage or current nothing comes;
+    temperature and cells are left out.
+
+    Args:
+        settings: Of the device.
+    """
+
+    def __init__(self, settings: ModbusSource) -> None:
+        logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # what it says is said here, once
+        self._settings, self._values = settings, values_of(settings)
+        self._requests: Sequence[Request] = ()
+        self._refused: set[str] = set()
+        self._counters = {"refused": 0, "not_measured": 0}
+        self._fault: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Where the device is."""
+        return self._settings.described
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Since start: answers that were exceptions, readings without voltage or current."""
+        return self._counters
+
+    @property
+    def fault(self) -> str | None:
+        """That the device answers, but measures nothing."""
+        return self._fault
+
+    async def bring(self) -> AsyncGenerator[bytes, None]:
+        """One line for each poll. After a late or missing answer the line is opened anew: no answer is taken for another's."""
+        self._requests = plan(self._values)
+        client = _client(self._settings)
+        try:
+            await self._connect(client)
+            words = await self._read(client)
+            yield CONNECTED
+            loop = asyncio.get_running_loop()
+            next_s = loop.time()
+            while True:
+                if line := self._line(words):
+                    yield line
+                next_s = max(next_s + self._settings.poll_s, loop.time())  # polls that were missed are not made up for
+                await asyncio.sleep(next_s - loop.time())
+                words = await self._read(client)
+        finally:
+            client.close()
+
+    async def _connect(self, client: Client) -> None:
+        """Raises: NothingComesError: It cannot be reached."""
+        what = "no connection" if self._settings.port is None else "the port cannot be opened"
+        try:
+            if not await client.connect():
+                raise NothingComesError(what)
+        except (ValueError, termios.error) as error:  # pyserial, of a baud rate or a device that is no serial port
+            raise NothingComesError(f"{what}: {error}") from None
+
+    def _line(self, words: Mapping[tuple[Table, int], int]) -> bytes | None:
+        """What the registers say; None where it is not voltage and current."""
+        reading = reading_of(self._values, words)
+        if reading is None:
+            self._counters["not_measured"] += 1
+            self._fault = "it answers, but measures no voltage or no current (absent, or not a number)"
+            return None
+        self._fault = None
+        return report_line(
+            reading.voltage_v, reading.current_a, temperature_c=reading.temperature_c, cells_v=reading.cells_v
+        )
+
+    async def _read(self, client: Client) -> Mapping[tuple[Table, int], int]:
+        """What all registers hold that are wanted.
+
+        Raises:
+            NothingComesError: No answer, or none with voltage and current.
+        """
+        words: dict[tuple[Table, int], int] = {}
+        waiting, done = list(self._requests), list[Request]()
+        while waiting:
+            request = waiting.pop(0)
+            try:
+                answer = await self._ask(client, request)
+            except _RefusedError as error:
+                waiting = [*self._instead(request, error), *waiting]
+                continue
+            words |= {(request.table, request.address + i): word for i, word in enumerate(answer)}
+            done.append(request)
+        self._requests = done
+        return words
+
+    def _instead(self, request: Request, error: _RefusedError) -> Sequence[Request]:
+        """What is asked for in place of a request that was refused.
+
+        Raises:
+            NothingComesError: There is no reading without it.
+        """
+        self._counters["refused"] += 1
+        if error.code in NO_SUCH_REGISTER:
+            parts = split(request)
+            if parts != (request,):
+                return parts
+            if not any(value.needed for value in request.values):
+                self._leave_out(request, error)
+                return ()
+        raise NothingComesError(f"{request.described}: {error}")
+
+    def _leave_out(self, request: Request, error: _RefusedError) -> None:
+        """Say so once."""
+        if request.described not in self._refused:
+            self._refused.add(request.described)
+            log.warning("left out", source=self.name, what=request.described, reason=str(error))
+
+    async def _ask(self, client: Client, request: Request) -> Sequence[int]:
+        """Raises: NothingComesError: No answer. _RefusedError: An exception came."""
+        read = client.read_input_registers if request.table == "input" else client.read_holding_registers
+        try:
+            answer = await read(request.address, count=request.words, device_id=self._settings.unit)
+        except ModbusException:
+            timeout_s = self._settings.timeout_s
+            raise NothingComesError(f"no answer within {timeout_s:g} s, asked for {request.described}") from None
+        if answer.isError():
+            raise _RefusedError(answer.exception_code)
+        if len(answer.registers) != request.words:
+            raise NothingComesError(f"{len(answer.registers)} registers came, asked for {request.described}")
+        return answer.registers
+
+
+def _client(settings: ModbusSource) -> Client:
+    """Not connected yet. It neither asks nor connects again by itself."""
+    if settings.port is None:
+        return AsyncModbusTcpClient(
+            settings.host or "",
+            port=settings.tcp_port,
+            framer=FramerType.RTU if settings.framing == "rtu" else FramerType.SOCKET,
+            timeout=settings.timeout_s,
+            reconnect_delay=0,
+            retries=0,
+        )
+    return AsyncModbusSerialClient(
+        settings.port,
+        baudrate=settings.baud,
+        parity=settings.parity[0].upper(),
+        stopbits=settings.stop_bits,
+        timeout=settings.timeout_s,
+        reconnect_delay=0,
+        retries=0,
+    )
+
+
+def bringer(settings: Settings) -> ModbusBringer:
+    """What ``[source]`` asks for."""
+    assert isinstance(settings.source, ModbusSource)  # noqa: S101 - as KINDS has it
+    return ModbusBringer(settings.source)

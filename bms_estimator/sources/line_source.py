@@ -1,0 +1,222 @@
+"""Sources that are no serial line: what brings values is a ``Bringer``; all else is the same for each of them."""
+
+import asyncio
+import contextlib
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from typing import Self
+
+import structlog
+
+from bms_estimator.model.clock import since_boot
+from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.sources.fault_log import FaultLog
+from bms_estimator.sources.serial.serial_port import FIRST_RETRY_S, LONGEST_RETRY_S, Read
+from bms_estimator.sources.source import Pulse, Tap
+
+LOOK_S = 1.0
+"""Often enough for a line of the log [s]."""
+SILENT_PERIODS = 3.0
+"""Without a sample for so many of the periods at which they are expected something is at fault."""
+
+log = structlog.get_logger(__name__)
+
+
+class NothingComesError(Exception):
+    """What is measured cannot be reached, or was lost; the message says why, for people. It may come yet."""
+
+
+class Bringer(ABC):
+    """The I/O part of a source that is no serial line."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What is read, for people: begins the messages."""
+
+    @abstractmethod
+    def bring(self) -> AsyncGenerator[bytes, None]:
+        """Connect; then ``CONNECTED``, and lines as ``report_line`` makes them, as they come.
+
+        Called again, after a pause, when it has ended or raised. It never blocks the event loop, and is closed at the end.
+
+        Raises:
+            NothingComesError, OSError: It cannot be reached, or was lost.
+        """
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Faults of what came, by kind, since start: what could not be read or used."""
+        return {}
+
+    @property
+    def fault(self) -> str | None:
+        """Why no line comes though it is connected, for people; None where nobody knows."""
+        return None
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the device said of itself."""
+        return {}
+
+
+class Reports:
+    """Async source of SAMPLE blocks from a bringer, which is begun anew whenever it ends.
+
+    All that makes a sample passes ``dialect.feed(arrival_s, line)``: a capture of these calls replays to the same bits.
+
+    Args:
+        bringer: What brings lines.
+        sensor: Sign of the current; ``protocol`` must be ``text``.
+        period_s: Between two samples, as expected [s].
+        tap: Gets the same (arrival time, line) as the dialect.
+        wall: Wall clock [s since 1970].
+        monotonic: Monotonic clock [s].
+        first_retry_s: Before what is missing or lost is tried again; doubles with each attempt [s].
+        look_s: So often is looked whether samples come [s].
+    """
+
+    def __init__(
+        self,
+        bringer: Bringer,
+        sensor: SensorSettings,
+        *,
+        period_s: float = 1.0,
+        tap: Tap | None = None,
+        wall: Callable[[], float] = time.time,
+        monotonic: Callable[[], float] = since_boot,
+        first_retry_s: float = FIRST_RETRY_S,
+        look_s: float = LOOK_S,
+    ) -> None:
+        self._bringer, self._dialect, self._tap = bringer, make_dialect(sensor), tap
+        self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
+        self._look_s, self._silent_s = look_s, SILENT_PERIODS * max(period_s, look_s)
+        self._first_retry_s, self._retry_s = first_retry_s, 0.0
+        self._lines: asyncio.Queue[Read | None] = asyncio.Queue()
+        self._message: str | None = "not opened yet"
+        self._said = ""
+        self._openings, self._connected = 0, False
+        self._tended_s = self._heard_s = monotonic()
+        self._arrived_s = math.nan  # of the last block's line, on the clock of the arrivals
+        self._faults = FaultLog()
+        self._task: asyncio.Task[None] | None = None
+        self._watcher: asyncio.Task[None] | None = None
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """The dialect's and the bringer's, ``reconnects``, and of a tap ``missed_reads``."""
+        counters = {**self._dialect.counters, **self._bringer.counters, "reconnects": max(self._openings - 1, 0)}
+        return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
+
+    @property
+    def message(self) -> str | None:
+        """Why no samples come; None when they do."""
+        return self._message
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the device said of itself."""
+        return self._bringer.board
+
+    @property
+    def cells(self) -> CellBlock:
+        """Beside the samples of the last block."""
+        return self._dialect.cells
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """Nobody knows."""
+        return self._dialect.clock_ppm
+
+    current_zero: None = None
+    """There is no zero to be set."""
+    relay: None = None
+    """Nor is there a relay."""
+
+    def pulse(self) -> Pulse:
+        """Whether somebody still looks after what is brought."""
+        now_s = self._monotonic()
+        return Pulse(now_s - self._tended_s, self._epoch_s + now_s - self._arrived_s, self._lines.qsize())
+
+    async def __aenter__(self) -> Self:
+        """Begin to have lines brought; nothing need be there yet."""
+        self._task = asyncio.create_task(self._have_brought(), name=self._bringer.name)
+        self._task.add_done_callback(lambda _: self._lines.put_nowait(None))
+        self._watcher = asyncio.create_task(self._watch(), name=f"watch {self._bringer.name}")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Have no more brought."""
+        tasks: set[asyncio.Task[None]] = {task for task in (self._watcher, self._task) if task is not None}
+        while tasks:  # wait_for of Python 3.11, in what a bringer calls, may swallow that it is to end
+            for task in tasks:
+                task.cancel()
+            _done, tasks = await asyncio.wait(tasks, timeout=LOOK_S)
+
+    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+        """Blocks as lines come. What the tap gets is what has been yielded."""
+        while (read := await self._lines.get()) is not None:
+            block = self._decode(*read)
+            if block.size:
+                self._arrived_s = read[0]
+                self._message, self._said, self._retry_s = None, "", self._first_retry_s
+                yield block
+        if self._task is not None and not self._task.cancelled():
+            self._task.result()
+
+    def _decode(self, arrival_s: float, line: bytes) -> SampleBlock:
+        if self._tap is not None:
+            self._tap.write(arrival_s, line)
+        block = self._dialect.feed(arrival_s, line)
+        if block.size:
+            self._heard_s = self._monotonic()
+        return block
+
+    async def _have_brought(self) -> None:
+        """Take what is brought, and begin anew. Only a fault of ours ends it: who iterates is given that."""
+        while True:
+            await self._pause()
+            reason = "it ended"
+            try:
+                async with contextlib.aclosing(self._bringer.bring()) as lines:
+                    async for line in lines:
+                        self._take(line)
+            except (NothingComesError, OSError) as error:
+                reason = str(error)
+            self._connected = False
+            self._say(f"{self._bringer.name}: {reason}; trying again")
+
+    async def _pause(self) -> None:
+        """Each one is longer until a sample came."""
+        wait_s, self._retry_s = self._retry_s, min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
+        await asyncio.sleep(wait_s)
+
+    def _take(self, line: bytes) -> None:
+        if line != CONNECTED:
+            self._lines.put_nowait((self._epoch_s + self._monotonic(), line))
+            return
+        self._openings += 1
+        self._connected, self._heard_s = True, self._monotonic()
+        self._message = f"{self._bringer.name}: connected, nothing has come yet"
+        log.info("connected", source=self._bringer.name)
+
+    async def _watch(self) -> None:
+        """Say why nothing comes; have faults logged."""
+        while True:
+            self._tended_s = now_s = self._monotonic()
+            if self._connected and now_s - self._heard_s >= self._silent_s:
+                why = self._bringer.fault or self._dialect.fault or "connected, but silent"
+                self._say(f"{self._bringer.name}: {why}")
+            self._faults.see(self.counters, now_s)
+            await asyncio.sleep(self._look_s)
+
+    def _say(self, message: str) -> None:
+        """Say why no samples come; in the log once for each reason, until samples come."""
+        if message != self._said:
+            log.warning("no samples", reason=message)
+        self._message = self._said = message

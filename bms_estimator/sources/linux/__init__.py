@@ -1,0 +1,1 @@
+"""Samples from sensors that the Linux kernel reads."""

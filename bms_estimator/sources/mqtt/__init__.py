@@ -1,0 +1,1 @@
+"""Samples from readings that others publish over MQTT."""

@@ -1,0 +1,1 @@
+"""Samples from a serial port, with a check of the board."""

@@ -1,0 +1,180 @@
+"""Whether the board on the line is the pack's: the one that was told, or remembered, or with which this run began.
+
+Another board has another divider: its voltages would be wrong by several percent, and nothing else would tell.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from threading import Thread
+
+import structlog
+
+from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, REMEMBERED, BoardMemory
+from bms_estimator.sources.serial.serial_port import Read
+
+HELD_READS = 4096
+"""So many reads are kept for a board that has not told its serial number yet: seconds at any rate."""
+
+RETRY_S = 60.0
+"""So often is looked whether the disk has the board, and it is written where it has not [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+class OtherBoardError(Exception):
+    """The board's serial number is not that of the pack's."""
+
+
+class Doorkeeper:
+    """Lets the reads of one board pass; those of a port opened anew wait until its serial number is known.
+
+    Args:
+        make: A dialect that hears them meanwhile.
+        serial: Of the pack's board, as the settings have it; empty: as remembered, else of the first board that comes.
+        memory: What outlives a restart; None: nothing does.
+    """
+
+    def __init__(self, make: Callable[[], Dialect], serial: str = "", memory: BoardMemory | None = None) -> None:
+        self._make, self._told, self._memory = make, serial, memory
+        self._known: Mapping[str, str] = memory.load() if memory else {}
+        self._kept = self._known  # on disk
+        self._nameless = self._looking = self._keeping = self._failed = self._refused = False
+        self._tried_s = -math.inf
+        self.stranger: Dialect | None = None
+        """What hears a board that is not known yet."""
+        self._held = deque[Read]()
+        self.unadmitted_bytes = 0
+        """Of boards that were refused, of ports lost before their board was known, and of reads that found no room."""
+
+    @property
+    def serial(self) -> str:
+        """Of the pack's board; empty: any may come."""
+        return self._told or self._known.get("serial", "")
+
+    def opened(self) -> None:
+        """The port was opened anew."""
+        self.stranger = self._make() if self.serial else None
+        self._refused = False
+        self._drop(self._held)
+        self._held.clear()
+
+    def look_again(self) -> None:
+        """Soon take note when somebody has accepted another board. A file that is gone tells nothing of the kind."""
+        if self._memory and not self._looking:
+            self._looking = True
+            Thread(target=self._look, args=(self._memory,), daemon=True).start()
+
+    def _look(self, memory: BoardMemory) -> None:
+        """In a thread of its own: a disk that hangs holds up nothing."""
+        try:
+            if memory.load() == NO_BOARD:
+                self._known = self._kept = NO_BOARD
+        finally:
+            self._looking = False
+
+    def admit(self, read: Read, dialect: Dialect) -> Sequence[Read]:
+        """The reads that ``dialect``, which hears the pack's board, may be fed now.
+
+        Raises:
+            OtherBoardError: Neither this one nor those after it, until the port is opened anew.
+        """
+        if self._refused:
+            self._drop((read,))
+            return ()
+        if self.stranger is None:
+            if self.serial and (swapped := dialect.serial_in(read[1])) is not None:
+                self._check(swapped, (read,))
+            return (read,)
+        if len(self._held) == HELD_READS:
+            self._drop((self._held.popleft(),))
+        self._held.append(read)
+        self.stranger.feed(*read)
+        if not self.stranger.board:
+            return ()
+        held = list(self._held)
+        self._held.clear()
+        self._check(self.stranger.board.get("serial", ""), held)
+        self.stranger = None
+        return held
+
+    def know(self, board: Mapping[str, str], now_s: float) -> None:
+        """Samples of ``board`` are taken: it is the pack's from now on. What has changed is said, and remembered.
+
+        Args:
+            board: What it says of itself.
+            now_s: Monotonic clock [s].
+        """
+        if not board:
+            return
+        if not board.get("serial"):
+            self._say_nameless()
+            return
+        before, self._known = self._known, {name: board.get(name, "") for name in REMEMBERED}
+        if self._known != before:
+            self._say_new(before)
+            self._tried_s = -math.inf
+        self._remember(now_s)
+
+    def _say_new(self, before: Mapping[str, str]) -> None:
+        changes = [name for name in REMEMBERED if before.get(name) and before[name] != self._known[name]]
+        if changes:
+            changed = {name: f"{before[name]} to {self._known[name]}" for name in changes}
+            log.warning(
+                "the board is calibrated differently" if "serial" not in changes else "another board", **changed
+            )
+        else:
+            log.info("this is the pack's board from now on", **self._known)
+
+    def _remember(self, now_s: float) -> None:
+        """A disk that hangs holds up nothing; one that failed, or lost the file, is tried again while samples come."""
+        if self._memory is None or self._keeping or now_s - self._tried_s < RETRY_S:
+            return
+        self._keeping, self._tried_s = True, now_s
+        Thread(target=self._keep, args=(self._memory, self._known), daemon=True).start()
+
+    def _keep(self, memory: BoardMemory, board: Mapping[str, str]) -> None:
+        """In a thread of its own."""
+        try:
+            if board != self._kept or memory.is_gone():
+                memory.keep(board)
+            self._kept, self._failed = board, False
+        except OSError as error:
+            if not self._failed:
+                log.warning("the board cannot be remembered yet", file=str(memory.path), reason=str(error))
+            self._failed = True
+        finally:
+            self._keeping = False
+
+    def _drop(self, reads: Iterable[Read]) -> None:
+        self.unadmitted_bytes += sum(len(data) for _, data in reads)
+
+    def _check(self, found: str, reads: Sequence[Read]) -> None:
+        """Let the board that has sent ``reads`` in.
+
+        Raises:
+            OtherBoardError: It is another.
+        """
+        if found == self.serial:
+            return
+        self._refused = True
+        self._drop(reads)
+        accept = (
+            "or set sensor.serial to its number"
+            if self._told
+            else f"or, if it takes its place, run `{self._memory.how_to_forget}` with the pack's settings file"
+            if self._memory
+            else "or start anew"
+        )
+        raise OtherBoardError(
+            f"board {found or 'without a serial number'} is not the pack's, {self.serial}: plug that in, {accept}"
+        )
+
+    def _say_nameless(self) -> None:
+        if not self._nameless:
+            self._nameless = True
+            log.warning(
+                "the board has no serial number: another in its place would not be noticed",
+                hint="give it one with `bms-estimator board --serial`",
+            )

@@ -1,0 +1,243 @@
+"""Asks whoever is on a serial port, one thing at a time: who is there, and a board for its hello and to keep a setting."""
+
+import itertools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self, TypeVar
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.protocols.devices.text import TextDialect
+from bms_estimator.protocols.firmware.frame_decoder import FrameFault
+from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command
+from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardDialect
+from bms_estimator.protocols.registry import DIALECTS
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.sources.serial.port_list import NoPortError, open_port
+
+if TYPE_CHECKING:
+    import serial
+
+PATIENCE_S = 3.0
+"""A board that was reset by the opening of its port spends two seconds in its boot loader [s]."""
+EACH_S = 1.5
+"""So much longer takes a baud rate for each protocol that is tried at it, in turns with the others [s]."""
+TURN_S = 0.3
+"""For an answer before another protocol's question goes out [s]."""
+READ_S = 0.1
+"""A read waits so long [s]."""
+READ_BYTES = 4096
+REFERENCE_RATE_HZ = 100
+"""The firmware's own: the bandgap is measured in every second sample, or in each without an NTC."""
+REFERENCE_SAMPLES = 300
+"""Of them the noise of the bandgap's mean is 0.03 %."""
+REFERENCE_S = 10.0
+"""So long may they take [s]."""
+
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True)
+class Found:
+    """Who answers on a port."""
+
+    protocol: str
+    baud: int
+    described: str
+    """For people."""
+    cells: int | None = None
+    """In series, where they are told."""
+
+    def __str__(self) -> str:
+        """What it is, and how it is spoken to unless it is a board at the firmware's own rate."""
+        usual = self.baud == BAUD and self.protocol in ("binary", "text")
+        return self.described if usual else f"{self.described}; protocol {self.protocol}, {self.baud} baud"
+
+
+def probe(port: str, baud: int | None = None) -> Found | str:
+    """Who is on ``port``, or for people why nobody is known to be.
+
+    A board of the firmware is looked for first. Then every protocol that ``sensor.protocol`` knows is tried at its own baud
+    rate, one question at a time: questions only, which change nothing, and settings stay as they are.
+
+    Args:
+        port: Device path; opened for ourselves alone.
+        baud: Try everything at this rate [1/s]; None: each at its own.
+    """
+    rates = _rates() if baud is None else {baud: list(DIALECTS)}
+    silence = "silent"
+    BoardDialect().feed(0.0, b"\0\n")  # loads its kernel: nothing compiles while an answer is waited for
+    try:
+        with open_port(port, next(iter(rates)), READ_S) as line:
+            for rate, protocols in rates.items():
+                line.baudrate = rate
+                line.reset_input_buffer()
+                dialects = {name: _prober(name) for name in protocols}
+                patience_s = PATIENCE_S if rate == BAUD and baud is None else EACH_S * len(dialects)
+                if (found := _ask_in_turns(line, dialects, patience_s)) is not None:
+                    return Found(found, rate, *_described(dialects[found]))
+                if silence == "silent":
+                    silence = _silence(list(dialects.values()))
+    except NoPortError as error:
+        return str(error).removeprefix(f"{port}: ")
+    except OSError as error:
+        return f"lost: {error}"
+    return silence
+
+
+def _rates() -> Mapping[int, Sequence[str]]:
+    """Protocols by baud rate, the firmware's first, then from the fastest down; text is read at any."""
+    rates: dict[int, list[str]] = {BAUD: []}
+    for name in DIALECTS:
+        rates.setdefault(SensorSettings.model_validate({"protocol": name}).baud, []).append(name)
+    for protocols in rates.values():
+        if "text" not in protocols:
+            protocols.append("text")
+    return {rate: rates[rate] for rate in sorted(rates, key=lambda rate: (rate != BAUD, -rate))}
+
+
+def _prober(protocol: str) -> Dialect:
+    dialect = DIALECTS[protocol](SensorSettings.model_validate({"protocol": protocol}))
+    dialect.probing = True
+    return dialect
+
+
+def _ask_in_turns(line: "serial.Serial", dialects: Mapping[str, Dialect], patience_s: float) -> str | None:
+    """Have all hear, and one of them ask at a time. Returns the protocol of the first that knows who is there.
+
+    Raises:
+        OSError: The port is lost.
+    """
+    turns, next_s = itertools.cycle(dialects.values()), 0.0
+    end_s = time.monotonic() + patience_s
+    while (now_s := time.monotonic()) < end_s:
+        if now_s >= next_s:
+            questions = (dialect.due(now_s) for dialect in itertools.islice(turns, len(dialects)))
+            if question := next(filter(None, questions), b""):
+                line.write(question)
+                next_s = now_s + TURN_S
+        data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
+        for name, dialect in dialects.items():
+            dialect.feed(now_s, data)
+            if dialect.described:
+                return name
+    return None
+
+
+def _described(dialect: Dialect) -> tuple[str, int | None]:
+    """What it is, and its cells."""
+    return dialect.described or "", dialect.cells.shape[1] or None
+
+
+class AskedBoard:
+    """A board that does nothing but answer; a context manager.
+
+    Args:
+        port: Device path; opened for ourselves alone.
+        baud: Of the board [1/s].
+
+    Raises:
+        NoPortError: The port cannot be opened.
+    """
+
+    def __init__(self, port: str, baud: int = BAUD) -> None:
+        self._port, self._line = port, open_port(port, baud, ASK_AGAIN_S)
+        self._board, self._text = BoardDialect(), TextDialect()
+
+    def __enter__(self) -> Self:
+        """The board."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the port."""
+        self._line.close()
+
+    def hello(self) -> Hello:
+        """What the board says of itself, after the last command.
+
+        Raises:
+            UserError: No board answers; the message says what is there instead.
+        """
+        return self._ask([self._board, self._text], lambda: self._board.hello)
+
+    def tell(self, frame: bytes) -> Hello:
+        """Give a command that may be given twice. Returns the hello after it.
+
+        Raises:
+            UserError: The board refuses, or does not answer.
+        """
+        command = self._board.tell(frame)
+        self._ask([self._board, self._text], lambda: command.done or None)
+        if command.refusal:
+            raise UserError(f"{self._port}: {command.refusal}")
+        return self.hello()
+
+    def reference_v(self) -> float:
+        """Full range of its converter as its bandgap tells now [V]; what it measured at its reset may be long ago.
+
+        The board samples at ``REFERENCE_RATE_HZ`` from then on.
+
+        Raises:
+            UserError: As ``tell``.
+        """
+        hello = self.tell(set_rate_command(REFERENCE_RATE_HZ))
+        now = BoardDialect()
+        now.feed(0.0, replace(hello, bandgap_sum=0, bandgap_count=0).encode())
+
+        def measured() -> float | None:
+            return now.reference_v if now.counters["frames_received"] >= REFERENCE_SAMPLES else None
+
+        return self._ask([now], measured, REFERENCE_S)
+
+    def _ask(
+        self, dialects: Sequence[Dialect], answer: Callable[[], Answer | None], patience_s: float | None = None
+    ) -> Answer:
+        """The answer.
+
+        Raises:
+            UserError: There is none.
+        """
+
+        def answer_or_text() -> Answer | None:
+            if self._text.described:
+                raise UserError(f"{self._port}: {FrameFault.TEXT.value}; it takes no commands")
+            return answer()
+
+        try:
+            answered = _converse(self._line, dialects, answer_or_text, patience_s)
+        except OSError as error:
+            raise UserError(f"{self._port}: lost: {error}") from None
+        if answered is None:
+            raise UserError(f"{self._port}: {_silence(dialects)}")
+        return answered
+
+
+def _converse(
+    line: "serial.Serial",
+    dialects: Sequence[Dialect],
+    answer: Callable[[], Answer | None],
+    patience_s: float | None = None,
+) -> Answer | None:
+    """Have dialects hear and talk until there is an answer; None where none comes.
+
+    Raises:
+        OSError: The port is lost.
+    """
+    end_s = time.monotonic() + (PATIENCE_S if patience_s is None else patience_s)
+    while (now_s := time.monotonic()) < end_s:
+        if (answered := answer()) is not None:
+            return answered
+        for dialect in dialects:
+            line.write(dialect.due(now_s))
+        data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
+        for dialect in dialects:
+            dialect.feed(now_s, data)
+    return answer()
+
+
+def _silence(dialects: Sequence[Dialect]) -> str:
+    """Why none of them knows who is there."""
+    if not dialects[0].counters["bytes_received"]:
+        return "silent"
+    return next((dialect.fault for dialect in dialects if dialect.fault), "no board answers")

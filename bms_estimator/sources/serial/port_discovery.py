@@ -1,0 +1,66 @@
+"""Where a board may be: on the port that is named or, known by its serial number, on any that may be a board's."""
+
+import math
+import os
+import time
+from collections.abc import Callable
+
+from bms_estimator.sources.serial.port_list import NoPortError, board_ports, resolve_port
+
+LEFT_S = 60.0
+"""A port with another board is not opened again for so long while there are others: opening may reset who is there [s]."""
+HELD_S = 1.0
+"""One that cannot be opened is tried again after so long: who held it may have looked for a board, too [s]."""
+
+
+class Whereabouts:
+    """Which port is tried next.
+
+    Args:
+        port: Device path, or ``auto``.
+        monotonic: Monotonic clock [s].
+
+    Attributes:
+        may_stay: Whether a device that tells nothing is waited for on the port that was chosen last. Else it may be
+            somebody else's: it is left soon.
+    """
+
+    def __init__(self, port: str, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._port, self._monotonic = port, monotonic
+        self._left: dict[str, tuple[float, float]] = {}  # path: when it was left, until when it is
+        self.may_stay = True
+
+    def next(self, serial: str) -> str:
+        """Device path to open now.
+
+        Args:
+            serial: Of the board that is looked for; empty: there is no way to know it on another port.
+
+        Raises:
+            NoPortError: There is none.
+        """
+        if not serial:
+            self.may_stay = True
+            return resolve_port(self._port)
+        there = board_ports()
+        if self._port == "auto":
+            home = there if len(there) == 1 else []
+        else:
+            home = [self._port] if os.path.exists(self._port) else []  # noqa: PTH110 - as in ``resolve_port``
+        known = {os.path.realpath(path) for path in home}
+        places, now_s = home + [path for path in there if os.path.realpath(path) not in known], self._monotonic()
+        if not places:
+            resolve_port(self._port)  # says why
+        self._left = {path: times for path, times in self._left.items() if path in places}
+        never = (-math.inf, -math.inf)
+        fresh = [path for path in places if self._left.get(path, never)[1] <= now_s] or home
+        if not fresh:
+            raise NoPortError(f"{self._port}: board {serial} is not there, nor on {', '.join(places)}")
+        chosen = min(fresh, key=lambda path: self._left.get(path, never)[0])  # each has its turn
+        self.may_stay = chosen in home
+        return chosen
+
+    def leave(self, path: str, seconds: float) -> None:
+        """Try the other ports first for so long."""
+        now_s = self._monotonic()
+        self._left[path] = now_s, now_s + seconds

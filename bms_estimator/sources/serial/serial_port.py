@@ -1,0 +1,141 @@
+"""A serial line: opened with pyserial, read when its descriptor has bytes, opened again when it is lost.
+
+Knows no protocol.
+"""
+
+import asyncio
+import os
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import structlog
+
+from bms_estimator.model.clock import since_boot
+from bms_estimator.sources.serial.port_list import HeldPortError, NoPortError
+
+if TYPE_CHECKING:
+    import serial
+
+FIRST_RETRY_S = 0.5
+"""Before a missing or lost port is tried again; doubles with each attempt [s]."""
+LONGEST_RETRY_S = 10.0
+READ_BYTES = 1 << 16
+
+Read = tuple[float, bytes]
+"""Arrival [s since 1970], bytes."""
+
+log = structlog.get_logger(__name__)
+
+
+class Line:
+    """A port, its bytes as they come, and what is sent.
+
+    Arrival times are the wall clock at start plus a clock that never steps since; it goes on while the machine sleeps.
+
+    Args:
+        open_next: Opens the port, wherever it is: its path, and the port.
+        say: Is told why the port is not open.
+        wall: Wall clock [s since 1970].
+        monotonic: Monotonic clock [s].
+        first_retry_s: Before a missing or lost port is tried again [s].
+
+    Attributes:
+        openings: How often it was opened.
+        lost: Set when the port has died, or by who wants it closed.
+    """
+
+    def __init__(
+        self,
+        open_next: Callable[[], tuple[str, "serial.Serial"]],
+        *,
+        say: Callable[[str], None],
+        wall: Callable[[], float] = time.time,
+        monotonic: Callable[[], float] = since_boot,
+        first_retry_s: float = FIRST_RETRY_S,
+    ) -> None:
+        self._open_next, self._say = open_next, say
+        self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
+        self._first_retry_s, self._retry_s = first_retry_s, 0.0
+        self._reads: asyncio.Queue[Read | None] = asyncio.Queue()
+        self._port: serial.Serial | None = None
+        self.openings = 0
+        self.lost = asyncio.Event()
+
+    @property
+    def now_s(self) -> float:
+        """On the clock of the arrivals [s since 1970]."""
+        return self._epoch_s + self._monotonic()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether bytes can be sent."""
+        return self._port is not None
+
+    @property
+    def waiting(self) -> int:
+        """Reads that nobody has taken yet."""
+        return self._reads.qsize()
+
+    async def open(self) -> str:
+        """Path of the port as soon as it can be opened; each attempt waits longer until one was ``good``."""
+        while True:
+            await asyncio.sleep(self._retry_s)
+            self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
+            try:
+                path, self._port = self._open_next()
+            except HeldPortError as error:  # who holds it is looked for: samples of other packs must not wait
+                reason = await asyncio.to_thread(str, error)
+            except (NoPortError, OSError) as error:
+                reason = str(error)
+            else:
+                break
+            self._say(f"waiting for {reason}")
+        self.openings += 1
+        self.lost.clear()
+        self._reads.put_nowait((self.now_s, b""))
+        asyncio.get_running_loop().add_reader(self._port.fileno(), self._read, self._port.fileno())
+        return path
+
+    def good(self) -> None:
+        """What is on the line is what was looked for: when it is lost it is looked for at once."""
+        self._retry_s = self._first_retry_s
+
+    def close(self) -> None:
+        """Close the port; it may be opened again."""
+        if self._port is not None:
+            asyncio.get_running_loop().remove_reader(self._port.fileno())
+            self._port.close()
+            self._port = None
+
+    def end(self) -> None:
+        """Let who reads come to an end."""
+        self._reads.put_nowait(None)
+
+    async def read(self) -> Read | None:
+        """What came next; without bytes where the port was opened, None at the end."""
+        return await self._reads.get()
+
+    def send(self, data: bytes) -> None:
+        """Write. What a dying port does not take is lost."""
+        if self._port is None or not data:
+            return
+        try:
+            os.write(self._port.fileno(), data)
+        except OSError as error:
+            log.warning("not sent", reason=str(error))
+
+    def _read(self, descriptor: int) -> None:
+        """The descriptor has bytes, or has died."""
+        arrival_s = self.now_s
+        try:
+            data = os.read(descriptor, READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            asyncio.get_running_loop().remove_reader(descriptor)
+            self.lost.set()
+            return
+        self._reads.put_nowait((arrival_s, data))

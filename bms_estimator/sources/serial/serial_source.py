@@ -1,0 +1,316 @@
+"""The board on a serial port, whatever it speaks: line and dialect tied together."""
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Self
+
+import structlog
+
+from bms_estimator.model.clock import since_boot
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.protocols.base.device_protocol import Command, Dialect
+from bms_estimator.protocols.firmware.messages import Relay
+from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.sources.fault_log import FaultLog
+from bms_estimator.sources.serial.board_check import Doorkeeper, OtherBoardError
+from bms_estimator.sources.serial.known_board_file import BoardMemory
+from bms_estimator.sources.serial.port_discovery import HELD_S, LEFT_S, Whereabouts
+from bms_estimator.sources.serial.port_list import NoPortError, open_port
+from bms_estimator.sources.serial.serial_port import FIRST_RETRY_S, Line, Read
+from bms_estimator.sources.source import Pulse, Tap
+
+if TYPE_CHECKING:
+    import serial
+
+TALK_S = 0.25
+"""So often is sent what is due [s]."""
+TALKS = 4
+"""After so many is looked whether samples come."""
+SILENT_S = 3.0
+"""Without a frame for so long the line is at fault [s], ..."""
+SILENT_PERIODS = 3.0
+"""... and of a slower device for so many of its periods."""
+ANSWER_S = 4.0
+"""A board measures for a second before it answers a command [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+class SerialBoard:
+    """Async source of SAMPLE blocks from a board.
+
+    All that makes a sample passes ``dialect.feed(arrival_s, data)``: a capture of these calls replays to the same bits.
+    It stays with the pack's board, and looks for it on other ports, as ``Doorkeeper`` and ``Whereabouts`` say.
+
+    Args:
+        settings: Port, protocol, baud rate, sample rate.
+        memory: Remembers the pack's board, if it can tell its serial number; None: it is known for this run only.
+        tap: Gets the same (arrival time, bytes) as the dialect.
+        wall: Wall clock [s since 1970].
+        monotonic: Monotonic clock [s].
+        first_retry_s: Before a missing or lost port is tried again [s].
+        silent_s: Without a frame for so long the line is at fault [s].
+    """
+
+    def __init__(
+        self,
+        settings: SensorSettings,
+        *,
+        memory: BoardMemory | None = None,
+        tap: Tap | None = None,
+        wall: Callable[[], float] = time.time,
+        monotonic: Callable[[], float] = since_boot,
+        first_retry_s: float = FIRST_RETRY_S,
+        silent_s: float = SILENT_S,
+    ) -> None:
+        self._settings, self._tap = settings, tap
+        slow_s = settings.period_s or 0.0
+        self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
+        self._monotonic = monotonic
+        make_dialect(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
+        self._dialect = make_dialect(settings)
+        tells_serial = settings.protocol == "binary"  # what prints text could never be told from another
+        self._door = Doorkeeper(lambda: make_dialect(settings), settings.serial or "", memory if tells_serial else None)
+        self._where = Whereabouts(settings.port, monotonic)
+        self._line = Line(
+            self._open_next,
+            say=self._say,
+            wall=wall,
+            monotonic=monotonic,
+            first_retry_s=first_retry_s,
+        )
+        self._message: str | None = "not opened yet"
+        self._openings = 0  # of the line, as far as its reads have been taken
+        self._refused = False  # the message says why what is on the port is not taken
+        self._path = ""  # of the port that is open
+        self._tended_s = monotonic()  # when the task last turned
+        self._arrived_s = math.nan  # of the last block's bytes, on the line's clock
+        self._faults = FaultLog()
+        self._decoded = asyncio.Event()
+        self._asking = asyncio.Lock()
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """The dialect's, ``unadmitted_bytes`` of the doorkeeper, ``reconnects``, and of a tap ``missed_reads``."""
+        counters = {
+            **self._dialect.counters,
+            "unadmitted_bytes": self._door.unadmitted_bytes,
+            "reconnects": max(self._line.openings - 1, 0),
+        }
+        return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
+
+    @property
+    def message(self) -> str | None:
+        """Why no samples come; None when they do."""
+        return self._message
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the board said of itself."""
+        return self._dialect.board
+
+    @property
+    def cells(self) -> CellBlock:
+        """Beside the samples of the last block."""
+        return self._dialect.cells
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock runs than the monotonic one."""
+        return self._dialect.clock_ppm
+
+    def pulse(self) -> Pulse:
+        """Whether line and task live."""
+        now_s = self._line.now_s
+        return Pulse(self._monotonic() - self._tended_s, now_s - self._arrived_s, self._line.waiting)
+
+    async def __aenter__(self) -> Self:
+        """Begin to open the port; it need not be there yet."""
+        self._task = asyncio.create_task(self._stay_open(), name="serial board")
+        self._task.add_done_callback(lambda _: self._line.end())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close the port."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+
+    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+        """Blocks as the descriptor brings them.
+
+        What the tap gets is what has been yielded: nothing is recorded that the caller has not taken.
+        """
+        while (read := await self._line.read()) is not None:
+            for arrival_s, data in self._admit(read):
+                block = self._decode(arrival_s, data)
+                if block.size:
+                    self._arrived_s = arrival_s
+                    if self._message is not None:
+                        self._message, self._refused = None, False
+                        self._line.good()
+                    yield block
+        if self._task is not None and not self._task.cancelled():
+            self._task.result()
+
+    def _admit(self, read: Read) -> Sequence[Read]:
+        """The reads that are decoded now."""
+        if not read[1]:
+            self._openings += 1
+            self._dialect.opened()
+            self._door.opened()
+            return ()
+        try:
+            return self._door.admit(read, self._dialect)
+        except OtherBoardError as error:
+            self._leave(f"{self._path}: refused: {error}")
+            return ()
+
+    def _leave(self, message: str) -> None:
+        """What is on the port is not taken: look elsewhere."""
+        self._say(message)
+        self._refused = True
+        self._where.leave(self._path, LEFT_S)
+        self._line.lost.set()
+
+    @property
+    def _listener(self) -> Dialect:
+        """Who hears the device that has been heard last."""
+        return self._door.stranger or self._dialect
+
+    def _send_due(self) -> None:
+        """Send what is due to the device that has been heard last, if it is the one on the port now."""
+        if self._openings == self._line.openings and not self._line.lost.is_set():
+            self._line.send(self._listener.due(self._line.now_s))
+
+    def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
+        if self._tap is not None:
+            self._tap.write(arrival_s, data)
+        block = self._dialect.feed(arrival_s, data)
+        self._decoded.set()
+        return block
+
+    async def current_zero(self) -> None:
+        """Have the board take the present current as zero, for good: nothing may flow meanwhile.
+
+        Samples after it are decoded with the new zero. Somebody must iterate over the blocks meanwhile.
+
+        Raises:
+            UserError: The board is not connected, takes no commands, does not answer, or refuses.
+        """
+        await self._ask(lambda: self._dialect.command("current_zero"))
+
+    async def relay(self, relay: Relay) -> None:
+        """Have the board set its relay pin; somebody must iterate over the blocks meanwhile.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
+        await self._ask(lambda: self._dialect.relay(relay))
+
+    async def _ask(self, ask: Callable[[], Command]) -> None:
+        """Have a command given, after those before it, and wait for its answer.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
+        async with self._asking:
+            await self._answer(ask())
+
+    async def _answer(self, command: Command) -> None:
+        """Wait for the answer to a command.
+
+        Raises:
+            UserError: As ``current_zero``.
+        """
+        try:
+            if not self._line.is_open:
+                raise UserError(f"the board is not connected: {self._message}")
+            self._send_due()
+            async with asyncio.timeout(ANSWER_S):
+                while not command.done:
+                    self._decoded.clear()
+                    await self._decoded.wait()
+        except TimeoutError:
+            raise UserError(f"the board has not answered within {ANSWER_S:.0f} s") from None
+        finally:
+            command.done = True
+        if command.refusal:
+            raise UserError(command.refusal)
+
+    def _open_next(self) -> tuple[str, "serial.Serial"]:
+        """Open the port on which the board may be.
+
+        Raises:
+            NoPortError: There is none, or it cannot be opened.
+        """
+        path = self._where.next(self._door.serial)
+        try:
+            return path, open_port(path, self._settings.baud)
+        except NoPortError:
+            self._where.leave(path, HELD_S)
+            raise
+
+    async def _stay_open(self) -> None:
+        """Open, attend until lost, and again."""
+        while True:
+            if self._refused:
+                self._door.look_again()
+            path = self._path = await self._line.open()
+            try:
+                await self._attend(path)
+            finally:
+                self._line.close()
+            if not self._refused:
+                self._say(f"{path}: lost, opening it again")
+
+    async def _attend(self, path: str) -> None:
+        """Watch the line until it is lost."""
+        if not self._refused:
+            self._message = f"{path}: open, no frame yet"
+            log.info("port opened", port=path, baud=self._settings.baud)
+        heard_s, frames = self._monotonic(), self._dialect.counters["frames_received"]
+        while not self._line.lost.is_set():
+            await self._talk()
+            now_s = self._monotonic()
+            counters = self._dialect.counters
+            if counters["frames_received"] != frames:
+                heard_s, frames = now_s, counters["frames_received"]
+                self._door.know(self.board, now_s)
+            elif self._refused:
+                continue
+            elif fault := self._listener.fault:
+                self._say_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
+            elif now_s - heard_s >= max(self._silent_s, self._listener.quiet_s):
+                self._say_or_leave(f"{path}: open, but silent")
+            self._faults.see(counters, now_s)
+
+    def _say_or_leave(self, message: str) -> None:
+        """Say why no samples come, and look elsewhere where the board only might be."""
+        if self._where.may_stay:
+            self._say(message)
+        else:
+            self._leave(message)
+
+    async def _talk(self) -> None:
+        """Send what falls due, until it is time to look whether samples come or the line is lost."""
+        for _ in range(TALKS):
+            self._tended_s = self._monotonic()
+            self._send_due()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(TALK_S):
+                    await self._line.lost.wait()
+                    return
+
+    def _say(self, message: str) -> None:
+        """Say why no samples come, once for each reason."""
+        self._tended_s = self._monotonic()
+        if message != self._message:
+            log.warning("no samples", reason=message)
+        self._message, self._refused = message, False

@@ -1,0 +1,64 @@
+"""Where samples come from: serial boards, captures, tables."""
+
+from collections.abc import AsyncIterator, Mapping
+from typing import NamedTuple, Protocol, Self
+
+from bms_estimator.model.sample import CellBlock, SampleBlock
+
+
+class Pulse(NamedTuple):
+    """Whether what brings samples lives."""
+
+    untended_s: float
+    """Since its task last looked after the line, or tried to open it [s]."""
+    late_s: float
+    """Since the bytes of the block that came last were read [s]."""
+    waiting: int
+    """Reads of the line that nobody has taken yet."""
+
+
+class Tap(Protocol):
+    """Takes all that the dialect is fed, as ``Recording`` does. Does not wait, and raises nothing."""
+
+    @property
+    def missed_reads(self) -> int:
+        """Reads of the line that it could not take."""
+
+    def write(self, arrival_s: float, data: bytes) -> None:
+        """Take one read of the line."""
+
+
+class Source(Protocol):
+    """An async iterator of SAMPLE blocks that knows its faults.
+
+    A serial board never ends by itself; a capture or a table ends with its last row.
+    """
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Since start: ``frames_received``, ``frames_lost``, ``crc_errors``, ``reconnects`` and faults by kind."""
+
+    @property
+    def message(self) -> str | None:
+        """Why no samples come, for people; None when they do."""
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """What the board said of itself in its hello; empty when there was none."""
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """How much faster the board's clock runs than the host's [1e-6]; None while unknown."""
+
+    @property
+    def cells(self) -> CellBlock:
+        """Beside the samples of the block that came last; ``NO_CELLS`` where no cells are measured."""
+
+    def __aiter__(self) -> AsyncIterator[SampleBlock]:
+        """Blocks of samples, none of them empty."""
+
+    async def __aenter__(self) -> Self:
+        """Open."""
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close."""

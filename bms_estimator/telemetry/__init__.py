@@ -1,0 +1,1 @@
+"""Published payloads from the state of the estimator: state, parameters, health, alarms, info."""

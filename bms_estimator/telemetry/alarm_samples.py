@@ -1,0 +1,120 @@
+"""Samples that wait to be judged, and the times between them."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.kernels.step import GAP_RATIO
+from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
+from bms_estimator.telemetry.alarm_state import Floats
+
+WAITING_ROWS = 256
+"""Initial capacity of a buffer [rows]."""
+RECENT_STEPS = 4.0
+"""A long step is usual until this multiple of it has passed without another one of about its length."""
+_NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
+"""``_extremes`` of a sample without cell voltages."""
+
+
+@dataclass
+class Steps:
+    """Times between samples. Between two samples a value is assumed to hold, unless there is a gap.
+
+    A gap is much longer than the longest step shortly before. Samples that come in bursts have one long step for each
+    burst: from the second on these are no gaps.
+
+    Attributes:
+        gap_s: Minimum length of a gap [s].
+    """
+
+    gap_s: float
+    _last_s: float = math.nan
+    _step_s: float = math.inf
+    _longest_s: float = 0.0
+    """Longest recent step [s]."""
+    _longest_at_s: float = -math.inf
+    """When a step of about this length was last seen [s]."""
+
+    def of(self, times_s: Floats) -> tuple[Floats, Floats]:
+        """Shape (n,) each: the time before each sample [s], 0 where the clock was set back; and 0 in gaps, too."""
+        passed_s = np.diff(times_s, prepend=self._last_s)
+        passed_s = np.where(passed_s > 0.0, passed_s, 0.0)
+        before_s = np.concatenate(([self._step_s], passed_s[:-1]))
+        seen_s = np.where(passed_s > np.maximum(self.gap_s, GAP_RATIO * before_s), 0.0, passed_s)
+        for i in np.flatnonzero(passed_s > self.gap_s).tolist():
+            if self._is_usual(float(times_s[i]), float(passed_s[i])):
+                seen_s[i] = passed_s[i]
+        self._last_s, self._step_s = float(times_s[-1]), float(passed_s[-1]) or self._step_s
+        return passed_s, seen_s
+
+    def _is_usual(self, at_s: float, step_s: float) -> bool:
+        """Return whether a step of about this length was seen recently, and record this one."""
+        is_recent = abs(at_s - self._longest_at_s) <= RECENT_STEPS * self._longest_s
+        is_usual = is_recent and step_s <= GAP_RATIO * self._longest_s
+        if not is_recent or step_s >= self._longest_s:
+            self._longest_s, self._longest_at_s = step_s, at_s
+        elif GAP_RATIO * step_s >= self._longest_s:
+            self._longest_at_s = at_s
+        return is_usual
+
+
+class Waiting:
+    """Samples that wait, with the estimator's trace of them and the extremes of their cell voltages.
+
+    Attributes:
+        size: Number of samples.
+    """
+
+    def __init__(self) -> None:
+        self._samples, self._traces, self._extremes = _Rows(SAMPLE), _Rows(TRACE), _Rows(np.float64, (3,))
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return self._samples.size
+
+    def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock) -> None:
+        """Append a block."""
+        self._samples.add(block, block.size)
+        self._traces.add(trace, trace.size)
+        self._extremes.add(_extremes(cells) if len(cells) == block.size else _NO_EXTREMES, block.size)
+
+    def take(self) -> tuple[SampleBlock, TraceBlock, Floats]:
+        """Remove and return all samples of known time, the trace, and lowest and highest cell voltage [V] and their number."""
+        samples, trace, extremes_v = self._samples.take(), self._traces.take(), self._extremes.take()
+        known = np.isfinite(samples["time_s"])
+        return (samples, trace, extremes_v) if known.all() else (samples[known], trace, extremes_v[known])
+
+
+class _Rows:
+    """Buffer of rows of one dtype, written in place because joining hundreds of short structured arrays takes milliseconds."""
+
+    def __init__(self, dtype: Any, columns: tuple[int, ...] = ()) -> None:
+        self._rows = np.zeros((WAITING_ROWS, *columns), dtype=dtype)
+        self.size = 0
+
+    def add(self, values: Any, count: int) -> None:
+        """Append ``count`` rows."""
+        end = self.size + count
+        if end > len(self._rows):
+            more = np.zeros((end, *self._rows.shape[1:]), dtype=self._rows.dtype)
+            self._rows = np.concatenate((self._rows, more))
+        self._rows[self.size : end] = values
+        self.size = end
+
+    def take(self) -> Any:
+        """Remove and return all rows; valid until the next call of ``add``."""
+        rows, self.size = self._rows[: self.size], 0
+        return rows
+
+
+def _extremes(cells: CellBlock) -> Floats:
+    """Lowest and highest cell voltage of each sample [V], NaN where there is none, and their number. Shape (n, 3)."""
+    if not cells.shape[1]:
+        return np.tile(_NO_EXTREMES, (len(cells), 1))
+    measured = np.count_nonzero(np.isfinite(cells), axis=1)
+    return np.stack((np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1), measured), axis=1)

@@ -1,0 +1,65 @@
+"""What was learned of a fuel cell, each parameter with its error."""
+
+import math
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell_model.fuel_cell import ACTIVATION, NAMES, TAFEL
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.payloads import Parameter
+from bms_estimator.telemetry.state import finite
+
+VALID_STD = 0.3
+"""An element or parameter known better than this, relative, is identified."""
+
+
+def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parameter]:
+    """The values of ``[fuel_cell]`` as they are learned now, at the file's temperature.
+
+    Args:
+        estimator: Of a fuel cell, after a sample; read only.
+        now_s: Wall clock [s since 1970].
+    """
+    a, covariance = estimator.state[0]["a"], ln_covariance(estimator)
+    std = np.sqrt(np.diagonal(covariance))
+    found = {}
+    for j, name in enumerate(NAMES):
+        if j == ACTIVATION:
+            found["exchange_current_a"] = _exchange_current(a, covariance, now_s)
+        else:
+            found[name] = _learned(float(a[1 + j]), float(std[j]), now_s)
+    return found
+
+
+def ln_covariance(estimator: Estimator) -> np.ndarray:
+    """Covariance of the ln of what is learned, shape (n, n), by the data that are remembered and the bounds.
+
+    Information is in V^2 s; the leakage is that of bounds that are one standard deviation wide. What the model itself lacks
+    is not in it.
+    """
+    m, q = estimator.record[0]["learning"], estimator.settings_record[0]["learning"]
+    n = int(q["count"])
+    lower, leak = np.tril(m["information"][:n, :n]), q["leak_v2s"][:n]
+    information = lower + np.tril(lower, -1).T + np.diag(leak)
+    return float(leak[0] * q["upper"][0] ** 2) * np.linalg.inv(information)
+
+
+def _exchange_current(a: np.ndarray, covariance: np.ndarray, now_s: float) -> Parameter:
+    """e^(-a / A): its ln varies with those of a and A by -a / A and a / A."""
+    ln_i_0 = -float(a[1 + ACTIVATION] / a[1 + TAFEL])
+    along = np.zeros(covariance.shape[0])
+    along[ACTIVATION], along[TAFEL] = ln_i_0, -ln_i_0
+    return _learned(math.exp(ln_i_0), math.sqrt(along @ covariance @ along), now_s)
+
+
+def _learned(value: float, ln_std: float, now_s: float) -> Parameter:
+    valid = ln_std < VALID_STD
+    return Parameter(
+        value=finite(value),
+        std=finite(value * ln_std),
+        valid=valid,
+        source="identified",
+        updated=iso_utc(now_s),
+        reason=None if valid else f"known to {ln_std:.0%} so far, valid below {VALID_STD:.0%}",
+    )

@@ -1,0 +1,131 @@
+"""Topics ``state`` and ``info`` from what the estimator left: pure functions."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator import __version__
+from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.payloads import PAYLOAD_VERSION, Estimate, Info
+from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.publish_window import WindowSummary
+from bms_estimator.telemetry.remaining_charge import RemainingCharge
+
+
+def finite(value: float) -> float | None:
+    """The value as a float, or None where it is NaN or infinite."""
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def estimate_report(
+    window: WindowSummary,
+    remaining: RemainingCharge,
+    counters: Mapping[str, int],
+    now_s: float,
+    flow: Flow,
+    capacity_ah: float | None,
+) -> Estimate:
+    """Topic ``state``.
+
+    Args:
+        window: What came since the last publication.
+        remaining: What is left in the pack.
+        counters: The source's.
+        now_s: Wall clock [s since 1970].
+        flow: What has gone through the terminals.
+        capacity_ah: Of the pack, rated; None of a fuel cell.
+    """
+    values = zip(
+        TRACE.names or (), window.last.item(), strict=True
+    )  # plain numbers: a field of a record costs as much as a sum
+    last = {name: value if math.isfinite(value) else None for name, value in values}
+    soc = last["soc"]
+    return Estimate(
+        time=iso_utc(window.arrival_s),
+        publish_time=iso_utc(now_s),
+        board_time_s=last["time_s"],
+        voltage_v=window.voltage_v,
+        current_a=window.current_a,
+        power_w=window.power_w,
+        temperature_c=finite(window.temperature_c),
+        **_cells(window.cells_v),
+        soc=soc,
+        soc_percent=None if soc is None else 100.0 * soc,
+        soc_std=last["soc_std"],
+        soc_coulomb=last["soc_coulomb"],
+        soc_ocv=last["soc_ocv"],
+        remaining_capacity_ah=finite(remaining.capacity_ah),
+        usable_capacity_ah=finite(remaining.usable_ah),
+        remaining_energy_wh=finite(remaining.energy_wh),
+        time_to_empty_s=finite(remaining.time_to_empty_s),
+        time_to_full_s=finite(remaining.time_to_full_s),
+        **flow._asdict(),
+        equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
+        voltage_estimate_v=last["voltage_estimate_v"],
+        innovation_v=last["innovation_v"],
+        tracking_error_v=last["tracking_error_v"],
+        delta_1=last["delta_1"],
+        delta_2=last["delta_2"],
+        delta_configured=last["adaptation_gain_hz"] is not None and last["delta_1"] is not None,
+        stability_margin=last["stability_margin"],
+        adaptive_gain_k=last["k"],
+        nussbaum_gain=last["nussbaum_gain"],
+        adaptation_gain_hz=last["adaptation_gain_hz"],
+        converged=bool(last["converged"]),
+        lock=bool(last["lock"]),
+        frames_received=counters.get("frames_received", 0),
+        frames_lost=counters.get("frames_lost", 0),
+        crc_errors=counters.get("crc_errors", 0),
+        sample_rate_hz=finite(window.sample_rate_hz),
+    )
+
+
+def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
+    """Fields of single cells; ``cells_v`` has shape (m,) [V], NaN where one is not known."""
+    if not (cells_v.size and np.isfinite(cells_v).any()):
+        return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))
+    lowest, highest = int(np.nanargmin(cells_v)), int(np.nanargmax(cells_v))
+    return {
+        "cell_lowest_v": float(cells_v[lowest]),
+        "cell_highest_v": float(cells_v[highest]),
+        "cell_lowest": lowest + 1,
+        "cell_highest": highest + 1,
+        "cells_v": [finite(volts) for volts in cells_v],
+    }
+
+
+def info_report(
+    settings: Settings, cell: PackModel, board: Mapping[str, str], started_s: float, *, temperature_sensor: bool
+) -> Info:
+    """Topic ``info``.
+
+    Args:
+        settings: The pack's settings.
+        cell: The pack as one object.
+        board: What the board said of itself.
+        started_s: Wall clock at start [s since 1970].
+        temperature_sensor: Whether the cell's temperature is measured.
+    """
+    learns = settings.observer.law == "learning" or not isinstance(cell, CellModel)
+    return Info(
+        device=settings.pack.name,
+        version=__version__,
+        payload_version=PAYLOAD_VERSION,
+        started=iso_utc(started_s),
+        cell=cell.cell.name,
+        capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
+        series_count=cell.cell.series_count,
+        nominal_voltage_v=cell.cell.nominal_voltage_v,
+        observer="learning" if learns else f"{settings.observer.law}, {settings.observer.nussbaum}",
+        temperature_sensor=temperature_sensor,
+        publish_rate_hz=settings.publish.rate_hz,
+        board=dict(board),
+    )

@@ -1,0 +1,228 @@
+"""Chapter 5 on captures: what each serves for, what it needs, what comes out."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports.experiment import Experiment, Recorded
+from bms_estimator.reports.experiment_figures import FIGURES
+from bms_estimator.reports.procedure import Capture, Kind, Protocol, kind_of, printed_bounds
+from bms_estimator.reports.report_items import Verdict
+from bms_estimator.reports.thesis_claims import CLAIMS, Claim, Result, claim
+from bms_estimator.sources.captures.replay import load_capture
+from tests.benchmarks import chapter5
+from tests.calibration.simulated_load import TRUTH, capture, constant, steps
+from tests.calibration.simulated_relaxation import relaxation
+
+CAPACITY_AH = TRUTH.cell.capacity_ah
+SERVES = {"relaxation": Kind.RELAXATION, "slow": Kind.CONSTANT, "constant": Kind.CONSTANT, "steps": Kind.STEPS}
+DOCUMENT = Path(__file__).parents[2] / "docs" / "chapter5.md"
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return {
+        "relaxation": relaxation(),
+        "slow": capture(constant(0.5, 24_000), soc=1.0),
+        "constant": capture(constant(1.0, 12_000), soc=1.0),
+        "steps": capture(steps(2), soc=0.98),
+    }
+
+
+def on(samples):
+    captures = [Capture(name, kind_of(name, block, CAPACITY_AH), block) for name, block in samples.items()]
+    return Protocol(TRUTH, captures, 1e-3)
+
+
+@pytest.fixture(scope="module")
+def protocol(samples):
+    return on(samples)
+
+
+@pytest.fixture(scope="module")
+def leaf(data):
+    """A capture with rests, and a 1C discharge cut out of one that charges as well."""
+    hppc, cc = (load_capture(data / "leaf" / f"{name}.csv.gz").rows for name in ("hppc_25c_from_full", "cc_1c"))
+    captures = [Capture("hppc", Kind.RELAXATION, hppc), Capture("cc", Kind.CONSTANT, chapter5.discharge(cc, 0.3))]
+    return Protocol(load_cell("leaf"), captures, 1e-3)
+
+
+@pytest.mark.parametrize("noise_a", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("name", SERVES)
+def test_kind_of_a_capture(samples, name, noise_a):
+    block = samples[name].copy()
+    block["current_a"] += noise_a * np.random.default_rng(0).standard_normal(block.size)
+    assert kind_of(name, block, CAPACITY_AH) is SERVES[name]
+
+
+def test_start_of_each_capture(protocol):
+    start = {c.name: protocol.initial_soc(c) for c in protocol.captures}
+    assert (start["relaxation"], start["constant"]) == (1.0, 1.0)
+    assert start["steps"] == pytest.approx(0.98, abs=0.01)
+
+
+def test_frozen_model_is_validated_on_other_loads(protocol):
+    """(5.3) as Table 11. The OCV of ``TRUTH`` is no (2.10): most of the error is what that form leaves of it."""
+    assert protocol.smallest.name == "slow"
+    assert [c.name for c in protocol.validating] == ["constant", "steps"]
+    found = {name: (run.mean_percent, run.max_percent) for name, run in protocol.dynamic.items()}
+    assert found["constant"] == pytest.approx((0.221, 0.687), abs=0.01)
+    assert found["steps"] == pytest.approx((0.224, 1.106), abs=0.01)
+
+
+def test_static_model_is_worse_on_every_load(protocol):
+    found = {name: run.mean_percent for name, run in protocol.static.items()}
+    assert found == pytest.approx({"slow": 0.331, "constant": 0.477, "steps": 0.262}, abs=0.01)
+    assert all(found[name] > run.mean_percent for name, run in protocol.dynamic.items())
+
+
+def test_soc_by_interpolation_lies_by_the_counted_one(protocol):
+    soc, e_o = protocol.interpolated("constant")
+    counted = protocol.dynamic["constant"].soc
+    assert 100.0 * np.sqrt(np.mean((soc - counted) ** 2)) == pytest.approx(1.15, abs=0.05)
+    assert e_o.shape == soc.shape
+
+
+@pytest.mark.parametrize("name", ["constant", "steps"])
+def test_what_validates_has_no_part_in_any_parameter(samples, name):
+    """Its voltage is off by 50 mV, and not one of a1..a21 moves."""
+    moved = samples[name].copy()
+    moved["voltage_v"][100:] += 0.05  # its first rest still tells the SOC it starts with
+    before, after = on(samples), on(samples | {name: moved})
+    assert after.a_for(name).tolist() == before.a_for(name).tolist()
+    assert after.joint_fit.a.tolist() == before.joint_fit.a.tolist()
+    assert after.dynamic[name].mean_percent > before.dynamic[name].mean_percent + 0.5
+
+
+def test_what_moves_the_others_is_what_served_step_3(samples):
+    moved = samples["constant"].copy()
+    moved["voltage_v"] += 0.05
+    before, after = on(samples), on(samples | {"constant": moved})
+    assert after.a_for("steps")[15] < before.a_for("steps")[15] - 0.005
+
+
+def test_a_load_beyond_the_thesis_s_c_rates_only_validates(samples):
+    fast = on(samples | {"constant": capture(constant(2.0, 6_000), soc=1.0)})
+    assert list(fast.r_s_curves) == ["slow", "relaxation"]
+    assert [c.name for c in fast.validating] == ["constant", "steps"]
+
+
+def test_validation_ends_where_the_lowest_point_of_all_relaxation_tests_lies(samples, protocol):
+    """A second test that ends half full takes nothing from what the first one gives."""
+    half = samples["relaxation"][: samples["relaxation"].size // 2]
+    both, alone = on(samples | {"half": half}), on(samples | {"relaxation": half})
+    assert [test.name for test in both.tests] == ["relaxation", "half"]
+    assert both.lowest_soc == protocol.lowest_soc < 0.1
+    assert alone.lowest_soc == both.tests[1].soc.min() > 0.4
+    assert both.dynamic["constant"].soc[-1] == pytest.approx(protocol.lowest_soc, abs=1e-3)
+    assert both.r_s_mean.soc.min() == pytest.approx(protocol.lowest_soc, abs=0.02)
+
+
+def test_bounds_are_the_printed_ones_scaled_by_cells_and_capacity():
+    pack = load_cell("thunder_power_6s")
+    assert printed_bounds(pack) == {name: pack.adaptation[name] for name in pack.adaptation}
+    scaled, ohm = printed_bounds(TRUTH), 6.6 / 3.0 / 6.0
+    assert scaled["a3"].limit == pytest.approx(ohm * pack.bounds(3).limit)
+    assert scaled["a9"].limit == pytest.approx(pack.bounds(9).limit / ohm)
+    assert scaled["a5"] == pack.adaptation["a5"]
+    own = TRUTH.model_copy(update={"adaptation": {"a3": pack.adaptation["a3"]}})
+    captures = [Capture(name, kind, np.empty(0)) for name, kind in SERVES.items()]
+    assert Protocol(own, captures, 1e-3).cell.bounds(3) == pack.adaptation["a3"]  # a cell file's own come first
+
+
+@pytest.mark.parametrize(
+    ("missing", "words"),
+    [(("relaxation",), "voltage relaxation test"), (("slow", "constant", "steps"), "constant load or steps")],
+)
+def test_what_is_missing_is_named(samples, missing, words):
+    captures = [Capture(name, SERVES[name], block) for name, block in samples.items() if name not in missing]
+    with pytest.raises(UserError, match=rf"needs a {words}; given: .*\)"):
+        Protocol(TRUTH, captures, 1e-3)
+
+
+def test_a_lone_constant_load_validates_and_step_2_runs_on_the_relaxation_test(leaf):
+    assert leaf.smallest.name == "hppc"
+    assert [c.name for c in leaf.validating] == ["cc"]
+
+
+@pytest.mark.parametrize(("kept", "missing"), [("steps", ("33", "34")), ("constant", ("36", "37", "38"))])
+def test_a_figure_of_a_load_that_is_missing_is_empty_and_says_so(samples, kept, missing):
+    recorded = Recorded(TRUTH, tuple((name, samples[name]) for name in ("relaxation", kept)), 1e-3)
+    experiment = Experiment(recorded)
+    drawn = {key: FIGURES[key](experiment) for key in ("33", "34", "36", "37", "38")}
+    assert {key for key, figure in drawn.items() if not figure.svg} == set(missing)
+    assert all(
+        "None of the captures is such a load." in drawn[key].reason for key in missing if key not in ("34", "36")
+    )
+    assert not any("None of the captures" in figure.reason for key, figure in drawn.items() if key not in missing)
+
+
+def test_leaf_figures(leaf):
+    """As in docs/chapter5.md."""
+    run, (soc, _) = leaf.dynamic["cc"], leaf.interpolated("cc")
+    assert (run.mean_percent, run.max_percent) == pytest.approx((0.543, 2.37), abs=0.005)
+    assert leaf.static["cc"].mean_percent == pytest.approx(0.517, abs=0.005)
+    assert 100.0 * np.sqrt(np.mean((soc - run.soc) ** 2)) == pytest.approx(2.7, abs=0.05)
+    assert 1e3 * np.sqrt(np.mean(leaf.joint_fit.residual_v**2)) == pytest.approx(5.8, abs=0.05)
+
+
+def test_leaf_verdicts(leaf):
+    found = {key: claim(key, [leaf]).verdict for key in CLAIMS}
+    fails, none = Verdict.CLAIM_FAILS, Verdict.NO_DATA
+    assert list(found.values()) == [fails, fails, none, none, fails, fails, Verdict.CLAIM_HOLDS, fails]
+
+
+def test_a_relaxation_test_that_serves_two_cells_counts_for_each(leaf):
+    """By the name of a capture the second result would stand in the first one's place."""
+    one, two = claim("RC products", [leaf]), claim("RC products", [leaf, leaf])
+    assert two.results == 2 * one.results
+    assert len(one.results) == 2
+
+
+def test_dynamic_against_static_is_their_ratio(leaf):
+    for key, limit in (("order", 1.0), ("ratio", 0.003 / 0.358)):
+        (result,) = claim(f"dynamic against static, {key}", [leaf]).results
+        assert (result.found, result.limit) == (pytest.approx(0.543 / 0.517, abs=0.01), limit)
+        assert not result.met
+
+
+@pytest.mark.parametrize(
+    ("met", "verdict"), [(0, Verdict.CLAIM_FAILS), (2, Verdict.CLAIM_FAILS), (3, Verdict.CLAIM_HOLDS)]
+)
+def test_a_claim_holds_when_it_is_met_on_more_than_half(met, verdict):
+    results = tuple(Result(f"load {i}", 1.0 if i < met else 2.0, 1.5) for i in range(4))
+    found = Claim("mean", "Table 11", "mean error at most 1.5 %", results)
+    assert (found.met, found.verdict) == (met, verdict)
+    assert found.span == {0: "2", 2: "1 to 2", 3: "1 to 2"}[met]
+    assert f"met on {met} of 4 captures (found {found.span})" in found.words
+
+
+@pytest.fixture(scope="module")
+def real_cells(shared_data):
+    return {experiment.name: chapter5.protocol(experiment) for experiment in chapter5.EXPERIMENTS}
+
+
+def test_the_document_gives_every_error_that_is_measured(real_cells):
+    """To the digits that it prints."""
+    measured = [" | ".join(row) for name, p in real_cells.items() for row in chapter5.lines(name, p)]
+    table = DOCUMENT.read_text(encoding="utf-8").split("## Errors")[1].split("\n## ")[0]
+    assert re.findall(r"^\| (.*) \|$", table, re.MULTILINE)[1:] == measured
+
+
+def test_the_document_gives_every_verdict(real_cells):
+    room = [real_cells[experiment.name] for experiment in chapter5.EXPERIMENTS if experiment.room]
+    measured = [
+        " | ".join((key, *everywhere, *at_room_temperature))
+        for (key, *everywhere), (_, *at_room_temperature) in zip(
+            chapter5.outcomes(list(real_cells.values())), chapter5.outcomes(room), strict=True
+        )
+    ]
+    table = DOCUMENT.read_text(encoding="utf-8").split("## Verdicts")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (.*) \|$", table, re.MULTILINE)
+    first = rows.index(measured[0])
+    assert rows[first : first + len(CLAIMS)] == measured
+    assert rows[-len(chapter5.STEP_3) :] == [" | ".join(row) for row in chapter5.steps_met(real_cells)]

@@ -1,0 +1,61 @@
+"""A JBD BMS over Bluetooth: real aiobmsble and bleak, which find BlueZ on a D-Bus of its own; only BlueZ is simulated."""
+
+import asyncio
+import json
+import shutil
+from collections.abc import AsyncGenerator
+from contextlib import aclosing
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.settings.ble_source import BleSource
+from bms_estimator.sources.line_source import Bringer, NothingComesError
+from tests.patience import LONG_S
+
+WHY = "aiobmsble is not installed: it needs Python 3.12 and the extra ble"
+ble_bms = pytest.importorskip("bms_estimator.sources.bluetooth.client", reason=WHY)
+bluez = pytest.importorskip("tests.sources.bluetooth.bluez", reason=WHY)
+if shutil.which("dbus-daemon") is None:
+    pytest.skip("dbus-daemon is not installed", allow_module_level=True)
+
+TOLD = {"voltage_v": 15.6, "current_a": -2.87, "temperature_c": 22.133, "cells_v": [3.43, 3.425, 3.432, 3.417]}
+"""Charge is positive."""
+
+
+def bringer(**told: object) -> Bringer:
+    made: Bringer = ble_bms.BleBringer(BleSource.model_validate({"kind": "ble", "poll_s": 0.5} | told))
+    return made
+
+
+async def to_the_end(brought: AsyncGenerator[bytes, None]) -> None:
+    async for _ in brought:
+        pass
+
+
+async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with asyncio.timeout(LONG_S), bluez.system_bus(tmp_path) as bus:
+        stack = bluez.BlueZ(bus)
+        await bus.request_name("org.bluez")
+        asked = bringer(address=bluez.ADDRESS.lower())
+        async with aclosing(asked.bring()) as brought:
+            assert await anext(brought) == CONNECTED
+            assert [json.loads(await anext(brought)) for _ in range(2)] == 2 * [TOLD]
+            stack.leave()
+            with pytest.raises(NothingComesError):
+                await to_the_end(brought)
+        monkeypatch.setattr(ble_bms, "SCAN_S", 0.2)
+        with pytest.raises(NothingComesError, match="does not advertise"):
+            await to_the_end(asked.bring())
+        monkeypatch.undo()
+        stack.near = True
+        async with aclosing(bringer(name=bluez.NAME, bms="jbd").bring()) as brought:
+            assert await anext(brought) == CONNECTED
+            assert json.loads(await anext(brought)) == TOLD
+
+
+def test_a_bms_that_nobody_knows() -> None:
+    with pytest.raises(UserError, match=r"source\.bms = 'jbdd': aiobmsble knows abc, .*jbd"):
+        bringer(address=bluez.ADDRESS, bms="jbdd")

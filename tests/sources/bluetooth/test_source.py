@@ -1,0 +1,80 @@
+"""What a BMS says over Bluetooth. Samples are aiobmsble's own: of its tests of JBD and Jikong BMS."""
+
+import math
+import sys
+
+import pytest
+from pydantic import ValidationError
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.reading import Reading
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.bluetooth.source import NEEDED_PYTHON, reading_of
+from bms_estimator.sources.factory import open_reports
+
+
+class Sensor:
+    """As aiobmsble's ``TempSensor``: a number with the name of what it is on."""
+
+    def __init__(self, value: float, on: str = "GENERIC") -> None:
+        self.value, self.type = value, type("T", (), {"name": on})
+
+    def __float__(self) -> float:
+        return self.value
+
+
+JBD = {
+    "voltage": 15.6,
+    "current": -2.87,
+    "battery_level": 100,
+    "temperature": 22.133,
+    "power": -44.772,
+    "battery_charging": False,
+    "cell_count": 4,
+    "cell_voltages": [3.43, 3.425, 3.432, 3.417],
+    "temp_values": [Sensor(22.4), Sensor(22.3), Sensor(21.7)],
+    "problem": False,
+}
+"""Discharging."""
+
+
+def test_a_sample_of_aiobmsble_is_a_reading_with_charge_positive() -> None:
+    reading = reading_of(JBD)
+    assert reading is not None
+    assert reading[:4] == Reading(15.6, -2.87, 22.133, (3.43, 3.425, 3.432, 3.417))[:4]
+    settings = Settings.model_validate({"source": {"kind": "ble", "name": "DP04S007L4S100A"}})
+    assert settings.sensor.current_sign == "charge_positive"
+
+
+def test_the_temperature_is_that_of_the_cells_where_sensors_on_them_are_known() -> None:
+    sensors = [Sensor(18.1, "CELL"), Sensor(18.3, "CELL"), Sensor(31.0, "MOSFET")]
+    reading = reading_of(JBD | {"temp_values": sensors})
+    assert reading is not None
+    assert reading.temperature_c == pytest.approx(18.2)
+
+
+@pytest.mark.parametrize(("sensors", "mean_c"), [([18.0, 19.0], 18.5), ([], math.nan), ([math.nan, 19.0], 19.0)])
+def test_without_a_temperature_of_the_bms_it_is_the_mean(sensors: list[float], mean_c: float) -> None:
+    reading = reading_of({"voltage": 13.2, "current": 0, "temp_values": sensors})
+    assert reading is not None
+    assert reading.temperature_c == pytest.approx(mean_c, nan_ok=True)
+    assert reading.cells_v == ()
+
+
+@pytest.mark.parametrize(
+    "sample", [{}, {"voltage": 13.2}, {"current": 1.0}, JBD | {"voltage": math.nan}, JBD | {"current": None}]
+)
+def test_without_voltage_or_current_there_is_no_reading(sample: dict[str, object]) -> None:
+    assert reading_of(sample) is None
+
+
+@pytest.mark.parametrize("told", [{}, {"name": "a", "address": "A4:C1:38:00:11:22"}, {"address": "A4C138001122"}])
+def test_settings_that_cannot_be(told: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        Settings.model_validate({"source": {"kind": "ble"} | told})
+
+
+@pytest.mark.skipif(sys.hexversion >= NEEDED_PYTHON, reason="this Python is new enough")
+def test_an_old_python_is_told_what_is_needed() -> None:
+    with pytest.raises(UserError, match=r"needs Python 3\.12 or newer; this is 3\."):
+        open_reports(Settings.model_validate({"source": {"kind": "ble", "name": "a"}}))

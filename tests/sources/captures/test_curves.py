@@ -1,0 +1,40 @@
+import gzip
+
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.curves import read_curve
+
+
+def test_a_curve_is_read_in_the_order_of_soc(tmp_path):
+    path = tmp_path / "c.csv"
+    path.write_text("# a book\nocv_v,soc\n4.2,1\n3.0,0\n3.7,0.5\n")
+    soc, ocv_v, hysteresis_v = read_curve(path)
+    assert (soc.tolist(), ocv_v.tolist(), hysteresis_v) == ([0.0, 0.5, 1.0], [3.0, 3.7, 4.2], None)
+    packed = tmp_path / "c.csv.gz"
+    packed.write_bytes(gzip.compress(b"soc,ocv_v,hysteresis_v\n0,3.0,0.01\n1,4.2,0.02\n"))
+    assert read_curve(packed).hysteresis_v.tolist() == [0.01, 0.02]
+
+
+@pytest.mark.parametrize("name", ["time.csv", "absent.csv", "raw.bms", "broken.csv.gz"])
+def test_what_is_no_curve_is_left_to_the_readers_of_captures(tmp_path, name):
+    (tmp_path / "time.csv").write_text("time_s,current_a,voltage_v\n0,1,3.7\n")
+    (tmp_path / "raw.bms").write_bytes(b"\x00\xff")
+    (tmp_path / "broken.csv.gz").write_bytes(b"soc,ocv_v")
+    assert read_curve(tmp_path / name) is None
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("0,3.0\n100,4.2\n", "soc runs from 0 to 100: must lie within 0..1, not percent"),
+        ("0,3.0\nhalf,3.7\n", "line 3: soc = 'half': must be a number"),
+        ("0,3.0\n0.5,nan\n", "a value is missing"),
+        ("", "no rows"),
+    ],
+)
+def test_a_bad_curve_is_refused(tmp_path, rows, message):
+    path = tmp_path / "c.csv"
+    path.write_text("soc,ocv_v\n" + rows)
+    with pytest.raises(UserError, match=message):
+        read_curve(path)

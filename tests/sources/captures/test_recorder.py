@@ -1,0 +1,144 @@
+"""A recording beside the estimate: it waits for nobody, and nobody waits for its disk."""
+
+import asyncio
+import errno
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter, read_capture
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from tests.patience import LONG_S
+from tests.serial_line import Line
+
+READS = [(0.5 * i, b"3.%d,0.1\n" % i) for i in range(100)]
+
+
+class Disk:
+    """What ``CaptureWriter`` writes to: it can hang, and it can fail."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.works = threading.Event()
+        self.works.set()
+        self.fails = False
+        write = CaptureWriter.write
+
+        def slowly(writer: CaptureWriter, arrival_s: float, data: bytes) -> None:
+            assert self.works.wait(LONG_S)
+            if self.fails:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            write(writer, arrival_s, data)
+
+        monkeypatch.setattr(CaptureWriter, "write", slowly)
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
+    made = Disk(monkeypatch)
+    yield made
+    made.works.set()
+
+
+def recorded(path: Path) -> list[tuple[float, bytes]]:
+    return [read for batch in read_capture(path) for read in batch]
+
+
+def give(recording: Recording) -> None:
+    for read in READS:
+        recording.write(*read)
+
+
+def test_a_disk_that_hangs_holds_nobody_up_and_has_all_in_order_at_the_end(tmp_path: Path, disk: Disk) -> None:
+    disk.works.clear()
+    with Recording(tmp_path / "line.bms", CaptureHeader()) as recording:
+        give(recording)
+        assert recorded(tmp_path / "line.bms") == []
+        disk.works.set()
+    assert recorded(tmp_path / "line.bms") == READS
+    assert recording.bytes == sum(len(data) for _, data in READS)
+    assert recording.missed_reads == 0
+    assert recording.ended.exception() is None
+
+
+def test_a_disk_that_stays_behind_ends_the_recording_and_what_was_missed_is_counted(tmp_path: Path, disk: Disk) -> None:
+    disk.works.clear()
+    with Recording(tmp_path / "line.bms", CaptureHeader(), waiting_reads=10) as recording:
+        give(recording)
+        disk.works.set()
+    kept = recorded(tmp_path / "line.bms")
+    assert 10 <= len(kept) <= 11  # one may be on its way to the disk
+    assert kept == READS[: len(kept)]
+    assert recording.missed_reads == len(READS) - len(kept)
+    assert "stays behind" in str(recording.ended.exception())
+
+
+async def test_a_full_disk_ends_the_recording_and_not_the_samples(tmp_path: Path, disk: Disk, line: Line) -> None:
+    line.plug()
+    with Recording(tmp_path / "line.bms", CaptureHeader(mode="text")) as recording:
+        settings = SensorSettings(port=str(line.path), protocol="text")
+        async with SerialBoard(settings, tap=recording) as source, asyncio.timeout(LONG_S):
+            while "no frame yet" not in (source.message or ""):  # noqa: ASYNC110 - the source has no event for it
+                await asyncio.sleep(0.01)
+            blocks = aiter(source)
+            disk.fails = True
+            line.write(b"3.81,0.1\n")
+            await anext(blocks)
+            while not recording.ended.done():  # noqa: ASYNC110 - of a thread
+                await asyncio.sleep(0.01)
+            line.write(b"3.82,0.1\n")
+            assert (await anext(blocks))["voltage_v"].tolist() == [3.82]
+            assert source.counters["missed_reads"] >= 1
+    assert isinstance(error := recording.ended.exception(), OSError)
+    assert error.errno == errno.ENOSPC
+
+
+def test_the_disk_takes_what_is_recorded_while_it_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, fdatasync, synced_reads = tmp_path / "line.bms", os.fdatasync, queue.SimpleQueue[int]()
+
+    def watched(descriptor: int) -> None:
+        fdatasync(descriptor)
+        synced_reads.put(len(recorded(path)))
+
+    monkeypatch.setattr(os, "fdatasync", watched)
+    with Recording(path, CaptureHeader(), sync_s=0.02) as recording:
+        for times in (1, 2):
+            give(recording)
+            while synced_reads.get(timeout=LONG_S) < times * len(READS):
+                pass
+
+
+def test_a_disk_that_does_not_take_it_ends_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(descriptor: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fdatasync", fails)
+    with Recording(tmp_path / "line.bms", CaptureHeader(), sync_s=0.02) as recording:
+        give(recording)
+        assert isinstance(error := recording.ended.exception(LONG_S), OSError)
+    assert error.errno == errno.EIO
+
+
+def test_a_disk_that_hangs_does_not_hold_up_the_end_of_the_process(tmp_path: Path) -> None:
+    script = """
+import sys, threading
+from pathlib import Path
+from bms_estimator.sources import raw_capture, recording
+
+recording.END_S = 0.01
+raw_capture.CaptureWriter.write = lambda *_: threading.Event().wait()
+with recording.Recording(Path(sys.argv[1]), raw_capture.CaptureHeader()) as recorded:
+    recorded.write(0.0, b"3.7,0.1\\n")
+print(recorded.fault)
+"""
+    command = [sys.executable, "-c", script, tmp_path / "line.bms"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=True)
+    assert "recording not ended" in ended.stdout
+    assert ended.stdout.endswith("the disk has not answered for 0.01 s\n")

@@ -1,0 +1,224 @@
+"""Frames of a CAN bus to readings; where a value lies is tried against cantools."""
+
+import math
+from pathlib import Path
+
+import pytest
+from cantools.database.can import Message
+from cantools.database.can import Signal as DbcSignal
+from cantools.database.conversion import BaseConversion
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.settings.can_source import CanSource, CellSignals, Signal
+from bms_estimator.sources.fieldbus.can_signals import KEPT_S, CanMap, Place, bits_of
+
+PYLONTECH = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])
+"""52.34 V, -12.3 A (charge is positive), 21.5 degC, as frame 0x356 has them."""
+DBC = """
+VERSION ""
+BU_: BMS
+BO_ 1280 Pack: 8 BMS
+ SG_ PackVoltage : 7|16@0+ (0.1,0) [0|1000] "V" X
+ SG_ PackCurrent : 23|16@0- (0.1,-1000) [-1000|1000] "A" X
+ SG_ Fast : 32|8@1+ (1,0) [0|0] "" X
+BO_ 1281 Cells: 8 BMS
+ SG_ Group M : 0|8@1+ (1,0) [0|3] "" X
+ SG_ Cell1 m0 : 8|16@1+ (1,0) [0|5000] "mV" X
+ SG_ Cell2 m0 : 24|16@1+ (1,0) [0|5000] "mV" X
+ SG_ Cell3 m1 : 8|16@1+ (1,0) [0|5000] "mV" X
+BO_ 2566848512 Other: 8 BMS
+ SG_ Fast : 0|8@1+ (1,0) [0|0] "" X
+ SG_ Temp : 8|8@1+ (1,-40) [0|0] "degC" X
+"""
+"""Made for these tests: big and little endian, a multiplexer, an identifier of 29 bits."""
+
+
+@pytest.fixture(scope="module")
+def named(tmp_path_factory: pytest.TempPathFactory) -> CanSource:
+    path = tmp_path_factory.mktemp("dbc") / "pack.dbc"
+    path.write_text(DBC)
+    return source(
+        dbc=str(path),
+        voltage={"signal": "PackVoltage"},
+        current={"signal": "Pack.PackCurrent"},
+        temperature={"signal": "Temp"},
+        cells=[{"signal": "Cell{}", "count": 3, "scale": 0.001}],
+    )
+
+
+def source(**told: object) -> CanSource:
+    return CanSource.model_validate({"kind": "can"} | told)
+
+
+@given(
+    st.binary(max_size=8),
+    st.integers(0, 63),
+    st.integers(1, 32),
+    st.sampled_from(["little", "big"]),
+    st.booleans(),
+)
+def test_a_value_lies_where_cantools_finds_it(data: bytes, start: int, bits: int, order: str, signed: bool) -> None:
+    signal = Signal(id=1, start_bit=start, bits=bits, byte_order=order, signed=signed)
+    end = start + bits if order == "little" else 8 * (start // 8) + 7 - start % 8 + bits
+    if end > 8 * len(data):
+        assert bits_of(signal, data) is None
+        return
+    conversion = BaseConversion.factory()
+    dbc = DbcSignal("x", start, bits, f"{order}_endian", signed, conversion)
+    message = Message(1, "m", len(data), [dbc])
+    assert bits_of(signal, data) == message.decode(data)["x"]
+
+
+@given(st.lists(st.tuples(st.sampled_from([0x355, 0x356, 0x357]), st.booleans(), st.binary(max_size=64)), max_size=20))
+def test_no_frames_make_it_raise(frames: list[tuple[int, bool, bytes]]) -> None:
+    map_ = CanMap(source(profile="pylontech-can"))
+    for identifier, extended, data in frames:
+        reading = map_.feed(0.0, identifier, extended, data)
+        assert (reading is not None) == ((identifier, extended) == (0x356, False) and len(data) >= 4)
+
+
+@given(st.lists(st.tuples(st.sampled_from([0x500, 0x501]), st.binary(max_size=64)), max_size=20))
+def test_no_frames_make_signals_of_a_dbc_file_raise(named: CanSource, frames: list[tuple[int, bytes]]) -> None:
+    map_ = CanMap(named)
+    for identifier, data in frames:
+        map_.feed(0.0, identifier, False, data)
+
+
+def test_a_known_bus_is_read() -> None:
+    given = source(profile="pylontech-can")
+    steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
+    assert given.sensor == {"current_sign": "charge_positive", **steps}
+    map_ = CanMap(given)
+    assert map_.places == (Place(0x356, False),)
+    assert map_.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
+    assert map_.feed(0.0, 0x355, False, bytes(4)) is None
+    reading = map_.feed(0.0, 0x356, False, PYLONTECH)
+    assert reading is not None
+    assert reading[:4] == (52.34, -12.3, 21.5, ())
+
+
+def test_a_frame_that_is_too_short_for_a_value_brings_the_others() -> None:
+    map_ = CanMap(source(profile="pylontech-can"))
+    reading = map_.feed(0.0, 0x356, False, PYLONTECH[:4])
+    assert reading is not None
+    assert reading[:2] == (52.34, -12.3)
+    assert math.isnan(reading.temperature_c)
+    assert map_.feed(0.0, 0x356, False, PYLONTECH[:2]) is None
+    assert map_.counters["short_frames"] == 2
+
+
+def test_a_reading_waits_for_voltage_and_current_and_has_the_newest_of_the_rest() -> None:
+    byte = {"bits": 8, "scale": 0.1}
+    map_ = CanMap(
+        source(
+            voltage=byte | {"id": 1},
+            current=byte | {"id": 2, "absent": 255},
+            temperature=byte | {"id": 3},
+            cells=[byte | {"id": 4, "count": 2}, byte | {"id": 5}],
+        )
+    )
+    assert map_.feed(0.0, 3, False, b"\xd2") is None
+    assert map_.feed(0.0, 4, False, b"\x20\x21") is None
+    assert map_.feed(0.0, 2, False, b"\x05") is None
+    assert map_.missing == "source.voltage (frame 0x001)"
+    reading = map_.feed(1.0, 1, False, b"\x82")
+    assert reading is not None
+    assert reading[:3] == (13.0, 0.5, 21.0)
+    assert reading.cells_v[:2] == (3.2, 3.3)
+    assert math.isnan(reading.cells_v[2])
+    assert map_.feed(2.0, 1, False, b"\x83") is None
+    assert map_.feed(2.0, 2, False, b"\xff") is None
+    assert map_.counters["not_measured"] == 1
+    assert map_.feed(3.0, 1, False, b"\x83") is None
+    assert map_.feed(6.1, 2, False, b"\x05") is None  # more than three periods apart
+    assert map_.feed(7.0, 1, False, b"\x83") is None
+    assert map_.feed(10.0, 2, False, b"\x05") is not None
+    assert map_.feed(11.0, 1, False, b"\x83") is None
+    assert map_.feed(12.0 + KEPT_S, 2, False, b"\x05") is None
+    assert map_.feed(13.0 + KEPT_S, 1, False, b"\x83") is None
+    late = map_.feed(13.5 + KEPT_S, 2, False, b"\x05")
+    assert late is not None
+    assert (late.voltage_v, late.cells_v) == (13.1, ())
+    assert math.isnan(late.temperature_c)
+
+
+@pytest.fixture
+def dbc(tmp_path: Path) -> Path:
+    path = tmp_path / "pack.dbc"
+    path.write_text(DBC)
+    return path
+
+
+def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
+    map_ = CanMap(named)
+    assert set(map_.places) == {Place(0x500, False), Place(0x501, False), Place(0x18FF0000, True)}
+    assert map_.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
+    assert map_.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
+    assert map_.feed(0.0, 0x501, False, bytes([1, 0xE6, 0x0C])) is None
+    assert map_.counters["short_frames"] == 0  # a multiplexer tells some of them at a time
+    assert map_.feed(0.0, 0x501, False, bytes([7, 0, 0])) is None
+    assert map_.counters["short_frames"] == 1
+    reading = map_.feed(0.0, 0x500, False, (4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
+    assert reading is not None
+    assert reading[:4] == (400.1, 12.3, 25.0, (3.3, 3.301, 3.302))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (
+            "Volts",
+            "source.voltage: signal = 'Volts': the DBC file has no such signal; it has Cell1, Cell2, Cell3, Fast",
+        ),
+        ("Fast", "several messages have it: write Pack.Fast or Other.Fast"),
+        ("Cells.PackVoltage", "no such signal"),
+    ],
+)
+def test_a_name_that_is_not_one_signal(dbc: Path, name: str, said: str) -> None:
+    with pytest.raises(UserError) as raised:
+        CanMap(source(dbc=str(dbc), voltage={"signal": name}, current={"signal": "PackCurrent"}))
+    assert said in str(raised.value)
+
+
+def test_a_dbc_file_that_is_none(tmp_path: Path) -> None:
+    named = {"voltage": {"signal": "V"}, "current": {"signal": "I"}}
+    with pytest.raises(UserError, match="cannot be read: No such file"):
+        CanMap(source(dbc=str(tmp_path / "none.dbc"), **named))
+    junk = tmp_path / "junk.dbc"
+    junk.write_bytes(bytes(range(256)))
+    with pytest.raises(UserError, match=f"source.dbc = {junk}: "):
+        CanMap(source(dbc=str(junk), **named))
+
+
+def test_cells_that_follow_each_other() -> None:
+    assert [s.start_bit for s in CellSignals(id=1, bits=12, count=3).members()] == [0, 12, 24]
+    big = CellSignals(id=1, start_bit=7, byte_order="big", count=2).members()
+    assert [bits_of(signal, b"\x0c\xe4\x0c\xe5") for signal in big] == [3300, 3301]
+    named = CellSignals(signal="C{}", count=2, first=0).members()
+    assert [signal.signal for signal in named] == ["C0", "C1"]
+
+
+V, I = {"id": 1}, {"id": 2}  # noqa: E741
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ({"profile": "pylontech"}, "'pylontech' is none of pylontech-can"),
+        ({"voltage": {}, "current": I}, "give signal"),
+        ({"voltage": V | {"signal": "x"}, "current": I}, "and not both"),
+        ({"voltage": {"signal": "x"}, "current": I}, "dbc: missing"),
+        ({"voltage": {"id": 0x800}, "current": I}, "extended = true"),
+        ({"voltage": V | {"scale": 0.0}, "current": I}, "must not be 0"),
+        ({"voltage": V, "current": I, "cells": [{"id": 3, "count": 97}]}, "96"),
+        ({"voltage": V, "current": I, "cells": 2 * [{"id": 3, "count": 60}]}, "at most 96"),
+        ({"voltage": V, "current": I, "cells": [{"id": 3, "count": 2, "byte_order": "big"}]}, "whole bytes"),
+        ({"voltage": V, "current": I, "dbc": "x", "cells": [{"signal": "Cell", "count": 2}]}, "holds {}"),
+    ],
+)
+def test_settings_that_cannot_be_say_why(told: dict[str, object], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        source(**told)

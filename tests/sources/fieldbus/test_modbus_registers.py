@@ -1,0 +1,177 @@
+"""Registers to readings, and the requests that bring them."""
+
+import itertools
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from bms_estimator.settings.modbus_source import MOST_WORDS, PROFILES, CellRegisters, ModbusSource, Register
+from bms_estimator.sources.fieldbus.modbus_registers import GAP_WORDS, Value, decode, plan, reading_of, split, values_of
+
+FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
+RANGES = {
+    "int16": st.integers(-(1 << 15), (1 << 15) - 1),
+    "uint16": st.integers(0, (1 << 16) - 1),
+    "int32": st.integers(-(1 << 31), (1 << 31) - 1),
+    "uint32": st.integers(0, (1 << 32) - 1),
+    "float32": st.floats(-1e6, 1e6, width=32),
+}
+
+
+def source(**told: object) -> ModbusSource:
+    return ModbusSource.model_validate({"kind": "modbus", "host": "127.0.0.1"} | told)
+
+
+def words(raw: float, kind: str, *, low_word_first: bool = False, address: int = 0) -> dict[tuple[str, int], int]:
+    data = struct.pack(FORMATS[kind], raw)
+    values = [int.from_bytes(data[i : i + 2], "big") for i in range(0, len(data), 2)]
+    return {("holding", address + i): word for i, word in enumerate(values[::-1] if low_word_first else values)}
+
+
+@given(st.data(), st.sampled_from(list(FORMATS)), st.booleans())
+def test_what_a_device_packs_is_what_is_read(data: st.DataObject, kind: str, low_word_first: bool) -> None:
+    raw = data.draw(RANGES[kind])
+    register = Register(address=7, type=kind, low_word_first=low_word_first, scale=0.01, offset=-2.0)
+    assert decode(register, words(raw, kind, low_word_first=low_word_first, address=7)) == round(raw * 0.01 - 2.0, 5)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(FORMATS)), st.booleans()), max_size=60))
+def test_requests_bring_every_register_once_and_none_is_too_long(wanted: list[tuple[int, str, bool]]) -> None:
+    values = [
+        Value("cells", Register(address=address, type=kind, table="input" if is_input else "holding"))
+        for address, kind, is_input in wanted
+    ]
+    requests = plan(values)
+    assert sorted((v for request in requests for v in request.values), key=repr) == sorted(values, key=repr)
+    for request in requests:
+        assert 1 <= request.words <= MOST_WORDS
+        for value in request.values:
+            assert value.register.table == request.table
+            assert request.address <= value.register.address
+            assert value.register.address + value.register.words <= request.address + request.words
+    for one, next_ in itertools.pairwise(requests):
+        near = next_.table == one.table and next_.address <= one.address + one.words + GAP_WORDS
+        assert not near or next_.address + 2 - one.address > MOST_WORDS - 1
+
+
+def test_a_known_device_is_asked_in_as_few_requests_as_possible() -> None:
+    (request,) = plan(values_of(source(profile="victron-gx")))
+    assert (request.table, request.address, request.words) == ("holding", 259, 4)
+    assert request.described == "source.voltage, source.current, source.temperature (holding registers 259 to 262)"
+    seplos = plan(values_of(source(profile="seplos-v3")))
+    assert [(r.table, r.address, r.words) for r in seplos] == [("input", 0x1000, 10), ("input", 0x1100, 16)]
+
+
+def test_a_refused_request_is_split_by_quantity_and_without_gaps() -> None:
+    (request,) = plan(values_of(source(profile="victron-gx")))
+    assert [(r.address, r.words) for r in split(request)] == [(259, 1), (261, 1), (262, 1)]
+    (alone,) = split(split(request)[0])
+    assert split(alone) == (alone,)
+
+
+def test_readings_of_known_devices() -> None:
+    victron = source(profile="victron-gx")
+    steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
+    assert victron.sensor == {"current_sign": "charge_positive", **steps}
+    told = words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
+    assert reading_of(values_of(victron), told) == (52.34, -12.3, -2.5, (), pytest.approx(math.nan, nan_ok=True))
+    seplos = source(profile="seplos-v3")
+    held = {0x1000: 5320, 0x1001: 0xFF38, 0x1009: 2961} | {0x1100 + i: 3325 + i for i in range(16)}
+    reading = reading_of(values_of(seplos), {("input", address): word for address, word in held.items()})
+    assert reading is not None
+    assert reading[:3] == (53.2, -2.0, 22.95)
+    assert reading.cells_v == tuple(round(3.325 + i / 1000, 3) for i in range(16))
+
+
+@pytest.mark.parametrize("raw", [math.nan, math.inf, -math.inf])
+def test_a_float_that_is_no_number_is_not_measured(raw: float) -> None:
+    register = {"address": 0, "type": "float32"}
+    given = source(voltage=register, current=register | {"address": 2}, temperature=register | {"address": 4})
+    held = words(13.0, "float32") | words(1.5, "float32", address=2) | words(raw, "float32", address=4)
+    reading = reading_of(values_of(given), held)
+    assert reading is not None
+    assert math.isnan(reading.temperature_c)
+    assert reading_of(values_of(given), held | words(raw, "float32")) is None
+    assert reading_of(values_of(given), held | words(raw, "float32", address=2)) is None
+
+
+def test_a_value_beyond_all_numbers_is_not_measured() -> None:
+    register = Register(address=0, type="float32", scale=1e300)
+    assert math.isnan(decode(register, words(1e30, "float32")))
+
+
+def test_what_stands_for_nothing_measured_is_nothing_measured() -> None:
+    given = source(
+        voltage={"address": 0, "scale": 0.01},
+        current={"address": 1, "type": "int16"},
+        temperature={"address": 2, "type": "int16", "absent": 32767},
+        cells={"address": 3, "count": 2, "absent": 0, "scale": 0.001},
+    )
+    held = {("holding", i): word for i, word in enumerate([1300, 0xFFFF, 32767, 3300, 0])}
+    reading = reading_of(values_of(given), held)
+    assert reading is not None
+    assert (reading.current_a, reading.cells_v[0]) == (-1.0, 3.3)
+    assert math.isnan(reading.temperature_c)
+    assert math.isnan(reading.cells_v[1])
+    none = reading_of(values_of(given), held | {("holding", 3): 0})
+    assert none is not None
+    assert none.cells_v == ()
+
+
+def test_cells_may_be_apart() -> None:
+    cells = CellRegisters(address=100, count=3, step=4)
+    assert [cells.cell(number).address for number in range(3)] == [100, 104, 108]
+
+
+V, I = {"address": 0}, {"address": 1}  # noqa: E741
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ({"profile": "victron"}, "profile: 'victron' is none of victron-gx, seplos-v3"),
+        ({"voltage": V, "current": I, "port": "/dev/ttyUSB0"}, "and not both"),
+        ({"voltage": V, "current": I, "host": None}, "give host"),
+        ({"voltage": V, "current": I, "host": None, "port": "/dev/x", "framing": "tcp"}, "serial line"),
+        ({"voltage": V}, "current"),
+        ({"voltage": V | {"scale": 0.0}, "current": I}, "must not be 0"),
+        ({"voltage": {"address": 65535, "type": "int32"}, "current": I}, "behind the last register"),
+        ({"voltage": V, "current": I, "cells": {"address": 65530, "count": 16}}, "behind the last register"),
+    ],
+)
+def test_settings_that_cannot_be_say_why(told: dict[str, object], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        source(**told)
+
+
+def test_what_is_told_goes_before_the_profile() -> None:
+    given = source(profile="victron-gx", unit=3, temperature={"address": 61, "type": "int16", "scale": 0.1})
+    assert given.unit == 3
+    assert given.temperature is not None
+    assert given.temperature.address == 61
+    assert given.voltage.address == 259
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_profile_is_whole(profile: str) -> None:
+    assert source(profile=profile).sensor["current_sign"] == "charge_positive"
+
+
+@pytest.mark.parametrize(
+    ("registers", "measured"),
+    [((2659, -25, 210), (26.59, -2.5, 21.0)), ((2659, 0, 0), (26.59, 0.0, None)), ((0, 0, 0), None)],
+)
+def test_what_a_gx_device_does_not_measure_reads_0_and_is_no_reading(
+    registers: tuple[int, int, int], measured: tuple[float, float, float | None] | None
+) -> None:
+    voltage, current, temperature = registers
+    read = words(voltage, "uint16", address=259) | words(current, "int16", address=261)
+    reading = reading_of(values_of(source(profile="victron-gx")), read | words(temperature, "int16", address=262))
+    assert (reading is None) is (measured is None)
+    if reading is not None and measured is not None:
+        warm_c = None if math.isnan(reading.temperature_c) else reading.temperature_c
+        assert (reading.voltage_v, reading.current_a, warm_c) == measured

@@ -1,0 +1,181 @@
+"""Sensors by sysfs: a folder that looks like it, its values in SI, files that fail, vanish, hang or hold junk."""
+
+import os
+import threading
+from collections.abc import AsyncGenerator
+from contextlib import aclosing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bms_estimator.protocols.base.reading import Reading, read_line
+from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.settings.linux_source import LinuxSource
+from bms_estimator.sources.line_source import NothingComesError
+from bms_estimator.sources.linux.linux_sensor import LinuxSensor
+from tests.patience import LONG_S
+from tests.sources.linux.sysfs_folder import hwmon, iio
+
+INA226 = {"in0_input": 25, "in1_input": 13280, "curr1_input": -2510, "shunt_resistor": 10000, "update_interval": 2}
+EIO = Path("/proc/self/mem")
+"""Reading its beginning is an input/output error."""
+
+
+def sensor(root: Path, **settings: Any) -> LinuxSensor:
+    return LinuxSensor(LinuxSource.model_validate({"kind": "linux", "interval_s": 0.01} | settings), root, hung_s=0.05)
+
+
+async def first(lines: AsyncGenerator[bytes, None]) -> Reading:
+    """The first sample of a sensor that was just begun."""
+    async with aclosing(lines):
+        assert await anext(lines) == CONNECTED
+        return _reading(await anext(lines))
+
+
+async def _drain(lines: AsyncGenerator[bytes, None]) -> None:
+    async for _ in lines:
+        pass
+
+
+def _reading(line: bytes) -> Reading:
+    reading = read_line(line)
+    assert reading
+    return reading
+
+
+@pytest.mark.parametrize("chip", ["ina226", "1-0040"])
+async def test_an_ina226_is_found_by_its_name_or_place(chip: str, tmp_path: Path):
+    hwmon(tmp_path, "cpu_thermal", "thermal", number=0, temp1_input=48312)
+    hwmon(tmp_path, **INA226)
+    reading = await first(sensor(tmp_path, chip=chip).bring())
+    assert (reading.voltage_v, reading.current_a) == (13.28, -2.51)
+
+
+@pytest.mark.parametrize(
+    ("settings", "voltage_v", "current_a"),
+    [
+        ({"voltage_scale": 4.0, "voltage_offset_v": 0.1}, 53.22, -2.51),
+        ({"shunt_ohm": 0.0005}, 13.28, -50.2),  # the driver takes it for 10 mohm
+        ({"current": "in0_input", "shunt_ohm": 0.0005}, 13.28, 50.0),
+        ({"current_scale": 1.02, "current_offset_a": 0.01}, 13.28, -2.5502),
+    ],
+)
+async def test_divider_and_shunt(settings: dict[str, Any], voltage_v: float, current_a: float, tmp_path: Path):
+    hwmon(tmp_path, **INA226)
+    reading = await first(sensor(tmp_path, **settings).bring())
+    assert (reading.voltage_v, reading.current_a) == (voltage_v, current_a)
+
+
+async def test_an_ads1115_over_a_divider_and_a_shunt_and_another_chip_for_the_temperature(tmp_path: Path):
+    scales = {"in_voltage0-voltage1_scale": 0.0078125, "in_voltage_scale": 0.125}
+    iio(tmp_path, in_voltage2_raw=26560, **{"in_voltage0-voltage1_raw": -640}, **scales)
+    hwmon(tmp_path, "lm75", "1-0049", number=5, temp1_input=21500)
+    reading = await first(
+        sensor(
+            tmp_path,
+            chip="ads1115",
+            voltage="in_voltage2",
+            current="in_voltage0-voltage1",
+            temperature="lm75/temp1_input",
+            voltage_scale=16.0,
+            shunt_ohm=0.00075,
+        ).bring()
+    )
+    assert reading == Reading(53.12, -6.666667, 21.5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"chip": "ina228"}, "ina228: no such chip in hwmon or iio; there: ina219, ina226. Is its driver loaded?"),
+        ({"chip": "ina219"}, "ina219: there are 2 (1-0041, 1-0042); name one by its place on the bus"),
+        ({"chip": "/nowhere"}, "/nowhere: no such folder; is the driver loaded?"),
+        ({"current": "curr2_input"}, "curr2_input: no such file; the chip has curr1_input, in0_input, in1_input"),
+        ({"current": "in0_input"}, "in0_input: a voltage; tell by source.shunt_ohm over which shunt"),
+        (
+            {"chip": "1-0041", "shunt_ohm": 0.1},
+            "tell the ratio by source.current_scale, without source.shunt_ohm",
+        ),
+    ],
+)
+async def test_what_is_not_there_is_said_with_what_to_do(settings: dict[str, Any], said: str, tmp_path: Path):
+    hwmon(tmp_path, **INA226)
+    for number, place in ((4, "1-0041"), (5, "1-0042")):
+        hwmon(tmp_path, "ina219", place, number, in1_input=1, curr1_input=1)
+    with pytest.raises(NothingComesError) as caught:
+        await first(sensor(tmp_path, **settings).bring())
+    assert str(caught.value).endswith(said)
+
+
+async def test_a_file_that_fails_or_holds_junk_costs_a_sample_and_is_counted_and_said(tmp_path: Path):
+    folder = hwmon(tmp_path, **INA226)
+    ina = sensor(tmp_path)
+    voltage, current = folder / "in1_input", folder / "curr1_input"
+    spoilt = {
+        "no number: b'busy'": lambda: current.write_text("busy"),
+        "no number: b''": lambda: current.write_text(""),
+        "no number: b'\\xff\\x00": lambda: current.write_bytes(b"\xff\x00" * 4000),
+        "curr1_input: Input/output error": lambda: (current.unlink(), current.symlink_to(EIO)),
+        "curr1_input: Is a directory": lambda: (current.unlink(), current.mkdir()),
+    }
+    async with aclosing(ina.bring()) as lines:
+        assert await anext(lines) == CONNECTED
+        await anext(lines)
+        for said, spoil in spoilt.items():
+            spoil()
+            assert ina._sample(await ina._read(ina._find)) == b""
+            assert said in (ina.fault or "")
+        current.rmdir()
+        current.write_text("1500\n")
+        voltage.write_text("12000\n")
+        while (reading := _reading(await anext(lines))).current_a != 1.5:
+            pass
+        assert reading.voltage_v == 12.0
+        assert ina.fault is None
+        assert ina.counters["value_errors"] >= 3
+        assert ina.counters["read_errors"] >= 2
+        voltage.unlink()  # the driver was taken away
+        with pytest.raises(FileNotFoundError):
+            await _drain(lines)
+
+
+async def test_a_bus_that_hangs_holds_up_nothing_and_is_left_until_it_answers(tmp_path: Path):
+    folder = hwmon(tmp_path, **INA226)
+    (folder / "curr1_input").unlink()
+    os.mkfifo(folder / "curr1_input")  # opening it waits for somebody who writes
+    ina = sensor(tmp_path)
+    before = set(threading.enumerate())
+    for _ in range(3):
+        with pytest.raises(NothingComesError, match=r"the bus has not answered for 0.05 s"):
+            await first(ina.bring())
+    assert len(set(threading.enumerate()) - before) == 1
+    writer = os.open(folder / "curr1_input", os.O_RDWR | os.O_NONBLOCK)
+    (folder / "curr1_input").unlink()
+    (folder / "curr1_input").write_text("1500\n")
+    os.close(writer)  # lets go who waits
+    ina._hung_s = LONG_S
+    assert (await first(ina.bring())).current_a == 1.5
+
+
+async def test_a_temperature_that_fails_costs_no_sample(tmp_path: Path):
+    hwmon(tmp_path, **INA226, temp1_input="nonsense")
+    ina = sensor(tmp_path, temperature="temp1_input")
+    reading = await first(ina.bring())
+    assert reading.temperature_c != reading.temperature_c
+    assert ina.counters == {"read_errors": 0, "value_errors": 1}
+
+
+@pytest.mark.parametrize(("update_interval", "interval_s"), [("2", 0.1), ("2253", 2.253), ("none", 1.0)])
+def test_it_is_polled_as_fast_as_the_chip_is_set_but_not_faster_than_anybody_needs(
+    update_interval: str, interval_s: float, tmp_path: Path
+):
+    hwmon(tmp_path, **INA226 | {"update_interval": update_interval})
+    assert sensor(tmp_path, interval_s=None)._find().interval_s == interval_s
+
+
+async def test_a_chip_slower_than_it_is_taken_for_says_what_to_set(tmp_path: Path):
+    hwmon(tmp_path, **INA226 | {"update_interval": "17000"})
+    with pytest.raises(NothingComesError, match=r"measures each 17 s only; .*source\.interval_s = 17$"):
+        await first(sensor(tmp_path, interval_s=None).bring())
+    assert await first(sensor(tmp_path, interval_s=17.0).bring())

@@ -1,0 +1,428 @@
+"""What other projects publish of a battery, each in its own form: one sample of it, and what is wrong with it said.
+
+The payloads are those of the projects named in ``settings/mqtt_profiles.py``, with numbers of ours.
+"""
+
+import json
+import random
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bms_estimator.protocols.devices.text import TextDialect
+from bms_estimator.settings.mqtt_source import MqttSource
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.mqtt.payload_value import MOST_CELLS, NoNumberError, many, one
+from bms_estimator.sources.mqtt.sample_assembler import Assembly
+
+Messages = list[tuple[str, str]]
+
+
+def source(**settings: Any) -> MqttSource:
+    return MqttSource.model_validate({"kind": "mqtt"} | settings)
+
+
+def own(**settings: Any) -> MqttSource:
+    """By hand, one payload for all."""
+    return source(**{"topic": "home/pack", "voltage": "u", "current": "i"} | settings)
+
+
+def told(assembly: Assembly, messages: Messages, at_s: float = 0.0, *, retained: bool = False) -> list[dict[str, Any]]:
+    """The samples that messages make, and what follows of them after the time to settle."""
+    lines = []
+    for topic, payload in messages:
+        assembly.take(topic, payload.encode(), at_s, retained=retained)
+        lines.append(assembly.line(at_s))
+    lines.append(assembly.line(at_s + 0.5))
+    return [json.loads(line) for line in lines if line]
+
+
+def esphome(node: str, voltage: str, current: str, temperature: str, cell: str) -> Messages:
+    """As a node publishes its sensors, one after the other."""
+    cells = [(cell.format(n), f"3.3{n:02}") for n in range(1, 17)]
+    values = [*cells, (temperature, "21.5"), (voltage, "52.98"), (current, "-12.34"), ("balancing_current", "0.000")]
+    return [(f"{node}/sensor/{node}_{name}/state", value) for name, value in values]
+
+
+SIXTEEN = [round(3.3 + n / 1000, 3) for n in range(1, 17)]
+PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
+    "batmon-ha": (
+        {"profile": "batmon-ha", "prefix": "jk_bms"},
+        [
+            ("jk_bms/soc/total_voltage", "52.98"),
+            ("jk_bms/soc/current", "12.34"),
+            ("jk_bms/soc/balance_current", "0.0"),
+            ("jk_bms/soc/soc_percent", "80.0"),
+            ("jk_bms/cell_voltages/1", "3.301"),
+            ("jk_bms/cell_voltages/2", "3.302"),
+            ("jk_bms/cell_voltages/min", "3.301"),
+            ("jk_bms/temperatures/1", "21.5"),
+        ],
+        {"voltage_v": 52.98, "current_a": 12.34},
+        "discharge_positive",
+    ),
+    "esphome-jk": (
+        {"profile": "esphome-jk", "prefix": "jk-bms"},
+        esphome("jk-bms", "total_voltage", "current", "temperature_sensor_1", "cell_voltage_{}"),
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN},
+        "charge_positive",
+    ),
+    "esphome-jbd": (
+        {"profile": "esphome-jbd", "prefix": "jbd-bms-ble"},
+        esphome("jbd-bms-ble", "total_voltage", "current", "temperature_1", "cell_voltage_{}"),
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN},
+        "charge_positive",
+    ),
+    "esphome-daly": (
+        {"profile": "esphome-daly", "prefix": "daly-bms"},
+        [
+            ("daly-bms/sensor/battery_voltage/state", "53.0"),
+            ("daly-bms/sensor/battery_current/state", "-12.3"),
+            ("daly-bms/sensor/cell_1_voltage/state", "3.301"),
+        ],
+        {"voltage_v": 53.0, "current_a": -12.3},
+        "discharge_positive",
+    ),
+    "venus": (
+        {"profile": "venus", "prefix": "c0619ab12345", "instance": "1"},
+        [
+            ("N/c0619ab12345/battery/1/Voltages/Cell1", '{"value":3.301}'),
+            ("N/c0619ab12345/battery/1/Dc/0/Temperature", '{"value":21.5}'),
+            ("N/c0619ab12345/battery/1/Dc/0/Voltage", '{"value":52.98}'),
+            ("N/c0619ab12345/battery/1/Dc/0/Current", '{"value":-12.34}'),
+            ("N/c0619ab12345/battery/2/Dc/0/Current", '{"value":-99.0}'),
+        ],
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": [3.301]},
+        "charge_positive",
+    ),
+    "battery-emulator": (
+        {"profile": "battery-emulator"},
+        [
+            ("BE/spec_data", '{"cell_voltages":[3.701,3.702,3.700],"cell_balancing":[false,false,true]}'),
+            (
+                "BE/info",
+                '{"bms_status":"ACTIVE","SOC":81.5,"temperature_max":21.5,"battery_current":-12.3,"battery_voltage":355.2}',
+            ),
+        ],
+        {"voltage_v": 355.2, "current_a": -12.3, "temperature_c": 21.5, "cells_v": [3.701, 3.702, 3.7]},
+        "charge_positive",
+    ),
+    "opendtu": (
+        {"profile": "opendtu"},
+        [
+            ("solar/battery/BatteryTempOneCelsius", "21"),
+            ("solar/battery/Cell1MilliVolt", "3301"),
+            ("solar/battery/CellMinMilliVolt", "3301"),
+            ("solar/battery/voltage", "52.98"),
+            ("solar/battery/current", "-12.34"),
+        ],
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.0, "cells_v": [3.301]},
+        "charge_positive",
+    ),
+    "tasmota": (
+        {"profile": "tasmota", "prefix": "shunt"},
+        [
+            (
+                "tele/shunt/SENSOR",
+                '{"Time":"2026-11-11T21:57:38","INA219":{"Voltage":13.28,"Current":2.510,"Power":33.3}}',
+            )
+        ],
+        {"voltage_v": 13.28, "current_a": 2.51},
+        "discharge_positive",
+    ),
+    "tasmota energy": (
+        {"profile": "tasmota", "prefix": "shunt", "instance": "ENERGY"},
+        [("tele/shunt/SENSOR", '{"Time":"2026-11-11T21:57:38","ENERGY":{"Power":33,"Voltage":13,"Current":2.510}}')],
+        {"voltage_v": 13.0, "current_a": 2.51},
+        "discharge_positive",
+    ),
+    "zigbee2mqtt": (
+        {"profile": "zigbee2mqtt", "prefix": "garage/meter"},
+        [("zigbee2mqtt/garage/meter", '{"voltage":52.1,"linkquality":34,"power":167,"current":3.2,"state":"ON"}')],
+        {"voltage_v": 52.1, "current_a": 3.2},
+        "discharge_positive",
+    ),
+}
+
+
+@pytest.mark.parametrize("project", PROJECTS)
+def test_what_a_project_publishes_is_a_sample(project: str) -> None:
+    table, messages, sample, sign = PROJECTS[project]
+    assembly = Assembly(source(**table))
+    first = told(assembly, messages)
+    assert first == [sample]
+    assert told(assembly, messages, 10.0)[0]["current_a"] == sample["current_a"]
+    assert assembly.fault is None
+    assert set(assembly.counters.values()) == {0}
+    settings = Settings.model_validate({"source": {"kind": "mqtt"} | table})
+    assert settings.sensor.current_sign == sign
+
+
+def test_a_batch_that_ends_with_cells_tells_them_with_the_next_sample() -> None:
+    table, messages, _, _ = PROJECTS["batmon-ha"]
+    assembly = Assembly(source(**table))
+    told(assembly, messages)
+    assert told(assembly, messages, 5.0)[0]["cells_v"] == [3.301, 3.302]
+
+
+@pytest.mark.parametrize(
+    ("where", "payload", "sample"),
+    [
+        ({}, '{"u": 52.1, "i": "-3.25"}', {"voltage_v": 52.1, "current_a": -3.25}),
+        (
+            {"voltage": {"path": "p.0.mv", "unit": "mV"}, "current": {"path": "p.1", "unit": "mA", "scale": -1}},
+            '{"p": [{"mv": 52100}, 3250]}',
+            {"voltage_v": 52.1, "current_a": -3.25},
+        ),
+        (
+            {"temperature": {"path": "t", "unit": "F"}, "current": {"path": "i", "scale": 0.1, "offset": -3000}},
+            '{"u": 52.1, "i": 29967.5, "t": 70.7}',
+            {"voltage_v": 52.1, "current_a": -3.25, "temperature_c": 21.5},
+        ),
+        (
+            {"cells": {"path": "cells.C{cell}.v", "unit": "mV"}, "temperature": {"path": "t", "unit": "K"}},
+            '{"u": 6.6, "i": 1, "t": 294.65, "cells": {"C01": {"v": 3301}, "C03": {"v": 3302}, "sum": 1}}',
+            {"voltage_v": 6.6, "current_a": 1.0, "temperature_c": 21.5, "cells_v": [3.301, None, 3.302]},
+        ),
+        (
+            {"cells": "c", "time": {"path": "t", "unit": "iso"}},
+            '{"u": 6.6, "i": 1, "t": "2026-11-11T21:57:38Z", "c": [3.301, null, "3.302"]}',
+            {"voltage_v": 6.6, "current_a": 1.0, "time_s": 1794434258.0, "cells_v": [3.301, None, 3.302]},
+        ),
+        (
+            {"time": {"path": "t", "unit": "ms"}},
+            '{"u": 6.6, "i": 1, "t": 12500}',
+            {"voltage_v": 6.6, "current_a": 1.0, "time_s": 12.5},
+        ),
+    ],
+)
+def test_paths_units_scales_and_times(where: dict[str, Any], payload: str, sample: dict[str, Any]) -> None:
+    assert told(Assembly(own(**where)), [("home/pack", payload)]) == [sample]
+
+
+def test_a_pack_with_as_many_cells_as_are_taken_is_a_sample_of_the_dialect() -> None:
+    assembly, dialect = Assembly(own(cells="c")), TextDialect()
+    payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MOST_CELLS})
+    assembly.take("home/pack", payload.encode(), 0.0, retained=False)
+    assert dialect.feed(0.0, assembly.line(0.0)).size == 1
+    assert dialect.cells.shape == (1, MOST_CELLS)
+
+
+def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ever() -> None:
+    assembly = Assembly(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
+    assert told(assembly, [("v", "52")]) == []
+    assert assembly.fault == "current: nothing comes on i"
+    assert told(assembly, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
+    assembly.take("i", b"2", 20.0, retained=False)
+    assert assembly.line(20.4) == b""
+    assert assembly.wait_s(20.4) == pytest.approx(0.1)
+    assert json.loads(assembly.line(20.5)) == {"voltage_v": 51.0, "current_a": 2.0}
+    assert assembly.wait_s(20.5) is None
+    assert told(assembly, [("i", "3")], 40.0) == []
+    assert assembly.counters["stale"] == 2
+    assert assembly.fault == "voltage: nothing on v for 30 s"
+    assert told(assembly, [("v", "50")], 41.0) == [{"voltage_v": 50.0, "current_a": 3.0}]
+    assert assembly.fault is None
+
+
+def test_temperature_and_cells_may_be_older() -> None:
+    assembly = Assembly(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature={"topic": "t"}))
+    both = [("v", "52"), ("i", "1")]
+    told(assembly, [("t", "21.5")])
+    assert told(assembly, both, 299.0)[0]["temperature_c"] == 21.5
+    assert "temperature_c" not in told(assembly, both, 301.0)[0]
+
+
+def test_what_the_broker_had_kept_is_not_taken() -> None:
+    assembly = Assembly(own(availability_topic="home/status"))
+    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
+    assert assembly.counters["retained"] == 1
+    assert assembly.fault == "nothing comes on home/pack, but what the broker has kept from earlier"
+    told(assembly, [("home/status", "offline")], retained=True)
+    assert assembly.fault == "the publisher says offline on home/status"
+    told(assembly, [("home/status", '{"state":"online"}')])
+    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    assert assembly.fault is None
+
+
+@pytest.mark.parametrize(
+    ("payload", "kind", "said"),
+    [
+        ('{"i": 1}', "missing", "voltage: home/pack: u: not in {'i': 1}"),
+        ('{"u": "unavailable", "i": 1}', "no_number", "no number: 'unavailable'"),
+        ('{"u": null, "i": 1}', "no_number", "no number: None"),
+        ('{"u": NaN, "i": 1}', "no_number", "no number: 'NaN'"),
+        ('{"u": true, "i": 1}', "no_number", "no number: True"),
+        ('{"u": [], "i": 1}', "no_number", "no number: []"),
+        ('{"u": 1e999, "i": 1}', "no_number", "no number: inf"),
+        ('{"u": 1%s, "i": 1}' % (400 * "0"), "no_number", "no number: 1000"),
+        ("unavailable", "no_number", "no JSON: 'unavailable'"),
+        ("", "no_number", "no JSON: ''"),
+        ("3_9", "no_number", "no JSON: '3_9'"),
+        ("42", "missing", "u: not in 42"),
+        (5000 * "[", "no_number", "no JSON: '[[["),
+    ],
+)
+def test_a_payload_that_tells_nothing_is_counted_and_said(payload: str, kind: str, said: str) -> None:
+    assembly = Assembly(own())
+    assert told(assembly, [("home/pack", payload)]) == []
+    assert assembly.counters[kind] >= 1
+    assert said in (assembly.fault or "")
+    assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+
+
+@given(st.binary() | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode))
+def test_no_payload_makes_it_raise(payload: bytes) -> None:
+    settings = own(cells="c.{cell}", temperature={"path": "0.1"}, time={"path": "t", "unit": "iso"})
+    assembly = Assembly(settings)
+    assembly.take("home/pack", payload, 0.0, retained=False)
+    assembly.line(1.0)
+    for name, place in settings.places():
+        for way in (one, many):
+            try:
+                way(payload, place, name)
+            except NoNumberError:
+                continue
+
+
+@pytest.mark.parametrize(
+    ("prefix", "instance", "begin"), [("jk-bms", "", "jk-bms_"), ("jk-bms", "", ""), ("home/bms", "jk-bms", "jk-bms_")]
+)
+def test_a_node_may_have_another_prefix_and_leave_its_name_away(prefix: str, instance: str, begin: str) -> None:
+    assembly = Assembly(source(profile="esphome-jk", prefix=prefix, instance=instance))
+    values = [("total_voltage", "52.98"), ("current", "-12.34"), ("balancing_current", "1")]
+    sample = told(assembly, [(f"{prefix}/sensor/{begin}{name}/state", value) for name, value in values])
+    assert sample == [{"voltage_v": 52.98, "current_a": -12.34}]
+
+
+def test_it_subscribes_to_nothing_twice() -> None:
+    jk = source(profile="esphome-jk", prefix="jk-bms")
+    assert Assembly(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
+    assert Assembly(own()).topics == ["home/pack"]
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({}, "voltage: missing; tell where it is found, or a profile: batmon-ha"),
+        ({"profile": "venus"}, "profile venus: prefix: missing (VRM portal ID"),
+        ({"profile": "tasmota"}, "profile tasmota: prefix: missing (Topic of the device"),
+        ({"voltage": "u", "current": "i"}, "voltage.topic: missing, and there is no topic for all of them"),
+        (
+            {"topic": "t", "voltage": {"path": "u", "unit": "A"}, "current": "i"},
+            "voltage.unit = A: must be one of V, mV",
+        ),
+        ({"topic": "t", "voltage": {"path": "u", "scale": 0}, "current": "i"}, "voltage.scale = 0: must not be 0"),
+        ({"topic": "t", "voltage": "u", "current": "i", "username": "me"}, "are for a broker at url"),
+    ],
+)
+def test_settings_that_cannot_be_are_said(table: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match="mqtt") as caught:
+        Settings.model_validate({"source": {"kind": "mqtt"} | table})
+    assert said in str(caught.value)
+
+
+def test_what_is_told_goes_before_the_profile() -> None:
+    told_too = source(profile="battery-emulator", current={"scale": -1}, temperature="temperature_min", interval_s=2)
+    assert told_too.current.topics == ("{prefix}/info{instance}",)
+    assert (told_too.current.path, told_too.current.scale) == ("battery_current", -1.0)
+    assert told_too.temperature.path == "temperature_min"
+    assert (told_too.prefix, told_too.period_s) == ("BE", 2.0)
+
+
+def _merged(*publishers: tuple[float, float, float, float]) -> list[tuple[float, float]]:
+    """Times and currents of publishers, each given by period, first and last time, and current."""
+    messages = [
+        (first_s + period_s * i, current_a)
+        for period_s, first_s, last_s, current_a in publishers
+        for i in range(round((last_s - first_s) / period_s))
+    ]
+    return sorted(messages)
+
+
+def _errors(messages: list[tuple[float, float]]) -> tuple[Assembly, list[float]]:
+    """Times at which a message was counted as one of two publishers [s]."""
+    assembly, found = Assembly(own()), list[float]()
+    for at_s, current_a in messages:
+        before = assembly.counters["publisher_errors"]
+        assembly.take("home/pack", json.dumps({"u": 52.0, "i": current_a}).encode(), at_s, retained=False)
+        found += [at_s] * (assembly.counters["publisher_errors"] - before)
+    return assembly, found
+
+
+@pytest.mark.parametrize("period_s", [0.2, 1.0, 2.7])
+def test_a_second_publisher_of_a_topic_is_counted_and_named_until_it_is_gone(period_s: float) -> None:
+    rival = (period_s, 100.3, 160.0, -80.0)
+    assembly, found = _errors(_merged((1.0, 0.0, 160.0, 5.0), rival))
+    assert 100.3 < found[0] < 115.0
+    assert found[-1] > 158.0
+    assert set(assembly.conflict.removeprefix("home/pack: current ").split(" and ")) == {"5", "-80"}
+    assembly, found = _errors(_merged((1.0, 0.0, 400.0, 5.0), rival))
+    assert assembly.conflict == ""
+    assert found[-1] < 160.0 + 64.0
+
+
+@pytest.mark.parametrize("on_s", [1, 2, 3, 10])
+def test_a_load_that_switches_on_and_off_is_no_second_publisher(on_s: int) -> None:
+    messages = [(float(second), 80.0 if second // on_s % 2 else -5.0) for second in range(1000)]
+    assembly, found = _errors(messages)
+    assert (assembly.conflict, found) == ("", [])
+
+
+@pytest.mark.parametrize(("on_s", "off_s", "spread"), [(3, 60, 0.0), (600, 1800, 0.1), (5, 15, 0.9)])
+def test_a_load_of_which_only_the_changes_are_published_is_no_second_publisher(
+    on_s: int, off_s: int, spread: float
+) -> None:
+    """A short pulse in each minute, a refrigerator, a load that somebody switches."""
+    chance, messages, at_s = random.Random(1), list[tuple[float, float]](), 0.0
+    for _ in range(200):
+        for pause_s, current_a in ((off_s, 80.0), (on_s, 5.0)):
+            at_s += pause_s * chance.uniform(1.0 - spread, 1.0 + spread)
+            messages.append((at_s, current_a))
+    assembly, found = _errors(messages)
+    assert (assembly.conflict, found) == ("", [])
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_publisher_that_reports_changes_beside_its_regular_messages_is_no_second_one(*, restarts: bool) -> None:
+    """A message each 10 s, counted from the last change or not, and a load that is on for 3 s of 61 s."""
+    messages: list[tuple[float, float]] = []
+    for cycle in range(30):
+        on_s = 61.0 * cycle
+        messages += [(on_s, 80.0), (on_s + 3.0, 5.0)]
+        if restarts:
+            messages += [(on_s + 3.0 + 10.0 * i, 5.0) for i in range(1, 6)]
+    if not restarts:
+        messages += [(10.0 * i + 0.5, 80.0 if (10.0 * i + 0.5) % 61.0 < 3.0 else 5.0) for i in range(183)]
+    assembly, found = _errors(sorted(messages))
+    assert (assembly.conflict, found) == ("", [])
+
+
+def test_a_second_publisher_that_is_slower_is_found() -> None:
+    _, found = _errors(_merged((1.0, 0.0, 400.0, 5.0), (10.0, 100.3, 400.0, -80.0)))
+    assert found
+    assert found[0] < 160.0
+
+
+def test_a_publisher_with_a_current_of_its_own_at_random_times_is_a_second_one() -> None:
+    chance, rival, at_s = random.Random(1), list[tuple[float, float]](), 100.0
+    while at_s < 160.0:
+        at_s += chance.expovariate(1.0)
+        rival.append((at_s, -80.0))
+    _, found = _errors(sorted(_merged((1.0, 0.0, 160.0, 5.0)) + rival))
+    assert 100.0 < found[0] < 115.0
+
+
+def test_cells_that_are_no_longer_measured_do_not_stay_as_they_were() -> None:
+    together = Assembly(own(cells="cells"))
+    payloads = ('{"u": 52.0, "i": 1.0, "cells": [3.3, 3.4]}', '{"u": 52.0, "i": 1.0, "cells": null}')
+    first, lost = told(together, [("home/pack", payload) for payload in payloads])
+    assert (first["cells_v"], "cells_v" in lost) == ([3.3, 3.4], False)
+    each = Assembly(own(cells={"topic": "home/cell/{cell}"}))
+    pack = ("home/pack", '{"u": 52.0, "i": 1.0}')
+    before, after = told(
+        each, [("home/cell/1", "3.3"), ("home/cell/2", "3.4"), pack, ("home/cell/1", "unavailable"), pack]
+    )
+    assert (before["cells_v"], after["cells_v"]) == ([3.3, 3.4], [None, 3.4])

@@ -1,0 +1,134 @@
+"""What is on the port need not be the board: nothing is sent to a stranger, and under ``auto`` one board is kept to; ``test_pinned_board`` has the rest."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from serial.tools import list_ports
+
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.protocols.firmware.messages import hello_command
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.sources.serial import port_list
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from tests.patience import LONG_S
+from tests.serial_line import Line, usb_port
+
+ASH_RESET = b"\x1a\xc1\x02\x0b\x0a\x52\x7e"
+"""What a Zigbee stick says after its reset."""
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - the condition is the test's
+            await asyncio.sleep(0.01)
+
+
+@contextlib.asynccontextmanager
+async def taken(source: SerialBoard, blocks: list[SampleBlock]):
+    """The source at work, its blocks kept."""
+
+    async def keep() -> None:
+        async for block in source:
+            blocks.append(block.copy())  # noqa: PERF401 - others read the list meanwhile
+
+    async with source:
+        task = asyncio.create_task(keep())
+        try:
+            yield
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_nothing_is_sent_to_a_device_that_speaks_something_else(line: Line) -> None:
+    line.plug()
+    source = SerialBoard(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
+    async with taken(source, []):
+        await until(lambda: source.message and "silent" in source.message)
+        assert line.heard() == b""
+        line.write(100 * ASH_RESET)
+        await until(lambda: source.message and "no valid frame" in source.message)
+        assert line.heard() == b""
+
+
+async def test_a_board_that_is_heard_is_asked_for_its_hello(line: Line) -> None:
+    line.plug()
+    source = SerialBoard(SensorSettings(port=str(line.path)), first_retry_s=0.05)
+    async with taken(source, []):
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"\0" + hello_command())  # any frame with a right CRC
+        heard = b""
+
+        def asked() -> bool:
+            nonlocal heard
+            heard += line.heard()
+            return heard.startswith(hello_command())
+
+        await until(asked)
+
+
+@pytest.fixture
+def auto(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """Where the only port is, if one is plugged in."""
+    path = tmp_path / "ttyUSB0"
+    monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path))] if path.is_symlink() else [])
+    monkeypatch.setattr(port_list, "BY_ID", tmp_path / "by-id")
+    return path
+
+
+@contextlib.contextmanager
+def linked(path: Path, target: str):
+    path.symlink_to(target)
+    try:
+        yield
+    finally:
+        path.unlink()
+
+
+@contextlib.asynccontextmanager
+async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
+    """A board on ``path`` that runs."""
+    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial) as board, linked(path, board.path):
+        task = asyncio.create_task(board.run())
+        try:
+            yield
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -> None:
+    blocks = list[SampleBlock]()
+    source = SerialBoard(SensorSettings(port="auto", sample_rate_hz=50), first_retry_s=0.05)
+    async with taken(source, blocks):
+        async with plugged_in(auto, serial=1):
+            await until(lambda: source._door.serial)
+        await until(lambda: source.message)
+        async with plugged_in(auto, serial=2, voltage_v=11.1):
+            await until(lambda: source.message and "refused" in source.message)
+            assert "board 00000002 is not the pack's, 00000001" in (source.message or "")
+            await until(lambda: source.counters["reconnects"] >= 2)  # it was looked at once more
+        taken_before = len(blocks)
+        async with plugged_in(auto, serial=1):
+            await until(lambda: len(blocks) > taken_before)
+        assert source.board["serial"] == "00000001"
+    assert np.concatenate(blocks)["voltage_v"] == pytest.approx(22.2, abs=0.1)
+
+
+async def test_auto_says_what_comes_in_place_of_its_own_board(auto: Path) -> None:
+    source = SerialBoard(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
+    async with taken(source, []):
+        async with plugged_in(auto, serial=1):
+            await until(lambda: source._door.serial)
+        await until(lambda: source.message)
+        with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, linked(auto, other.path):
+            task = asyncio.create_task(other.run())
+            await until(lambda: source.message and "prints text" in source.message)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)

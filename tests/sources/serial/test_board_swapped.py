@@ -1,0 +1,165 @@
+"""A board that runs is wired to the open port in place of ours: no reset tells, and its scaling is another."""
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+from bms_estimator.protocols.firmware.framing import LONGEST_DOUBT_S
+from bms_estimator.protocols.firmware.messages import Hello, hello_command
+from bms_estimator.protocols.firmware.protocol import BoardDialect
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.simulation.virtual_adc import BoardParts, Reading
+from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.sources.serial.board_check import HELD_READS, Doorkeeper, OtherBoardError
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from tests.serial_line import Line
+from tests.sources.serial.test_pinned_board import until
+
+PACK_V = 22.2
+PERIOD_S = 0.01
+BEGIN_S = 1_700_000_000.0
+
+
+class Running:
+    """A board that has run for ``age_s`` and counted ``sequence`` samples."""
+
+    def __init__(self, serial: int, divider: float, sequence: int = 0, age_s: float = 0.0) -> None:
+        self._board = VirtualBoard(
+            lambda _: Reading(0.5, PACK_V, 25.0), serial=serial, parts=BoardParts(divider=divider)
+        )
+        self._board._sequence, self._board._ns = sequence, int(age_s * 1e9)
+
+    def hello(self) -> bytes:
+        hello: Hello = self._board._hello()
+        return hello.encode()
+
+    def frames(self, count: int) -> list[bytes]:
+        taken = []
+        for _ in range(count):
+            self._board._line.clear()
+            self._board._take_sample()
+            taken.append(bytes(self._board._line))
+        return taken
+
+
+def fed(decoder: FrameDecoder, begin_s: float, frames: list[bytes]) -> SampleBlock:
+    return np.concatenate([decoder.feed(begin_s + PERIOD_S * i, frame) for i, frame in enumerate(frames)])
+
+
+def ours() -> FrameDecoder:
+    """A decoder that has heard our board for a second."""
+    decoder, board = FrameDecoder(), Running(1, 6.1)
+    decoder.feed(BEGIN_S, board.hello())
+    assert fed(decoder, BEGIN_S + PERIOD_S, board.frames(100))["voltage_v"] == pytest.approx(PACK_V, abs=0.1)
+    return decoder
+
+
+@pytest.mark.parametrize(
+    ("sequence", "age_s", "away_s"),
+    [(50_000, 900.0, 1.0), (101, 900.0, 1.0), (50_000, 2.0, 1.0), (700_000, 3500.0, 3600.0), (3000, 30.0, 3600.0)],
+    ids=["ahead", "by its clock alone", "by its sequence alone", "after an hour", "begun within that hour"],
+)
+def test_samples_that_ours_cannot_have_sent_wait_for_a_hello(sequence: int, age_s: float, away_s: float) -> None:
+    decoder, other = ours(), Running(2, 9.0, sequence, age_s)
+    begin_s = BEGIN_S + 1.0 + away_s
+    assert fed(decoder, begin_s, other.frames(100)).size == 0
+    assert decoder.hello is None
+    decoder.feed(begin_s + 1.0, other.hello())
+    taken = fed(decoder, begin_s + 1.0 + PERIOD_S, other.frames(100))
+    assert taken.size == 100
+    assert taken["voltage_v"] == pytest.approx(PACK_V, abs=0.1)
+    assert decoder.board["serial"] == "00000002"
+
+
+def test_what_was_lost_is_no_reason_to_doubt_whose_the_samples_are() -> None:
+    decoder, board = ours(), Running(1, 6.1, 100, 1.0)
+    board.frames(12_345)
+    taken = fed(decoder, BEGIN_S + 1.0 + 123.46, board.frames(10))
+    assert taken.size == 10
+    assert decoder.hello
+    assert decoder.counters.frames_lost == 12_345
+
+
+def test_a_board_that_tells_nothing_is_taken_after_a_while_and_the_gap_is_told() -> None:
+    """Its line may have no way back: it cannot be asked."""
+    decoder, board = ours(), Running(1, 6.1, 100, 900.0)
+    taken = fed(decoder, BEGIN_S + 2.0, board.frames(1000))
+    assert taken.size == decoder.counters.frames_received - 100 == 1000 - LONGEST_DOUBT_S / PERIOD_S
+    assert decoder.counters.before_hello == LONGEST_DOUBT_S / PERIOD_S
+    assert decoder.hello is None
+    lost = ours()
+    taken = fed(lost, BEGIN_S + 2.0, Running(1, 6.1, 50_000, 900.0).frames(1000))
+    assert taken["status"][0] & SampleStatus.GAP
+    assert not taken["status"][1:].any()
+
+
+async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(line: Line) -> None:
+    line.plug()
+    source = SerialBoard(SensorSettings(port=str(line.path)), first_retry_s=0.05)
+    blocks: list[SampleBlock] = []
+    ours, other = Running(1, 6.1), Running(2, 9.0, 50_000, 900.0)
+
+    async def keep() -> None:
+        async for block in source:
+            blocks.append(block)  # noqa: PERF401 - the test reads the list meanwhile
+
+    async with source:
+        task = asyncio.create_task(keep())
+        try:
+            await until(lambda: source.message and "no frame yet" in source.message)
+            line.write(ours.hello() + b"".join(ours.frames(10)))
+            await until(lambda: source._door.serial)
+            heard = line.heard()
+            line.write(b"".join(other.frames(10)))
+
+            def asked() -> bool:
+                nonlocal heard
+                heard += line.heard()
+                return hello_command() in heard
+
+            await until(asked)
+            line.write(other.hello() + b"".join(other.frames(10)))
+            await until(lambda: source.message and "board 00000002 is not the pack's, 00000001" in source.message)
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+    assert np.concatenate(blocks)["voltage_v"] == pytest.approx(np.full(10, PACK_V), abs=0.1)
+
+
+def door_of_ours() -> tuple[Doorkeeper, BoardDialect]:
+    """It knows our board."""
+    dialect, door = BoardDialect(), Doorkeeper(BoardDialect)
+    dialect.feed(BEGIN_S, Running(1, 6.1).hello())
+    door.know(dialect.board, 0.0)
+    return door, dialect
+
+
+def test_nothing_of_a_board_that_was_refused_passes_before_the_port_is_opened_anew() -> None:
+    """Reads that wait behind the one with its hello have none."""
+    own, other = Running(1, 6.1), Running(2, 9.0)
+    door, dialect = door_of_ours()
+    with pytest.raises(OtherBoardError):
+        door.admit((BEGIN_S, other.hello()), dialect)
+    frame = other.frames(1)[0]
+    assert door.admit((BEGIN_S, frame), dialect) == ()
+    assert door.unadmitted_bytes == len(other.hello() + frame)
+    door.opened()
+    assert len(door.admit((BEGIN_S, own.hello()), dialect)) == 1
+
+
+def test_each_byte_of_a_board_that_is_not_known_yet_passes_once_or_is_counted() -> None:
+    board = Running(1, 6.1)
+    door, dialect = door_of_ours()
+    reads = [(BEGIN_S, frame) for frame in board.frames(HELD_READS + 5)]
+    door.opened()
+    assert not any(door.admit(read, dialect) for read in reads[:7])
+    door.opened()  # the port was lost
+    assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7])
+    assert not any(door.admit(read, dialect) for read in reads)
+    hello = BEGIN_S, board.hello()
+    assert door.admit(hello, dialect) == [*reads[6:], hello]
+    door.opened()
+    assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])

@@ -1,0 +1,108 @@
+"""Who is on a port is found without doing harm: devices of all protocols are asked by questions alone."""
+
+import contextlib
+import os
+import tty
+
+import pytest
+
+from bms_estimator.protocols.devices import daly, jbd, jk, junctek
+from bms_estimator.protocols.devices.pylontech import PylontechDialect
+from bms_estimator.simulation.bms_answers import BMS_ANSWERS
+from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.simulated_meter import METERS
+from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.sources.serial import device_detection, port_list
+from bms_estimator.sources.serial.device_detection import Found
+from tests.device_line import on_a_line
+from tests.patience import LONG_S
+
+
+@pytest.fixture(autouse=True)
+def quick_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_detection, "TURN_S", 0.05)
+
+
+def steady(_: float) -> Reading:
+    return Reading(-3.2, 26.4, 21.0)
+
+
+def bms(name: str) -> SimulatedBms:
+    return SimulatedBms(name, steady, cells=8)
+
+
+@pytest.mark.parametrize("name", [name for name in BMS_ANSWERS if name != "jk-pb"])
+def test_a_bms_is_named_with_its_cells(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_detection, "EACH_S", LONG_S)
+    with on_a_line(bms(name)) as path:
+        found = device_detection.probe(path, 115_200)
+    assert isinstance(found, Found)
+    assert (found.protocol, found.baud, found.cells) == (name, 115_200, 8)
+    assert "8 cells" in str(found)
+    assert str(found).endswith(f"; protocol {name}, 115200 baud")
+
+
+@pytest.mark.parametrize("name", METERS)
+def test_a_meter_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_detection, "EACH_S", LONG_S)
+    with on_a_line(METERS[name](steady, 1.0)) as path:
+        found = device_detection.probe(path, 115_200)
+    assert isinstance(found, Found)
+    assert found.protocol == name
+
+
+def test_it_is_found_at_its_own_baud_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_detection, "PATIENCE_S", 0.1)  # for a board, which is not there
+    monkeypatch.setattr(device_detection, "EACH_S", LONG_S)
+    with on_a_line(bms("jk")) as path:
+        found = device_detection.probe(path)
+    assert isinstance(found, Found)
+    assert (found.protocol, found.baud) == ("jk", 115_200)
+
+
+def test_the_newer_jk_that_is_only_asked_by_what_others_take_for_a_write_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(device_detection, "EACH_S", 0.1)
+    monkeypatch.setattr(device_detection, "PATIENCE_S", 0.1)
+    with on_a_line(bms("jk-pb")) as path:
+        assert device_detection.probe(path) == "silent"
+
+
+def test_a_silent_device_is_sent_questions_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_detection, "EACH_S", 0.3)
+    monkeypatch.setattr(device_detection, "PATIENCE_S", 0.1)
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    try:
+        assert device_detection.probe(os.ttyname(slave)) == "silent"
+        sent = os.read(master, 1 << 16)
+    finally:
+        os.close(slave)
+        os.close(master)
+    assert jk.OLD_QUESTION in sent
+    questions = [
+        jk.OLD_QUESTION,
+        junctek.ASK,
+        PylontechDialect().due(0.0),
+        *(jbd.question(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
+        *(daly.question(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
+    ]
+    for question in questions:
+        sent = sent.replace(question, b"")
+    assert sent == b""
+
+
+def test_a_device_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(port_list, "WRITE_S", 0.05)
+    master, slave = os.openpty()
+    try:
+        tty.setraw(slave)
+        os.set_blocking(slave, False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(slave, b"x")
+        assert device_detection.probe(os.ttyname(slave), 115_200) == "lost: Write timeout"
+    finally:
+        os.close(slave)
+        os.close(master)

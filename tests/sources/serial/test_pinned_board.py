@@ -1,0 +1,431 @@
+"""One board belongs to a pack: it is known by its serial number on whatever port, and no other is taken in its place."""
+
+import asyncio
+import contextlib
+import json
+import os
+import shutil
+import stat
+import tty
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from serial.tools import list_ports
+from structlog.testing import capture_logs
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.service.serve import serve
+from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
+from bms_estimator.simulation.virtual_adc import BoardParts, Reading
+from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.sources.serial import board_check, port_list, serial_source
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, BoardMemory
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from tests.collector import Collector
+from tests.command_line import run
+from tests.patience import LONG_S
+from tests.serial_line import usb_port
+
+OURS_V, OTHERS_V = 22.2, 11.1
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - the condition is the test's
+            await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Where ports are: each link in it is a USB port with a board's chip."""
+    there = tmp_path / "dev"
+    there.mkdir()
+    monkeypatch.setattr(list_ports, "comports", lambda: [usb_port(str(path)) for path in there.iterdir()])
+    monkeypatch.setattr(port_list, "BY_ID", tmp_path / "by-id")
+    monkeypatch.setattr(serial_source, "TALK_S", 0.02)
+    return there
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> BoardMemory:
+    return BoardMemory(tmp_path, "house")
+
+
+class Taken(SerialBoard):
+    """A source at work."""
+
+    blocks: list[SampleBlock]
+
+    @property
+    def voltage_v(self) -> float:
+        """Of the last sample."""
+        return float(self.blocks[-1]["voltage_v"][-1]) if self.blocks else float("nan")
+
+
+@contextlib.asynccontextmanager
+async def source(port: Path | str, memory: BoardMemory | None = None, **settings: Any) -> AsyncIterator[Taken]:
+    taken = Taken(SensorSettings(port=str(port), **settings), memory=memory, first_retry_s=0.05, silent_s=0.3)
+    taken.blocks = []
+
+    async def keep() -> None:
+        async for block in taken:
+            taken.blocks.append(block.copy())
+
+    async with taken:
+        task = asyncio.create_task(keep())
+        try:
+            yield taken
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def board(path: Path, serial: int = 1, voltage_v: float = OURS_V, **options: Any) -> AsyncIterator[VirtualBoard]:
+    """A board that runs, plugged in at ``path``."""
+    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial, **options) as virtual:
+        path.symlink_to(virtual.path)  # noqa: ASYNC240 - at once
+        task = asyncio.create_task(virtual.run())
+        try:
+            yield virtual
+        finally:
+            path.unlink()  # noqa: ASYNC240
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+async def remembered(memory: BoardMemory, serial: str) -> None:
+    await until(lambda: memory.load().get("serial") == serial)
+
+
+async def test_another_board_on_the_named_port_is_refused_after_a_restart(folder: Path, memory: BoardMemory) -> None:
+    port = folder / "ttyUSB0"
+    async with source(port, memory), board(port):
+        await remembered(memory, "00000001")
+    async with source(port, memory) as taken, board(port, serial=2, voltage_v=OTHERS_V):
+        await until(lambda: taken.message and "refused" in taken.message)
+        said = (
+            f"{port}: refused: board 00000002 is not the pack's, 00000001: plug that in, or, if it takes its place, run"
+        )
+        assert said in (taken.message or "")
+        assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (taken.message or "")
+        await until(lambda: taken.counters["reconnects"] >= 1)
+        assert taken.blocks == []
+
+
+async def test_another_board_on_the_named_port_is_refused_within_a_run(folder: Path) -> None:
+    port = folder / "ttyUSB0"
+    async with source(port) as taken:
+        async with board(port):
+            await until(lambda: taken._door.serial)
+        await until(lambda: taken.message)
+        async with board(port, serial=2, voltage_v=OTHERS_V):
+            await until(lambda: taken.message and "refused" in taken.message)
+        seen = len(taken.blocks)
+        async with board(port):
+            await until(lambda: len(taken.blocks) > seen)
+    assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
+
+
+async def test_the_first_board_is_not_taken_when_the_settings_name_another(folder: Path, memory: BoardMemory) -> None:
+    port = folder / "ttyUSB0"
+    async with source(port, memory, serial="0000002a") as taken:
+        async with board(port, voltage_v=OTHERS_V):
+            await until(lambda: taken.message and "refused" in taken.message)
+            assert "board 00000001 is not the pack's, 0000002a" in (taken.message or "")
+            assert "set sensor.serial" in (taken.message or "")
+        async with board(port, serial=42):
+            await until(lambda: taken.blocks)
+        assert taken.voltage_v == pytest.approx(OURS_V, abs=0.1)
+
+
+async def test_a_board_without_a_serial_number_is_none_that_is_known(folder: Path, memory: BoardMemory) -> None:
+    port = folder / "ttyUSB0"
+    with capture_logs() as logs:
+        async with source(port, memory) as taken, board(port, serial=0):
+            await until(lambda: [line for line in logs if "no serial number" in line["event"]])
+            assert taken.board["serial"] == ""
+    assert memory.load() == {}
+    async with source(port, memory, serial="00000001") as taken, board(port, serial=0):
+        await until(lambda: "board without a serial number is not the pack's" in (taken.message or ""))
+
+
+async def test_a_board_that_takes_the_place_of_another_behind_the_same_adapter_is_refused(folder: Path) -> None:
+    """The port stays: nothing but the hello tells."""
+    port = folder / "ttyUSB0"
+    async with source(port) as taken, board(port) as virtual:
+        await until(lambda: taken._door.serial)
+        virtual._kept[20] = 2
+        virtual._converter = VirtualBoard(lambda _: Reading(0.5, 1.0), parts=BoardParts(divider=9.0))._converter
+        virtual.reset()
+        await until(lambda: taken.message and "board 00000002 is not the pack's, 00000001" in taken.message)
+    assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
+
+
+async def test_a_board_back_under_another_name_is_found(folder: Path, memory: BoardMemory) -> None:
+    port = folder / "ttyUSB0"
+    async with source(port, memory) as taken:
+        async with board(port):
+            await until(lambda: taken._door.serial)
+        await until(lambda: taken.message)
+        seen = len(taken.blocks)
+        async with board(folder / "ttyUSB1", serial=2, voltage_v=OTHERS_V), board(folder / "ttyUSB2"):
+            await until(lambda: len(taken.blocks) > seen)
+        seen = len(taken.blocks)
+        async with board(port):  # and again where it was
+            await until(lambda: len(taken.blocks) > seen)
+    assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
+
+
+async def test_two_boards_that_were_swapped_are_each_found_by_their_own_pack(folder: Path, tmp_path: Path) -> None:
+    one, two = folder / "ttyUSB0", folder / "ttyUSB1"
+    memories = [BoardMemory(tmp_path, name) for name in ("house", "shed")]
+    async with (
+        source(one, memories[0]),
+        source(two, memories[1]),
+        board(one, serial=1),
+        board(two, serial=2, voltage_v=OTHERS_V),
+    ):
+        await remembered(memories[0], "00000001")
+        await remembered(memories[1], "00000002")
+    async with (
+        source(one, memories[0]) as house,
+        source(two, memories[1]) as shed,
+        board(two, serial=1),
+        board(one, serial=2, voltage_v=OTHERS_V),
+    ):
+        await until(lambda: house.blocks and shed.blocks)
+    assert np.concatenate(house.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
+    assert np.concatenate(shed.blocks)["voltage_v"] == pytest.approx(OTHERS_V, abs=0.1)
+
+
+async def test_two_packs_find_their_boards_among_all_ports(folder: Path) -> None:
+    async with (
+        source("auto", serial="00000001") as house,
+        source("auto", serial="00000002") as shed,
+        board(folder / "a", serial=2, voltage_v=OTHERS_V),
+        board(folder / "b", serial=1),
+    ):
+        await until(lambda: house.blocks and shed.blocks)
+    assert np.concatenate(house.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
+    assert np.concatenate(shed.blocks)["voltage_v"] == pytest.approx(OTHERS_V, abs=0.1)
+
+
+async def test_the_search_writes_nothing_to_a_silent_device_and_leaves_it(folder: Path) -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    (folder / "ttyUSB0").symlink_to(os.ttyname(slave))
+    os.set_blocking(master, False)
+    try:
+        async with source(folder / "gone", serial="00000001") as taken:
+            await until(lambda: taken._where._left)
+            async with board(folder / "ttyUSB1"):
+                await until(lambda: taken.blocks)
+        with pytest.raises(BlockingIOError):
+            os.read(master, 1)
+    finally:
+        os.close(slave)
+        os.close(master)
+
+
+async def test_a_changed_calibration_is_taken_and_said(folder: Path, memory: BoardMemory) -> None:
+    port = folder / "ttyUSB0"
+    async with source(port, memory), board(port):
+        await remembered(memory, "00000001")
+    with capture_logs() as logs:
+        async with source(port, memory) as taken, board(port, parts=BoardParts(divider=5.4)):
+            await until(lambda: memory.load().get("divider") == "5.4")
+            assert taken.blocks
+    said = [line for line in logs if line["event"] == "the board is calibrated differently"]
+    assert [line["divider"] for line in said] == ["6.1 to 5.4"]
+    assert "serial" not in said[0]
+
+
+async def test_a_service_that_runs_takes_another_board_once_it_is_accepted(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    memory, port = BoardMemory(tmp_path, "house"), folder / "ttyUSB0"
+    pack = tmp_path / "pack.toml"
+    pack.write_text(f'[pack]\nname = "house"\n[state]\nfolder = "{tmp_path}"\n')
+    async with source(port, memory) as taken:
+        async with board(port):
+            await remembered(memory, "00000001")
+        async with board(port, serial=2, voltage_v=OTHERS_V):
+            await until(lambda: taken.message and "refused" in taken.message)
+            code, text, _ = run(capsys, "board", "--accept", pack)
+            assert code == 0
+            assert f"{memory.path}: board 00000001 is forgotten: the next that comes is the pack's\n" in text
+            await remembered(memory, "00000002")
+            assert taken.voltage_v == pytest.approx(OTHERS_V, abs=0.1)
+
+
+async def test_a_memory_that_was_deleted_lets_no_other_board_in(folder: Path, memory: BoardMemory) -> None:
+    port = folder / "ttyUSB0"
+    async with source(port, memory) as taken:
+        async with board(port):
+            await remembered(memory, "00000001")
+        memory.path.unlink()
+        async with board(port, serial=2):
+            await until(lambda: taken.message and "refused" in taken.message)
+            refused = taken.counters["reconnects"]
+            await until(lambda: taken.counters["reconnects"] > refused)
+            assert "refused" in (taken.message or "")
+
+
+async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_health(
+    folder: Path, tmp_path: Path, memory: BoardMemory
+) -> None:
+    port = folder / "ttyUSB0"
+    settings = Settings(
+        pack=PackSettings(name="house", cell="ncr18650", series=6), sensor=SensorSettings(port=str(port))
+    )
+
+    async def served(until_told: Callable[[Snapshot], bool]) -> Snapshot:
+        stop, sink = asyncio.Event(), Collector()
+        cell = load_cell("ncr18650").pack(6, 1)
+        running = asyncio.create_task(serve(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
+        try:
+            return await sink.until(until_told)
+        finally:
+            stop.set()
+            await running
+
+    async with board(port):
+        await served(lambda s: s.health.samples["samples"] > 0 and bool(memory.load()))
+    async with board(port, serial=2, voltage_v=OTHERS_V):
+        told = await served(lambda s: "refused" in (s.health.sensor_message or ""))
+    assert "board 00000002 is not the pack's, 00000001" in (told.health.sensor_message or "")
+    assert told.health.samples["samples"] <= 1  # that of the checkpoint
+
+
+async def test_a_board_that_prints_text_is_taken_whatever_board_was_remembered(
+    folder: Path, memory: BoardMemory
+) -> None:
+    port = folder / "ttyUSB0"
+    memory.keep({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
+    async with source(port, memory, protocol="text") as taken, board(port, mode="text"):
+        await until(lambda: taken.blocks)
+
+
+async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_it_does(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_check, "RETRY_S", 0.05, raising=False)
+    memory, said = BoardMemory(tmp_path / "gone", "house"), "the board cannot be remembered"
+    memory.path.parent.touch()  # a file where the folder should be
+    with capture_logs() as logs:
+        async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
+            await until(lambda: [line for line in logs if said in line["event"]])
+            seen = len(taken.blocks)
+            await until(lambda: len(taken.blocks) > seen + 3)
+            memory.path.parent.unlink()
+            await remembered(memory, "00000001")
+    assert len([line for line in logs if said in line["event"]]) == 1
+    assert stat.S_IMODE(memory.path.parent.stat().st_mode) == 0o700
+
+
+async def test_a_folder_that_is_deleted_comes_back_with_the_board(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_check, "RETRY_S", 0.05)
+    memory = BoardMemory(tmp_path / "state", "house")
+    async with source(folder / "ttyUSB0", memory), board(folder / "ttyUSB0"):
+        await remembered(memory, "00000001")
+        shutil.rmtree(memory.path.parent)
+        await remembered(memory, "00000001")
+
+
+async def test_a_board_that_is_to_be_forgotten_is_not_written_down_again(
+    folder: Path, memory: BoardMemory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_check, "RETRY_S", 0.0)
+    async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
+        await remembered(memory, "00000001")
+        memory.keep(NO_BOARD)
+        seen = len(taken.blocks)
+        await until(lambda: len(taken.blocks) > seen + 30)
+        assert memory.load() == NO_BOARD
+
+
+def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memory: BoardMemory) -> None:
+    kept = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
+    stranger = memory.path.with_name("stranger")
+    stranger.write_text("theirs")
+    memory.path.with_suffix(".new").symlink_to(stranger)
+    memory.keep(kept)
+    assert memory.load() == kept
+    assert stat.S_IMODE(memory.path.stat().st_mode) == 0o600
+    assert stranger.read_text() == "theirs"
+    linked = BoardMemory(memory.path.parent, "linked")
+    linked.path.symlink_to(memory.path)
+    assert linked.load() == {}
+
+
+def test_a_memory_that_is_a_pipe_is_none(memory: BoardMemory) -> None:
+    os.mkfifo(memory.path)
+    writer = os.open(memory.path, os.O_RDWR)
+    try:
+        assert memory.load() == {}
+    finally:
+        os.close(writer)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", "[" * 4000, '{"serial": 1}', json.dumps({"serial": "x" * 3000}), "\xff", "null"]
+)
+def test_a_memory_that_is_damaged_is_none_and_said(memory: BoardMemory, text: str) -> None:
+    memory.path.write_text(text, encoding="latin-1")
+    with capture_logs() as logs:
+        assert memory.load() == {}
+    assert [line["file"] for line in logs] == [str(memory.path)]
+
+
+def test_the_settings_name_a_board_as_the_board_command_shows_it() -> None:
+    assert SensorSettings(serial="0000002a").serial == "0000002a"
+    for wrong in ("42", "0000002A", 42):
+        with pytest.raises(ValidationError):
+            SensorSettings.model_validate({"serial": wrong})
+    with pytest.raises(ValidationError, match="only a binary board tells its number"):
+        SensorSettings(serial="0000002a", protocol="text")
+
+
+def test_a_board_that_the_settings_name_is_accepted_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pack = tmp_path / "pack.toml"
+    pack.write_text('[sensor]\nserial = "0000002a"\n')
+    code, _, err = run(capsys, "board", "--accept", pack)
+    assert code == 2
+    assert "sensor.serial = 0000002a: the settings name the board; change it there" in err
+
+
+def test_a_board_is_accepted_in_the_folder_that_is_named_and_only_where_one_is_known(
+    tmp_path: Path, memory: BoardMemory, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "mine"))
+    pack = tmp_path / "pack.toml"
+    pack.write_text('[pack]\nname = "house"\n')
+    memory.keep({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
+    code, _, err = run(capsys, "board", "--accept", pack)
+    assert code == 2
+    assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is known there" in err
+    assert run(capsys, "board", "--folder", memory.path.parent, "--accept", pack)[0] == 0
+    assert memory.load() == NO_BOARD
+    code, _, err = run(capsys, "board", "--folder", tmp_path)
+    assert code == 2
+    assert "goes with --accept" in err
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for others")
+def test_what_root_writes_is_for_the_owner_of_the_folder(tmp_path: Path) -> None:
+    theirs = tmp_path / "theirs"
+    theirs.mkdir(mode=0o700)
+    os.chown(theirs, 65534, 65533)
+    memory = BoardMemory(theirs, "house")
+    memory.keep(NO_BOARD)
+    found = memory.path.stat()
+    assert (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == (65534, 65533, 0o600)

@@ -1,0 +1,263 @@
+import asyncio
+import contextlib
+import errno
+import os
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import serial
+from serial.tools import list_ports
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.protocols.firmware.messages import ResetCause
+from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.sources.serial import port_list
+from bms_estimator.sources.serial.device_detection import probe
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from tests.patience import LONG_S
+from tests.serial_line import Line
+
+STEADY = Reading(0.5, 22.2, 25.0)
+
+
+def board(line: Line, **options: Any) -> SerialBoard:
+    settings = {"port": str(line.path), "protocol": "text", "baud": 115_200} | options.pop("settings", {})
+    return SerialBoard(SensorSettings(**settings), first_retry_s=0.05, silent_s=0.3, **options)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - the condition is the test's
+            await asyncio.sleep(0.01)
+
+
+async def take(source: SerialBoard, samples: int) -> SampleBlock:
+    blocks: list[SampleBlock] = []
+    async with asyncio.timeout(LONG_S):
+        async for block in source:
+            blocks.append(block.copy())
+            if sum(b.size for b in blocks) >= samples:
+                break
+    return np.concatenate(blocks)
+
+
+async def drain(source: SerialBoard) -> None:
+    async for _ in source:
+        pass
+
+
+@contextlib.asynccontextmanager
+async def at_work(*tasks: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    """All of them go on beside the test."""
+    running = [asyncio.create_task(task) for task in tasks]
+    try:
+        yield
+    finally:
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+
+
+async def keep(source: SerialBoard, blocks: list[SampleBlock]) -> None:
+    async for block in source:
+        blocks.append(block.copy())  # noqa: PERF401 - others read the list meanwhile
+
+
+def count(blocks: list[SampleBlock]) -> int:
+    return sum(block.size for block in blocks)
+
+
+async def test_a_missing_port_is_waited_for_and_said(line: Line) -> None:
+    async with board(line) as source:
+        await until(lambda: source.message and "does not exist" in source.message)
+        assert str(line.path) in (source.message or "")
+        line.plug()
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"3.80,0.10\r\n3.81,0.20\r\n")
+        samples = await take(source, 2)
+        assert source.message is None
+    assert samples["voltage_v"].tolist() == [3.80, 3.81]
+    assert source.counters["reconnects"] == 0
+
+
+async def test_a_board_unplugged_in_mid_run_is_taken_up_again(line: Line) -> None:
+    line.plug()
+    async with board(line) as source:
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"3.80,0.10\n")
+        await take(source, 1)
+        line.unplug()
+        await until(lambda: source.message is not None)
+        line.plug()
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"3.70,0.10\n")
+        samples = await take(source, 1)
+    assert samples["voltage_v"].tolist() == [3.70]
+    assert source.counters["reconnects"] == 1
+
+
+async def test_a_port_held_by_another_process_names_the_process_which_the_loop_does_not_look_for(
+    line: Line, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def holder(port: str) -> str | None:
+        looked_in.add(threading.current_thread())
+        return look(port)
+
+    looked_in, look = set[threading.Thread](), port_list.holder
+    monkeypatch.setattr(port_list, "holder", holder)
+    line.plug()
+    script = (
+        "import serial,sys; s = serial.Serial(sys.argv[1], exclusive=True); print('open', flush=True); sys.stdin.read()"
+    )
+    other = subprocess.Popen(  # noqa: ASYNC220 - started at once
+        [sys.executable, "-c", script, str(line.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    try:
+        assert other.stdout
+        await asyncio.to_thread(other.stdout.readline)
+        async with board(line) as source:
+            await until(lambda: source.message and f"(pid {other.pid})" in source.message)
+            assert looked_in
+            assert threading.current_thread() not in looked_in
+            other.communicate()
+            await until(lambda: source.message and "no frame yet" in source.message)
+    finally:
+        other.communicate()
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "error"),
+    [
+        (termios, "tcsetattr", termios.error(errno.EIO, "Input/output error")),
+        (termios, "tcflush", termios.error(errno.EIO, "Input/output error")),
+        (serial.Serial, "_update_dtr_state", OSError(errno.EIO, "Input/output error")),
+        (serial.Serial, "_reconfigure_port", ValueError("Failed to set custom baud rate")),
+        (os, "open", OSError(errno.ENODEV, "No such device")),
+    ],
+)
+async def test_a_port_that_dies_while_it_is_opened_is_opened_again(
+    line: Line, part: object, name: str, error: Exception
+) -> None:
+    def die(*_: object, **__: object) -> None:
+        raise error
+
+    line.plug()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(part, name, die)
+        async with board(line) as source:
+            await until(lambda: source.message and f"{line.path}: cannot be opened" in source.message)
+            said, probed = source.message, probe(str(line.path))
+            patch.undo()
+            await until(lambda: source.message and "no frame yet" in source.message)
+    assert str(error.args[-1]) in (said or "")
+    assert probed.startswith("cannot be opened")
+
+
+async def test_ports_that_all_go_while_they_are_listed_are_waited_for(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(port_list, "BY_ID", tmp_path / "by-id")
+        patch.setattr(Path, "is_dir", lambda _: True)  # it was there a moment ago
+        patch.setattr(list_ports, "comports", list)
+        async with SerialBoard(SensorSettings(port="auto")) as source:
+            await until(lambda: source.message == "waiting for auto: no USB serial port is there")
+
+
+async def test_a_silent_board_and_one_at_another_baud_rate_are_told_apart(line: Line) -> None:
+    line.plug()
+    async with board(line) as source:
+        taking = asyncio.create_task(drain(source))
+        await until(lambda: source.message and "silent" in source.message)
+        async with asyncio.timeout(LONG_S):
+            while "baud" not in (source.message or ""):
+                line.write(bytes(range(128, 256)))
+                await asyncio.sleep(0.05)
+        assert "at 115200 baud" in (source.message or "")
+        assert "wrong baud rate" in (source.message or "")
+        line.write(b"\n3.80,0.10\n")
+        await until(lambda: source.message is None)
+    await taking
+
+
+async def test_the_sign_of_the_current_is_turned_once(line: Line) -> None:
+    line.plug()
+    async with board(line, settings={"current_sign": "charge_positive"}) as source:
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"3.80,-0.25\n")
+        samples = await take(source, 1)
+    assert samples["current_a"].tolist() == [0.25]
+
+
+async def test_the_tap_gets_what_the_decoder_is_fed(line: Line) -> None:
+    class Tap(list[tuple[float, bytes]]):
+        def write(self, arrival_s: float, data: bytes) -> None:
+            self.append((arrival_s, data))
+
+    tap = Tap()
+    line.plug()
+    async with board(line, tap=tap, wall=lambda: 1e9, monotonic=lambda: 5.0) as source:
+        await until(lambda: source.message and "no frame yet" in source.message)
+        line.write(b"junk\n3.80,0.10\n")
+        await take(source, 1)
+    assert b"".join(data for _, data in tap) == b"junk\n3.80,0.10\n"
+    assert {arrival_s for arrival_s, _ in tap} == {1e9}
+
+
+async def test_a_text_board_takes_no_commands(line: Line) -> None:
+    async with board(line) as source:
+        with pytest.raises(UserError, match="takes no commands"):
+            await source.current_zero()
+
+
+async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> None:
+    blocks: list[SampleBlock] = []
+    with VirtualBoard(lambda _: STEADY) as virtual:
+        async with (
+            SerialBoard(SensorSettings(port=virtual.path)) as source,
+            at_work(virtual.run(), keep(source, blocks)),
+        ):
+            await until(lambda: count(blocks) >= 20)
+            assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.5, abs=0.03)
+            await source.current_zero()
+            blocks.clear()
+            await until(lambda: count(blocks) >= 20)
+            assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.0, abs=0.03)
+
+
+async def test_the_rate_is_set_again_after_a_reset_whose_hello_was_damaged() -> None:
+    blocks: list[SampleBlock] = []
+    with VirtualBoard(lambda _: STEADY) as virtual:
+        source = SerialBoard(SensorSettings(port=virtual.path, sample_rate_hz=250))
+        async with source, at_work(virtual.run(), keep(source, blocks)):
+            await until(lambda: source.board.get("sample_rate_hz") == "250" and count(blocks) >= 200)
+            virtual.send(b"half a frame, which runs into the hello")
+            virtual.reset(ResetCause.BROWN_OUT)
+            await until(lambda: source.counters["resets"] == 1)
+            await until(lambda: source.board.get("sample_rate_hz") == "250")
+            blocks.clear()
+            await until(lambda: count(blocks) >= 20)
+    assert np.diff(np.concatenate(blocks)["time_s"]) == pytest.approx(0.004)
+    assert source.counters["resets"] == 1
+
+
+async def test_a_board_that_was_not_heard_from_its_start_tells_of_itself_and_gets_its_rate(tmp_path: Path) -> None:
+    path, blocks = tmp_path / "board", list[SampleBlock]()
+    source = SerialBoard(SensorSettings(port=str(path), sample_rate_hz=50), first_retry_s=0.05)
+    async with source, at_work(keep(source, blocks)):
+        for _ in range(2):
+            with VirtualBoard(lambda _: STEADY) as virtual:
+                async with at_work(virtual.run()):
+                    await asyncio.sleep(0.1)  # its first hello is gone by the time at which the port is opened
+                    path.symlink_to(virtual.path)
+                    said = {"serial": "00000001", "sample_rate_hz": "50"}
+                    await until(lambda said=said: source.board.items() >= said.items())
+                path.unlink()

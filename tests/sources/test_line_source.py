@@ -1,0 +1,129 @@
+"""Sources that are no serial line: what is brought becomes samples, is recorded, and replays to the same bits."""
+
+import asyncio
+from collections.abc import AsyncGenerator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from structlog.testing import capture_logs
+
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.protocols.base.report_line import CONNECTED, report_line
+from bms_estimator.settings.pack import SensorSettings, Settings
+from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.captures.replay import RawCapture
+from bms_estimator.sources.line_source import Bringer, NothingComesError, Reports
+from tests.patience import LONG_S
+
+TEXT = SensorSettings(protocol="text")
+
+
+class Scripted(Bringer):
+    """Each time it is begun it plays the next script; after the last it brings nothing more."""
+
+    name = "a device"
+
+    def __init__(self, *scripts: Sequence[bytes | Exception]) -> None:
+        self._scripts = list(scripts)
+        self.begun = 0
+
+    async def bring(self) -> AsyncGenerator[bytes, None]:
+        self.begun += 1
+        for line in self._scripts.pop(0) if self._scripts else ():
+            if isinstance(line, Exception):
+                raise line
+            yield line
+        if not self._scripts:
+            await asyncio.Event().wait()
+
+
+async def take(source: Reports, samples: int) -> SampleBlock:
+    """The next so many samples."""
+    blocks: list[SampleBlock] = []
+    async with asyncio.timeout(LONG_S):
+        async for block in source:
+            blocks.append(block)
+            if sum(b.size for b in blocks) >= samples:
+                break
+    return np.concatenate(blocks)
+
+
+async def message(source: Reports, wanted: str) -> None:
+    """Once this is what it says."""
+    async with asyncio.timeout(LONG_S):
+        while source.message != wanted:  # noqa: ASYNC110 - it has no event for it
+            await asyncio.sleep(0.001)
+
+
+def lines(*volts: float) -> list[bytes]:
+    return [CONNECTED, *(report_line(v, -2.0, temperature_c=21.5, cells_v=[v / 16, None]) for v in volts)]
+
+
+async def test_what_is_lost_is_brought_anew_with_a_reason_and_counted():
+    script = [NothingComesError("no answer")], [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
+    source = Reports(Scripted(*script), TEXT, first_retry_s=0.001)
+    with capture_logs() as logged:
+        async with source:
+            block = await take(source, 2)
+    assert block["voltage_v"].tolist() == [52.1, 52.2]
+    assert block["current_a"].tolist() == [-2.0, -2.0]
+    assert block["temperature_c"].tolist() == [21.5, 21.5]
+    assert np.array_equal(source.cells, [[3.2625, np.nan]], equal_nan=True)
+    assert source.message is None
+    assert source.counters["frames_received"] == 2
+    assert source.counters["reconnects"] == 1
+    reasons = [line["reason"] for line in logged if line["event"] == "no samples"]
+    assert reasons == ["a device: no answer; trying again", "a device: [Errno 5] Input/output error; trying again"]
+
+
+async def test_a_recording_of_what_was_brought_replays_to_the_same_bits(tmp_path: Path):
+    path = tmp_path / "brought.raw"
+    sensor = SensorSettings(protocol="text", current_sign="charge_positive")
+    brought = [*lines(50.0, 51.0), b"junk\n", *lines(52.0)[1:], report_line(53.0, 1.25, time_s=7.5)]
+    with Recording(path, header_of(sensor)) as recording:
+        source = Reports(Scripted(brought), sensor, tap=recording)
+        async with source:
+            live = await take(source, 4)
+    again = RawCapture(path)
+    replayed = np.concatenate(list(again))
+    assert [replayed[name].tobytes() for name in SAMPLE.names or ()] == [live[name].tobytes() for name in SAMPLE.names]
+    assert live["current_a"].tolist() == [2.0, 2.0, 2.0, -1.25]
+    assert source.counters == {**again.decoder.counters, "reconnects": 0, "missed_reads": 0}
+    assert again.decoder.counters["text_errors"] == 1
+
+
+async def test_it_says_that_nothing_comes_and_what_comes_instead():
+    junk = [CONNECTED, b'{"soc":1}\n', b'{"voltage":"unavailable"}\n']
+    for script, said in (
+        ([CONNECTED], "a device: connected, but silent"),
+        (junk, 'a device: lines come that do not tell voltage and current; the first: \'{"voltage":"unavailable"}\''),
+    ):
+        source = Reports(Scripted(script), TEXT, period_s=0.001, look_s=0.001)
+        async with source:
+            taking = asyncio.create_task(take(source, 1))
+            await message(source, said)
+            taking.cancel()
+
+
+async def test_a_fault_of_ours_is_not_hidden():
+    source = Reports(Scripted([*lines(50.0), KeyError("ours")]), TEXT)
+    async with source:
+        with pytest.raises(KeyError, match="ours"):
+            await take(source, 2)
+
+
+@pytest.mark.parametrize("values", [(float("nan"), 1.0), (50.0, float("inf"))])
+def test_a_line_is_a_sample(values: tuple[float, float]):
+    with pytest.raises(ValueError, match="no sample"):
+        report_line(*values)
+
+
+def test_a_source_makes_the_sensor_what_its_lines_are_unless_told():
+    settings = Settings.model_validate({"source": {"kind": "linux", "voltage_scale": 4.0}})
+    assert (settings.sensor.protocol, settings.sensor.voltage_resolution_v) == ("text", 5e-3)
+    told = SensorSettings(voltage_resolution_v=0.1, current_sign="charge_positive")
+    settings = Settings.model_validate({"source": {"kind": "linux"}, "sensor": told})
+    assert settings.sensor == told.model_copy(update={"protocol": "text", "period_s": 1.0})
+    assert settings.sensor.sample_period_s == 1.0

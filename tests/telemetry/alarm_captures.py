@@ -1,0 +1,115 @@
+"""Captures of a board that prints JSON lines, each second one, replayed through estimator and publisher."""
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.service.live import new_estimator
+from bms_estimator.settings.pack import Settings
+from bms_estimator.snapshot.publisher import Publisher
+from bms_estimator.sources.captures.raw_capture import CaptureWriter, header_of
+from bms_estimator.sources.captures.replay import Replay, open_capture
+from bms_estimator.telemetry.alarms import Change
+from tests.collector import Collector
+
+WALL_S = 1_700_000_000.0
+PACK = load_cell("nmc", 10.0).pack(2, 1)
+"""Two cells: 5.4 to 8.5 V, 10 A of charge, 50 A of load."""
+
+
+class Line(NamedTuple):
+    """What the board says for so many seconds."""
+
+    seconds: float
+    voltage_v: float = 7.4
+    current_a: float = 0.0
+    temperature_c: float | None = 25.0
+    cells_v: tuple[float, ...] = ()
+    silent: bool = False
+
+    def text(self) -> bytes:
+        said: dict[str, Any] = {"voltage": self.voltage_v, "current": self.current_a}
+        said |= {} if self.temperature_c is None else {"temperature": self.temperature_c}
+        said |= {"cells": self.cells_v} if self.cells_v else {}
+        return json.dumps(said).encode() + b"\n"
+
+
+@dataclass
+class Told:
+    """What came of a replay."""
+
+    changes: list[Change] = field(default_factory=list)
+    snapshots: list[Snapshot] = field(default_factory=list)
+    kept: str = ""
+
+    def turns(self, name: str) -> list[tuple[float, bool]]:
+        """When an alarm was raised and when it ended, in seconds of the capture."""
+        turns = [change for change in self.changes if change.alarm.name == name and change.turn == "active"]
+        return [(round(change.at_s, 3), change.alarm.active) for change in turns]
+
+    def watched(self, name: str) -> list[tuple[float, bool]]:
+        """When an alarm could no longer be watched and when it could again, in seconds of the capture."""
+        turns = [change for change in self.changes if change.alarm.name == name and change.turn == "watched"]
+        return [(round(change.at_s, 3), change.alarm.watched) for change in turns]
+
+
+def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
+    """A raw capture of these lines."""
+    arrival_s = 100.0
+    header = header_of(settings().sensor)
+    writer = CaptureWriter(path, header)
+    writer.write(arrival_s, b"\n")
+    for line in lines:
+        for _ in range(round(line.seconds / period_s)):
+            if not line.silent:
+                writer.write(arrival_s, line.text())
+            arrival_s += period_s
+    writer.close()
+    return path
+
+
+def settings(alarms: dict[str, Any] | None = None, **sections: Any) -> Settings:
+    """Of a board that prints text."""
+    tables = {"sensor": {"protocol": "text"}, "pack": {"initial_soc": 0.5}, "alarms": alarms or {}}
+    return Settings.model_validate(tables | sections)
+
+
+async def replayed(
+    path: Path,
+    told: Settings,
+    cell: CellModel = PACK,
+    kept: str = "",
+    *,
+    at_once: bool = False,
+    begin_s: float = WALL_S,
+) -> Told:
+    """The capture through estimator and publisher, whose clocks are the capture's.
+
+    Args:
+        path: The capture.
+        told: The pack's settings.
+        cell: The pack.
+        kept: Alarms of a run before.
+        begin_s: Wall clock at its begin [s since 1970].
+        at_once: As few and long blocks as the capture has; else each sample as it came.
+    """
+    now_s, result, sink = 0.0, Told(), Collector()
+    source = Replay(open_capture(path, told.sensor), longest_s=math.inf if at_once else 0.05)
+    estimator = new_estimator(told, cell)
+    clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
+    publisher = Publisher(
+        told, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
+    )
+    publisher.watch.alarms.restore(kept)
+    async for block in source:
+        now_s = float(block["time_s"][-1])
+        publisher.add(block, estimator.run(block))
+    publisher.publish_last()
+    result.snapshots, result.kept = sink.snapshots, publisher.watch.alarms.kept
+    return result

@@ -1,0 +1,433 @@
+"""Each alarm is raised and ends on a capture; what holds whatever the alarm is."""
+
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.events import events
+from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
+from bms_estimator.settings.alarm_limits import Watched, out_of_range, watched
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.telemetry.alarm_inputs import Inputs
+from bms_estimator.telemetry.alarm_state import AlarmState
+from bms_estimator.telemetry.alarms import Alarms, Counts
+from tests.telemetry.alarm_captures import PACK, WALL_S, Line, Told, record, replayed, settings
+
+NAN = math.nan
+GOOD_CELLS = (3.70, 3.70)
+COUNTED: dict[str, Any] = {"identifier": {"enabled": False}}
+"""The SOC is what is counted, and without a band."""
+
+CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]] = {
+    "pack_over_voltage": ([Line(30), Line(10, voltage_v=8.6), Line(30)], {}, [(32.0, True)]),
+    "pack_under_voltage": ([Line(30), Line(20, voltage_v=5.3), Line(60)], {}, [(35.0, True), (80.0, False)]),
+    "cell_over_voltage": (
+        [Line(30, cells_v=GOOD_CELLS), Line(10, cells_v=(3.7, 4.3)), Line(30, cells_v=GOOD_CELLS)],
+        {},
+        [(32.0, True)],
+    ),
+    "cell_under_voltage": (
+        [Line(30, cells_v=GOOD_CELLS), Line(10, cells_v=(3.7, 2.6)), Line(50, cells_v=GOOD_CELLS)],
+        {},
+        [(35.0, True), (70.0, False)],
+    ),
+    "discharge_over_current": ([Line(30), Line(20, current_a=55.0), Line(80)], {}, [(40.0, True)]),
+    "charge_over_current": ([Line(30), Line(20, current_a=-11.0), Line(80)], {}, [(40.0, True)]),
+    "over_temperature": ([Line(30), Line(20, temperature_c=61.0), Line(80)], {}, [(40.0, True), (110.0, False)]),
+    "under_temperature": ([Line(30), Line(20, temperature_c=-21.0), Line(80)], {}, [(40.0, True), (110.0, False)]),
+    "charging_below_freezing": (
+        [Line(30, temperature_c=-5.0), Line(20, temperature_c=-5.0, current_a=-2.0), Line(30, temperature_c=-5.0)],
+        {},
+        [(40.0, True)],
+    ),
+    "soc_low": (
+        [Line(400, current_a=20.0), Line(500, current_a=-18.0)],
+        COUNTED | {"pack": {"initial_soc": 0.2}},
+        [(190.0, True), (0.0, False)],
+    ),
+    "stability_margin_low": (
+        [Line(400, current_a=20.0), Line(500, current_a=-18.0)],
+        COUNTED | {"pack": {"initial_soc": 0.2}},
+        [(317.0, True), (0.0, False)],
+    ),
+    "cell_imbalance": (
+        [Line(10, cells_v=GOOD_CELLS), Line(80, cells_v=(3.7, 3.64)), Line(80, cells_v=GOOD_CELLS)],
+        {},
+        [(70.0, True), (150.0, False)],
+    ),
+    "sensor_fault": ([Line(30), Line(20, voltage_v=0.5), Line(60)], {}, [(40.0, True), (80.0, False)]),
+    "model_mismatch": ([Line(30), Line(80, voltage_v=7.9), Line(150)], COUNTED, [(90.0, True), (0.0, False)]),
+    "link_lost": ([Line(30), Line(30, silent=True), Line(30)], {}, [(60.0, True), (66.0, False)]),
+}
+"""By alarm: a capture, sections of the settings, and when it is raised and ends; 0: some time later."""
+
+
+def test_there_is_a_capture_of_each_alarm() -> None:
+    assert set(CAPTURES) == set(ALARMS) - {"hook_failed"}, "no capture has hooks"
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+async def test_each_alarm_is_raised_and_ends_on_a_capture(name: str, tmp_path: Path) -> None:
+    lines, sections, expected = CAPTURES[name]
+    latched = len(expected) == 1
+    told = await replayed(record(tmp_path / "capture.bms", lines), settings(**sections))
+    turns = told.turns(name)
+    assert [active for _, active in turns] == [active for _, active in expected]
+    for (at_s, _), (expected_s, _) in zip(turns, expected, strict=True):
+        assert expected_s in (0.0, at_s)
+    raised = next(
+        alarm for snapshot in told.snapshots for alarm in snapshot.alarms if alarm.name == name and alarm.since
+    )
+    assert raised.active
+    assert raised.text
+    last = next(alarm for alarm in told.snapshots[-1].alarms if alarm.name == name)
+    assert (last.active, last.latched, bool(last.text)) == (latched, latched, latched)
+
+
+async def test_no_alarm_is_raised_by_a_pack_that_is_well_and_none_is_shown_of_what_is_not_measured(
+    tmp_path: Path,
+) -> None:
+    lines = [Line(60, current_a=5.0, temperature_c=None), Line(60, current_a=-5.0, temperature_c=None)]
+    told = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert told.changes == []
+    shown = {alarm.name for alarm in told.snapshots[-1].alarms}
+    assert set(ALARMS) - shown == {
+        "hook_failed",
+        "cell_over_voltage",
+        "cell_under_voltage",
+        "cell_imbalance",
+        "over_temperature",
+        "under_temperature",
+        "charging_below_freezing",
+    }
+
+
+async def test_an_over_current_of_200_ms_is_seen_and_published_once_though_it_is_over(tmp_path: Path) -> None:
+    rule = {"delay_s": 0.0, "clear_delay_s": 0.0, "latch": False}
+    path = record(tmp_path / "capture.bms", [Line(5), Line(0.2, current_a=60.0), Line(5)], period_s=0.1)
+    told = await replayed(path, settings({"discharge_over_current": rule}))
+    turns = told.turns("discharge_over_current")
+    assert [active for _, active in turns] == [True, False]
+    shown = [a.active for s in told.snapshots for a in s.alarms if a.name == "discharge_over_current"]
+    assert True in shown
+    assert not shown[-1]
+    named = [event.name for before, after in itertools.pairwise(told.snapshots) for event in events(before, after)]
+    assert [name for name in named if name.startswith("alarm")] == ["alarm_raised", "alarm_cleared"]
+
+
+async def test_however_a_capture_is_cut_into_blocks_the_same_is_raised_at_the_same_time(tmp_path: Path) -> None:
+    path = record(tmp_path / "capture.bms", CAPTURES["pack_under_voltage"][0])
+    told = await replayed(path, settings())
+    again = await replayed(path, settings(), at_once=True)
+    assert _named(again) == _named(told) != []
+
+
+def _named(told: Told) -> list[tuple[float, str, bool]]:
+    return [(change.at_s, change.alarm.name, change.alarm.active) for change in told.changes]
+
+
+def _values(state: AlarmState, *values: float, step_s: float = 1.0, begin_s: float = 0.0) -> list[tuple[float, bool]]:
+    """When it is raised and ends, of values each ``step_s``."""
+    times_s = begin_s + step_s * np.arange(len(values))
+    steps_s = np.full(len(values), step_s)
+    return [(turn.at_s, turn.raising is not None) for turn in state.take(times_s, steps_s, np.array(values), WALL_S)]
+
+
+def _state(**told: Any) -> AlarmState:
+    rule = {"severity": "warning", "unit": "V", "above": True, "limit": 10.0, "clear": 8.0, "delay_s": 2.0}
+    return AlarmState(Watched(**{"name": "pack_over_voltage", "clear_delay_s": 3.0, "latch": False, **rule, **told}))
+
+
+@pytest.mark.parametrize(
+    ("values", "turns"),
+    [
+        ([9.9, 10.0, 10.0, 10.0, 9.0], [(3.0, True)]),  # reached is enough, for the whole delay
+        ([10.0, 10.0, 9.99, 10.0, 10.0, 9.0], []),  # the delay begins anew
+        ([11.0] * 3 + [8.0] * 9, [(2.0, True)]),  # back at clear is not back beyond it
+        ([11.0] * 3 + [7.9] * 3 + [8.0] + [7.9] * 4, [(2.0, True), (10.0, False)]),
+        ([11.0, 11.0, NAN, NAN, 11.0, 11.0], [(4.0, True)]),  # what was not measured adds nothing and ends nothing
+        ([11.0] * 3 + [NAN] * 20, [(2.0, True)]),
+        ([NAN] * 5, []),
+    ],
+)
+def test_limit_clear_and_delays_at_their_edges(values: list[float], turns: list[tuple[float, bool]]) -> None:
+    assert _values(_state(), *values) == turns
+    below = _state(above=False, limit=-10.0, clear=-8.0)
+    assert _values(below, *(-value for value in values)) == turns
+
+
+def test_how_values_are_cut_changes_nothing() -> None:
+    values = [11.0, 11.0, 9.0, 11.0, 11.0, 11.0, NAN, 7.0, 7.0, 7.0, 7.0, 11.0]
+    state = _state()
+    one_by_one = [turn for i, value in enumerate(values) for turn in _values(state, value, begin_s=float(i))]
+    assert one_by_one == _values(_state(), *values) == [(5.0, True), (10.0, False)]
+
+
+def test_no_delay_and_no_hysteresis_are_one_turn_for_each_side() -> None:
+    state = _state(clear=10.0, delay_s=0.0, clear_delay_s=0.0)
+    assert _values(state, 9.0, 10.0, 9.9, 10.0) == [(1.0, True), (2.0, False), (3.0, True)]
+
+
+def test_one_that_latches_waits_until_somebody_knows_and_comes_again_unless_it_is_known() -> None:
+    state = _state(latch=True, delay_s=0.0, clear_delay_s=0.0)
+    assert _values(state, 11.0, 7.0) == [(0.0, True)]
+    assert state.gone
+    assert _values(state, 11.0) == []  # it never ended
+    assert not state.gone
+    assert not state.acknowledge(), "the cause is there"
+    assert _values(state, 7.0) == [(0.0, False)]
+    assert not state.acknowledge()
+    assert _values(state, 11.0, 7.0) == [(0.0, True)], "nobody knows of this one"
+    assert state.acknowledge()
+    assert state.raising is None
+
+
+async def test_a_gap_between_samples_counts_for_no_delay_and_slow_sampling_is_no_gap(tmp_path: Path) -> None:
+    rule = {"over_temperature": {"delay_s": 25.0}, "link_lost": {"enabled": False}}
+    hot = Line(20, temperature_c=70.0)
+    lines = [Line(5), hot, hot._replace(silent=True), hot._replace(seconds=10)]
+    told = await replayed(record(tmp_path / "gap.bms", lines), settings(rule))
+    assert told.turns("over_temperature") == [(51.0, True)]  # 19 s, nothing, then 6 s
+    slow = [Line(50), Line(80, temperature_c=70.0)]
+    told = await replayed(record(tmp_path / "slow.bms", slow, period_s=10.0), settings(rule))
+    assert told.turns("over_temperature") == [(80.0, True)]
+
+
+async def test_what_latches_outlives_a_restart(tmp_path: Path) -> None:
+    before = await replayed(record(tmp_path / "one.bms", CAPTURES["pack_over_voltage"][0]), settings())
+    assert '"pack_over_voltage"' in before.kept
+    well = record(tmp_path / "two.bms", [Line(30)])
+    after = await replayed(well, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    first, last = (next(a for a in s.alarms if a.active) for s in (after.snapshots[0], after.snapshots[-1]))
+    assert (first, last.since, last.latched) == (last, first.since, True)
+    assert after.changes == []
+    named = [event.name for event in events(None, after.snapshots[0])]
+    assert "alarm_raised" not in named, "the run before has told of it"
+    off = await replayed(well, settings({"pack_over_voltage": {"latch": False}}), kept=before.kept)
+    assert not any(alarm.active for alarm in off.snapshots[-1].alarms)
+
+
+async def test_what_is_raised_outlives_a_restart_and_ends_where_it_would_have_ended(tmp_path: Path) -> None:
+    low = record(tmp_path / "one.bms", [Line(30), Line(20, voltage_v=5.3)])
+    before = await replayed(low, settings())
+    better = record(tmp_path / "two.bms", [Line(30, voltage_v=5.7), Line(60)])  # above its limit, below where it ends
+    after = await replayed(better, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    assert after.snapshots[0].alarms != ()
+    assert after.turns("pack_under_voltage") == [(60.0, False)]
+    assert json.loads(after.kept).keys() & {"pack_under_voltage"} == set()
+
+
+async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
+    alarms = Alarms(
+        watched(settings({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}}), PACK),
+        0.2,
+        5.0,
+        Inputs(10.0, 2),
+        10.0,
+    )
+    block = np.zeros(2, dtype=SAMPLE)
+    block["time_s"], block["current_a"], block["voltage_v"] = [0.0, 0.1], 25.0, 7.4
+    block["status"] = [0, int(SampleStatus.CURRENT_SATURATED)]
+    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    (change,) = alarms.changes()
+    assert (change.alarm.name, change.at_s, change.alarm.value) == ("discharge_over_current", 0.1, None)
+    assert change.alarm.since == iso_utc(WALL_S)
+
+
+def test_silence_that_is_back_is_the_cause_of_a_latched_link_lost_again() -> None:
+    alarms = Alarms(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    kept = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
+    alarms.restore(json.dumps({"link_lost": kept}))
+    alarms.silent(1.0, WALL_S, "")
+    assert json.loads(alarms.kept)["link_lost"]["gone"]
+    alarms.silent(1000.0, WALL_S, "")
+    assert json.loads(alarms.kept)["link_lost"] == kept | {"gone": False}
+    assert alarms.acknowledge(None) == ["link_lost"]
+    assert alarms.active == ("link_lost",), "the cause is there"
+
+
+def test_an_alarm_that_was_kept_with_a_value_that_is_none_is_refused() -> None:
+    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    kept = {"since_s": WALL_S, "value": math.inf, "gone": False, "acknowledged": False}
+    with pytest.raises(ValueError, match="pack_over_voltage: value = inf"):
+        alarms.restore(json.dumps({"pack_over_voltage": kept}))
+
+
+@pytest.mark.parametrize(
+    ("alarms", "reason"),
+    [
+        ({"pack_over_voltage": {"limit_v": 8.4, "clear_v": 8.5}}, r"clear_v = 8\.5: must not be above limit_v = 8\.4"),
+        ({"soc_low": {"clear": 0.05}}, r"soc_low\.clear = 0\.05: must not be below limit = 0\.1"),
+    ],
+)
+def test_an_alarm_that_would_end_where_it_is_raised_is_refused(alarms: dict[str, Any], reason: str) -> None:
+    with pytest.raises(UserError, match=reason):
+        watched(settings(alarms), PACK)
+
+
+def test_a_limit_that_the_pack_never_reaches_is_named() -> None:
+    assert out_of_range(settings(), PACK) == []
+    (line,) = out_of_range(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
+    assert line.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 3.65 to 4.5 V")
+
+
+def test_limits_follow_chemistry_size_and_what_is_set() -> None:
+    lfp = {each.name: each for each in watched(settings(), load_cell("lfp", 100.0).pack(16, 2))}
+    assert (lfp["pack_over_voltage"].limit, lfp["pack_over_voltage"].clear) == pytest.approx((58.4, 54.4))
+    assert (lfp["discharge_over_current"].limit, lfp["charge_over_current"].limit) == (1000.0, 200.0)
+    told = {"pack_over_voltage": {"limit_v": 57.6}, "cell_imbalance": {"enabled": False}}
+    told_of = {each.name: each for each in watched(settings(told), load_cell("lfp", 100.0).pack(16, 2))}
+    assert told_of["pack_over_voltage"].clear == pytest.approx(53.6)
+    assert told_of["pack_over_voltage"].latch
+    assert "cell_imbalance" not in told_of
+    stack = {each.name for each in watched(settings(), load_fuel_cell("pem_30w"))}
+    assert not stack & {"cell_over_voltage", "cell_under_voltage", "charge_over_current", "charging_below_freezing"}
+
+
+CHARGED = Line(30, voltage_v=7.6, current_a=-5.0, cells_v=(3.8, 3.8))
+LOSSES = [
+    (CHARGED._replace(temperature_c=None), "temperature", ("charging_below_freezing", "over_temperature")),
+    (CHARGED._replace(cells_v=()), "cell voltages", ("cell_over_voltage", "cell_under_voltage")),
+    (CHARGED._replace(cells_v=(3.8,)), "cell voltages", ("cell_over_voltage", "cell_under_voltage")),
+]
+"""What is lost while the pack is charged, the word for it, and the critical alarms that need it."""
+
+
+@pytest.mark.parametrize(("lost", "word", "blind"), LOSSES)
+async def test_a_quantity_that_is_lost_raises_sensor_fault_after_ten_seconds_and_its_alarms_say_so(
+    lost: Line, word: str, blind: tuple[str, ...], tmp_path: Path
+) -> None:
+    lines = [CHARGED, lost, CHARGED._replace(seconds=60)]
+    told = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert told.turns("sensor_fault") == [(40.0, True), (100.0, False)]  # measured again for 10 s, then its own 30 s
+    for name in blind:
+        assert told.watched(name) == [(40.0, False), (70.0, True)]
+    assert told.watched("pack_over_voltage") == []
+    shown = [{a.name: a for a in s.alarms} for s in told.snapshots]
+    unwatched = [alarms[name] for alarms in shown for name in blind if not alarms[name].watched]
+    assert {alarm.active for alarm in unwatched} == {False}
+    assert all(word in (alarm.unwatched_reason or "") for alarm in unwatched)
+    fault = next(alarms["sensor_fault"] for alarms in shown if alarms["sensor_fault"].active)
+    assert all(name in fault.text for name in (word, *blind))
+    named = [e.name for before, after in itertools.pairwise(told.snapshots) for e in events(before, after)]
+    assert {"alarm_raised", "alarm_unwatched", "alarm_watched", "alarm_cleared"} <= set(named)
+
+
+async def test_a_loss_shorter_than_the_delay_and_one_that_no_critical_alarm_needs_raise_nothing(tmp_path: Path) -> None:
+    short = [CHARGED, CHARGED._replace(seconds=10, temperature_c=None), CHARGED]
+    path = record(tmp_path / "short.bms", short)
+    assert (await replayed(path, settings())).changes == []
+    told = await replayed(path, settings({"lost_s": 5.0}))
+    assert told.turns("sensor_fault")[:1] == [(35.0, True)]
+    warnings = {name: {"severity": "warning"} for name in ("over_temperature", "charging_below_freezing")}
+    lines = [CHARGED, CHARGED._replace(temperature_c=None)]
+    told = await replayed(record(tmp_path / "warning.bms", lines), settings(warnings))
+    assert told.turns("sensor_fault") == []
+    assert told.watched("over_temperature") == [(40.0, False)]
+
+
+async def test_a_quantity_that_comes_beside_few_samples_is_measured_again_after_a_loss(tmp_path: Path) -> None:
+    rare = [CHARGED._replace(seconds=1), CHARGED._replace(seconds=4, temperature_c=None)]
+    lines = [*rare * 6, CHARGED._replace(temperature_c=None), *rare * 8]
+    told = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert told.watched("over_temperature") == [(36.0, False), (70.0, True)]
+
+
+async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None:
+    lines = [CHARGED, CHARGED._replace(temperature_c=None)]
+    before = await replayed(record(tmp_path / "one.bms", lines), settings())
+    without = record(tmp_path / "two.bms", [CHARGED._replace(temperature_c=None)])
+    after = await replayed(without, settings(), kept=before.kept, begin_s=WALL_S + 1000.0)
+    first = {alarm.name: alarm for alarm in after.snapshots[0].alarms}
+    assert (first["sensor_fault"].active, first["over_temperature"].watched) == (True, False)
+    assert (after.turns("sensor_fault"), after.watched("over_temperature")) == ([], [])
+    lost_meanwhile = await replayed(record(tmp_path / "three.bms", [CHARGED]), settings())
+    after = await replayed(without, settings(), kept=lost_meanwhile.kept, begin_s=WALL_S + 1000.0)
+    assert after.turns("sensor_fault") == [(10.0, True)]
+
+
+def test_without_samples_alarms_are_unwatched_until_some_come() -> None:
+    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    block = np.zeros(1, dtype=SAMPLE)
+    block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
+    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    seen = [(9.9, True, None), (10.0, False, "no cable"), (0.1, True, None)]
+    for silent_s, is_watched, reason in seen:
+        alarms.silent(silent_s, WALL_S, "no cable")
+        shown = {alarm.name: alarm for alarm in alarms.report()}
+        assert (shown["pack_over_voltage"].watched, shown["pack_over_voltage"].unwatched_reason) == (is_watched, reason)
+        assert shown["link_lost"].watched
+        assert "over_temperature" not in shown, "it was never measured"
+
+
+def test_an_alarm_that_silence_kept_from_being_watched_is_so_over_a_restart_until_samples_come() -> None:
+    before, after = (Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0) for _ in range(2))
+    block = np.zeros(1, dtype=SAMPLE)
+    block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
+    before.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    before.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    before.silent(10.0, WALL_S, "no cable")
+    after.restore(before.kept)
+    after.silent(0.0, WALL_S, "")
+    assert "pack_over_voltage" in after.unwatched, "no sample has come since the restart"
+    after.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    after.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    after.silent(0.0, WALL_S, "")
+    changed = {change.alarm.name: change for change in after.changes()}
+    assert (changed["pack_over_voltage"].turn, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
+    assert after.unwatched == ()
+    assert "silence" not in json.loads(after.kept)
+
+
+def test_saved_quantities_that_are_damaged_are_refused() -> None:
+    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    with pytest.raises(ValueError, match="temperature: measured = 77"):
+        alarms.restore(json.dumps({"inputs": {"temperature": [77, True]}}))
+
+
+@pytest.mark.parametrize("spacing_s", [0.0, 0.1, 1.0])
+def test_a_delay_counts_the_time_between_bursts_of_samples(spacing_s: float) -> None:
+    """Two samples at a time, twice a minute: over the limit from the fifth burst on."""
+    rule = {"pack_over_voltage": {"delay_s": 10.0}}
+    alarms = Alarms(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    for burst in range(12):
+        block = np.zeros(2, dtype=SAMPLE)
+        block["time_s"], block["voltage_v"] = 30.0 * burst + np.array([0.0, spacing_s]), 8.6 if burst >= 4 else 7.4
+        alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+        alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
+    assert turns == [150.0], "the first burst after which it has been over the limit for 10 s"
+
+
+def test_a_gap_that_does_not_come_again_soon_counts_for_no_delay() -> None:
+    rule = {"pack_over_voltage": {"delay_s": 25.0}}
+    alarms = Alarms(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    times_s = [*range(5), *range(25, 200), *range(220, 300)]
+    block = np.zeros(len(times_s), dtype=SAMPLE)
+    block["time_s"] = times_s
+    block["voltage_v"] = np.where((block["time_s"] < 180.0) & (block["time_s"] > 10.0), 7.4, 8.6)
+    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
+    assert turns == [226.0]  # 180 to 199 s, nothing for 20 s, then 6 s
+
+
+async def test_a_sensor_that_comes_and_goes_delays_its_alarm_no_longer_than_one_that_stays(tmp_path: Path) -> None:
+    """A loose wire: one value in five seconds, which is not yet a lost sensor."""
+    hot = [Line(1, temperature_c=61.0), Line(4, temperature_c=None)] * 4
+    told = await replayed(record(tmp_path / "capture.bms", [Line(30), *hot]), settings())
+    assert told.turns("over_temperature") == [(40.0, True)]
+    assert told.turns("sensor_fault") == []

@@ -1,0 +1,16 @@
+"""Topic ``info``: which law the observer is said to have."""
+
+import pytest
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.settings.pack import ObserverSettings, Settings
+from bms_estimator.telemetry.state import info_report
+
+
+@pytest.mark.parametrize(
+    ("law", "said"), [("learning", "learning"), ("improved", "improved, k2-cos"), ("scheme-1", "scheme-1, k2-cos")]
+)
+def test_a_law_without_a_nussbaum_function_names_none(law: str, said: str) -> None:
+    observer = ObserverSettings.model_validate({"law": law, "nussbaum": "k2-cos"})
+    info = info_report(Settings(observer=observer), load_cell("chen_mora"), {}, 0.0, temperature_sensor=False)
+    assert info.observer == said
