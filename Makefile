@@ -131,13 +131,13 @@ firmware: ## the board's firmware and its simulator, where the compilers are ins
 integrations: apt venv ## what the real Node-RED, AsyncAPI's parser, InfluxDB and promtool make of us; installs the first two in .node
 	@[ -d $(NODE)/node_modules/node-red ] || npm install --prefix $(NODE) --no-audit --no-fund --ignore-scripts node-red@4.1.15 @asyncapi/parser@3.6.3
 	$(BIN)/python -m pytest tests/deploy/test_node_red.py tests/deploy/test_asyncapi.py tests/deploy/test_grafana.py \
-		tests/deploy/test_telegraf.py tests/sinks/test_influx.py tests/sinks/test_prometheus.py $(ARGS)
+		tests/deploy/test_telegraf.py tests/sinks/exports/test_influx.py tests/sinks/exports/test_prometheus.py $(ARGS)
 
 payloads: venv ## remember what is published now; refuses what readers would miss in the same version
-	@$(BIN)/python -m tests.sinks.payload_record
+	@$(BIN)/python -m tests.sinks.mqtt.payload_record
 
 kernels: venv
-	$(BIN)/python -c 'from bms_estimator.service.warm_up import load_kernels; load_kernels()'
+	$(BIN)/python -c 'from bms_estimator.service.kernel_warm_up import load_kernels; load_kernels()'
 
 lock: ## write requirements.lock anew after a change of dependencies (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --universal pyproject.toml -o requirements.lock

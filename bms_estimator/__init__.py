@@ -20,8 +20,8 @@ __version__ = version("bms_estimator")
 _HOME = {
     "Estimator": "estimator",
     "estimate": "estimator",
-    "identify": "calibration.identify",
-    "load_capture": "sources.replay",
+    "identify": "calibration.elements.identify",
+    "load_capture": "sources.captures.replay",
     "load_cell": "model.cell",
     "validate": "calibration.validate",
 }

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from bms_estimator.service.warm_up import load_kernels
+from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.full_disk import disk_without_files, full_disk
 from tests.mosquitto import broker
 from tests.serial_line import line

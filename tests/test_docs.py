@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.fleet import COMMANDS as OF_A_FLEET
+from bms_estimator.cli.fleet.commands import COMMANDS as OF_A_FLEET
 from bms_estimator.cli.main import COMMANDS
 
 ROOT = Path(__file__).parents[1]

@@ -9,38 +9,45 @@ from pathlib import Path
 import typer
 
 from bms_estimator import __version__
-from bms_estimator.cli.lazy import Entry, LazyGroup
+from bms_estimator.cli.lazy_group import Entry, LazyGroup
 from bms_estimator.model.errors import UserError
 
 COMMANDS = {
-    "run": Entry("bms_estimator.cli.run:run", "Estimate live from a board and publish."),
-    "top": Entry("bms_estimator.cli.top:top", "All packs of a broker at a glance."),
+    "run": Entry("bms_estimator.cli.live.run:run", "Estimate live from a board and publish."),
+    "top": Entry("bms_estimator.cli.live.top:top", "All packs of a broker at a glance."),
     "edge": Entry(
-        "bms_estimator.cli.edge:edge", "Send a pack's raw samples to a fleet's server, and estimate nothing."
+        "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet's server, and estimate nothing."
     ),
-    "replay": Entry("bms_estimator.cli.replay:replay", "Estimate from a recorded capture or a table."),
-    "alarms": Entry("bms_estimator.cli.alarms:alarms", "Which alarms a recorded capture would have raised."),
-    "record": Entry("bms_estimator.cli.record:record", "Record a board's raw bytes with their arrival times."),
-    "simulate": Entry("bms_estimator.cli.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
-    "ports": Entry("bms_estimator.cli.ports:ports", "List serial ports, and ask them for a board."),
-    "board": Entry("bms_estimator.cli.board:board", "Show a board, set its bandgap, gains and serial number."),
-    "dashboard": Entry("bms_estimator.cli.dashboard:dashboard", "The live page of all packs of a broker."),
-    "demo": Entry("bms_estimator.cli.demo:demo", "Broker, board and service in one terminal."),
+    "replay": Entry("bms_estimator.cli.captures.replay:replay", "Estimate from a recorded capture or a table."),
+    "alarms": Entry("bms_estimator.cli.captures.alarms:alarms", "Which alarms a recorded capture would have raised."),
+    "record": Entry("bms_estimator.cli.live.record:record", "Record a board's raw bytes with their arrival times."),
+    "simulate": Entry("bms_estimator.cli.live.simulate:simulate", "Serve a simulated board on a pseudo-terminal."),
+    "ports": Entry("bms_estimator.cli.live.ports:ports", "List serial ports, and ask them for a board."),
+    "board": Entry("bms_estimator.cli.live.board:board", "Show a board, set its bandgap, gains and serial number."),
+    "dashboard": Entry("bms_estimator.cli.live.dashboard:dashboard", "The live page of all packs of a broker."),
+    "demo": Entry("bms_estimator.cli.live.demo:demo", "Broker, board and service in one terminal."),
     "ocv": Entry(
-        "bms_estimator.cli.ocv:ocv", "Open-circuit voltage from rests, slow curves or given curves, into a cell file."
+        "bms_estimator.cli.cell.ocv:ocv",
+        "Open-circuit voltage from rests, slow curves or given curves, into a cell file.",
     ),
     "identify": Entry(
-        "bms_estimator.cli.identify:identify_command", "A cell's elements from captures, into a cell file."
+        "bms_estimator.cli.cell.identify:identify_command", "A cell's elements from captures, into a cell file."
     ),
-    "adapt": Entry("bms_estimator.cli.adapt:adapt_command", "a1..a15 by the thesis's observer, into a cell file."),
-    "capacity": Entry("bms_estimator.cli.capacity:capacity", "Capacity from rests and the charge between them."),
-    "cell": Entry("bms_estimator.cli.cell:app", "What a pack's service has learned, as a cell file."),
-    "history": Entry("bms_estimator.cli.history:history", "What the service kept of a pack, by the minute, as CSV."),
-    "validate": Entry("bms_estimator.cli.validate:validate_command", "A cell's model against a capture, open loop."),
-    "thesis": Entry("bms_estimator.cli.thesis:thesis", "Recompute the thesis's tables and figures as a report."),
-    "asyncapi": Entry("bms_estimator.cli.asyncapi:asyncapi", "What is published, as an AsyncAPI document."),
-    "fleet": Entry("bms_estimator.cli.fleet:app", "Many packs: a server, workers, questions to all of them."),
-    "config": Entry("bms_estimator.cli.config:app", "Write, check and show a pack's settings."),
+    "adapt": Entry("bms_estimator.cli.cell.adapt:adapt_command", "a1..a15 by the thesis's observer, into a cell file."),
+    "capacity": Entry("bms_estimator.cli.cell.capacity:capacity", "Capacity from rests and the charge between them."),
+    "cell": Entry("bms_estimator.cli.cell.export:app", "What a pack's service has learned, as a cell file."),
+    "history": Entry(
+        "bms_estimator.cli.live.history:history", "What the service kept of a pack, by the minute, as CSV."
+    ),
+    "validate": Entry(
+        "bms_estimator.cli.captures.validate:validate_command", "A cell's model against a capture, open loop."
+    ),
+    "thesis": Entry(
+        "bms_estimator.cli.captures.thesis:thesis", "Recompute the thesis's tables and figures as a report."
+    ),
+    "asyncapi": Entry("bms_estimator.cli.settings.asyncapi:asyncapi", "What is published, as an AsyncAPI document."),
+    "fleet": Entry("bms_estimator.cli.fleet.commands:app", "Many packs: a server, workers, questions to all of them."),
+    "config": Entry("bms_estimator.cli.settings.config:app", "Write, check and show a pack's settings."),
 }
 
 EXTRAS = {

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import bms_estimator
-from bms_estimator.demo.truth import Truth
+from bms_estimator.demo.true_soc import Truth
 from bms_estimator.model.errors import UserError
 from bms_estimator.simulation.firmware_board import FirmwareBoard
 from bms_estimator.simulation.virtual_board import VirtualBoard

@@ -8,11 +8,11 @@ from pathlib import Path
 from bms_estimator.demo.board import running_board
 from bms_estimator.demo.broker import LOOPBACK, DemoBroker, choose_port
 from bms_estimator.demo.totals import Totals
-from bms_estimator.demo.truth import Truth
+from bms_estimator.demo.true_soc import Truth
 from bms_estimator.model.cell import load_cell
-from bms_estimator.page.sink import Pages
+from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.service.serve import serve
+from bms_estimator.service.pack_service import serve
 from bms_estimator.settings.pack import (
     MqttSettings,
     ObserverSettings,
@@ -23,7 +23,7 @@ from bms_estimator.settings.pack import (
 )
 from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings, parse_listen
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
-from bms_estimator.sinks.console_sink import ConsoleSink
+from bms_estimator.sinks.terminal.sink import ConsoleSink
 
 CELL = "chen_mora"
 LOAD_A = 0.5

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Self
 
 from bms_estimator.model.payloads import Estimate, Snapshot
-from bms_estimator.sinks.console_view import BAND_STDS
+from bms_estimator.sinks.terminal.panels import BAND_STDS
 
 
 class Totals:

@@ -70,4 +70,4 @@ class Hour(Report):
     tau_tl_std_s: float | None
     delta_1: float | None = Field(description="SOC below which C_ts is negative (2.11)")
     delta_2: float | None = Field(description="SOC below which C_tl is negative (2.12)")
-    suspects: int = Field(description="bits of model.suspect.Suspect")
+    suspects: int = Field(description="bits of model.input_faults.Suspect")

@@ -108,7 +108,7 @@ class TableOcv(Strict):
 
 
 class Ladder(Strict):
-    """Overpotential as a series resistance and RC branches of fixed time constants (``kernels.ladder.TAU_S``).
+    """Overpotential as a series resistance and RC branches of fixed time constants (``kernels.cell_model.rc_ladder.TAU_S``).
 
     R(SOC, T) = weak + strong, each with the Arrhenius factor of its own activation energy, both given at 25 C.
     """

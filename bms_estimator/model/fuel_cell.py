@@ -35,7 +35,7 @@ Parameter = Literal[
     "limiting_current_a",
     "internal_current_a",
 ]
-"""What is identified of a stack, in the order of ``kernels.fuel_cell.NAMES``."""
+"""What is identified of a stack, in the order of ``kernels.cell_model.fuel_cell.NAMES``."""
 
 
 class FuelCell(Strict):
@@ -68,7 +68,7 @@ class FuelCellModel(Strict):
     def a(self) -> NDArray[np.float64]:
         """What the kernels take, shape (16,).
 
-        From 1 on the parameters of ``kernels.fuel_cell.NAMES``, then cells in series, temperature [C], hydrogen and
+        From 1 on the parameters of ``kernels.cell_model.fuel_cell.NAMES``, then cells in series, temperature [C], hydrogen and
         oxygen [atm].
         """
         f = self.fuel_cell

@@ -4,7 +4,7 @@ from enum import IntFlag
 
 
 class Suspect(IntFlag):
-    """Bits of ``suspects`` of ``kernels.input_checks.CHECKS``; several may be set."""
+    """Bits of ``suspects`` of ``kernels.kalman_filter.input_checks.CHECKS``; several may be set."""
 
     SIGN_OF_CURRENT = 1
     OFFSET = 2

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field
 
 PAYLOAD_VERSION = 1
-"""Of all that is published; ``sinks/payloads.py`` says when it goes up."""
+"""Of all that is published; ``sinks/mqtt/topics.py`` says when it goes up."""
 
 
 class Report(BaseModel):

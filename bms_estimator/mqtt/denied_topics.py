@@ -7,8 +7,8 @@ import structlog
 
 from bms_estimator.mqtt.connection import Refusal
 from bms_estimator.process.backoff import Pauses
-from bms_estimator.sinks import Delivery
-from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.sinks.sink import Delivery
 
 log = structlog.get_logger(__name__)
 

@@ -7,8 +7,8 @@ from typing import Protocol
 from bms_estimator.mqtt.connection import Connection
 from bms_estimator.mqtt.denied_topics import Refusals
 from bms_estimator.process.backoff import Pauses
-from bms_estimator.sinks import Delivery
-from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.sinks.sink import Delivery
 from bms_estimator.store.outbox import Outbox, Waiting
 
 WINDOW = 16

@@ -9,7 +9,7 @@ import contextlib
 from collections import deque
 from typing import Self
 
-from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt.messages import Message
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox_queue import PAGE, Queue, Waiting
 from bms_estimator.store.outbox_table import Outcome, Work, look

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import NamedTuple
 
-from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt.messages import Message
 from bms_estimator.store.number_ranges import Runs
 
 MEMORY_MOST = 4096

@@ -5,7 +5,7 @@ import sqlite3
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt.messages import Message
 from bms_estimator.store.number_ranges import Runs
 from bms_estimator.store.outbox_queue import Waiting
 

@@ -46,7 +46,7 @@ class Meter:
 
     Args:
         before: Counted by the runs before.
-        gap_s: A step longer than this is a gap, unless the one before was about as long [s]; as ``kernels.sample_step.is_gap``.
+        gap_s: A step longer than this is a gap, unless the one before was about as long [s]; as ``kernels.step.is_gap``.
         sums: Shape (1,), dtype ``FLOW_SUMS``: what it counts in, where that outlives it.
     """
 

@@ -22,11 +22,11 @@ from aiomqtt import Client as Edge
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 
-from bms_estimator.fleet import subjects
-from bms_estimator.fleet.claims import Role
-from bms_estimator.fleet.pack_bucket import write_bucket
-from bms_estimator.fleet.streams import MAX_BLOCK_BYTES, RAW_BYTES
-from bms_estimator.service.warm_up import load_kernels
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES, RAW_BYTES
+from bms_estimator.fleet.packs.pack_bucket import write_bucket
+from bms_estimator.fleet.server.jwt_claims import Role
+from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.benchmarks.table import Row
 from tests.fleet.tenant import Tenant, heavy_block, mqtt_client, numbered, one_tenant
 from tests.fleet.workers import KIND, PERIOD_S, SAMPLES, Heartbeats, Process, block

@@ -23,11 +23,11 @@ from nats.aio.msg import Msg
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.fleet import subjects
+from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
-from bms_estimator.fleet.simulated_fleet import BLOCK_S, SimulatedFleet
-from bms_estimator.fleet.worker import CHECKPOINT_S
-from bms_estimator.service.warm_up import load_kernels
+from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
+from bms_estimator.fleet.worker.worker import CHECKPOINT_S
+from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.benchmarks.fleet_rig import Rig, cpu_s, make, rig, rss_mib
 from tests.patience import LONG_S
 

@@ -24,16 +24,16 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
 
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import decode
 from bms_estimator.estimator.estimator import Estimator, estimator_of
-from bms_estimator.fleet import subjects
-from bms_estimator.fleet.block import decode
 from bms_estimator.fleet.heartbeat import DEAD_S, Heartbeat
-from bms_estimator.fleet.keeping import Pointer
-from bms_estimator.fleet.pack_bucket import PackBucket
-from bms_estimator.fleet.partition import Partition
-from bms_estimator.fleet.simulated_fleet import SimulatedFleet
-from bms_estimator.fleet.stored import stored
-from bms_estimator.service.warm_up import load_kernels
+from bms_estimator.fleet.nats.stored_messages import stored
+from bms_estimator.fleet.packs.pack_bucket import PackBucket
+from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
+from bms_estimator.fleet.worker.checkpoint_store import Pointer
+from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.benchmarks.fleet_rig import Rig, make, rig
 from tests.patience import LONG_S
 

@@ -17,7 +17,7 @@ import nats
 import psutil
 from nats.aio.client import Client
 
-from bms_estimator.fleet.streams import make_streams
+from bms_estimator.fleet.nats.streams import make_streams
 from tests.fleet.engine import running
 from tests.fleet.many_packs import beat, load, many, publish
 from tests.free_port import free_port

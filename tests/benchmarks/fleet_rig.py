@@ -9,8 +9,8 @@ from pathlib import Path
 import psutil
 from nats.aio.client import Client
 
-from bms_estimator.fleet.simulated_fleet import SimulatedFleet
-from bms_estimator.fleet.streams import make_streams
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from tests.command_line import PROGRAM
 from tests.fleet.engine import Engine, connected, running
 from tests.patience import LONG_S

@@ -34,6 +34,7 @@ import structlog
 from rich.console import Console
 from serial.tools.list_ports_common import ListPortInfo
 
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
@@ -47,12 +48,12 @@ from bms_estimator.protocols.devices.vedirect import VeDirectDialect
 from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
 from bms_estimator.protocols.firmware.protocol import BoardDialect
 from bms_estimator.protocols.registry import make_dialect
-from bms_estimator.service.checkpoint import CheckpointFile
 from bms_estimator.settings.pack import SensorSettings, Settings, load_settings
-from bms_estimator.sinks import Delivery, console_line
-from bms_estimator.sinks.console_scene import Scene
-from bms_estimator.sinks.console_view import View
-from bms_estimator.sinks.requests import Requests, number
+from bms_estimator.sinks.mqtt.requests import Requests, number
+from bms_estimator.sinks.sink import Delivery
+from bms_estimator.sinks.terminal import text_line
+from bms_estimator.sinks.terminal.panels import View
+from bms_estimator.sinks.terminal.scene import Scene
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.raw_capture import MAGIC
 from bms_estimator.sources.captures.replay import load_capture
@@ -206,7 +207,7 @@ def _published(_: Path) -> Read:
         published = Published("bms")
         for topic in topics:
             heard = published.take(f"bms/pack/{topic}", data, 0.0)
-            told = console_line.line(heard) if heard else None
+            told = text_line.line(heard) if heard else None
             assert told is None or told.isprintable(), told
         if data:
             scene = Scene("pack", published.devices["pack"].topics, 0.0, 0.0)

@@ -18,11 +18,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
-from bms_estimator.fleet.block import Block
-from bms_estimator.fleet.hour import HOUR_SUMS, Hour, add, begin, row
-from bms_estimator.fleet.hour_files import write
-from bms_estimator.fleet.questions import LIMITS, Limits, ask
+from bms_estimator.fleet.queries.duckdb_queries import LIMITS, Limits, ask
+from bms_estimator.fleet.queries.parquet_files import write
+from bms_estimator.fleet.worker.hour_summary import HOUR_SUMS, Hour, add, begin, row
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import PackSettings

@@ -8,9 +8,9 @@ import numpy as np
 from load import CELL, pulses
 from table import Row
 
-from bms_estimator.fleet import hour
-from bms_estimator.fleet.block import Block, decode, encode
-from bms_estimator.fleet.partition import Partition
+from bms_estimator.edge.block import Block, decode, encode
+from bms_estimator.fleet.worker import hour_summary
+from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import Settings
@@ -93,12 +93,12 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
     yield "its bytes", _us(lambda: decode(blocks[-1]))
     yield "the state unpacked", _us(lambda: bench.put(packed))
     yield "the estimator", _us(step) - put_back_us
-    yield "the hour's sums", _us(lambda: hour.add(bench.record["hour"], trace, block, estimator))
+    yield "the hour's sums", _us(lambda: hour_summary.add(bench.record["hour"], trace, block, estimator))
     yield "what has flowed", _us(lambda: (of_type.meter.add(trace), of_type.meter.flow))
     yield "topic state", _us(state)
     yield "the state packed", _us(bench.take)
     parameters_us = _us(lambda: parameter_report(estimator, wall_s).model_dump_json())
-    row_us = _us(lambda: hour.row(of_type.settings, 480_000, bench.record["hour"], estimator).model_dump_json())
+    row_us = _us(lambda: hour_summary.row(of_type.settings, 480_000, bench.record["hour"], estimator).model_dump_json())
     yield "topic parameters and the row of an hour, a 60th of it", (parameters_us + row_us) / 60
 
 

@@ -8,7 +8,7 @@ from numba.core.caching import _CacheLocator
 
 import bms_estimator
 from bms_estimator.numba_cache import COMPILED_IN
-from bms_estimator.service.warm_up import load_kernels
+from bms_estimator.service.kernel_warm_up import load_kernels
 
 PACKAGE = Path(bms_estimator.__file__).parent
 LEFT_OUT = "sample_step.run-"

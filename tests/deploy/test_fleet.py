@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.fleet_serve import _nodes
-from bms_estimator.fleet.server import Place, Told, node_of
-from bms_estimator.fleet.server_config import Accounts, configuration
+from bms_estimator.cli.fleet.serve import _nodes
+from bms_estimator.fleet.server.nats_config import Accounts, configuration
+from bms_estimator.fleet.server.nats_server import Place, Told, node_of
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.settings.fleet import FleetSettings
 from tests.deploy.test_unit import HIGHEST_EXPOSURE, verify

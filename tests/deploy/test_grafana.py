@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from bms_estimator.model.payloads import Alarm, Estimate
-from bms_estimator.sinks.line_protocol import ALARM, STATE, lines
+from bms_estimator.sinks.exports.line_protocol import ALARM, STATE, lines
 from tests.influxdb import INFLUXD, InfluxDB
 from tests.sinks.snapshots import ONE, SOC_LOW
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 import pytest
 
 from bms_estimator.model.payloads import Alarm, Estimate
-from bms_estimator.sinks.messages import Messages
+from bms_estimator.sinks.mqtt.messages import Messages
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from bms_estimator.model.payloads import Snapshot
-from bms_estimator.sinks.line_protocol import lines
-from bms_estimator.sinks.messages import Messages
+from bms_estimator.sinks.exports.line_protocol import lines
+from bms_estimator.sinks.mqtt.messages import Messages
 from tests.sinks.snapshots import ONE, SOC_LOW
 
 CONFIGURATION = tomllib.loads((Path(__file__).parents[2] / "deploy/telegraf/bms.conf").read_text(encoding="utf-8"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS
-from bms_estimator.cli.summary import Summary
+from bms_estimator.cli.captures.replay_summary import Summary
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
 from bms_estimator.kernels.step import Verdict

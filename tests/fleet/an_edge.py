@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from bms_estimator.fleet.block import Block, encode
-from bms_estimator.fleet.partition import Partition, Taken
+from bms_estimator.edge.block import Block, encode
+from bms_estimator.fleet.worker.partition import Partition, Taken
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import PackSettings, Settings

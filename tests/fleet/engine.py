@@ -14,7 +14,7 @@ from typing import Any
 import nats
 from nats.aio.client import Client
 
-from bms_estimator.fleet.server_config import Accounts, Cluster, Node, Tls, configuration
+from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls, configuration
 from tests.free_port import free_port
 from tests.patience import LONG_S
 

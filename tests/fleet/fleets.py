@@ -7,9 +7,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bms_estimator.fleet.hour_files import SCHEMA
 from bms_estimator.fleet.hour_row import Hour
-from bms_estimator.fleet.questions import AGED_SOC, CHARGE_ERROR
+from bms_estimator.fleet.queries.duckdb_queries import AGED_SOC, CHARGE_ERROR
+from bms_estimator.fleet.queries.parquet_files import SCHEMA
 
 BEGIN = 490_000 // 24 * 24
 """The hour at which they begin, a midnight."""

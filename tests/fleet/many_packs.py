@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from nats.aio.client import Client
 
-from bms_estimator.fleet import subjects
+from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
-from bms_estimator.fleet.pack_bucket import write_bucket
-from bms_estimator.fleet.pack_row import PackKind, stored
+from bms_estimator.fleet.packs.pack_bucket import write_bucket
+from bms_estimator.fleet.packs.pack_row import PackKind, stored
 from tests.sinks.snapshots import ONE
 
 HOME, VAN, PLANT = (

@@ -10,10 +10,10 @@ import nats
 import numpy as np
 from nats.aio.client import Client
 
-from bms_estimator.fleet import subjects
-from bms_estimator.fleet.page import fleet_page
-from bms_estimator.fleet.page_feed import Server
-from bms_estimator.fleet.streams import make_streams
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.page.fleet_page import fleet_page
+from bms_estimator.fleet.page.nats_feed import Server
 from bms_estimator.model.input_faults import Suspect
 from bms_estimator.settings.page import PageSettings
 from tests.fleet.engine import running

@@ -8,10 +8,10 @@ import nats
 import numpy as np
 from nats.js.errors import NotFoundError
 
-from bms_estimator.fleet import subjects
-from bms_estimator.fleet.block import Block, decode
-from bms_estimator.fleet.streams import make_streams
-from bms_estimator.fleet.subjects import Awaits
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import Block, decode
+from bms_estimator.edge.subjects import Awaits
+from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.model.sample import SampleBlock
 from tests.fleet.engine import connected
 from tests.patience import LONG_S, end

@@ -10,10 +10,10 @@ import nats
 import numpy as np
 from nats.aio.client import Client
 
-from bms_estimator.fleet import credentials
-from bms_estimator.fleet.block import Block, encode
-from bms_estimator.fleet.claims import Role
-from bms_estimator.fleet.streams import make_streams
+from bms_estimator.edge.block import Block, encode
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.server import credentials
+from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.fleet import TenantSettings
 from tests.fleet.engine import Engine, running

@@ -15,15 +15,15 @@ import numpy as np
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import estimator_of
-from bms_estimator.fleet import subjects
-from bms_estimator.fleet.block import Block, encode
 from bms_estimator.fleet.heartbeat import Heartbeat
-from bms_estimator.fleet.keeping import Keeping
-from bms_estimator.fleet.known_packs import KnownPacks
-from bms_estimator.fleet.pack_bucket import write_bucket
-from bms_estimator.fleet.pack_row import PackKind, stored
-from bms_estimator.fleet.partition import Partition
+from bms_estimator.fleet.packs.pack_bucket import write_bucket
+from bms_estimator.fleet.packs.pack_registry import KnownPacks
+from bms_estimator.fleet.packs.pack_row import PackKind, stored
+from bms_estimator.fleet.worker.checkpoint_store import Keeping
+from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import SAMPLE
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S

@@ -14,16 +14,16 @@ import pytest
 
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.sinks.home_assistant import Described, discovery
-from bms_estimator.sinks.messages import Message, Messages, Sent
+from bms_estimator.sinks.home_assistant.discovery import Described, discovery
+from bms_estimator.sinks.mqtt.messages import Message, Messages, Sent
 from bms_estimator.telemetry.rest_detector import WATCHED_S
 from tests.home_assistant.conftest import DASHBOARD
 from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant
 from tests.home_assistant.packs import Packs
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
-from tests.sinks.test_home_assistant import CELLS, MOST_ROWS_PER_MIN, noisy, restless, rows
-from tests.sinks.test_home_assistant import described as shown
+from tests.sinks.home_assistant.test_discovery import CELLS, MOST_ROWS_PER_MIN, noisy, restless, rows
+from tests.sinks.home_assistant.test_discovery import described as shown
 
 SOC, SET_SOC, LOW = "sensor.bms_pack_soc_percent", "number.bms_pack_set_soc", "binary_sensor.bms_pack_alarm_soc_low"
 NOT_GRANTED = '"event": "request not granted", "pack": "bench"'

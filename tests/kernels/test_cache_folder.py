@@ -28,13 +28,13 @@ def imported(source: Path) -> set[Path]:
 
 def test_every_file_with_compiled_code_is_in_the_caches_name() -> None:
     compiled = {path for path in PACKAGE.rglob("*.py") if re.search(r"^@njit\b", path.read_text(), re.MULTILINE)}
-    assert PACKAGE / "sources" / "wire" / "framing.py" in compiled
+    assert PACKAGE / "protocols" / "firmware" / "framing.py" in compiled
     assert compiled <= set(numba_cache.COMPILED_IN)
 
 
 def test_every_file_that_a_kernel_imports_is_in_the_caches_name() -> None:
     found = set().union(*(imported(source) for source in numba_cache.COMPILED_IN))
-    assert PACKAGE / "model" / "suspect.py" in found
+    assert PACKAGE / "model" / "input_faults.py" in found
     assert found <= set(numba_cache.COMPILED_IN)
 
 

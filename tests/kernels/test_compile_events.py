@@ -1,6 +1,6 @@
 """A person hears which kernel is being compiled."""
 
-from bms_estimator.cli.compiling import compiling_shown
+from bms_estimator.cli.options.compile_progress import compiling_shown
 from bms_estimator.kernels.cell_model import margins
 from bms_estimator.kernels.compile_events import compiling_told
 from bms_estimator.numba_cache import njit

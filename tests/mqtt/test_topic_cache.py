@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.mqtt.topic_cache import MAX_DEVICE_BYTES, MAX_DEVICES, MAX_TOPICS, SILENT_S, Heard, Published, parsed
-from bms_estimator.sinks.messages import Messages, Sent
+from bms_estimator.sinks.mqtt.messages import Messages, Sent
 from tests.sinks.snapshots import NOW, ONE
 
 

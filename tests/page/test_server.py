@@ -12,11 +12,11 @@ import pytest
 from yarl import URL
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.page import web as of_server
-from bms_estimator.page.hub import Hub
-from bms_estimator.page.past import Past
-from bms_estimator.page.server import FILES, STATIC, PageServer
-from bms_estimator.page.sink import Pages, PageSink
+from bms_estimator.page import web_server as of_server
+from bms_estimator.page.history_query import Past
+from bms_estimator.page.pack_topics import Hub
+from bms_estimator.page.page_server import FILES, STATIC, PageServer
+from bms_estimator.page.page_sink import Pages, PageSink
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.store.minute import epoch_s
 from tests.patience import LONG_S

@@ -18,7 +18,7 @@ from bms_estimator.model.payloads import Alarm, HookHealth
 from bms_estimator.protocols.firmware.messages import Relay
 from bms_estimator.service import alarm_hooks
 from bms_estimator.service.alarm_hooks import Hooks, unusable
-from bms_estimator.service.serve import serve
+from bms_estimator.service.pack_service import serve
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.virtual_adc import Reading

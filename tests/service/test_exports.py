@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.service.serve import serve
+from bms_estimator.service.pack_service import serve
 from bms_estimator.settings.pack import Settings
 from tests.free_port import free_port
 from tests.influxdb import INFLUXD, InfluxDB

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
+from bms_estimator.checkpoint.checkpoint_file import FORMAT, LATER, CheckpointFile, Ledger
 from bms_estimator.model.payloads import Totals
 from bms_estimator.process.boot_clock import Moment
-from bms_estimator.service import saving
-from bms_estimator.service.checkpoint import FORMAT, LATER, CheckpointFile, Ledger
-from bms_estimator.service.live import new_estimator, run_live
+from bms_estimator.service import checkpoint_writer
+from bms_estimator.service.live_loop import new_estimator, run_live
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import Flow
 from bms_estimator.telemetry.lifetime_totals import gap_lengths
+from tests.checkpoint.test_checkpoint import CELL, NEW, SETTINGS, a_used_pack, edited, often, ran, saved_as
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
-from tests.service.test_checkpoint import CELL, NEW, SETTINGS, a_used_pack, edited, often, ran, saved_as
 
 OLD_FILES = {4: 0.5762, 5: 0.4149, 6: 0.4132}
 """SOC by format: 4 is that of 0.1.0."""
@@ -193,7 +193,7 @@ async def test_a_checkpoint_of_a_later_version_is_taken_up_by_that_version_once_
     before, command, _ = said.split("`")
     assert before.endswith("is installed again, stop the service and ")
     subprocess.run(command, shell=True, check=True)  # noqa: ASYNC221 - as a person would
-    monkeypatch.setattr("bms_estimator.service.checkpoint.FORMAT", FORMAT + 1)
+    monkeypatch.setattr("bms_estimator.checkpoint.checkpoint_file.FORMAT", FORMAT + 1)
     restored = (await ran(folder, samples=1)).health.checkpoint
     assert restored == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
@@ -243,8 +243,8 @@ async def test_a_state_folder_that_is_deleted_is_made_anew_for_its_owner_alone(t
 async def test_a_disk_that_hangs_stops_neither_the_estimate_nor_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(saving, "HUNG_S", 0.01)
-    monkeypatch.setattr(saving, "LAST_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "HUNG_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "LAST_S", 0.01)
     release = threading.Event()
 
     class Hung(CheckpointFile):

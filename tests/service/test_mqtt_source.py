@@ -10,7 +10,7 @@ import aiomqtt
 from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.service.serve import serve
+from bms_estimator.service.pack_service import serve
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import header_of

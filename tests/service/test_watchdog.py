@@ -8,20 +8,20 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.process.systemd import Notifier
-from bms_estimator.service.live import run_live
-from bms_estimator.service.serve import recording_health
+from bms_estimator.service import publisher
+from bms_estimator.service.latency import Latency
+from bms_estimator.service.live_loop import run_live
+from bms_estimator.service.pack_service import recording_health
 from bms_estimator.settings.pack import SensorSettings
-from bms_estimator.snapshot import publisher
-from bms_estimator.snapshot.latency import Latency
 from bms_estimator.sources.captures.raw_capture import header_of
 from bms_estimator.sources.captures.recorder import Recording
 from bms_estimator.sources.serial.serial_port import Line
 from bms_estimator.sources.serial.serial_source import SerialBoard
 from bms_estimator.sources.source import Pulse
+from tests.checkpoint.test_checkpoint import CELL, SETTINGS
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
-from tests.service.test_checkpoint import CELL, SETTINGS
 
 
 class Systemd:

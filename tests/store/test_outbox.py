@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt.messages import Message
 from bms_estimator.store import outbox as outbox_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
@@ -272,7 +272,7 @@ async def test_a_disk_that_fails_for_long_costs_no_memory(path):
 KILLED = """
 import asyncio, sys
 from pathlib import Path
-from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt.messages import Message
 from bms_estimator.store.database import Database
 from bms_estimator.store.outbox import Outbox
 

@@ -15,7 +15,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
-from bms_estimator.service.warm_up import load_kernels
+from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.world.world import Result, World
 
 HOUR_S = 3600.0

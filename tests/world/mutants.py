@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
-from bms_estimator.service.checkpoint import CheckpointFile
-from bms_estimator.sinks.messages import Messages
+from bms_estimator.sinks.mqtt.messages import Messages
 from bms_estimator.sources.serial.board_check import Doorkeeper
 from bms_estimator.store.outbox_queue import Queue
 

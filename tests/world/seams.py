@@ -63,9 +63,9 @@ class _Instead:
         return getattr(self._module, name)
 
 
-SLOWER = (("service.live", "LAG_STEP_S", 2.0), ("sources.serial_board", "TALK_S", 0.5))
+SLOWER = (("service.live_loop", "LAG_STEP_S", 2.0), ("sources.serial.serial_source", "TALK_S", 0.5))
 """What looks around all the time does so less often: module, name, seconds. It is what an idle hour would cost most."""
-REMEMBERED = (("estimator.records", "decay_table"),)
+REMEMBERED = (("estimator.settings_records", "decay_table"),)
 """Pure functions whose values are worth keeping from start to start."""
 
 

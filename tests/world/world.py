@@ -16,9 +16,9 @@ from typing import Any, Self
 
 import structlog
 
+from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointFile, Restored
 from bms_estimator.model.payloads import Snapshot
-from bms_estimator.service import serve as service
-from bms_estimator.service.checkpoint import REFUSED, CheckpointFile, Restored
+from bms_estimator.service import pack_service as service
 from bms_estimator.settings.pack import (
     IdentifierSettings,
     MqttSettings,

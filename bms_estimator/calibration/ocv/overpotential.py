@@ -15,7 +15,7 @@ KELVIN = 273.15
 
 
 def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:
-    """``kernels.ladder.arrhenius`` of many temperatures."""
+    """``kernels.cell_model.rc_ladder.arrhenius`` of many temperatures."""
     return np.asarray(
         np.exp(energy_j / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / (REFERENCE_C + KELVIN))), dtype=np.float64
     )

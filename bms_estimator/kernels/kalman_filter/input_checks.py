@@ -89,7 +89,7 @@ CHECKS = np.dtype(
         ("wrong_v", "f8"),  # running mean of the error that stays [V]
         ("searches", "f8"),  # times the filter began again of late
         ("seen_reopened", "i8"),
-        ("suspects", "i8"),  # bits of model.suspect.Suspect
+        ("suspects", "i8"),  # bits of model.input_faults.Suspect
         ("good_mean", "f8", STATES),  # of the likeliest filter when it was last kept
         ("good_covariance", "f8", (STATES, STATES)),
         ("good_soc", "f8"),

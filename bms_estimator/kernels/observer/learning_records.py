@@ -10,7 +10,7 @@ CONSTANTS = 16
 LEARNING_SETTINGS = np.dtype(
     [
         ("enabled", "i8"),  # 0: a printed law
-        ("model", "i8"),  # kernels.learning_model.Model
+        ("model", "i8"),  # kernels.observer.learning_model.Model
         ("count", "i8"),  # parameters that are learned
         ("file", "f8", CONSTANTS),  # what theta = 0 stands for
         ("lower", "f8", LEARNABLE),  # bounds of theta

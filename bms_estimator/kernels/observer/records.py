@@ -26,10 +26,10 @@ OBSERVER_SETTINGS = np.dtype(
         ("rate", "f8", PARAMETERS),  # lx + ly of (3.18), lambda of (3.17) [1/s]
         ("drive", "f8", PARAMETERS),  # 1 where e^2 drives the parameter, 0 where it is held
         ("output_r_s", "f8"),  # 1: output (3.14) with u R_s; 0: output (4.1)
-        ("nussbaum", "i8"),  # kernels.nussbaum.Nussbaum
+        ("nussbaum", "i8"),  # kernels.observer.nussbaum.Nussbaum
         ("alpha", "f8"),  # a of (3.10), in (2, 3]
         ("gain_scale", "f8"),  # lambda^(1/a) of (3.10) [1/(V^2 s)]
-        ("ml_series", "f8", SERIES_TERMS),  # kernels.mittag_leffler tables
+        ("ml_series", "f8", SERIES_TERMS),  # kernels.observer.mittag_leffler tables
         ("ml_decay", "f8", TABLE_POINTS),
         ("ml_decay_slope", "f8", TABLE_POINTS),
         ("k0", "f8"),  # k(t0) [V^2 s]

@@ -1,4 +1,4 @@
-"""Records of a raw capture (``sources.raw_capture`` has the format) taken apart, a megabyte at a time."""
+"""Records of a raw capture (``sources.captures.raw_capture`` has the format) taken apart, a megabyte at a time."""
 
 import numpy as np
 from numpy.typing import NDArray

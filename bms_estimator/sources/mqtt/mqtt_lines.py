@@ -16,7 +16,7 @@ from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.protocols.base.report_line import CONNECTED
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import MqttSettings, Settings
-from bms_estimator.sinks.messages import Message
+from bms_estimator.sinks.mqtt.messages import Message
 from bms_estimator.sources.line_source import Bringer, NothingComesError
 from bms_estimator.sources.mqtt.sample_assembler import Assembly
 

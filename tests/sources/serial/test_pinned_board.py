@@ -20,7 +20,7 @@ from structlog.testing import capture_logs
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.service.serve import serve
+from bms_estimator.service.pack_service import serve
 from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard

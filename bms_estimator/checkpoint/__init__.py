@@ -1,0 +1,1 @@
+"""Saved estimator state: file, content, identity, restore."""

@@ -1,0 +1,218 @@
+"""``bms-estimator replay``: the estimator over a capture."""
+
+import asyncio
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack, contextmanager, nullcontext
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from bms_estimator.cli.captures.replay_summary import Result, Summary
+from bms_estimator.cli.options.capture_options import (
+    OR_FUEL_CELL_HELP,
+    AsJson,
+    CapacityAh,
+    Force,
+    SignOfCurrent,
+    check_out,
+)
+from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.cli.options.pack_options import pack_or_cell, refuse_soc, with_broker, with_pack
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.service.live_loop import new_estimator
+from bms_estimator.service.publisher import Publisher
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.sink import MqttSink
+from bms_estimator.sinks.sink import Delivery
+from bms_estimator.sinks.trace_file import TableSink, table_sink
+from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
+from bms_estimator.sources.captures.stdin import standard_input
+from bms_estimator.store.outbox import Outbox
+from bms_estimator.telemetry.health import dropped_text
+from bms_estimator.telemetry.impossible import impossible_sample
+
+MANY = 0.01
+"""Part of the samples that is more than a glitch now and then."""
+
+
+def replay(
+    capture: Annotated[
+        Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet; -: from stdin", show_default=False)
+    ],
+    cell: Annotated[str | None, typer.Option(help=OR_FUEL_CELL_HELP, show_default=False)] = None,
+    capacity_ah: CapacityAh = None,
+    pack: Annotated[Path | None, typer.Option(help="settings of the pack, pack.toml", show_default=False)] = None,
+    soc: Annotated[
+        float | None, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample; else from the OCV")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="estimates sample by sample: .csv, .csv.gz, .parquet", show_default=False)
+    ] = None,
+    force: Force = False,
+    current_sign: SignOfCurrent = None,
+    as_json: AsJson = False,
+    mqtt: Annotated[str | None, typer.Option(help="publish to this broker, mqtt://host:port")] = None,
+    speed: Annotated[
+        float | None, typer.Option(parser=decimal(1e-3), help="times as fast as recorded; else as fast as it goes")
+    ] = None,
+) -> None:
+    """Estimate from a recorded capture or a table.
+
+    The same estimator as in live operation: a capture that ``record`` made gives the same estimates to the last bit.
+    """
+    settings, model = pack_or_cell(pack, cell, capacity_ah)
+    if soc is not None:
+        refuse_soc(model, "--soc")
+        settings = with_pack(settings, initial_soc=soc)
+    settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
+    if out is not None:
+        check_out(out, [capture], force=force)
+    with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
+        with compiling_shown():
+            source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
+        replayed = Replay(source, speed=speed)
+        result = asyncio.run(_replay(settings, model, replayed, table_sink(out) if out else None))
+        if isinstance(source, RawCapture):
+            for warning in _unread(source, result.duration_s or 0.0):
+                typer.echo(f"warning: {capture}: {warning}", err=True)
+        if result.samples == 0:
+            raise UserError(f"{path}: no usable sample; dropped: {_dropped(result)}")
+    if as_json:
+        sys.stdout.write(json.dumps(asdict(result)) + "\n")
+    else:
+        Console().print(result_table(path.name, result))
+
+
+def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
+    """What of a capture could not be read."""
+    if source.damaged:
+        yield f"damaged after {duration_s:.1f} s; the rest was not read"
+    if source.unread_bytes:
+        yield f"its last {source.unread_bytes:,} bytes are no whole record: cut off there, or a length is damaged"
+
+
+async def _replay(settings: Settings, cell: PackModel, source: Replay, table: TableSink | None) -> Result:
+    """Source -> estimator -> table, summary, broker."""
+    with compiling_shown():
+        estimator, summary = new_estimator(settings, cell), Summary()
+    async with AsyncExitStack() as stack:
+        publisher = await _publisher(stack, settings, cell, estimator, source)
+        stack.enter_context(table or nullcontext())
+        show = stack.enter_context(_progress(source))
+        started_s, impossible = time.perf_counter(), None
+        async for block in source:
+            trace = estimator.run(block)
+            summary.add(trace)
+            if trace.size < block.size:
+                impossible = impossible_sample(block, estimator.settings[0]) or impossible
+            if table:
+                table.write(trace)
+            if publisher:
+                publisher.add(block, trace)
+                await asyncio.sleep(0)
+            show()
+        wall_s = time.perf_counter() - started_s
+        if publisher:
+            publisher.publish_last()
+    result = summary.result(estimator, source.samples, wall_s)
+    return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))
+
+
+async def _publisher(
+    stack: AsyncExitStack, settings: Settings, cell: PackModel, estimator: Estimator, source: Replay
+) -> Publisher | None:
+    """Who publishes, when there is a broker."""
+    if settings.mqtt is None:
+        return None
+    delivery = Delivery()
+    outbox = Outbox(None, most=settings.store.outbox_messages)
+    home = settings.home_assistant
+    mqtt = MqttSink(settings.mqtt, settings.pack.name, Requests(delivery), delivery, outbox, home_assistant=home)
+    sinks = [await stack.enter_async_context(mqtt)]
+    return Publisher(settings, cell, estimator, source=source, sinks=sinks, clock=Clock(), delivery=delivery)
+
+
+@contextmanager
+def _progress(source: Replay) -> Iterator[Callable[[], None]]:
+    """A bar on stderr where that is a terminal; the value is called after each block."""
+    console = Console(stderr=True)
+    columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[samples]:,} samples"), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        bar = progress.add_task("replay", total=1.0, samples=0)
+        yield lambda: progress.update(bar, completed=source.capture.fraction, samples=source.samples)
+
+
+def result_table(title: str, result: Result) -> Table:
+    """The outcome for people."""
+    table = Table(title=title, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
+    table.add_column(style="dim")
+    table.add_column(justify="right")
+    lock = f"[red]lost {result.lock_losses} times[/]" if result.lock_lost else "[green]kept[/]"
+    rows = {
+        "samples": f"{result.samples:,}",
+        "dropped": _dropped(result),
+        **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
+        **({"clock set back": _set_back(result)} if result.time_steps_back else {}),
+        "duration": _text(result.duration_s, ",.1f", "s"),
+        **({} if result.parameters else _soc(result)),
+        "innovation, RMS": _text(result.innovation_rms_v, ".3f", "mV", 1e3),
+        "voltage error, RMS": _text(result.voltage_rms_error_v, ".3f", "mV", 1e3),
+        "lock": lock,
+        "k at the end": _text(result.k_final, ".4g", "V²s"),
+        "speed": f"{_text(result.samples_per_s, ',.0f')} samples/s, {result.wall_s:.2f} s",
+    }
+    learned = {
+        name: f"{'' if p.valid else 'not valid: '}{_text(p.value, '.4g')} ± {_text(p.std, '.2g')}"
+        for name, p in result.parameters.items()
+    }
+    for name, value in (rows | learned).items():
+        table.add_row(name, value)
+    for suspicion in result.suspects:
+        table.add_row("suspected", f"[yellow]{suspicion}[/]")
+    return table
+
+
+def _soc(result: Result) -> dict[str, str]:
+    return {
+        "SOC": f"{_text(result.soc_initial, '.2%')} to {_text(result.soc_final, '.2%')}",
+        "SOC, std at the end": _text(result.soc_std_final, ".2%"),
+        **_temperature(result),
+    }
+
+
+def _temperature(result: Result) -> dict[str, str]:
+    unusable = f"{result.temperatures_dropped:,} values that no cell has"
+    if not result.temperature_sensor:
+        none = unusable if result.temperatures_dropped else "not measured"
+        return {"temperature": f"{none}: the band is wider"}
+    return {"temperature": unusable} if result.temperatures_dropped else {}
+
+
+def _set_back(result: Result) -> str:
+    """How often, and what that looks like."""
+    text = f"{result.time_steps_back:,} times"
+    return f"{text}: are the rows in the order of time?" if result.time_steps_back > MANY * result.samples else text
+
+
+def _dropped(result: Result) -> str:
+    """What was not used, and, where that is more than single samples, why."""
+    text, number = dropped_text(result.dropped), sum(result.dropped.values())
+    return f"{text}; {result.impossible}" if result.impossible and number > MANY * result.samples else text
+
+
+def _text(value: float | None, form: str, unit: str = "", scale: float = 1.0) -> str:
+    return "-" if value is None else f"{value * scale:{form}} {unit}".rstrip()

@@ -1,0 +1,102 @@
+"""``bms-estimator thesis``: the thesis recomputed, as a report."""
+
+import textwrap
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh, SignOfCurrent, check_once, name_of
+from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.cli.options.pack_options import TABLE_RESOLUTION_V
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.reports import report_items
+from bms_estimator.reports.experiment import Recorded
+from bms_estimator.reports.html import LONG_CELL, write
+from bms_estimator.reports.thesis_report import Report, build
+from bms_estimator.sources.captures.replay import load_capture
+
+WIDE = 160
+"""A table of the thesis is not squeezed into fewer columns."""
+
+
+def thesis(
+    captures: Annotated[
+        list[Path] | None,
+        typer.Argument(help="for chapter 5: recorded captures, CSV (.gz) or Parquet; else a simulated 6S pack"),
+    ] = None,
+    cell: Annotated[str | None, typer.Option(help=f"of the captures: {CELL_HELP}", show_default=False)] = None,
+    capacity_ah: CapacityAh = None,
+    resolution_v: Annotated[
+        float, typer.Option(parser=decimal(1e-9), help="one step of the captures' voltage [V]")
+    ] = TABLE_RESOLUTION_V,
+    current_sign: SignOfCurrent = None,
+    out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
+    table: Annotated[str | None, typer.Option(help="this table only, 1 to 13 or Errata", show_default=False)] = None,
+    figure: Annotated[str | None, typer.Option(help="this figure only, 1 to 50", show_default=False)] = None,
+) -> None:
+    """Recompute the thesis's tables and figures, and write them beside the printed ones as one HTML page.
+
+    Chapters 2 to 4 are simulated. Chapter 5 runs on the captures: at least one voltage relaxation test, and one
+    constant load or steps, all from the same type of cell.
+    """
+    recorded = _recorded(captures, cell, capacity_ah, resolution_v, current_sign) if captures else None
+    started_s = time.perf_counter()
+    with _progress() as show:
+        report = build(recorded, table=table, figure=figure, progress=show)
+        try:
+            path = write(report, out)
+        except OSError as error:
+            raise UserError(f"--out {out}: cannot be written: {error.strerror}") from None
+    console = Console()
+    if table or figure:
+        _show(console, report)
+    counts = Counter(item.verdict.value for item in report.items)
+    typer.echo("; ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    typer.echo(f"{path}: written in {time.perf_counter() - started_s:.1f} s")
+
+
+def _recorded(
+    captures: list[Path], cell: str | None, capacity_ah: float | None, resolution_v: float, current_sign: SignOfCurrent
+) -> Recorded:
+    if cell is None:
+        raise UserError("captures need --cell NAME|CELL.toml: its capacity, limits and bounds")
+    check_once(captures)
+    loaded = [load_capture(path, current_sign=current_sign) for path in captures]
+    named = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
+    return Recorded(load_cell(cell, capacity_ah), named, resolution_v)
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on stderr where that is a terminal; the value is told what is made next."""
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        bar = progress.add_task("", total=None)
+        yield lambda title, done, total: progress.update(bar, description=title, completed=done, total=total)
+
+
+def _show(console: Console, report: Report) -> None:
+    """What was asked for, in the terminal."""
+    for item in report.items:
+        if isinstance(item, report_items.Table):
+            shown = Table(title=f"{report_items.name(item)}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)
+            for column, cells in zip(item.columns, zip(*item.rows, strict=True), strict=True):
+                text = max(map(len, cells)) > LONG_CELL
+                shown.add_column(textwrap.fill(column, 12), justify="left" if text else "right", no_wrap=not text)
+            for row in item.rows:
+                shown.add_row(*row)
+            Console(width=max(console.width, WIDE)).print(shown)
+        else:
+            console.print(f"Figure {item.key}  {item.title}", highlight=False)
+        console.print(f"{report_items.label(item)}: {item.reason}", highlight=False)

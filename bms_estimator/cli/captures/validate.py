@@ -1,0 +1,95 @@
+"""``bms-estimator validate``: a cell's model against a capture."""
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console, Group
+from rich.table import Table
+
+from bms_estimator.calibration.validate import Errors, Validation, validate
+from bms_estimator.cli.options.capture_options import AsJson, CapacityAh, CellName, SignOfCurrent
+from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.model.cell import load_cell
+from bms_estimator.sources.captures.replay import load_capture
+
+
+def validate_command(
+    capture: Annotated[Path, typer.Argument(help="recorded capture, CSV (.gz) or Parquet", show_default=False)],
+    cell: CellName,
+    capacity_ah: CapacityAh = None,
+    soc: Annotated[
+        float | None,
+        typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample; else from the first rest's voltage"),
+    ] = None,
+    current_sign: SignOfCurrent = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a capture's voltage from its current alone and compare.
+
+    Open loop: the parameters are frozen and the voltage is not used, except the first rest's for the initial SOC.
+    """
+    model = load_cell(cell, capacity_ah)
+    found = validate(load_capture(capture, current_sign=current_sign), model, initial_soc=soc)
+    for line in found.warnings:
+        typer.echo(f"warning: {line}", err=True)
+    if as_json:
+        sys.stdout.write(json.dumps(_json(found)) + "\n")
+    else:
+        Console().print(_tables(capture, found))
+
+
+def _json(found: Validation) -> dict[str, Any]:
+    above = {f"{key}_soc_above_0_1": value for key, value in _errors(found.above).items()}
+    return (
+        _errors(found.all)
+        | above
+        | {
+            "initial_soc": found.initial_soc,
+            "initial_soc_from": found.initial_soc_from,
+            "final_soc": found.final_soc,
+            "glitches": found.glitches,
+            "resting": _errors(found.resting),
+            "loaded": _errors(found.loaded),
+            "extra_series_resistance_ohm": _number(found.extra_ohm),
+            "with_extra_series_resistance": _errors(found.without_extra_ohm),
+            "warnings": list(found.warnings),
+        }
+    )
+
+
+def _errors(errors: Errors) -> dict[str, Any]:
+    return {
+        "samples": errors.samples,
+        "voltage_rms_mv": _number(1e3 * errors.voltage_rms_v),
+        "mean_abs_percent": _number(errors.mean_abs_percent),
+        "max_abs_percent": _number(errors.max_abs_percent),
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _tables(capture: Path, found: Validation) -> Group:
+    """The outcome for people."""
+    table = Table(title=capture.name, title_justify="left", box=box.SIMPLE_HEAD)
+    for column in ("", "samples", "RMS", "mean", "max"):
+        table.add_column(column, justify="left" if not column else "right")
+    rows = {
+        "all": found.all,
+        "SOC > 0.1": found.above,
+        "  at rest": found.resting,
+        "  under load": found.loaded,
+        f"  with {1e3 * found.extra_ohm:+.2f} mohm in series": found.without_extra_ohm,
+    }
+    for name, e in rows.items():
+        if e.samples:
+            percents = (f"{e.mean_abs_percent:.3f} %", f"{e.max_abs_percent:.2f} %")
+            table.add_row(name, f"{e.samples:,}", f"{1e3 * e.voltage_rms_v:.2f} mV", *percents)
+    soc = f"SOC {found.initial_soc:.4f} ({found.initial_soc_from}) to {found.final_soc:.4f}"
+    return Group(table, f"{soc}; {found.glitches} glitches left out")

@@ -1,0 +1,122 @@
+"""``bms-estimator adapt``: the thesis's steps 2 and 3 on captures, into a cell file."""
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from bms_estimator.calibration.thesis.adapt import Adaptation, adapt
+from bms_estimator.cli.options.capture_options import (
+    AsJson,
+    CapacityAh,
+    CapturesFromRest,
+    CellName,
+    Force,
+    InitialSoc,
+    NewCellFile,
+    SignOfCurrent,
+    check_once,
+    check_out,
+    write_as_named,
+)
+from bms_estimator.model.cell import load_cell
+from bms_estimator.sources.captures.replay import load_capture
+
+
+def adapt_command(
+    captures: CapturesFromRest,
+    cell: CellName,
+    out: NewCellFile,
+    capacity_ah: CapacityAh = None,
+    soc: InitialSoc = None,
+    current_sign: SignOfCurrent = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate a1..a15 by the thesis's adaptive observer and write a cell file.
+
+    Algorithm 1 runs over the capture of the smallest mean current; its averages (3.19) are a1..a12. (4.2) over all
+    captures gives R_s. The OCV is the cell's: find it by `ocv` before. Nothing is written if replays started in mid-load
+    get more than 5 % worse.
+    """
+    check_out(out, captures, force=force)
+    check_once(captures)
+    model = load_cell(cell, capacity_ah)
+    found = adapt([load_capture(path, current_sign=current_sign) for path in captures], model, soc=soc)
+    write_as_named(out, found.cell, _remarks(cell, found))
+    if as_json:
+        sys.stdout.write(json.dumps(_json(out, found)) + "\n")
+        return
+    console = Console()
+    console.print(f"{out}: written", _a_table(found), _capture_table(found), *_remarks(cell, found)[1:], sep="\n")
+
+
+def _json(out: Path, found: Adaptation) -> dict[str, Any]:
+    std = [None] * 12 + [_number(x) for x in found.steps.r_s.std]
+    a = found.steps.a[1:].tolist()
+    return {
+        "out": str(out),
+        "a": {f"a{i}": {"value": value, "std": std[i - 1]} for i, value in enumerate(a, start=1)},
+        "algorithm_1": found.steps.run.outcome,
+        "t_int_s": found.steps.run.window.t_int_s,
+        "t_unst_s": found.steps.run.window.t_unst_s,
+        "r_s_rms_mohm": 1e3 * found.steps.r_s.rms_ohm,
+        "error_mv": 1e3 * _error_v(found),
+        "captures": [
+            {
+                "name": c.name,
+                "initial_soc": c.initial_soc,
+                "voltage_rms_mv_soc_above_0_1": 1e3 * c.voltage_rms_v,
+                "score_before_percent": _number(c.score_before),
+                "score_after_percent": _number(c.score_after),
+                "held_back": c.held_back,
+            }
+            for c in found.captures
+        ],
+        "score_before_percent": _number(found.score_before),
+        "score_after_percent": _number(found.score_after),
+    }
+
+
+def _error_v(found: Adaptation) -> float:
+    return math.nan if found.cell.ladder is None else found.cell.ladder.error_v
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _remarks(cell: str, found: Adaptation) -> list[str]:
+    run, std = found.steps.run, found.steps.r_s.std
+    names = ", ".join(c.name for c in found.captures)
+    return [
+        f"a1..a15 by the thesis's steps 2 and 3 from {names};",
+        f"capacity and open-circuit voltage from {Path(cell).name}. Algorithm 1: {run.outcome}.",
+        "a1..a12 have no error: (3.18) leads them to the weighted mean of their bounds.",
+        f"Standard errors of a13, a14, a15: {std[0]:.2g} ohm, {std[1]:.2g}, {std[2]:.2g} ohm (nan: at a bound).",
+        f"Error of the voltage above SOC 0.1: {1e3 * _error_v(found):.1f} mV RMS.",
+        f"Interval score of replays started in mid-load: {found.score_before:.2f} % before, {found.score_after:.2f} % after.",
+    ]
+
+
+def _a_table(found: Adaptation) -> Table:
+    """a1..a15, a row for each element."""
+    table = Table("element", "amplitude", "exponent", "offset", box=box.SIMPLE_HEAD)
+    for name, first in (("R_ts", 1), ("R_tl", 4), ("C_ts", 7), ("C_tl", 10), ("R_s", 13)):
+        table.add_row(f"{name}: a{first}..a{first + 2}", *(f"{x:.4g}" for x in found.steps.a[first : first + 3]))
+    return table
+
+
+def _capture_table(found: Adaptation) -> Table:
+    table = Table("capture", "SOC", "RMS", "before", "after", "held back", box=box.SIMPLE_HEAD)
+    for c in found.captures:
+        scores = (f"{x:.2f} %" if math.isfinite(x) else "-" for x in (c.score_before, c.score_after))
+        table.add_row(
+            c.name, f"{c.initial_soc:.3f}", f"{1e3 * c.voltage_rms_v:.1f} mV", *scores, "yes" if c.held_back else "no"
+        )
+    return table

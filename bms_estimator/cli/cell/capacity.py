@@ -1,0 +1,143 @@
+"""``bms-estimator capacity``: capacity from rests and the charge counted between them."""
+
+import json
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console, Group
+from rich.table import Table
+
+from bms_estimator.calibration.capacity import Anchor, Capacity, measure_capacity
+from bms_estimator.cli.options.capture_options import CELL_HELP, AsJson, CapacityAh, SignOfCurrent
+from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.replay import load_capture
+
+SHOWN_ANCHORS = 30
+UNITS = 30.0
+"""No capacity is declared so many times too large or too small."""
+"""So many are listed for people; all with ``--json``."""
+
+
+@dataclass(frozen=True)
+class AnchorResult:
+    """One anchor, as ``--json`` prints it."""
+
+    capture: str
+    time_s: float
+    rest_s: float
+    ocv_v: float
+    ocv_std_v: float  # of the rest, without the curve's error
+    soc: float
+    soc_std: float
+    counted_ah: float
+    off: float  # SOC by the voltage less that by the charge
+
+
+@dataclass(frozen=True)
+class CapacityResult:
+    """The outcome, as ``--json`` prints it."""
+
+    capacity_ah: float
+    capacity_std_ah: float
+    declared_ah: float
+    current_offset_a: float
+    current_offset_std_a: float
+    anchors: list[AnchorResult]
+    rejected: list[str]
+
+
+def capacity(
+    captures: Annotated[
+        list[Path], typer.Argument(help="captures with rests, CSV (.gz) or Parquet, of one cell", show_default=False)
+    ],
+    cell: Annotated[str, typer.Option(help=f"{CELL_HELP}; its OCV", show_default=False)],
+    capacity_ah: CapacityAh = None,
+    current_offset_std_a: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(0.0),
+            help="how wrong the sensor's zero may be [A]; else as `identifier.current_offset_std_a` has it",
+            show_default=False,
+        ),
+    ] = None,
+    current_sign: SignOfCurrent = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the capacity from rests and the charge counted between them.
+
+    Each rest tells the SOC by the cell's OCV, as well as the curve is known and steep there. From all of them together,
+    over any load, comes the charge from full to empty with its standard deviation. A cell file is not written:
+    `cell.capacity_ah` and `cell.capacity_std` of a cell file are the place for what was measured.
+    """
+    model = load_cell(cell, capacity_ah)
+    loaded = [load_capture(path, current_sign=current_sign) for path in captures]
+    found = measure_capacity(loaded, model, offset_std_a=current_offset_std_a)
+    if not 1.0 / UNITS < found.capacity_ah / model.cell.capacity_ah < UNITS:
+        raise UserError(
+            f"{found.capacity_ah:.4g} Ah where {model.cell.capacity_ah:.4g} Ah is declared: is the current in amperes, the time in seconds?"
+        )
+    result = _result(found, model)
+    if as_json:
+        sys.stdout.write(json.dumps(asdict(result)) + "\n")
+    else:
+        Console().print(_shown(result))
+
+
+def _result(found: Capacity, cell: CellModel) -> CapacityResult:
+    return CapacityResult(
+        capacity_ah=found.capacity_ah,
+        capacity_std_ah=found.std_ah,
+        declared_ah=cell.cell.capacity_ah,
+        current_offset_a=found.offset_a,
+        current_offset_std_a=found.offset_std_a,
+        anchors=[_anchor(a, off) for a, off in zip(found.anchors, found.residual, strict=True)],
+        rejected=list(found.rejected),
+    )
+
+
+def _anchor(anchor: Anchor, off: float) -> AnchorResult:
+    return AnchorResult(
+        capture=anchor.capture,
+        time_s=anchor.time_s,
+        rest_s=anchor.rest.duration_s,
+        ocv_v=anchor.rest.ocv_v,
+        ocv_std_v=anchor.own_v,
+        soc=anchor.soc,
+        soc_std=anchor.soc_std,
+        counted_ah=anchor.counted_ah,
+        off=off,
+    )
+
+
+def _counted(anchors: int) -> str:
+    more = f", the first {SHOWN_ANCHORS} above (--json: all)" if anchors > SHOWN_ANCHORS else ""
+    return f"{anchors} anchors{more}"
+
+
+def _shown(result: CapacityResult) -> Group:
+    """The outcome for people."""
+    anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "off", box=box.SIMPLE_HEAD)
+    for column in anchors.columns[1:]:
+        column.justify, column.no_wrap = "right", True
+    for one in result.anchors[:SHOWN_ANCHORS]:
+        anchors.add_row(
+            one.capture,
+            f"{one.time_s:.0f} s",
+            f"{one.rest_s / 60.0:.0f} min",
+            f"{one.ocv_v:.4f} V",
+            f"{one.soc:.3f} ± {one.soc_std:.3f}",
+            f"{one.counted_ah:.3f} Ah",
+            f"{one.off:+.3f}",
+        )
+    lines = [
+        f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah, declared {result.declared_ah:.4g} Ah",
+        f"offset of the current sensor {1e3 * result.current_offset_a:+.1f} ± {1e3 * result.current_offset_std_a:.1f} mA",
+        f"{_counted(len(result.anchors))}, {len(result.rejected)} rests that are none",
+    ]
+    return Group(anchors, *lines)

@@ -1,0 +1,113 @@
+"""``bms-estimator cell``: what a pack's service has learned, as a cell file."""
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.restore import resume
+from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_out, name_of
+from bms_estimator.cli.options.pack_options import load_pack, unpacked_cell
+from bms_estimator.estimator.identified_parameters import learned_cell, learned_ocv, relative_capacity
+from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.service.live_loop import new_estimator
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="What a pack's service has learned of its cells.")
+
+TENTHS = np.linspace(0.0, 1.0, 11)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """The outcome, as ``--json`` prints it."""
+
+    out: str
+    checkpoint: str
+    capacity_ah: float
+    capacity_std_ah: float
+    r_s_factor: float  # over the configured cell's
+    ocv_correction_mv: list[float]  # of one cell of the file, at SOC 0, 0.1 ... 1
+    ocv_error_mv: list[float]
+
+
+@app.callback()
+def _group() -> None:
+    """Keep ``export`` a command of its own name."""
+
+
+@app.command()
+def export(
+    pack: Annotated[Path, typer.Argument(help="settings of the pack, pack.toml", show_default=False)],
+    out: NewCellFile,
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="its checkpoint; else where its service keeps it", show_default=False)
+    ] = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a cell file with what a pack's checkpoint holds: OCV, capacity and resistances, each with its error.
+
+    A service that starts from it, here or on a replacement, begins with what this one has learned.
+    """
+    settings, model = load_pack(pack)
+    cell, series = unpacked_cell(pack, settings), settings.pack.series
+    file = CheckpointFile(checkpoint.parent if checkpoint else state_folder(settings), settings, model)
+    if checkpoint:
+        file.path = checkpoint
+    check_out(out, [pack, file.path], force=force)
+    if checkpoint and not checkpoint.exists():
+        raise UserError(f"--checkpoint {checkpoint}: no such file")
+    found = file.load()
+    if found.reason:
+        raise UserError(
+            f"{file.path}: no checkpoint to export: {found.reason}; a service of {pack} saves one each "
+            f"{settings.state.checkpoint_s:g} s (--checkpoint names another file)"
+        )
+    estimator = new_estimator(settings, model)
+    wrong = resume(estimator, found.state, 0.0)
+    if wrong or not estimator.record[0]["filter"]["started"]:
+        raise UserError(f"{file.path}: nothing to export: {wrong or 'the identifier was off, it has learned nothing'}")
+    learned = learned_cell(estimator, cell, series)
+    renamed = learned.model_copy(update={"cell": learned.cell.model_copy(update={"name": name_of(out)})})
+    correction_v, std_v = learned_ocv(estimator.record[0], estimator.settings_record[0], TENTHS)
+    capacity, cell_ah = relative_capacity(estimator.record[0]), cell.cell.capacity_ah
+    result = Exported(
+        out=str(out),
+        checkpoint=str(file.path),
+        capacity_ah=capacity.value * cell_ah,
+        capacity_std_ah=capacity.std * cell_ah,
+        r_s_factor=learned.r_s.offset_ohm / cell.r_s.offset_ohm,
+        ocv_correction_mv=(1e3 * correction_v / series).tolist(),
+        ocv_error_mv=(1e3 * std_v / series).tolist(),
+    )
+    write_cell(out, renamed, _remarks(result, settings.pack.cell))
+    typer.echo(json.dumps(asdict(result)) if as_json else _text(result))
+
+
+def _remarks(result: Exported, cell: str) -> list[str]:
+    return [
+        f"Learned by a service from {Path(cell).name}: capacity {result.capacity_ah:.4g} +- {result.capacity_std_ah:.2g} Ah,",
+        f"series resistance times {result.r_s_factor:.3f}, OCV corrected by {_rms(result.ocv_correction_mv):.1f} mV RMS.",
+    ]
+
+
+def _text(result: Exported) -> str:
+    correction, error = (
+        " ".join(f"{mv:.0f}" for mv in column) for column in (result.ocv_correction_mv, result.ocv_error_mv)
+    )
+    return (
+        f"{result.out}: written from {result.checkpoint}\n"
+        f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah; series resistance x {result.r_s_factor:.3f}\n"
+        f"OCV at SOC 0, 0.1 ... 1 corrected by {correction} mV, known to {error} mV"
+    )
+
+
+def _rms(values: list[float]) -> float:
+    return math.sqrt(sum(value**2 for value in values) / len(values))

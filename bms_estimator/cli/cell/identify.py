@@ -1,0 +1,175 @@
+"""``bms-estimator identify``: a cell's resistances from captures, into a cell file."""
+
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console, Group
+from rich.table import Table
+
+from bms_estimator.calibration.elements.identify import CaptureFit, Identification, identify
+from bms_estimator.cli.cell.identify_fuel_cell import identify_fuel_cell
+from bms_estimator.cli.options.capture_options import (
+    OR_FUEL_CELL_HELP,
+    AsJson,
+    CapacityAh,
+    CapturesFromRest,
+    Force,
+    InitialSoc,
+    NewCellFile,
+    SignOfCurrent,
+    check_once,
+    check_out,
+    write_as_named,
+)
+from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.model.cell import is_fuel_cell, load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.replay import load_capture
+
+
+def identify_command(
+    captures: CapturesFromRest,
+    cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; its capacity and OCV", show_default=False)],
+    out: NewCellFile,
+    capacity_ah: CapacityAh = None,
+    soc: InitialSoc = None,
+    temperature_c: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(), help="of captures without the column temperature_c; else 25", show_default=False
+        ),
+    ] = None,
+    keep_ocv: Annotated[bool, typer.Option(help="leave the open-circuit voltage as it is")] = False,
+    current_sign: SignOfCurrent = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Identify a cell's resistances from captures and write a cell file.
+
+    Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole range of SOC tell most;
+    the OCV is better found by `ocv` before. Written is only what makes replays cut in mid-load no worse, give or take 5 %.
+
+    Of a fuel cell: polarisation curves (columns current_a, voltage_v) and records, docs/fuel-cell.md.
+    """
+    check_out(out, captures, force=force)
+    check_once(captures)
+    if is_fuel_cell(cell):
+        if capacity_ah is not None or soc is not None or keep_ocv:
+            raise UserError(f"{cell} is a fuel cell: --capacity-ah, --soc and --keep-ocv are of batteries")
+        identify_fuel_cell(captures, cell, out, temperature_c=temperature_c, current_sign=current_sign, as_json=as_json)
+        return
+    model = load_cell(cell, capacity_ah)
+    loaded = [load_capture(path, current_sign=current_sign) for path in captures]
+    started_s = time.perf_counter()
+    found = identify(loaded, model, refine_ocv=not keep_ocv, initial_soc=soc, temperature_c=temperature_c)
+    seconds = time.perf_counter() - started_s
+    start = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
+    write_as_named(out, found.cell, _remarks(start, found))
+    if as_json:
+        sys.stdout.write(json.dumps(_json(out, found, seconds)) + "\n")
+    else:
+        Console().print(_tables(out, found, seconds))
+
+
+def _json(out: Path, found: Identification, seconds: float) -> dict[str, Any]:
+    return {
+        "out": str(out),
+        "elements": [
+            {"soc": soc}
+            | {f"{name}_ohm": value for name, (value, _) in row.items()}
+            | {f"{name}_ohm_std": std for name, (_, std) in row.items()}
+            for soc, row in found.elements.items()
+        ],
+        "temperature_c": _temperatures(found),
+        "error_mv": 1e3 * _error_v(found),
+        "captures": [
+            {
+                "name": c.name,
+                "samples": c.samples,
+                "glitches": c.glitches,
+                "initial_soc": c.initial_soc,
+                "temperature_c": c.temperature_c,
+                "miscount_percent": 100.0 * c.miscount,
+                "voltage_rms_mv_soc_above_0_1": 1e3 * c.voltage_rms_v,
+                "score_before_percent": _number(c.score_before),
+                "score_after_percent": _number(c.score_after),
+                "held_back": c.held_back,
+            }
+            for c in found.captures
+        ],
+        "left_out": list(found.left_out),
+        "ocv_correction_rms_mv": 1e3 * found.ocv_correction_v,
+        "score_before_percent": _number(found.score_before),
+        "score_after_percent": _number(found.score_after),
+        "seconds": seconds,
+    }
+
+
+def _temperatures(found: Identification) -> tuple[float, float]:
+    ladder = found.cell.ladder
+    return (math.nan, math.nan) if ladder is None else ladder.temperature_c
+
+
+def _error_v(found: Identification) -> float:
+    return math.nan if found.cell.ladder is None else found.cell.ladder.error_v
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _remarks(cell: str, found: Identification) -> list[str]:
+    fitted = ", ".join(f"{c.name} ({1e3 * c.voltage_rms_v:.1f} mV RMS)" for c in found.captures)
+    low_c, high_c = _temperatures(found)
+    lines = [
+        f"Resistances identified from {fitted}, SOC above 0.1;",
+        f"capacity and open-circuit voltage from {Path(cell).name}. Cell temperatures {low_c:g} to {high_c:g} C.",
+    ]
+    if found.ocv_correction_v:
+        lines.append(f"OCV: that of {Path(cell).name}, corrected by {1e3 * found.ocv_correction_v:.1f} mV RMS.")
+    return [*lines, f"{_scores(found)}."]
+
+
+def _scores(found: Identification) -> str:
+    if not math.isfinite(found.score_after):
+        return "No capture is long enough for replays cut in mid-load"
+    held = sum(c.held_back for c in found.captures)
+    return (
+        f"Replays cut in mid-load, started 0.2 wrong: interval score {found.score_before:.2f} % before, "
+        f"{found.score_after:.2f} % after; {held} of {len(found.captures)} captures held back from what they judge"
+    )
+
+
+def _tables(out: Path, found: Identification, seconds: float) -> Group:
+    """The outcome for people."""
+    shown = Table("SOC", *(f"{soc:g}" for soc in found.elements), title=f"{out}: written", box=box.SIMPLE_HEAD)
+    shown.title_justify = "left"
+    for name in next(iter(found.elements.values())):
+        cells = (found.elements[soc][name] for soc in found.elements)
+        shown.add_row(f"{name} \\[mohm], 25 °C", *(f"{1e3 * value:.4g} ± {1e3 * std:.2g}" for value, std in cells))
+    fits = Table(box=box.SIMPLE_HEAD)
+    for column in ("capture", "°C", "SOC", "count", "RMS", "before", "after", "held back"):
+        fits.add_column(column, justify="left" if column in ("capture", "held back") else "right")
+    for c in found.captures:
+        fits.add_row(*_row(c))
+    low_c, high_c = _temperatures(found)
+    lines = [f"cell temperatures {low_c:g} to {high_c:g} °C; outside, the band widens", _scores(found)]
+    if found.ocv_correction_v:
+        lines.append(f"OCV corrected by {1e3 * found.ocv_correction_v:.1f} mV RMS")
+    if found.left_out:
+        lines.append(f"left out, too small a current to tell of resistances: {', '.join(found.left_out)}")
+    return Group(shown, fits, *lines, f"{seconds:.1f} s")
+
+
+def _row(c: CaptureFit) -> tuple[str, ...]:
+    temperature = "no sensor" if c.temperature_c is None else f"{c.temperature_c[0]:.0f} to {c.temperature_c[1]:.0f}"
+    scores = (f"{x:.2f} %" if math.isfinite(x) else "-" for x in (c.score_before, c.score_after))
+    name, rms = c.name.split(".")[0], f"{1e3 * c.voltage_rms_v:.1f} mV"
+    count = f"{100.0 * c.miscount:+.1f} %"
+    return name, temperature, f"{c.initial_soc:.3f}", count, rms, *scores, "yes" if c.held_back else "no"

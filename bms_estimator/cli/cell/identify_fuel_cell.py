@@ -1,0 +1,142 @@
+"""``bms-estimator identify`` of a fuel cell: its parameters from polarisation curves and records, into a file."""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console, Group
+from rich.table import Table
+
+from bms_estimator.calibration.fuel_cell_fit import KEYS, Floats, FuelCellFit, Source, fit_fuel_cell
+from bms_estimator.cli.options.capture_options import name_of, unlike
+from bms_estimator.kernels.kalman_filter.hypotheses import COLDEST_C, HOTTEST_C
+from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.sources.captures.curves import read_polarisation
+from bms_estimator.sources.captures.replay import load_capture
+
+DIGITS = 4
+FEWEST = 3
+"""Points that a curve or record needs."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter as it is printed."""
+
+    value: float
+    std: float | None
+    """Of the value, in its unit; None where the data did not tell of it."""
+    of_start: float
+    """What the file of --cell has."""
+    reason: str | None
+    """Why the data did not tell of it."""
+
+
+def identify_fuel_cell(
+    paths: Sequence[Path],
+    cell: str,
+    out: Path,
+    *,
+    temperature_c: float | None,
+    current_sign: CurrentSign | None,
+    as_json: bool,
+) -> None:
+    """Identify, write the file and print the outcome; arguments as of ``identify_command``."""
+    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
+        raise UserError(f"--temperature-c {temperature_c:g}: must lie within {COLDEST_C:g} and {HOTTEST_C:g} C")
+    start = load_fuel_cell(cell)
+    names = unlike([name_of(path) for path in paths], paths)
+    sources = [_source(*one, start, temperature_c, current_sign) for one in zip(names, paths, strict=True)]
+    started_s = time.perf_counter()
+    fit = fit_fuel_cell(sources, start)
+    seconds = time.perf_counter() - started_s
+    values: dict[str, Value] = {
+        key: Value(
+            value=getattr(fit.model.fuel_cell, key),
+            std=fit.model.std[key] * getattr(fit.model.fuel_cell, key) if key in fit.model.std else None,
+            of_start=getattr(start.fuel_cell, key),
+            reason=fit.not_told.get(key),
+        )
+        for key in KEYS
+    }
+    renamed = fit.model.model_copy(update={"cell": fit.model.cell.model_copy(update={"name": name_of(out)})})
+    write_cell(out, renamed, _remarks(cell, fit))
+    if as_json:
+        outcome = {"out": str(out), "parameters": {k: asdict(v) for k, v in values.items()}}
+        rms = {f"{name}_rms_mv": 1e3 * rms_v for name, rms_v in fit.rms_v.items()}
+        sys.stdout.write(json.dumps(outcome | rms | {"seconds": seconds}) + "\n")
+    else:
+        Console().print(_tables(out, values, fit, seconds))
+
+
+def _source(
+    name: str, path: Path, model: FuelCellModel, temperature_c: float | None, sign: CurrentSign | None
+) -> Source:
+    """A polarisation curve where the file has no times, else a record, without what no such stack can give."""
+    points = read_polarisation(path)
+    if points is not None:
+        time_s, (current_a, voltage_v, sensed_c) = None, points.T
+        current_a = -current_a if sign == "charge_positive" else current_a
+    else:
+        record = load_capture(path, current_sign=sign)
+        time_s, current_a, voltage_v, sensed_c = (
+            record[name] for name in ("time_s", "current_a", "voltage_v", "temperature_c")
+        )
+    good = _usable(path, model, current_a, voltage_v)
+    if time_s is not None:
+        good &= np.diff(time_s, prepend=-np.inf) > 0.0
+    sensed = (sensed_c >= COLDEST_C) & (sensed_c <= HOTTEST_C)
+    celsius = np.where(sensed, sensed_c, math.nan if temperature_c is None else temperature_c)
+    return Source(
+        name=name,
+        time_s=None if time_s is None else time_s[good],
+        current_a=np.ascontiguousarray(current_a[good]),
+        voltage_v=voltage_v[good],
+        temperature_c=celsius[good],
+    )
+
+
+def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floats) -> NDArray[np.bool_]:
+    """Which points such a stack can give, shape (n,).
+
+    Raises:
+        UserError: Most have another sign, or too few are left.
+    """
+    c = model.cell
+    charging = current_a < -model.fuel_cell.internal_current_a
+    if 2 * charging.sum() > charging.size:
+        raise UserError(f"{path}: the current is negative, but a fuel cell takes no charge: is --current-sign right?")
+    good: NDArray[np.bool_] = (voltage_v >= c.voltage_min_v) & (voltage_v <= c.voltage_max_v)
+    good &= (current_a <= c.current_max_a) & ~charging
+    if good.sum() < FEWEST:
+        limits = f"{c.voltage_min_v:g} to {c.voltage_max_v:g} V and up to {c.current_max_a:g} A"
+        raise UserError(f"{path}: {good.sum()} usable points: give at least {FEWEST} of {limits}, as {c.name} has them")
+    return good
+
+
+def _remarks(cell: str, fit: FuelCellFit) -> list[str]:
+    fits = ", ".join(f"{name} ({1e3 * rms_v:.1f} mV RMS)" for name, rms_v in fit.rms_v.items())
+    kept = f"As in the file, because the data do not tell: {', '.join(fit.not_told)}." if fit.not_told else ""
+    return [line for line in (f"Identified from {fits}, begun at {Path(cell).name}.", kept) if line]
+
+
+def _tables(out: Path, values: dict[str, Value], fit: FuelCellFit, seconds: float) -> Group:
+    """The outcome for people."""
+    table = Table(title=f"{out}: written", title_justify="left", box=box.SIMPLE_HEAD)
+    for column in ("", "identified", "±", "before"):
+        table.add_column(column, justify="right" if column else "left")
+    for key, v in values.items():
+        std = "as before" if v.std is None else f"{v.std:.2g}"
+        table.add_row(key, f"{v.value:.{DIGITS}g}", std, f"{v.of_start:.{DIGITS}g}")
+    left = [f"{name}: {1e3 * rms_v:.1f} mV RMS" for name, rms_v in fit.rms_v.items()]
+    return Group(table, *left, *(f"{key}: {reason}" for key, reason in fit.not_told.items()), f"{seconds:.1f} s")

@@ -1,0 +1,102 @@
+"""``bms-estimator fleet capture``: what a pack has sent, as a capture."""
+
+import asyncio
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
+from bms_estimator.cli.options.capture_options import Force, check_out
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.errors import UserError
+from bms_estimator.sinks.trace_file import table_sink
+
+if TYPE_CHECKING:
+    from bms_estimator.fleet.identification.block_capture import Captured
+
+FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
+FEW = 5
+"""So many holes are shown."""
+BLOCK_S = 120.0
+"""What begins no later than this after what was asked for is not said to be missing [s]: a block is of about a minute."""
+
+Since = Annotated[
+    datetime | None, typer.Option("--from", formats=FORMATS, help="UTC; else from the oldest that is kept")
+]
+Until = Annotated[datetime | None, typer.Option("--to", formats=FORMATS, help="to before, UTC; else to the newest")]
+
+
+def capture(
+    pack: Annotated[str, typer.Argument(help="its name", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="table to write: .parquet, .csv.gz or .csv", show_default=False)],
+    since: Since = None,
+    until: Until = None,
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+    force: Force = False,
+) -> None:
+    """Write what a pack has sent as a table that `replay`, `identify`, `validate` and `capacity` read.
+
+    Blocks are in the order of their numbers, each once; the server keeps them for days only (`fleet serve`). With
+    `fleet packs show PACK --out FOLDER` beside it, `replay` estimates as the workers did.
+    """
+    check_out(out, [], force=force)
+    sink = table_sink(out)
+    since_s, until_s = epoch_s(since, -math.inf), epoch_s(until, math.inf)
+    found = asyncio.run(fetched(pack, since_s, until_s, (server, creds, ca)))
+    if not found.blocks:
+        raise UserError(nothing(pack, found))
+    rows = 0
+    with sink:
+        for block in found.samples():
+            sink.write(block)
+            rows += block.size
+    first_s, last_s = found.span_s
+    typer.echo(f"{out}: {rows} samples in {found.blocks} blocks of {pack}, {iso_utc(first_s)} to {iso_utc(last_s)}")
+    for line in _warnings(found, since_s):
+        typer.echo(f"warning: {pack}: {line}", err=True)
+
+
+def epoch_s(time: datetime | None, otherwise_s: float) -> float:
+    """As seconds since 1970; told in UTC."""
+    return otherwise_s if time is None else time.replace(tzinfo=UTC).timestamp()
+
+
+async def fetched(pack: str, since_s: float, until_s: float, where: tuple[str, Path | None, Path | None]) -> "Captured":
+    """What the server has of a pack.
+
+    Raises:
+        UserError: It cannot be asked.
+    """
+    from bms_estimator.fleet.identification.capture import fetch  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
+
+    async with connected(*where) as nc:
+        return await fetch(nc, pack, since_s=since_s, until_s=until_s)
+
+
+def nothing(pack: str, found: "Captured") -> str:
+    """Why there is no sample of a pack."""
+    damaged = f"; {found.damaged} messages of it were no blocks" if found.damaged else ""
+    return (
+        f"{pack}: the server keeps no sample of it in this span{damaged}; is its name right, does its edge send "
+        "(`fleet packs list` has the table, the streams keep blocks as long as `fleet serve` was told)?"
+    )
+
+
+def _warnings(found: "Captured", since_s: float) -> list[str]:
+    first_s, _ = found.span_s
+    lines = []
+    if since_s > -math.inf and first_s > since_s + BLOCK_S:
+        lines.append(f"from {iso_utc(since_s)} was asked for; what is kept begins at {iso_utc(first_s)}")
+    if found.missing:
+        holes = ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in found.missing[:FEW])
+        more = f" and {len(found.missing) - FEW} more holes" if len(found.missing) > FEW else ""
+        lines.append(f"blocks {holes}{more} are not there: they were lost, or the edge sends them again")
+    if found.damaged:
+        lines.append(f"{found.damaged} messages were no blocks")
+    return lines

@@ -1,0 +1,45 @@
+"""``bms-estimator fleet demo``: a fleet in one terminal."""
+
+import asyncio
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.options.browser import open_browser
+from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.fleet.simulation.demo import Demo, free_port, run_demo
+from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
+from bms_estimator.process.signals import stop_on_signal
+
+
+def demo(
+    packs: Annotated[int, typer.Option(parser=whole(1, 100_000), help="simulated, each with its edge")] = 1000,
+    seconds: Annotated[float, typer.Option(parser=decimal(3.0), help="how long edges send")] = 45.0,
+    page_port: Annotated[
+        int | None, typer.Option(parser=whole(1, 65535), help="of the page; else a free one", show_default=False)
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="open the page where there is a desktop")
+    ] = True,
+) -> None:
+    """Server, simulated packs, two workers and the fleet's page in one terminal; one worker is killed. About a minute.
+
+    All are real processes on the loopback, with free ports and a folder that goes at the end. The edges run at ten times
+    the speed. What is said comes from the workers' heartbeats and from estimates beside the simulated packs' true SOC.
+    """
+    with compiling_shown():
+        load_fleet_kernels()
+    with tempfile.TemporaryDirectory(prefix="fleet-demo-") as folder:
+        opened = open_browser if browser else _leave
+        asyncio.run(_run(Demo(packs, seconds, page_port or free_port(), Path(folder), typer.echo, opened)))
+
+
+async def _run(demo: Demo) -> None:
+    await run_demo(demo, stop_on_signal())
+
+
+def _leave(_url: str) -> None:
+    """Open nothing."""

@@ -1,0 +1,198 @@
+"""``bms-estimator fleet identify``: packs identified anew from what they have sent."""
+
+import asyncio
+import csv
+import io
+import json
+import math
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from bms_estimator.cli.fleet.capture import Since, Until, epoch_s
+from bms_estimator.cli.fleet.packs import known_packs, refuse_unknown
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, Where
+from bms_estimator.cli.options.capture_options import AsJson, Force, check_out
+from bms_estimator.cli.options.number_options import whole
+from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
+from bms_estimator.fleet.packs.pack_registry import KnownPacks
+from bms_estimator.fleet.packs.pack_row import PackKind, stored
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.text_file import write_text
+
+if TYPE_CHECKING:
+    from bms_estimator.fleet.identification.reidentify import Reidentified
+
+RESULTS = "results.csv"
+
+
+def identify(
+    packs: Annotated[list[str] | None, typer.Argument(help="their names", show_default=False)] = None,
+    from_file: Annotated[
+        Path | None, typer.Option(help="names, one a line, or a CSV with the column pack", show_default=False)
+    ] = None,
+    out: Annotated[Path, typer.Option(help="folder for cell files and results.csv")] = Path("identified"),
+    put: Annotated[
+        bool, typer.Option("--put", help="let the fleet know the new cells: workers take them at once")
+    ] = False,
+    since: Since = None,
+    until: Until = None,
+    processes: Annotated[
+        int | None, typer.Option(parser=whole(1), help="on this machine; else one for each CPU", show_default=False)
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="tcp://host:port of a Dask cluster's scheduler", show_default=False)
+    ] = None,
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Identify packs anew from the blocks that the server still has of them.
+
+    Two thirds of the samples identify; the last third judges the old cell and the new one by the voltage that each
+    predicts. A cell file is written only where the new one is better; why not is said of each other pack.
+    """
+    where = (server, creds, ca)
+    names = _names(packs or [], from_file)
+    check_out(out / RESULTS, [], force=force)
+    known = asyncio.run(known_packs(where))
+    refuse_unknown(names, known)
+    found = list["Reidentified"]()
+    for outcome in _outcomes(
+        names, known, (epoch_s(since, -math.inf), epoch_s(until, math.inf)), where, scheduler, processes
+    ):
+        found.append(outcome)
+        if outcome.cell_file:
+            write_text(out / f"{outcome.pack}.toml", outcome.cell_file, make_folder=True)
+        if sys.stderr.isatty():
+            typer.echo(f"{len(found)} of {len(names)}: {outcome.pack}", err=True)
+    _write_results(out / RESULTS, found)
+    unput = asyncio.run(_put(found, known, where)) if put else []
+    if as_json:
+        typer.echo(json.dumps([_row(one) for one in found]))
+    else:
+        better = sum(bool(one.cell_file) for one in found)
+        typer.echo(f"{out}: {better} of {len(found)} packs have a better cell")
+        Console().print(_table(found))
+    for pack in unput:
+        typer.echo(f"warning: {pack}: its row was changed meanwhile; its new cell was not put", err=True)
+
+
+def _outcomes(
+    names: Sequence[str],
+    known: KnownPacks,
+    span_s: tuple[float, float],
+    where: Where,
+    scheduler: str | None,
+    processes: int | None,
+) -> Iterator["Reidentified"]:
+    from bms_estimator.fleet.identification.batch import Task, reidentify_all  # noqa: PLC0415 - needs Dask and NATS
+    from bms_estimator.fleet.identification.reidentify import Reidentified  # noqa: PLC0415 - slow to import
+
+    tasks, (server, creds, ca) = [], where
+    for name in names:
+        kind = known.kind(name)
+        if isinstance(kind, PackKind) and not known.reason(name):
+            tasks.append(Task(name, kind, known.cell_file(kind.cell), *span_s, server, creds, ca))
+        else:
+            yield Reidentified(name, reason=known.reason(name))
+    yield from reidentify_all(tasks, scheduler=scheduler, processes=processes or os.cpu_count() or 1)
+
+
+def _names(packs: Sequence[str], from_file: Path | None) -> list[str]:
+    """Each once, in their order."""
+    names = [*packs, *(_listed(from_file) if from_file is not None else [])]
+    if not names:
+        raise UserError("name at least one pack, or give --from-file LIST")
+    return list(dict.fromkeys(names))
+
+
+def _listed(path: Path) -> list[str]:
+    """The column ``pack`` of a CSV, or the first one."""
+    try:
+        rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row and row[0].strip()]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"--from-file {path}: cannot be read: {error}") from None
+    column = rows[0].index("pack") if rows and "pack" in rows[0] else None
+    listed = rows if column is None else rows[1:]
+    return [row[column or 0].strip() for row in listed if len(row) > (column or 0) and not row[0].startswith("#")]
+
+
+async def _put(found: Sequence["Reidentified"], known: KnownPacks, where: Where) -> list[str]:
+    """Put new cells, and let their packs' rows name them; returns the packs whose row another has changed."""
+    from bms_estimator.fleet.identification.reidentify import cell_name  # noqa: PLC0415
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.packs.pack_bucket import put, read_bucket  # noqa: PLC0415
+
+    cells, rows, changed = dict[str, bytes](), dict[str, bytes](), list[str]()
+    async with connected(*where) as nc:
+        held = await read_bucket(nc, PACKS_BUCKET)
+        for one in found:
+            kind = known.kind(one.pack)
+            if not one.cell_file or not isinstance(kind, PackKind):
+                continue
+            if held.get(one.pack) != stored(kind):
+                changed.append(one.pack)
+                continue
+            name = cell_name(one.pack)
+            cells[name] = one.cell_file.encode()
+            rows[one.pack] = stored(kind.model_copy(update={"cell": name, "capacity_ah": None}))
+        await put(nc, CELLS_BUCKET, cells)
+        await put(nc, PACKS_BUCKET, rows)
+    return changed
+
+
+def _row(one: "Reidentified") -> dict[str, object]:
+    """As a program reads it: no number where there is none."""
+    values = asdict(one) | {"better": bool(one.cell_file)}
+    del values["cell_file"]
+    return {
+        name: value if not isinstance(value, float) or math.isfinite(value) else None for name, value in values.items()
+    }
+
+
+def _write_results(path: Path, found: Sequence["Reidentified"]) -> None:
+    rows, table = list(map(_row, found)), io.StringIO()
+    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, table.getvalue(), make_folder=True)
+
+
+def _table(found: Sequence["Reidentified"]) -> Table:
+    """Before and after, for people."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for column in ("pack", "hours", "Ah", "R_s [mohm]", "RMS [mV]", "", "why not"):
+        table.add_column(column, justify="left" if column in ("pack", "", "why not") else "right")
+    for one in found:
+        table.add_row(
+            one.pack,
+            _number(one.hours, 1),
+            _change(one.capacity_before_ah, one.capacity_ah, one.capacity_std_ah, 1.0),
+            _change(one.r_s_before_ohm, one.r_s_ohm, math.nan, 1e3),
+            _change(one.rms_before_v, one.rms_v, math.nan, 1e3),
+            one.way if one.cell_file else "",
+            one.reason,
+        )
+    return table
+
+
+def _change(before: float, after: float, std: float, factor: float) -> str:
+    if not math.isfinite(after):
+        return _number(factor * before, 3) if math.isfinite(before) else "-"
+    sure = f" ± {factor * std:.2g}" if math.isfinite(std) else ""
+    return f"{factor * before:.4g} to {factor * after:.4g}{sure}"
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"

@@ -1,0 +1,161 @@
+"""``bms-estimator fleet packs``: which cells each pack has."""
+
+import asyncio
+import sys
+from collections.abc import Collection, Container
+from pathlib import Path
+from typing import Annotated
+
+import tomlkit
+import typer
+
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, Where
+from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
+from bms_estimator.fleet.packs.csv_table import CELL_FILE, PackTable, check_models, read_table, table_lines
+from bms_estimator.fleet.packs.pack_registry import KnownPacks
+from bms_estimator.fleet.packs.pack_row import PackKind, model_key, settings_of
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.text_file import write_text
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Which cells each pack has.")
+
+
+@app.command()
+def load(
+    table: Annotated[Path, typer.Argument(help="CSV: pack, cell, capacity_ah, series ...", show_default=False)],
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+    remove: Annotated[bool, typer.Option("--remove", help="packs that are not in the table go")] = False,
+) -> None:
+    """Let the server know the packs of a table; what it knows already is not written again.
+
+    Workers take up what has changed within seconds. A cell that ends in .toml is a cell file beside the table.
+    """
+    read = read_table(table)
+    files = {name: _text(path) for name, path in read.cell_files.items()}
+    typer.echo(asyncio.run(_load(table, read, files, (server, creds, ca), remove=remove)))
+
+
+@app.command("list")
+def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> None:
+    """Print the table that the server has, as CSV that `load` reads; what is wrong with a row goes to stderr."""
+    known = asyncio.run(known_packs((server, creds, ca)))
+    kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackKind)}
+    of_each = {
+        model_key(kind): pack for pack, kind in reversed(kinds.items())
+    }  # one, whose cell stands for the others'
+    for pack in (*(pack for pack in sorted(known) if pack not in kinds), *of_each.values()):
+        if reason := known.reason(pack):
+            typer.echo(f"warning: {pack}: {reason}", err=True)
+    sys.stdout.writelines(table_lines(kinds))
+
+
+@app.command()
+def remove(
+    packs: Annotated[list[str], typer.Argument(help="their names", show_default=False)],
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+) -> None:
+    """Let the server forget packs; what they send from then on is held by the workers as unknown."""
+    asyncio.run(_remove(set(packs), (server, creds, ca)))
+    typer.echo(f"{len(set(packs))} removed")
+
+
+@app.command()
+def show(
+    pack: Annotated[str, typer.Argument(help="its name", show_default=False)],
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder for its pack.toml and its cell file", show_default=False)
+    ] = None,
+) -> None:
+    """Print a pack's settings as a pack file, with which `replay` estimates as the workers do."""
+    known = asyncio.run(known_packs((server, creds, ca)))
+    refuse_unknown([pack], known)
+    files = pack_files(pack, known)
+    if out is None:
+        typer.echo(files["pack.toml"].rstrip())
+        return
+    for name, text in files.items():
+        write_text(out / name, text, make_folder=True)
+    typer.echo(f"{out}: {' and '.join(files)} written")
+
+
+def pack_files(pack: str, known: KnownPacks) -> dict[str, str]:
+    """Texts by file name: the pack's file, and its cell's unless the package brings it.
+
+    Raises:
+        UserError: Its row or its cell is wrong.
+    """
+    kind = known.kind(pack)
+    if not isinstance(kind, PackKind) or known.reason(pack):
+        raise UserError(f"{pack}: {known.reason(pack)}")
+    text, cell = known.cell_file(kind.cell), kind.cell
+    settings = settings_of(kind).model_dump(mode="json", exclude_unset=True)
+    settings["pack"] |= {"name": pack, "cell": cell if text is None else f"{cell}{CELL_FILE}"}
+    return {"pack.toml": tomlkit.dumps(settings)} | ({} if text is None else {f"{cell}{CELL_FILE}": text})
+
+
+def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:
+    """That each pack is in the table.
+
+    Raises:
+        UserError: Some are not.
+    """
+    unknown = [pack for pack in packs if pack not in known]
+    if unknown:
+        raise UserError(f"{', '.join(unknown)}: not in the table of packs; `fleet packs list` prints it")
+
+
+async def known_packs(where: Where) -> KnownPacks:
+    """All that the server has of packs."""
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.packs.pack_bucket import PackBucket  # noqa: PLC0415
+
+    async with connected(*where) as nc:
+        bucket = PackBucket(nc)
+        await bucket.refresh()
+    return bucket.packs
+
+
+async def _load(path: Path, read: PackTable, files: dict[str, str], where: Where, *, remove: bool) -> str:
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
+    from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket  # noqa: PLC0415
+
+    async with connected(*where) as nc:
+        held = {name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()}
+        check_models(path, read, held | files)
+        cells = await write_bucket(nc, CELLS_BUCKET, {name: text.encode() for name, text in files.items()})
+        rows = {name: line.data for name, line in read.packs.items()}
+        packs = await write_bucket(nc, PACKS_BUCKET, rows, remove=remove)
+    kinds = len(set(rows.values()))
+    counts = {
+        "new": packs.new,
+        "changed": packs.changed,
+        "as before": packs.same,
+        "removed": packs.removed,
+        "not in the table, kept (--remove lets them go)": packs.left,
+        "cell files written": cells.new + cells.changed,
+    }
+    said = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+    return f"{path}: {len(rows)} packs of {kinds} kinds: {said}"
+
+
+async def _remove(packs: set[str], where: Where) -> None:
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
+    from bms_estimator.fleet.packs.pack_bucket import read_bucket, remove_keys  # noqa: PLC0415
+
+    async with connected(*where) as nc:
+        refuse_unknown(packs, await read_bucket(nc, PACKS_BUCKET))
+        await remove_keys(nc, PACKS_BUCKET, packs)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read: {error}") from None

@@ -1,0 +1,53 @@
+"""``bms-estimator fleet page``: the page of all packs of a fleet."""
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
+from bms_estimator.cli.options.browser import open_browser
+from bms_estimator.cli.options.page_options import page_settings
+from bms_estimator.fleet.page import nats_feed
+from bms_estimator.fleet.page.fleet_page import fleet_page
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.settings.page import PageSettings
+
+DEFAULT_LISTEN = "127.0.0.1:8080"
+
+
+def page(
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+    listen: Annotated[str, typer.Option(help="host:port of the page")] = DEFAULT_LISTEN,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="of the Parquet files, as `fleet collect` writes them, for what is seen over time", show_default=False
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="file with the token that a browser must show", show_default=False)
+    ] = None,
+    host: Annotated[
+        list[str] | None, typer.Option(help="a further name under which browsers reach it", show_default=False)
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open it where there is a desktop")] = True,
+) -> None:
+    """Serve the page of all packs of a fleet, until SIGINT or SIGTERM."""
+    settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
+    configure_logs()
+    with drained():
+        asyncio.run(_serve(nats_feed.Server(server, creds, ca), settings, folder, browser=browser))
+
+
+async def _serve(server: nats_feed.Server, settings: PageSettings, hours: Path | None, *, browser: bool) -> None:
+    stop = stop_on_signal()
+    async with fleet_page(server, settings, hours) as url:
+        typer.echo(f"page of the fleet: {url}")
+        if browser:
+            open_browser(url)
+        await stop.wait()

@@ -1,0 +1,118 @@
+"""``bms-estimator fleet collect`` and ``fleet ask``."""
+
+import asyncio
+import sys
+from csv import writer
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, Where
+from bms_estimator.model.errors import UserError
+
+if TYPE_CHECKING:
+    from bms_estimator.fleet.queries.duckdb_queries import Answer, Question
+
+FOLDER = Path("hours")
+
+
+def collect(
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+    folder: Annotated[Path, typer.Option(help="of the Parquet files")] = FOLDER,
+    period: Annotated[float, typer.Option(min=0.0, help="a row waits at most so long for its file [s]")] = 300.0,
+) -> None:
+    """Write the summaries of hours to Parquet, until SIGINT or SIGTERM."""
+    from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.process.log_setup import configure_logs, drained  # noqa: PLC0415
+
+    configure_logs()
+    with drained(), only_collector(folder):
+        asyncio.run(_collect((server, creds, ca), folder, period))
+
+
+async def _collect(where: Where, folder: Path, period_s: float) -> None:
+    from bms_estimator.fleet.nats.connection import connect, part  # noqa: PLC0415
+    from bms_estimator.fleet.queries.collector import Collector  # noqa: PLC0415
+    from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
+    from bms_estimator.process.tasks import end  # noqa: PLC0415
+
+    server, creds, ca = where
+    stop = stop_on_signal()
+    connecting, stopping = (
+        asyncio.ensure_future(connect(server, "collector", creds=creds, ca=ca)),
+        asyncio.ensure_future(stop.wait()),
+    )
+    await asyncio.wait((connecting, stopping), return_when=asyncio.FIRST_COMPLETED)
+    if not connecting.done():  # told to stop before a server was there
+        await end(connecting)
+        return
+    nc = connecting.result()
+    try:
+        await Collector(nc, folder, period_s=period_s).run(stop)
+    finally:
+        await part(nc)
+
+
+def ask(
+    name: Annotated[
+        str | None, typer.Argument(help="of the question, or sql; all are listed without", show_default=False)
+    ] = None,
+    query: Annotated[str | None, typer.Argument(help="of sql: SELECT ... FROM hours", show_default=False)] = None,
+    folder: Annotated[Path, typer.Option(help="of the Parquet files, as `fleet collect` writes them")] = FOLDER,
+    days: Annotated[int | None, typer.Option(min=1, help="only the last so many; else all", show_default=False)] = None,
+    within: Annotated[float, typer.Option(min=0.0, help="failing: a limit is reached within so many days")] = 90.0,
+    json: Annotated[bool, typer.Option("--json", help="as a list of objects")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="as CSV")] = False,
+) -> None:
+    """Ask the summaries of all packs; without a name: what can be asked."""
+    from bms_estimator.fleet.queries import duckdb_queries as questions  # noqa: PLC0415 - its packages are optional
+
+    if name is None:
+        _list(questions.QUESTIONS)
+        return
+    if (query is not None) != (name == "sql"):
+        raise UserError("a query belongs to sql, and to nothing else: fleet ask sql 'SELECT count(*) FROM hours'")
+    if json and csv:
+        raise UserError("--json and --csv: choose one")
+    if query is not None:
+        answer = questions.select(folder, query, days=days)
+    else:
+        answer = questions.ask(folder, name, days=days, limits=questions.Limits(within_days=within))
+    (_print_json if json else _print_csv if csv else _print_table)(answer)
+
+
+def _list(questions: "dict[str, Question]") -> None:
+    for name, question in questions.items():
+        typer.echo(f"{name:10}{question.help}")
+    typer.echo(f"{'sql':10}SELECT on the view hours; its columns: fleet ask sql 'DESCRIBE hours'")
+
+
+def _print_json(answer: "Answer") -> None:
+    typer.echo(dumps(answer.records, indent=1, allow_nan=False, default=str))
+
+
+def _print_csv(answer: "Answer") -> None:
+    table = writer(sys.stdout, lineterminator="\n")
+    table.writerow(answer.columns)
+    table.writerows(answer.rows)
+
+
+def _print_table(answer: "Answer") -> None:
+    """As wide as it must be: a name that is cut is none."""
+    table = Table(*answer.columns, box=box.SIMPLE)
+    for row in answer.rows:
+        table.add_row(
+            *("" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value) for value in row)
+        )
+    console = Console(highlight=False, markup=False)
+    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=10_000)).maximum)
+    console.print(table)
+    if not answer.rows:
+        typer.echo("none")

@@ -1,0 +1,141 @@
+"""``bms-estimator fleet serve`` and ``fleet user``: the server, and who may connect to it."""
+
+import asyncio
+import os
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import TypeAdapter, ValidationError
+
+from bms_estimator.fleet.server import credentials
+from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts
+from bms_estimator.fleet.server.nats_server import Place, Told
+from bms_estimator.fleet.server.nats_server import serve as serving
+from bms_estimator.model.config_file import read_toml
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.settings.fleet import FleetSettings
+from bms_estimator.settings.pack import DeviceName
+from bms_estimator.settings.page import parse_listen
+
+SettingsFile = Annotated[
+    Path | None, typer.Argument(help="settings of the fleet, fleet.toml; without, all as it comes", show_default=False)
+]
+Folder = Annotated[Path | None, typer.Option(help="for streams and keys; else that of the settings")]
+
+
+def serve(
+    settings_file: SettingsFile = None,
+    folder: Folder = None,
+    listen: Annotated[str | None, typer.Option(help="host:port for workers; else that of the settings")] = None,
+    mqtt: Annotated[str | None, typer.Option(help="host:port for edges; else that of the settings")] = None,
+    node: Annotated[int, typer.Option(min=1, max=5, help="number of this node, of those of --of")] = 1,
+    of: Annotated[
+        str | None,
+        typer.Option(help=f"three nodes: where each is heard by the others, host:port,host,... ({CLUSTER_PORT})"),
+    ] = None,
+) -> None:
+    """Run a node of the fleet's server, with its streams, until SIGINT or SIGTERM.
+
+    The first start makes keys for each tenant. Nodes other than the one that has them need a copy of keys/claims.json.
+    """
+    settings = _settings(settings_file, listen=listen, mqtt=mqtt)
+    place = Place(_folder(settings, folder), node, _nodes(settings, node, of))
+
+    def read() -> Told:
+        settings = _settings(settings_file, listen=listen, mqtt=mqtt)
+        return Told(settings, _accounts(settings, place))
+
+    configure_logs()
+    with drained():
+        code = asyncio.run(serving(place, read, typer.echo))
+    raise typer.Exit(code)
+
+
+def user(
+    tenant: Annotated[str, typer.Argument(help="name in the settings of the fleet", show_default=False)],
+    pack: Annotated[str, typer.Argument(help="device that the token is for", show_default=False)],
+    settings_file: Annotated[Path | None, typer.Option("--settings", help="fleet.toml")] = None,
+    folder: Folder = None,
+    days: Annotated[
+        float | None, typer.Option(min=0.0, max=36_600.0, help="it is refused afterwards; without: never")
+    ] = None,
+) -> None:
+    """Print the token with which a pack's edge connects: MQTT's password, with any name.
+
+    It may send blocks of this pack and hear what is awaited of it, nothing else. Keep it as a password.
+    """
+    try:
+        TypeAdapter(DeviceName).validate_python(pack)
+    except ValidationError:
+        raise UserError(f"{pack!r}: no name of a pack: letters, digits, _ and -, 64 at most") from None
+    keys = Place(_folder(_settings(settings_file), folder)).keys
+    now = datetime.now(UTC)
+    typer.echo(credentials.edge_token(keys, tenant, pack, now, None if days is None else now + timedelta(days=days)))
+
+
+def _settings(path: Path | None, **given: str | None) -> FleetSettings:
+    """With what the command line says of the server.
+
+    Raises:
+        UserError: It cannot be.
+    """
+    settings = read_toml(path, FleetSettings) if path else FleetSettings()
+    told = {name: value for name, value in given.items() if value is not None}
+    if not told:
+        return settings
+    table: dict[str, Any] = settings.model_dump()
+    try:
+        return FleetSettings.model_validate(table | {"server": table["server"] | told})
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        options = ", ".join(f"--{name} {value}" for name, value in told.items())
+        raise UserError(f"{options}: {reason}") from None
+
+
+def _folder(settings: FleetSettings, given: Path | None) -> Path:
+    systemd = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    home = Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state") / "bms-estimator-fleet"
+    return (given or settings.server.folder or Path(systemd or home)).expanduser().absolute()
+
+
+def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, ...]:
+    """Where all nodes are heard by each other.
+
+    Raises:
+        UserError: What --of says cannot be, or needs keys and certificates that are not there.
+    """
+    if of is None:
+        if number != 1:
+            raise UserError(f"--node {number}: of which nodes? --of host,host,host names them all")
+        return ()
+    nodes = tuple(host if _has_port(host) else f"{host}:{CLUSTER_PORT}" for host in of.split(","))
+    if len(set(nodes)) != len(nodes) or len(nodes) not in (3, 5):
+        raise UserError(f"--of {of}: must name 3 or 5 nodes, each once: with two, none goes on without the other")
+    if number > len(nodes):
+        raise UserError(f"--node {number}: --of names {len(nodes)}")
+    try:
+        if not all(parse_listen(node).loopback for node in nodes):
+            settings.refuse_open(f"--of {of}")
+    except ValueError as error:
+        raise UserError(f"--of {of}: {error}") from None
+    return nodes
+
+
+def _has_port(host: str) -> bool:
+    return host.rpartition(":")[2].isdigit() and (host.count(":") == 1 or "]:" in host)
+
+
+def _accounts(settings: FleetSettings, place: Place) -> Accounts | None:
+    """Who may connect; keys are made on the first node alone.
+
+    Raises:
+        UserError: Another node has no claims yet.
+    """
+    if not settings.tenants:
+        return None
+    if place.number == 1 or credentials.has_keys(place.keys):
+        return credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC))
+    return credentials.read_accounts(place.keys)

@@ -1,0 +1,113 @@
+"""``bms-estimator fleet simulate``: many edges with their packs, without any."""
+
+import asyncio
+import math
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import TypeAdapter, ValidationError
+
+from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
+from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
+from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.text_file import write_text
+from bms_estimator.mqtt.broker_config import check
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.settings.pack import DeviceName, MqttSettings
+
+MOST_PACKS = 999_999
+"""Their names have six digits."""
+
+
+def simulate(
+    packs: Annotated[int, typer.Option(parser=whole(1, MOST_PACKS), help="how many")] = 1000,
+    mqtt: Annotated[
+        str | None,
+        typer.Option(help="of the fleet's server, mqtt://host:port or mqtts://host:port; several with commas"),
+    ] = None,
+    username: Annotated[str | None, typer.Option(help="of somebody who may publish for all of them")] = None,
+    password_file: Annotated[Path | None, typer.Option(help="file with the password")] = None,
+    ca: Annotated[
+        Path | None, typer.Option(help="certificate of who signed the server's; else those of the system")
+    ] = None,
+    speed: Annotated[float, typer.Option(parser=decimal(1e-3, 1e5), help="the packs' seconds per second")] = 1.0,
+    blocks: Annotated[
+        int | None, typer.Option(parser=whole(1), help="minutes of each pack; else until Ctrl-C", show_default=False)
+    ] = None,
+    seed: Annotated[int, typer.Option(parser=whole(), help="another seed, other packs")] = 1,
+    begin: Annotated[
+        datetime | None, typer.Option(help="when the edges began; a minute ago when left out", show_default=False)
+    ] = None,
+    prefix: Annotated[str, typer.Option(help="of the packs' names")] = "sim",
+    connections: Annotated[int, typer.Option(parser=whole(1, 100), help="MQTT connections for all edges")] = 4,
+    table: Annotated[Path | None, typer.Option(help="write the table for `fleet packs load` here")] = None,
+    truth: Annotated[Path | None, typer.Option(help="write what no estimator is told here, as CSV")] = None,
+) -> None:
+    """Be the edges of many packs: send a block of samples a minute for each, and again what workers ask for.
+
+    A few MQTT connections stand for all edges, so that the cost of a connection an edge is not in what is measured. Of
+    the shipped cells, with capacities and resistances that differ; a block follows from seed, pack and number, so that
+    nothing is kept. With --table and without --mqtt the table is written, and that is all.
+    """
+    if mqtt is None and table is None and truth is None:
+        raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write the table of the packs alone")
+    fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin), prefix=_prefix(prefix))
+    for path, text in ((table, fleet.table), (truth, fleet.truth_table)):
+        if path is not None:
+            write_text(path, text())
+    if mqtt is not None:
+        settings = _broker(mqtt, username=username, password_file=password_file, ca_file=ca)
+        typer.echo(asyncio.run(_run(fleet, settings, connections, speed, blocks)))
+
+
+async def _run(
+    fleet: SimulatedFleet, settings: MqttSettings, connections: int, speed: float, blocks: int | None
+) -> Report:
+    start_s = time.time() - BLOCK_S / speed  # the first blocks are complete within the next minute
+    edges = SimulatedEdges(fleet, start_s=start_s, speed=speed, last=blocks)
+    return await run_edges(fleet, edges, settings, connections=connections, stop=stop_on_signal(), said=typer.echo)
+
+
+def _begin_ns(begin: datetime | None) -> int:
+    """Nanoseconds since 1970; a time without a zone is local."""
+    if begin is None:
+        return time.time_ns() - BLOCK_S * 10**9
+    if not math.isfinite(begin.timestamp()) or begin.timestamp() <= 0:
+        raise UserError(f"--begin {begin}: must be after 1970")
+    return int(begin.timestamp()) * 10**9
+
+
+def _prefix(prefix: str) -> str:
+    """One that makes names of packs."""
+    try:
+        return TypeAdapter(DeviceName).validate_python(prefix)
+    except ValidationError:
+        raise UserError(f"--prefix {prefix}: only letters, digits, _ and -") from None
+
+
+def _broker(url: str, **given: str | Path | None) -> MqttSettings:
+    """Whom to connect to.
+
+    Raises:
+        UserError: It cannot be.
+    """
+    try:
+        settings = MqttSettings.model_validate({"url": tuple(url.split(",")), **given})
+        check(settings)
+    except ValidationError as error:
+        raise UserError(f"--mqtt {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+    except UserError as error:
+        raise UserError(_with_options(str(error))) from None
+    return settings
+
+
+def _with_options(said: str) -> str:
+    """What is said of settings, of the options that they were given by."""
+    for setting, option in (("url", "--mqtt"), ("password_file", "--password-file"), ("ca_file", "--ca")):
+        said = said.replace(f"mqtt.{setting} = ", f"{option} ")
+    return said

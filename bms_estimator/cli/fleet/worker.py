@@ -1,0 +1,55 @@
+"""``bms-estimator fleet worker``: estimates of the packs of some partitions, for as long as it runs."""
+
+import asyncio
+import os
+import re
+import socket
+from typing import Annotated
+
+import structlog
+import typer
+
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
+from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
+from bms_estimator.fleet.worker.worker import CHECKPOINT_S, Options, work
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import starting, stop_on_signal
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+def worker(
+    server: Server = SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+    name: Annotated[
+        str | None, typer.Option(help="its own among workers", show_default="host and process number")
+    ] = None,
+    checkpoint_s: Annotated[
+        float, typer.Option(min=1.0, help="between two checkpoints of a partition [s]")
+    ] = CHECKPOINT_S,
+) -> None:
+    """Estimate the packs of some partitions, until SIGINT or SIGTERM.
+
+    All workers of a tenant share its partitions; when one joins or leaves, the others take over.
+    """
+    options = Options(server, _named(name), creds, ca, checkpoint_s)
+    configure_logs()
+    with starting(None), drained():
+        with compiling_shown(structlog.get_logger(__name__).info):
+            load_fleet_kernels()
+        asyncio.run(_work(options))
+
+
+async def _work(options: Options) -> None:
+    await work(options, stop_on_signal())
+
+
+def _named(name: str | None) -> str:
+    if name is None:
+        return re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}")[-64:]
+    if not _NAME.fullmatch(name):
+        raise UserError(f"--name {name}: letters, digits, - and _ only, 64 at most")
+    return name

@@ -1,0 +1,1 @@
+"""Commands on running devices and services."""

@@ -1,0 +1,186 @@
+"""``bms-estimator board``: what a board says of itself, and what is set once when it is new."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.protocols.firmware.messages import (
+    BAUD,
+    LEAST_BANDGAP_V,
+    LEAST_DIVIDER,
+    LEAST_VOLTS_PER_AMPERE,
+    MOST_BANDGAP_V,
+    MOST_DIVIDER,
+    MOST_VOLTS_PER_AMPERE,
+    Channels,
+    Hello,
+    set_bandgap_command,
+    set_current_slope_command,
+    set_divider_command,
+    set_ratiometric_command,
+    set_serial_command,
+)
+from bms_estimator.settings.pack import Settings, load_settings
+from bms_estimator.sources.serial.device_detection import AskedBoard
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, BoardMemory
+from bms_estimator.sources.serial.port_list import NoPortError, resolve_port
+
+
+def board(
+    port: Annotated[str, typer.Argument(help="serial port; auto: the only one that is there")] = "auto",
+    aref_v: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(), help="measured between AREF and GND [V]: sets the board's bandgap", show_default=False
+        ),
+    ] = None,
+    divider: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(LEAST_DIVIDER, MOST_DIVIDER),
+            help="sets how many times A0 the pack's voltage is",
+            show_default=False,
+        ),
+    ] = None,
+    volts_per_ampere: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE),
+            help="sets the slope of the current sensor [V/A]; of a ratiometric one at 5 V",
+            show_default=False,
+        ),
+    ] = None,
+    ratiometric: Annotated[
+        bool | None,
+        typer.Option(
+            "--ratiometric/--absolute",
+            help="sets whether that slope is proportional to the 5 V supply or the same at any",
+            show_default=False,
+        ),
+    ] = None,
+    serial: Annotated[
+        int | None,
+        typer.Option(
+            parser=whole(1, 2**32 - 1), help="sets the board's serial number; shown in hexadecimal", show_default=False
+        ),
+    ] = None,
+    accept: Annotated[
+        Path | None,
+        typer.Option(
+            help="settings of a pack: its service takes the next board that comes as the pack's; no port is opened",
+            show_default=False,
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="with --accept: state folder of the service, if not that of the settings or yours"),
+    ] = None,
+    baud: Annotated[int, typer.Option(parser=whole(1200), help="of the board")] = BAUD,
+) -> None:
+    """Show what a board says of itself, and set what it keeps in its EEPROM: bandgap, gains and serial number.
+
+    Voltage and current are as right as the bandgap is, which differs by up to 10 % from board to board, and as the gains
+    of divider and current sensor are.
+    """
+    if accept is not None:
+        settings = load_settings(accept)
+        _accept_next(settings, folder or state_folder(settings))
+        return
+    if folder is not None:
+        raise UserError(f"--folder {folder}: goes with --accept")
+    try:
+        with AskedBoard(resolve_port(port), baud) as asked:
+            hello = asked.hello()
+            typer.echo(_described(hello))
+            if aref_v is not None:
+                told = asked.tell(set_bandgap_command(_bandgap_v(asked, hello, aref_v)))
+                typer.echo(f"bandgap: was {_volts(hello)}, now {_volts(told)}")
+            if divider is not None:
+                told = asked.tell(set_divider_command(divider))
+                typer.echo(f"divider: was {_divider(hello)}, now {_divider(told)}")
+            if volts_per_ampere is not None or ratiometric is not None:
+                told = _set_current(asked, volts_per_ampere, ratiometric)
+                typer.echo(f"current: was {_slope(hello)}, now {_slope(told)}")
+            if serial is not None:
+                told = asked.tell(set_serial_command(serial))
+                typer.echo(f"serial: was {hello.serial:08x}, now {told.serial:08x}")
+    except NoPortError as error:
+        raise UserError(str(error)) from None
+
+
+def _accept_next(settings: Settings, folder: Path) -> None:
+    """Have the pack's service, whose state is in ``folder``, forget its board.
+
+    Raises:
+        UserError: Its settings name the board, none is known in the folder, or the file cannot be written.
+    """
+    if settings.sensor.serial:
+        raise UserError(f"sensor.serial = {settings.sensor.serial}: the settings name the board; change it there")
+    memory = BoardMemory(folder, settings.pack.name)
+    known = memory.load()
+    if not known:
+        raise UserError(
+            f"{memory.path}: no board is known there; if the service keeps its state elsewhere, name that with --folder "
+            "(the installed unit's is /var/lib/bms-estimator, for root alone)"
+        )
+    try:
+        memory.keep(NO_BOARD)
+    except OSError as error:
+        raise UserError(f"{memory.path}: cannot be written: {error.strerror}") from error
+    forgotten = f"board {known['serial']} is forgotten" if known["serial"] else "no board was known"
+    typer.echo(f"{memory.path}: {forgotten}: the next that comes is the pack's")
+
+
+def _bandgap_v(asked: AskedBoard, hello: Hello, aref_v: float) -> float:
+    """The bandgap with which the board's reference is ``aref_v``.
+
+    Raises:
+        UserError: No board has such a bandgap.
+    """
+    reference_v = asked.reference_v()
+    bandgap_v = hello.bandgap_uv * 1e-6 * aref_v / reference_v
+    if not LEAST_BANDGAP_V <= bandgap_v <= MOST_BANDGAP_V:
+        raise UserError(
+            f"--aref-v {aref_v:g}: the bandgap would be {bandgap_v:.3f} V, but every board's is between "
+            f"{LEAST_BANDGAP_V} and {MOST_BANDGAP_V} V; with {_volts(hello)} the board measures {reference_v:.3f} V at AREF"
+        )
+    return bandgap_v
+
+
+def _set_current(asked: AskedBoard, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
+    if ratiometric is not None:
+        told = asked.tell(set_ratiometric_command(ratiometric))
+    if volts_per_ampere is not None:
+        told = asked.tell(set_current_slope_command(volts_per_ampere))
+    return told
+
+
+def _described(hello: Hello) -> str:
+    ntc = f"{hello.ntc_r25_ohm} ohm at 25 degC, beta {hello.ntc_beta_k} K" if hello.channels & Channels.NTC else "none"
+    return (
+        f"firmware   {hello.firmware}\n"
+        f"serial     {hello.serial:08x}\n"
+        f"rate       {hello.rate_hz} Hz\n"
+        f"voltage    divider {_divider(hello)}\n"
+        f"current    {_slope(hello)}, zero at {hello.current_zero_ppm * 1e-6:.6f} of the reference\n"
+        f"NTC        {ntc}\n"
+        f"bandgap    {_volts(hello)}\n"
+        f"reference  {hello.reference_v:.3f} V, measured against the bandgap at reset"
+    )
+
+
+def _volts(hello: Hello) -> str:
+    return f"{hello.bandgap_uv * 1e-6:.4f} V"
+
+
+def _divider(hello: Hello) -> str:
+    return f"{hello.divider_ppm * 1e-6:g}"
+
+
+def _slope(hello: Hello) -> str:
+    ratiometric = " at 5 V, ratiometric" if hello.channels & Channels.CURRENT_RATIOMETRIC else ""
+    return f"{hello.current_uv_per_a * 1e-6:g} V/A{ratiometric}"

@@ -1,0 +1,54 @@
+"""``bms-estimator dashboard``: the live page of all packs of a broker."""
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.options.browser import open_browser
+from bms_estimator.cli.options.pack_options import with_broker
+from bms_estimator.cli.options.page_options import page_settings
+from bms_estimator.page.broker_page import dashboard as serving
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.settings.pack import MqttSettings, Settings, load_settings
+from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
+
+
+def dashboard(
+    pack: Annotated[
+        Path | None,
+        typer.Argument(help="settings of a pack, whose \\[mqtt] and \\[page] are taken", show_default=False),
+    ] = None,
+    mqtt: Annotated[
+        str | None, typer.Option(help="broker, mqtt://host:port; else that of PACK, or mqtt://localhost:1883")
+    ] = None,
+    listen: Annotated[
+        str | None, typer.Option(help=f"host:port of the page; else that of PACK, or {DEFAULT_LISTEN}")
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="file with the token that a browser must show", show_default=False)
+    ] = None,
+    folder: Annotated[
+        Path | None, typer.Option(help="state folder of the services on this machine, for their history")
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open it where there is a desktop")] = True,
+) -> None:
+    """Serve the live page of all packs that publish to a broker, until SIGINT or SIGTERM."""
+    settings = load_settings(pack) if pack else Settings()
+    broker = (with_broker(settings, mqtt) if mqtt else settings).mqtt or MqttSettings()
+    page = page_settings(settings.page or PageSettings(), listen=listen, token_file=token_file)
+    configure_logs()
+    with drained():
+        asyncio.run(_serve(broker, page, folder or state_folder(settings), browser=browser))
+
+
+async def _serve(broker: MqttSettings, page: PageSettings, folder: Path, *, browser: bool) -> None:
+    stop = stop_on_signal()
+    async with serving(broker, page, folder) as url:
+        typer.echo(f"live page: {url}")
+        if browser:
+            open_browser(url)
+        await stop.wait()

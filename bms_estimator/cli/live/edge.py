@@ -1,0 +1,28 @@
+"""``bms-estimator edge``: a pack's raw samples to a fleet's server. Loads no kernel, unless the board's frames need it."""
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.options.pack_options import with_sensor
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import starting
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.service.edge_service import serve_edge
+from bms_estimator.settings.pack import load_settings
+
+
+def edge(
+    pack: Annotated[Path, typer.Argument(help="settings of the pack, with \\[edge]")] = Path("pack.toml"),
+    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
+) -> None:
+    """Send a pack's raw samples to a fleet's server, until SIGINT or SIGTERM. Estimates nothing.
+
+    What the server has not got is kept on disk, and sent when it can be: see docs/fleet-edge.md.
+    """
+    settings = with_sensor(load_settings(pack), port=port)
+    configure_logs()
+    with starting(None), drained():
+        asyncio.run(serve_edge(settings, state_folder(settings)))

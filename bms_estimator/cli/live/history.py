@@ -1,0 +1,73 @@
+"""``bms-estimator history``: what the service kept of a pack, minute by minute."""
+
+import csv
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, Annotated
+
+import typer
+
+from bms_estimator.cli.options.capture_options import Force, check_out
+from bms_estimator.cli.options.number_options import whole
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.settings.pack import load_settings
+from bms_estimator.store.history_reader import HistoryFile, PastEvent
+from bms_estimator.store.minute import MINUTE_S, Minute
+
+FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
+
+
+def history(
+    pack: Annotated[Path, typer.Argument(help="settings of the pack, pack.toml")],
+    since: Annotated[datetime | None, typer.Option(formats=FORMATS, help="from, UTC; else all there is")] = None,
+    until: Annotated[datetime | None, typer.Option(formats=FORMATS, help="to before, UTC; else now")] = None,
+    step: Annotated[
+        int, typer.Option(parser=whole(MINUTE_S), help="a row for each so many seconds, whole minutes")
+    ] = MINUTE_S,
+    events: Annotated[bool, typer.Option("--events", help="what happened, in place of what was measured")] = False,
+    folder: Annotated[
+        Path | None, typer.Option(help="state folder of the service, if not that of the settings or yours")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file to write; else to stdout")] = None,
+    force: Force = False,
+) -> None:
+    """Print the history of a pack as CSV: means, extremes and sums by the minute, or longer steps.
+
+    Reads while the service runs. Charge and energy out are of discharge.
+    """
+    if step % MINUTE_S:
+        raise UserError(f"--step {step}: must be whole minutes: a multiple of {MINUTE_S}")
+    settings = load_settings(pack)
+    path = (folder or state_folder(settings)) / f"{settings.pack.name}.sqlite"
+    if out is not None:
+        check_out(out, [pack, path], force=force)
+    since_s = since.replace(tzinfo=UTC).timestamp() if since else 0.0
+    until_s = until.replace(tzinfo=UTC).timestamp() if until else time.time() + MINUTE_S
+    header: Sequence[str] = PastEvent._fields if events else Minute._fields
+    file = HistoryFile(path)
+    found = file.events(since_s, until_s) if events else file.rows(since_s, until_s, step)
+    try:
+        with out.open("w", encoding="utf-8", newline="") if out else nullcontext(sys.stdout) as table:
+            _write(table, header, found)
+    except OSError as error:
+        if out is None:
+            raise
+        raise UserError(f"--out {out}: cannot be written: {error.strerror}") from error
+
+
+def _write(file: IO[str], header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """CSV with the time as text in place of seconds."""
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(["time", *header[1:]])
+    for time_s, *values in rows:
+        writer.writerow([iso_utc(float(str(time_s))), *(_number(value) for value in values)])
+
+
+def _number(value: object) -> object:
+    return f"{value:.6g}" if isinstance(value, float) else value

@@ -1,0 +1,51 @@
+"""``bms-estimator ports``: which serial ports there are, and what is on them."""
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from serial.tools import list_ports
+
+from bms_estimator.cli.options.number_options import whole
+from bms_estimator.sources.serial.device_detection import probe as ask
+from bms_estimator.sources.serial.port_list import holder, stable_names
+
+
+def ports(
+    paths: Annotated[list[str] | None, typer.Argument(help="these only; else all that are found")] = None,
+    probe: Annotated[
+        bool, typer.Option("--probe", help="ask each who is there; opening a port may reset its board")
+    ] = False,
+    baud: Annotated[
+        int | None,
+        typer.Option(parser=whole(1200), help="to ask at; else each protocol's own", show_default=False),
+    ] = None,
+) -> None:
+    """List serial ports under their stable names, and ask them for boards, BMS and meters.
+
+    ``stable name`` is what belongs in ``sensor.port``: it stays when boards are plugged in another order.
+    """
+    found = {port.device: port.description for port in list_ports.comports()}
+    shown = {path: found.get(path, "") for path in paths} if paths else found
+    if not shown:
+        typer.echo("no serial port is there; is the board plugged in?")
+        return
+    names = {str(name.resolve()): str(name) for name in stable_names()}
+    table = Table(box=box.SIMPLE_HEAD)
+    for title in ("port", "what it says of itself", "held by", *(["who is there"] if probe else [])):
+        table.add_column(title, overflow="fold")
+    for device, description in sorted(shown.items()):
+        name = names.get(device, device)
+        held = holder(device) or ""
+        with asking(device) if probe else nullcontext():
+            table.add_row(name, description, held, *([str(ask(device, baud))] if probe else []))
+    Console().print(table)
+
+
+def asking(port: str) -> AbstractContextManager[object]:
+    """Says on a terminal that it takes a while."""
+    console = Console(stderr=True)
+    return console.status(f"asking on {port} who is there: up to 20 s") if console.is_terminal else nullcontext()

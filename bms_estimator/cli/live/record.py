@@ -1,0 +1,134 @@
+"""``bms-estimator record``: a board's raw bytes with their arrival times."""
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.pack_options import load_pack, with_sensor
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import stop_on_signal, until_first_ends
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.source import Source
+
+REDRAW_S = 0.25
+
+
+def record(
+    out: Annotated[Path, typer.Argument(help="new file", show_default=False)],
+    pack: Annotated[
+        Path | None, typer.Option(help="settings of the pack, for its \\[sensor] or \\[source]", show_default=False)
+    ] = None,
+    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
+    baud: Annotated[int | None, typer.Option(parser=whole(1200), help="in place of sensor.baud")] = None,
+    rate_hz: Annotated[
+        int | None, typer.Option(parser=whole(1, 1000), help="in place of sensor.sample_rate_hz")
+    ] = None,
+    text: Annotated[bool, typer.Option("--text", help="the board prints text lines")] = False,
+    seconds: Annotated[
+        float | None,
+        typer.Option(parser=decimal(0.0), help="from the first bytes; else until Ctrl-C", show_default=False),
+    ] = None,
+) -> None:
+    """Record a board's raw bytes with their arrival times, until Ctrl-C.
+
+    Each read of the line goes to the file as it comes: whatever kills the recorder, ``replay`` reads all to the last whole
+    frame. Without --pack and --port the only board that is there is taken.
+    """
+    settings = load_pack(pack)[0] if pack else Settings()
+    protocol = "text" if text else None
+    settings = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol)
+    with drained(), Recording(out, header_of(settings.sensor, settings.source)) as recording:
+        progress = asyncio.run(_record(settings, recording, seconds))
+    if recording.fault:
+        raise UserError(f"recording ended: {recording.fault}")
+    typer.echo(progress.summary(), err=True)
+
+
+async def _record(settings: Settings, recording: Recording, seconds: float | None) -> "Progress":
+    """Source -> file, until a signal, the time's end or the disk's."""
+    stop = stop_on_signal()
+    console, log = Console(stderr=True), deque[str]()
+    configure_logs(log if console.is_terminal else None)
+    async with open_reports(settings, tap=recording) or SerialBoard(settings.sensor, tap=recording) as source:
+        progress = Progress(source, recording)
+        await until_first_ends(
+            stop.wait(),
+            _end(recording),
+            _drain(source),
+            _time_over(recording, seconds),
+            _show(console, progress, log),
+        )
+    return progress
+
+
+async def _drain(source: Source) -> None:
+    async for _ in source:
+        pass
+
+
+async def _end(recording: Recording) -> None:
+    with contextlib.suppress(OSError):  # said by the caller
+        await asyncio.wrap_future(recording.ended)
+
+
+async def _time_over(recording: Recording, seconds: float | None) -> None:
+    """Ends ``seconds`` after the first bytes; with None never."""
+    while seconds is None or not recording.bytes:  # noqa: ASYNC110 - the tap has no event for it
+        await asyncio.sleep(REDRAW_S)
+    await asyncio.sleep(seconds)
+
+
+async def _show(console: Console, progress: "Progress", log: deque[str]) -> None:
+    """A progress line where there is a terminal, the log's lines above it."""
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        while True:
+            while log:
+                console.print(Text.from_ansi(log.popleft()))
+            if console.is_terminal:
+                live.update(progress.line(), refresh=True)
+            await asyncio.sleep(REDRAW_S)
+
+
+class Progress:
+    """What has been recorded so far."""
+
+    def __init__(self, source: Source, recording: Recording) -> None:
+        self._source, self._recording = source, recording
+        self._started_s = time.monotonic()
+        self._last = (self._started_s, 0)
+        self._rate_hz = 0.0
+
+    def line(self) -> Text:
+        """For a screen that is drawn anew."""
+        why = f"  {self._source.message}" if self._source.message else ""
+        now_s, frames = time.monotonic(), self._source.counters["frames_received"]
+        if now_s - self._last[0] >= 1.0:
+            self._rate_hz = (frames - self._last[1]) / (now_s - self._last[0])
+            self._last = now_s, frames
+        return Text(f"{self.summary()}, {self._rate_hz:.0f} Hz{why}", no_wrap=True, overflow="ellipsis")
+
+    def summary(self) -> str:
+        """Of the whole recording."""
+        counters = self._source.counters
+        faults = sum(
+            counters.get(name, 0) for name in ("cobs_errors", "length_errors", "version_errors", "text_errors")
+        )
+        return (
+            f"{time.monotonic() - self._started_s:.1f} s, {self._recording.bytes:,} bytes, "
+            f"{counters['frames_received']:,} frames, {counters.get('frames_lost', 0):,} lost, "
+            f"{counters.get('crc_errors', 0):,} CRC errors, {faults:,} other faults"
+        )

@@ -1,0 +1,102 @@
+"""``bms-estimator run``: the service of one pack, or of several."""
+
+import asyncio
+import contextlib
+import sys
+from collections import deque
+from collections.abc import Coroutine, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import structlog
+import typer
+
+from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.signals import starting
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.service.kernel_warm_up import load_kernels
+from bms_estimator.service.multi_pack_service import serve_several
+from bms_estimator.service.pack_service import serve
+from bms_estimator.service.settings_reload import Reload, ask_all, reload_on_hangup
+from bms_estimator.settings.pack import Settings, load_settings
+from bms_estimator.sinks.terminal.panels import LOG_LINES
+from bms_estimator.sinks.terminal.sink import ConsoleSink
+from bms_estimator.sources.captures.raw_capture import header_of
+from bms_estimator.sources.captures.recorder import Recording
+
+
+def run(
+    packs: Annotated[
+        list[Path] | None, typer.Argument(help="settings of the pack, or of each", show_default="pack.toml")
+    ] = None,
+    port: Annotated[str | None, typer.Option(help="serial port in place of sensor.port")] = None,
+    mqtt: Annotated[str | None, typer.Option(help="broker in place of mqtt.url, mqtt://host:port")] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="also record the board's raw bytes in this new file", show_default=False)
+    ] = None,
+    view: Annotated[
+        bool | None, typer.Option("--view/--no-view", help="live view on stdout; without either: on a terminal")
+    ] = None,
+) -> None:
+    """Estimate live from a board and publish, until SIGINT or SIGTERM.
+
+    Several packs are served in one process, each with its own board and connection to the broker.
+    """
+    paths = packs or [Path("pack.toml")]
+    told = partial(_told, port=port, mqtt=mqtt)
+    loaded = [(told(settings), cell) for settings, cell in map(load_pack, paths)]
+    reads = [lambda path=path: told(load_settings(path)) for path in paths]
+    reloads = [Reload(settings, read) for (settings, _), read in zip(loaded, reads, strict=True)]
+    with starting(None if _on_terminal() else partial(ask_all, reloads)):
+        if len(loaded) == 1:
+            _run_one(*loaded[0], reloads[0], record, view=sys.stdout.isatty() if view is None else view)
+        else:
+            if port or record or view:
+                raise UserError("--port, --record and --view are for one pack")
+            _run_several(loaded, reloads)
+
+
+def _told(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
+    """With what the command line says."""
+    if mqtt:
+        settings = with_broker(settings, mqtt)
+    return with_sensor(settings, port=port)
+
+
+def _on_terminal() -> bool:
+    return bool(sys.stdin and sys.stdin.isatty())
+
+
+async def _reloading(service: Coroutine[Any, Any, object], reloads: Sequence[Reload]) -> None:
+    """Serve, and read the settings anew on SIGHUP; where there is a terminal it says that this is gone, and ends us."""
+    if not _on_terminal():
+        reload_on_hangup(reloads)
+    await service
+
+
+def _run_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[Reload]) -> None:
+    configure_logs()
+    with drained():
+        _load_kernels()
+        asyncio.run(_reloading(serve_several(packs, reloads), reloads))
+
+
+def _run_one(settings: Settings, cell: PackModel, reload: Reload, record: Path | None, *, view: bool) -> None:
+    log: deque[str] = deque(maxlen=LOG_LINES)
+    configure_logs(log if view and sys.stdout.isatty() else None)
+    recorder = Recording(record, header_of(settings.sensor, settings.source)) if record else contextlib.nullcontext()
+    sinks = [ConsoleSink(log=log)] if view else []
+    with drained(), recorder as tap:
+        _load_kernels()
+        service = serve(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings), reload=reload)
+        asyncio.run(_reloading(service, [reload]))
+
+
+def _load_kernels() -> None:
+    with compiling_shown(structlog.get_logger(__name__).info):
+        load_kernels()

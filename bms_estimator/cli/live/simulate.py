@@ -1,0 +1,115 @@
+"""``bms-estimator simulate``: a board without hardware, on a pseudo-terminal."""
+
+import asyncio
+import math
+from typing import Annotated, Literal
+
+import typer
+
+from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh
+from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.pack_options import with_broker
+from bms_estimator.model.cell import Cell, load_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.log_setup import configure_logs
+from bms_estimator.process.signals import stop_on_signal, until_first_ends
+from bms_estimator.settings.pack import MqttSettings, Settings
+from bms_estimator.simulation.bms_answers import BMS_ANSWERS
+from bms_estimator.simulation.esphome_node import SimulatedNode
+from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
+from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
+from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
+
+DEVICES = (*METERS, *BMS_ANSWERS)
+DEFAULT_LOAD_C = 3.0
+"""A load of so many times the capacity per hour moves SOC while one looks."""
+
+
+def simulate(
+    cell: Annotated[str, typer.Option(help=CELL_HELP)] = "chen_mora",
+    capacity_ah: CapacityAh = None,
+    series: Annotated[int, typer.Option(parser=whole(1), help="of them in series")] = 1,
+    load: Annotated[LoadName, typer.Option(help="what it is under")] = LoadName.RANDOM,
+    current_a: Annotated[
+        float | None,
+        typer.Option(parser=decimal(), help="of the load, positive on discharge; else 3C", show_default=False),
+    ] = None,
+    soc: Annotated[float, typer.Option(parser=decimal(0.0, 1.0), help="at the start")] = 0.9,
+    rate_hz: Annotated[
+        int, typer.Option(parser=whole(1, 1000), help="samples per second until the host asks for others")
+    ] = RATE_HZ_AT_RESET,
+    text: Annotated[bool, typer.Option("--text", help="print text lines, as hobby sketches do")] = False,
+    protocol: Annotated[
+        str | None,
+        typer.Option(
+            help=f"be another device, as sensor.protocol names it: {', '.join(DEVICES)}; jk-pb is a jk with the newer frames",
+            show_default=False,
+        ),
+    ] = None,
+    mqtt: Annotated[
+        str | None,
+        typer.Option(help="publish to this broker what an ESPHome node says of a JK-BMS", show_default=False),
+    ] = None,
+    prefix: Annotated[str, typer.Option(help="name of that node")] = "jk-bms",
+    noise_lsb: Annotated[float, typer.Option(parser=decimal(0.0), help="of its converter, in steps")] = 0.5,
+    speed: Annotated[float, typer.Option(parser=decimal(1e-3), help="its seconds per second")] = 1.0,
+    seconds: Annotated[
+        float, typer.Option(parser=decimal(0.0), help="of its time; else until Ctrl-C", show_default=False)
+    ] = math.inf,
+    seed: Annotated[int, typer.Option(parser=whole(), help="of load and noise")] = 0,
+) -> None:
+    """Serve a simulated board on a pseudo-terminal, until Ctrl-C.
+
+    Prints the path of the pseudo-terminal, for ``run --port PATH``. The board speaks the firmware's protocol; a
+    simulated pack with a 10-bit converter is at its pins. With --mqtt it is a JK-BMS that an ESPHome node publishes, for
+    ``source.profile = "esphome-jk"``.
+    """
+    model = load_cell(cell, capacity_ah).pack(series, 1)
+    ampere = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
+    pack = SimulatedPack(model, LOADS[load](ampere, seed), soc=soc)
+    board: VirtualBoard | SimulatedMeter | SimulatedNode
+    if mqtt is not None:
+        configure_logs()
+        broker = with_broker(Settings(), mqtt).mqtt or MqttSettings()
+        cells = model.cell.series_count
+        board = SimulatedNode(pack, cells=cells, mqtt=broker, prefix=prefix, speed=speed, seed=seed)
+    elif protocol is None:
+        mode: Literal["binary", "text"] = "text" if text else "binary"
+        board = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)
+    elif protocol in METERS:
+        board = METERS[protocol](pack, speed)
+    elif protocol in BMS_ANSWERS:
+        board = _bms(protocol, pack, model.cell, speed, seed)
+    else:
+        raise UserError(f"--protocol {protocol}: must be one of {', '.join(DEVICES)}")
+    asyncio.run(_serve(board, seconds))
+    typer.echo(f"{board.samples:,} samples in {board.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
+
+
+def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int) -> SimulatedBms:
+    """With a cell for each in series.
+
+    Raises:
+        UserError: It has no room for so many.
+    """
+    try:
+        return SimulatedBms(
+            protocol,
+            pack,
+            cells=cell.series_count,
+            speed=speed,
+            soc=lambda: pack.soc,
+            capacity_ah=cell.capacity_ah,
+            seed=seed,
+        )
+    except ValueError as error:
+        raise UserError(f"--series: {error}") from None
+
+
+async def _serve(board: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: float) -> None:
+    """Until ``seconds`` are over, or SIGINT or SIGTERM."""
+    stop = stop_on_signal()
+    with board:
+        typer.echo(board.path)
+        await until_first_ends(stop.wait(), board.run(seconds))

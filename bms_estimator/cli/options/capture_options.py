@@ -1,0 +1,80 @@
+"""Options and checks of the commands that work on recordings; nothing is overwritten unasked."""
+
+import filecmp
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import CurrentSign
+
+AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object")]
+CELL_HELP = "lfp, nmc, nca, lco, lmo, lto: generic; else a shipped cell's name or a cell file"
+OR_FUEL_CELL_HELP = f"{CELL_HELP}; pem_30w or a fuel cell's file"
+CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
+CapacityAh = Annotated[
+    float | None,
+    typer.Option(
+        parser=decimal(), help="what the cell holds; a generic one needs it, else the cell file's", show_default=False
+    ),
+]
+CapturesFromRest = Annotated[
+    list[Path], typer.Argument(help="recorded captures, CSV (.gz) or Parquet, each from rest", show_default=False)
+]
+InitialSoc = Annotated[
+    float | None,
+    typer.Option(
+        parser=decimal(0.0, 1.0), help="at the first sample of each capture; else from the first rest's voltage"
+    ),
+]
+NewCellFile = Annotated[Path, typer.Option(help="cell file to write", show_default=False)]
+Force = Annotated[bool, typer.Option("--force", help="replace the file of --out")]
+SignOfCurrent = Annotated[
+    CurrentSign | None,
+    typer.Option(help="what the current in the file is when positive; else as the file's format says, else discharge"),
+]
+
+
+def check_out(out: Path, read: Sequence[Path], *, force: bool) -> None:
+    """Refuse to write over a file unasked, and over what is read in any case.
+
+    Raises:
+        UserError: ``out`` is one of ``read``, or it is a file already and ``force`` is not given.
+    """
+    if any(out.exists() and path.exists() and out.samefile(path) for path in read):
+        raise UserError(f"--out {out}: is what is read; name another file")
+    if out.is_file() and not force:
+        raise UserError(f"--out {out}: exists already; --force replaces it")
+
+
+def check_once(captures: Sequence[Path]) -> None:
+    """Refuse a capture that is given twice, under one name or two.
+
+    Raises:
+        UserError: Which one.
+    """
+    for i, path in enumerate(captures):
+        for other in captures[:i]:
+            if path.is_file() and other.is_file() and filecmp.cmp(path, other, shallow=False):
+                same = "given twice" if path.samefile(other) else f"the same as {other}"
+                raise UserError(f"{path}: {same}; it would count twice")
+
+
+def unlike(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
+    """Names of files, and the path in place of one that another has too."""
+    return [name if names.count(name) == 1 else str(path) for name, path in zip(names, paths, strict=True)]
+
+
+def name_of(path: Path) -> str:
+    """Name of a capture or cell: its file's name without the endings."""
+    return path.name.split(".")[0]
+
+
+def write_as_named(out: Path, cell: CellModel, remarks: list[str]) -> None:
+    """Write a cell file whose cell has the file's name, with ``remarks`` on top."""
+    write_cell(out, cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})}), remarks)

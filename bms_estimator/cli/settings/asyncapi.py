@@ -1,0 +1,18 @@
+"""``bms-estimator asyncapi``: what is published, for programs that read it."""
+
+import json
+from typing import Annotated
+
+import typer
+
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.sinks.mqtt.asyncapi import document
+
+
+def asyncapi(
+    base_topic: Annotated[str, typer.Option(help="mqtt.base_topic of the pack file")] = str(
+        MqttSettings.model_fields["base_topic"].default
+    ),
+) -> None:
+    """Print all topics and payloads as an AsyncAPI 3 document, for generators of clients and of pages."""
+    typer.echo(json.dumps(document(base_topic), indent=2, allow_nan=False))

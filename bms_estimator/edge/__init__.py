@@ -1,0 +1,1 @@
+"""The fleet's end on the device: samples to blocks, block store, NATS subjects."""

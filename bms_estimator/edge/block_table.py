@@ -1,0 +1,196 @@
+"""What an edge keeps on its disk, and what is done with it, each in one transaction."""
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bms_estimator.edge.batching import Gathered
+from bms_estimator.edge.block import MOST_NUMBER, Block, BlockError, decode, encode
+
+NS = 1_000_000_000
+LATEST_S = MOST_NUMBER // NS - 1
+"""No store is made later [s since 1970]: the year 2262."""
+DROP_ROWS = 64
+"""Blocks that are looked at together where room must be made."""
+EDGE_TABLES = (
+    """
+    CREATE TABLE store (
+        made_s INTEGER NOT NULL,
+        next INTEGER NOT NULL,
+        last_s REAL NOT NULL,
+        bytes INTEGER NOT NULL,
+        run TEXT NOT NULL,
+        taken INTEGER NOT NULL
+    );
+    CREATE TABLE block (number INTEGER PRIMARY KEY, data BLOB NOT NULL);
+    """,
+)
+"""As ``store.migrations.MIGRATIONS``."""
+
+
+class Kept(NamedTuple):
+    """A store and what is in it."""
+
+    made_s: int
+    """When it was made [s since 1970]: whole seconds, so that times of its samples lose nothing."""
+    next: int
+    """Number of the next block."""
+    last_s: float
+    """Time of its last sample, since it was made [s]; 0 without any."""
+    bytes: int
+    """Of its blocks."""
+    run: str
+    """Who put the last block ..."""
+    taken: int
+    """... and how many it had put."""
+
+
+class Settled(NamedTuple):
+    """After a transaction."""
+
+    kept: Kept
+    oldest: int
+    """Number of the oldest block; ``kept.next`` where there is none."""
+    dropped: int
+    """Blocks that had to make room."""
+
+
+@dataclass(frozen=True)
+class Settle:
+    """Put blocks, forget what is safe, make room; may be done twice.
+
+    Raises:
+        sqlite3.Error: As the disk has it.
+    """
+
+    run: str
+    """Of this process: what it has put before is not put again."""
+    put: Sequence[tuple[int, Gathered]]
+    """Blocks and their running numbers in this process, from 1; their times are seconds since 1970."""
+    safe: int
+    """Blocks below this number are forgotten."""
+    known_s: int
+    """When the store was made that this process knows; 0: none yet. An earlier one is none [s since 1970]."""
+    after_s: int
+    """A store that was not made later than this is none, either: a new one is begun [s since 1970]."""
+    most_bytes: int
+    now_s: float
+    """Wall clock [s since 1970]."""
+    count: bool
+    """Whether to count the bytes anew."""
+
+    def __call__(self, connection: sqlite3.Connection) -> Settled:
+        """Do it."""
+        kept = _kept(connection)
+        if kept is None or kept.made_s < self.known_s or kept.made_s <= self.after_s:
+            kept = self._begin(connection)
+        else:
+            removed = _bytes(connection, f"WHERE number < {self.safe:d}")
+            connection.execute("DELETE FROM block WHERE number < ?", (self.safe,))
+            kept = kept._replace(bytes=_bytes(connection) if self.count else kept.bytes - removed)
+        done = kept.taken if kept.run == self.run else 0
+        for index, gathered in self.put:
+            if index > done:
+                kept = _put(connection, kept, gathered)._replace(run=self.run, taken=index)
+        kept, dropped = _make_room(connection, kept, self.most_bytes)
+        connection.execute("DELETE FROM store")
+        connection.execute("INSERT INTO store VALUES (?, ?, ?, ?, ?, ?)", kept)
+        (oldest,) = connection.execute("SELECT min(number) FROM block").fetchone()
+        return Settled(kept, kept.next if oldest is None else oldest, dropped)
+
+    def _begin(self, connection: sqlite3.Connection) -> Kept:
+        """A new store, made when the first sample that waits for it was taken."""
+        connection.execute("DELETE FROM block")
+        first_s = float(self.put[0][1].samples["time_s"][0]) if self.put else self.now_s
+        return Kept(max(int(first_s), self.known_s + 1, self.after_s + 1), 1, 0.0, 0, "", 0)
+
+
+class Page(NamedTuple):
+    """Blocks that follow each other, as they are read."""
+
+    first: int
+    """Number of the first one that can be read; what was asked for before it cannot."""
+    blocks: list[tuple[int, bytes]]
+
+
+@dataclass(frozen=True)
+class Read:
+    """Read blocks in order.
+
+    Raises:
+        sqlite3.Error: As the disk has it.
+    """
+
+    made_s: int
+    """Of the store [s since 1970]."""
+    first: int
+    end: int
+    """After the last one."""
+    most: int
+
+    def __call__(self, connection: sqlite3.Connection) -> Page:
+        """Do it."""
+        asked = "SELECT number, data FROM block WHERE number >= ? AND number < ? ORDER BY number LIMIT ?"
+        blocks = list[tuple[int, bytes]]()
+        first = self.end
+        for number, data in connection.execute(asked, (self.first, self.end, self.most)).fetchall():
+            if not _sound(self.made_s, number, data):
+                if blocks:
+                    break
+                first = number + 1
+            elif blocks and number != blocks[-1][0] + 1:
+                break
+            else:
+                blocks.append((number, data))
+        return Page(blocks[0][0] if blocks else first, blocks)
+
+
+def _kept(connection: sqlite3.Connection) -> Kept | None:
+    """The store that is there; None of one that cannot be."""
+    row = connection.execute("SELECT made_s, next, last_s, bytes, run, taken FROM store").fetchone()
+    if row is None or [*map(type, row)] != [int, int, float, int, str, int]:
+        return None
+    kept = Kept(*row)
+    return kept if 0 < kept.made_s <= LATEST_S and 0 < kept.next < MOST_NUMBER else None
+
+
+def _put(connection: sqlite3.Connection, kept: Kept, gathered: Gathered) -> Kept:
+    samples = gathered.samples.copy()
+    samples["time_s"] = np.maximum(samples["time_s"] - kept.made_s, kept.last_s)
+    data = encode(Block(kept.made_s * NS, kept.next, kept.next, gathered.arrival_s, samples))
+    connection.execute("INSERT OR REPLACE INTO block VALUES (?, ?)", (kept.next, data))
+    last_s = float(samples["time_s"][-1])
+    return kept._replace(next=kept.next + 1, last_s=last_s, bytes=kept.bytes + len(data))
+
+
+def _make_room(connection: sqlite3.Connection, kept: Kept, most_bytes: int) -> tuple[Kept, int]:
+    """Drop the oldest, but never the newest."""
+    dropped = 0
+    oldest = "SELECT number, length(data) FROM block WHERE number < ? ORDER BY number LIMIT ?"
+    while kept.bytes > most_bytes and (rows := connection.execute(oldest, (kept.next - 1, DROP_ROWS)).fetchall()):
+        for number, size in rows:
+            if kept.bytes <= most_bytes:
+                break
+            connection.execute("DELETE FROM block WHERE number = ?", (number,))
+            kept = kept._replace(bytes=kept.bytes - size)
+            dropped += 1
+    return kept, dropped
+
+
+def _bytes(connection: sqlite3.Connection, where: str = "") -> int:
+    (size,) = connection.execute(f"SELECT coalesce(sum(length(data)), 0) FROM block {where}").fetchone()  # noqa: S608 - ours
+    return int(size)
+
+
+def _sound(made_s: int, number: int, data: Any) -> bool:
+    """Whether a row is a block as it was put."""
+    if not isinstance(data, bytes):
+        return False
+    try:
+        block = decode(data)
+    except BlockError:
+        return False
+    return block.store == made_s * NS and block.number == number

@@ -1,0 +1,1 @@
+"""Re-identification of cells from captured blocks."""

@@ -1,0 +1,112 @@
+"""A pack's blocks, as the stream has them, put together: in the order of their numbers, each once."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bms_estimator.edge.block import Block, BlockError, decode
+from bms_estimator.model.sample import SampleBlock
+
+ROWS = 65_536
+"""Samples of blocks are handed over at least so many at a time, but the last."""
+
+
+@dataclass
+class Captured:
+    """What was found of one pack; ``add`` its blocks in the stream's order.
+
+    As workers do, a store that is older than one already met is left out: its edge has been given another.
+
+    Args:
+        since_s: Samples before it are left out [s since 1970].
+        until_s: Samples from it on are.
+
+    Attributes:
+        damaged: Messages that were no block.
+        again: Blocks that came more than once, or of a store that is over.
+    """
+
+    since_s: float = -np.inf
+    until_s: float = np.inf
+    damaged: int = 0
+    again: int = 0
+    _blocks: dict[tuple[int, int], bytes] = field(default_factory=dict)
+    _store: int = 0
+
+    def add(self, data: bytes) -> None:
+        """Take what came of the pack next."""
+        try:
+            block = decode(data)
+        except BlockError:
+            self.damaged += 1
+            return
+        key = (block.store, block.number)
+        if block.store < self._store or key in self._blocks:
+            self.again += 1
+            return
+        self._store = block.store
+        if _wall_s(block, -1) >= self.since_s and _wall_s(block, 0) < self.until_s:
+            self._blocks[key] = data
+
+    @property
+    def blocks(self) -> int:
+        """So many were found."""
+        return len(self._blocks)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Wall clock of the first and of the last sample [s since 1970]; of no block NaN."""
+        if not self._blocks:
+            return np.nan, np.nan
+        ordered = sorted(self._blocks)
+        first_s, last_s = _wall_s(self._block(ordered[0]), 0), _wall_s(self._block(ordered[-1]), -1)
+        return max(first_s, self.since_s), min(last_s, self.until_s)
+
+    @property
+    def missing(self) -> list[tuple[int, int]]:
+        """First and last number of the blocks that are not there between two that are, of all stores."""
+        pairs = zip(ordered := sorted(self._blocks), ordered[1:], strict=False)
+        return [(a + 1, b - 1) for (store, a), (other, b) in pairs if store == other and b > a + 1]
+
+    def samples(self) -> Iterator[SampleBlock]:
+        """All samples.
+
+        ``time_s`` is that of the first store; where another took its place it goes on by the edge's wall clock, and where
+        that had been set back from the last sample on.
+        """
+        parts, rows = list[SampleBlock](), 0
+        for part in self._parts():
+            parts.append(part)
+            rows += part.size
+            if rows >= ROWS:
+                yield np.concatenate(parts)
+                parts, rows = [], 0
+        if parts:
+            yield np.concatenate(parts)
+
+    def _parts(self) -> Iterator[SampleBlock]:
+        store, origin, offset_s, last_s = 0, 0, 0.0, 0.0
+        for key in sorted(self._blocks):
+            block = self._block(key)
+            samples = block.samples[self._wanted(block)]
+            if not samples.size:
+                continue
+            origin = origin or block.store
+            if store not in (0, block.store):
+                offset_s = max((block.store - origin) * 1e-9, last_s - float(samples["time_s"][0]))
+            store = block.store
+            samples["time_s"] += offset_s
+            last_s = float(samples["time_s"][-1])
+            yield samples
+
+    def _wanted(self, block: Block) -> np.ndarray:
+        wall_s = block.store * 1e-9 + block.samples["time_s"]
+        return (wall_s >= self.since_s) & (wall_s < self.until_s)
+
+    def _block(self, key: tuple[int, int]) -> Block:
+        return decode(self._blocks[key])
+
+
+def _wall_s(block: Block, sample: int) -> float:
+    return block.store * 1e-9 + float(block.samples["time_s"][sample])

@@ -1,0 +1,1 @@
+"""Connection to NATS and its streams."""

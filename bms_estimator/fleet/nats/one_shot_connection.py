@@ -1,0 +1,50 @@
+"""A connection for one question to the server: what is wrong with it is said at once."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import nats
+import nats.errors
+from nats.aio.client import Client
+
+from bms_estimator.fleet.nats.connection import FLUSH_S, addresses, context, readable
+from bms_estimator.fleet.nats.reasons import reason
+from bms_estimator.fleet.nats.stream_reader import StreamError
+from bms_estimator.model.errors import UserError
+
+CONNECT_S, RETRY_S = 5, 0.1
+"""So long an answer of the server is waited for; between two attempts [s]."""
+
+
+@asynccontextmanager
+async def connected(server: str, creds: Path | None = None, ca: Path | None = None) -> AsyncIterator[Client]:
+    """A connection that is not made again: what breaks it ends the command.
+
+    Raises:
+        UserError: Nobody answers there, or refuses; a file cannot be read; later, as a stream cannot be read.
+    """
+    troubles = list[Exception]()
+
+    async def trouble(error: Exception) -> None:
+        troubles.append(error)
+
+    try:
+        nc = await nats.connect(
+            addresses(server),
+            user_credentials=readable(creds) if creds is not None else None,
+            tls=context(ca) if ca is not None else None,
+            allow_reconnect=False,
+            max_reconnect_attempts=1,  # of each server that cannot be reached
+            reconnect_time_wait=RETRY_S,
+            connect_timeout=CONNECT_S,
+            flush_timeout=FLUSH_S,
+            error_cb=trouble,
+        )
+    except (nats.errors.Error, OSError, ValueError) as error:
+        raise UserError(f"--server {server}: {reason(troubles[-1] if troubles else error)}") from None
+    try:
+        async with nc:
+            yield nc
+    except (StreamError, nats.errors.Error) as error:  # what is not allowed is said beside the question
+        raise UserError(f"--server {server}: {reason(troubles[-1] if troubles else error)}") from None

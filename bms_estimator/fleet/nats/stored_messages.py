@@ -1,0 +1,42 @@
+"""What a stream has under a subject, from one sequence to another."""
+
+import asyncio
+from collections.abc import AsyncGenerator
+
+from nats.aio.client import Client
+
+from bms_estimator.fleet.nats.stream_reader import ANSWER_S, Stored, StreamError, read_stream
+
+BEHIND_S = 0.1
+"""Between two looks at a node that does not have yet what another has [s]."""
+
+
+async def stored(nc: Client, stream: str, subject: str, first: int, last: int) -> AsyncGenerator[Stored, None]:
+    """All messages from one sequence to another, in their order.
+
+    The node that answers may be behind the one that leads the stream: so they end with the message ``last``, not where that
+    node knows no more.
+
+    Args:
+        nc: Connected.
+        stream: Its name; it must allow direct gets.
+        subject: May have wildcards.
+        first: Sequence in the stream.
+        last: That of a message which the subject covers.
+
+    Raises:
+        StreamError: The server does not answer, or refuses.
+        nats.errors.Error: As above.
+    """
+    for _ in range(round(ANSWER_S / BEHIND_S)):
+        async for batch in read_stream(nc, stream, subject, first=first):
+            for message in batch:
+                if message.sequence <= last:
+                    yield message
+            first = batch[-1].sequence + 1
+            if first > last:
+                return
+        if (await nc.jetstream().stream_info(stream)).state.first_seq > last:
+            return  # it has grown too old meanwhile
+        await asyncio.sleep(BEHIND_S)
+    raise StreamError(f"the server has lost message {last} of {stream}, or the node that answers is far behind")

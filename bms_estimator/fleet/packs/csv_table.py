@@ -1,0 +1,227 @@
+"""The table of a fleet's packs: CSV, one row for each, read with errors that name line, column and what to do."""
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import NamedTuple
+
+from pydantic import ValidationError
+
+from bms_estimator.fleet.packs.pack_row import COLUMNS, PackKind, known_cells, model_key, model_of, stored
+from bms_estimator.model.errors import UserError
+from bms_estimator.settings.pack import DEVICE_NAME
+
+MOST_SAID = 20
+"""Of the errors of a table so many are shown."""
+CELL_FILE = ".toml"
+"""The end of a cell that is a file beside the table."""
+_WHOLE = ("series", "parallel")
+_WORDS = ("pack", "cell", "protocol")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+
+
+class Line(NamedTuple):
+    """A row of the table and where it stands."""
+
+    number: int
+    kind: PackKind
+    data: bytes
+    """As ``stored`` makes it of the kind."""
+
+
+@dataclass(frozen=True)
+class PackTable:
+    """A table that was read.
+
+    Attributes:
+        packs: By name.
+        cell_files: Files that it names, by the names of their cells.
+    """
+
+    packs: Mapping[str, Line]
+    cell_files: Mapping[str, Path]
+
+
+class _RowError(ValueError):
+    """What is wrong with one value: its column, and what to do."""
+
+
+def read_table(path: Path) -> PackTable:
+    """Read a table of packs.
+
+    The first line names the columns, separated by ``,`` or ``;``; ``pack`` and ``cell`` must be there.
+
+    Raises:
+        UserError: It cannot be read; or one line for each wrong value, ``MOST_SAID`` at most.
+    """
+    return _Reader(path).table()
+
+
+def check_models(path: Path, table: PackTable, cell_files: Mapping[str, str]) -> None:
+    """That each kind of pack has a cell.
+
+    Args:
+        path: What the table is called.
+        table: As ``read_table`` gives it.
+        cell_files: Texts by the names of their cells.
+
+    Raises:
+        UserError: One line for each kind that has none, with its first line in the table.
+    """
+    alike = dict[tuple[object, ...], list[Line]]()
+    for line in table.packs.values():
+        alike.setdefault(model_key(line.kind), []).append(line)
+    errors = []
+    for lines in alike.values():
+        first = lines[0]
+        try:
+            model_of(first.kind, cell_files.get(first.kind.cell))
+        except UserError as error:
+            others = f", and {len(lines) - 1} more of its kind" if len(lines) > 1 else ""
+            errors.append(f"{path}: line {first.number}{others}: {error}")
+    _refuse(path, errors)
+
+
+class _Reader:
+    """One table on its way."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._kinds = dict[tuple[str, ...], tuple[PackKind, bytes]]()
+        self._files = dict[str, Path]()
+
+    def table(self) -> PackTable:
+        """As ``read_table``."""
+        rows = csv.reader(io.StringIO(text := self._text(), newline=""), delimiter=_separator(text), strict=True)
+        packs, errors = dict[str, Line](), list[str]()
+        try:
+            columns = self._columns(next(rows, []))
+            for values in rows:
+                if not any(value.strip() for value in values):
+                    continue
+                try:
+                    name, kind, data = self._row(columns, [value.strip() for value in values])
+                    _refuse_again(name, packs)
+                    packs[name] = Line(rows.line_num, kind, data)
+                except _RowError as error:
+                    errors.append(f"{self._path}: line {rows.line_num}, {error}")
+        except csv.Error as error:
+            errors.append(f"{self._path}: line {rows.line_num}: {error}; a quote that is opened must be closed")
+        _refuse(self._path, errors)
+        if not packs:
+            raise UserError(f"{self._path}: no row below the line of column names; give one for each pack")
+        return PackTable(packs, self._files)
+
+    def _text(self) -> str:
+        try:
+            return self._path.read_text(encoding="utf-8-sig")
+        except OSError as error:
+            raise UserError(f"{self._path}: cannot be read: {error.strerror}") from None
+        except UnicodeDecodeError as error:
+            raise UserError(f"{self._path}: not UTF-8 (byte {error.start}); save it as CSV in UTF-8") from None
+
+    def _columns(self, header: Sequence[str]) -> list[str]:
+        """The columns by the first line.
+
+        Raises:
+            UserError: One is unknown, twice or missing.
+        """
+        names = [name.strip() for name in header]
+        errors = [f"column {name!r} is unknown; {_meant(name)}" for name in names if name not in COLUMNS]
+        errors += [f"column {name} is there twice" for name in COLUMNS if names.count(name) > 1]
+        errors += [f"no column {name}; there must be one" for name in ("pack", "cell") if name not in names]
+        _refuse(self._path, [f"{self._path}: line 1: {error}" for error in errors])
+        return names
+
+    def _row(self, columns: list[str], values: list[str]) -> tuple[str, PackKind, bytes]:
+        if len(values) != len(columns):
+            raise _RowError(f"{len(values)} values in {len(columns)} columns; give one for each, empty for the default")
+        place = columns.index("pack")
+        name = values[place]
+        if not re.fullmatch(DEVICE_NAME, name):
+            raise _RowError(_said("pack", name, "must be 1 to 64 letters, digits, _ and -"))
+        key = (*values[:place], *values[place + 1 :])
+        if key not in self._kinds:
+            told = {column: value for column, value in zip(columns, values, strict=True) if value and column != "pack"}
+            kind = self._kind(told)
+            self._kinds[key] = kind, stored(kind)
+        return name, *self._kinds[key]
+
+    def _kind(self, told: Mapping[str, str]) -> PackKind:
+        """What packs of the same values have in common."""
+        values: dict[str, object] = {column: _value(column, value) for column, value in told.items()}
+        cell = told.get("cell", "")
+        if cell.endswith(CELL_FILE):
+            values["cell"] = self._cell_file(cell)
+        try:
+            return PackKind.model_validate(values)
+        except ValidationError as error:
+            detail = error.errors()[0]
+            column = str(detail["loc"][0])
+            described = PackKind.model_fields[column].description
+            if column not in told:
+                raise _RowError(f"column {column}: is empty; give {described}") from None
+            message = detail["msg"].removeprefix("Value error, ")
+            raise _RowError(_said(column, told[column], f"{message} ({described})")) from None
+
+    def _cell_file(self, value: str) -> str:
+        """The name of the cell in a file."""
+        path = self._path.parent / value
+        name = path.name.removesuffix(CELL_FILE)
+        if not path.is_file():
+            raise _RowError(_said("cell", value, f"no such file beside the table ({path})"))
+        if not re.fullmatch(DEVICE_NAME, name):
+            raise _RowError(_said("cell", value, "its name before .toml must be 1 to 64 letters, digits, _ and -"))
+        if name in known_cells():
+            raise _RowError(_said("cell", value, f"{name} is a cell of the package; give the file another name"))
+        if not self._files.setdefault(name, path).samefile(path):
+            raise _RowError(_said("cell", value, f"another file of this name is {self._files[name]}; rename one"))
+        return name
+
+
+def _refuse_again(name: str, packs: Mapping[str, Line]) -> None:
+    if name in packs:
+        raise _RowError(_said("pack", name, f"is on line {packs[name].number} already; take one away"))
+
+
+def _value(column: str, value: str) -> object:
+    if column in _WORDS:
+        return value
+    if not _NUMBER.fullmatch(value):
+        hint = ", with a point and not a comma" if "," in value else ""
+        raise _RowError(_said(column, value, f"must be a number{hint}"))
+    return int(value) if column in _WHOLE and value.isdecimal() else float(value)
+
+
+def _said(column: str, value: str, wrong: str) -> str:
+    return f"column {column} = {value!r}: {wrong}"
+
+
+def _separator(text: str) -> str:
+    """The one that the first line has more of."""
+    first = text.partition("\n")[0]
+    return max(",;", key=first.count)
+
+
+def _meant(name: str) -> str:
+    close = get_close_matches(name, COLUMNS, n=1)
+    return f"is {close[0]} meant?" if close else f"there are {', '.join(COLUMNS)}"
+
+
+def _refuse(path: Path, errors: Sequence[str]) -> None:
+    if errors:
+        left = len(errors) - MOST_SAID
+        raise UserError("\n".join([*errors[:MOST_SAID], *([f"{path}: and {left} more"] if left > 0 else [])]))
+
+
+def table_lines(packs: Mapping[str, PackKind]) -> Iterator[str]:
+    """The same as CSV, lines with their ends: only the columns of which at least one pack has something."""
+    told = {name: kind.model_dump(exclude_defaults=True) for name, kind in sorted(packs.items())}
+    columns = [column for column in COLUMNS if column == "pack" or any(column in row for row in told.values())]
+    yield ",".join(columns) + "\n"
+    for name, row in told.items():
+        yield ",".join(str(({"pack": name} | row).get(column, "")) for column in columns) + "\n"

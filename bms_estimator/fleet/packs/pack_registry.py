@@ -1,0 +1,113 @@
+"""What a worker knows of packs: rows and cell files as they come, and what they make of each pack.
+
+Packs with the same bytes share one settings object and one model; those that nobody asks for are never made. Whatever is
+wrong with a row makes its packs unknown, with the reason.
+"""
+
+from collections.abc import Collection, Iterator
+from functools import lru_cache
+
+from bms_estimator.fleet.packs.pack_row import PackKind, kind_of, known_cells, model_of, settings_of
+from bms_estimator.fleet.packs.pack_type import type_estimator
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.settings.pack import Settings
+
+MOST_KINDS = 1024
+"""So many kinds of packs are kept ready."""
+NOT_TOLD = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
+
+
+class KnownPacks:
+    """Rows and cell files, from which a pack's settings and model follow."""
+
+    def __init__(self) -> None:
+        self._rows = dict[str, bytes]()
+        self._same = dict[bytes, bytes]()
+        self._cells = dict[str, str]()
+        self._kind = lru_cache(MOST_KINDS)(_kind)
+        self._made = lru_cache(MOST_KINDS)(_made)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __contains__(self, pack: object) -> bool:
+        return pack in self._rows
+
+    def __call__(self, pack: str) -> tuple[Settings, PackModel] | None:
+        """The settings of its kind, the same object for all of them and without the pack's name, and its model; None: ``reason``."""
+        found = self._found(pack)
+        return None if isinstance(found, str) else found
+
+    def reason(self, pack: str) -> str:
+        """Why a pack is unknown; empty where it is not."""
+        found = self._found(pack)
+        return found if isinstance(found, str) else ""
+
+    def kind(self, pack: str) -> PackKind | str | None:
+        """Its row, or what is wrong with it; None where there is none."""
+        data = self._rows.get(pack)
+        return None if data is None else self._kind(data)
+
+    def cell_file(self, name: str) -> str | None:
+        """The text of a cell file; None where there is none, or the package's cell of that name goes before."""
+        return None if name in known_cells() else self._cells.get(name)
+
+    def set_row(self, pack: str, data: bytes | None) -> bool:
+        """A pack has another row; None: none any more. Whether this is news."""
+        if data == self._rows.get(pack):
+            return False
+        if data is None:
+            del self._rows[pack]
+        else:
+            self._rows[pack] = self._same.setdefault(data, data)
+        return True
+
+    def set_cell(self, name: str, file: bytes | None) -> bool:
+        """A cell file is another; None: there is none any more. Whether this is news."""
+        text = None if file is None else file.decode(errors="replace")
+        if text == self._cells.get(name):
+            return False
+        if text is None:
+            del self._cells[name]
+        else:
+            self._cells[name] = text
+        return True
+
+    def made_of(self, cells: Collection[str]) -> set[str]:
+        """The packs that are made of one of some cells; looks at all packs."""
+        found = set[str]()
+        for pack, data in self._rows.items() if cells else ():
+            kind = self._kind(data)
+            if not isinstance(kind, str) and kind.cell in cells:
+                found.add(pack)
+        return found
+
+    def _found(self, pack: str) -> tuple[Settings, PackModel] | str:
+        kind = self.kind(pack)
+        if kind is None:
+            return NOT_TOLD
+        if isinstance(kind, str):
+            return f"its row is wrong: {kind}"
+        return self._made(kind, self._cells.get(kind.cell))
+
+
+def _kind(data: bytes) -> PackKind | str:
+    try:
+        return kind_of(data)
+    except ValueError as error:
+        return str(error)
+
+
+def _made(kind: PackKind, cell_file: str | None) -> tuple[Settings, PackModel] | str:
+    try:
+        settings, model = settings_of(kind), model_of(kind, cell_file)
+        type_estimator(settings, model)  # kept: a partition asks for the same next
+    except UserError as error:
+        return str(error)
+    except (ValueError, ArithmeticError) as error:
+        return f"no estimator can be made of its values: {error}"
+    return settings, model

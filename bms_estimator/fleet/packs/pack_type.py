@@ -1,0 +1,124 @@
+"""Packs of one type: they share an estimator's settings, which take longer to make than a day's samples to estimate."""
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.checkpoint.checkpoint_file import pack_identity
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.settings.pack import PackSettings, Settings
+from bms_estimator.telemetry.charge_energy import Flow, Meter
+
+MOST_TYPES = 256
+"""Of so many the settings are kept, 40 kB each; those of more are made again and again, 50 ms each."""
+Digest = tuple[int, int]
+"""The first 128 bits, as two words."""
+
+
+@dataclass(frozen=True, eq=False)
+class PackType:
+    """What packs with the same settings have in common.
+
+    Attributes:
+        settings: Of the packs, but for the name.
+        made_of: Digest of all that the estimator is made of.
+        meaning: Digest of what gives a state its meaning; under another it begins anew.
+        estimator: Works on the record of the partition.
+        meter: Counts for one pack after the other.
+        capacity_ah: Of the pack, rated; None of a fuel cell.
+    """
+
+    settings: PackSettings
+    made_of: Digest
+    meaning: Digest
+    estimator: Estimator
+    meter: Meter
+    capacity_ah: float | None
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    made_of: Digest
+    settings: Settings = field(compare=False)
+    cell: PackModel = field(compare=False)
+
+
+def made_of(settings: Settings, cell: PackModel) -> Digest:
+    """Digest of all that a pack's estimator is made of."""
+    sensor = settings.sensor
+    parts = (
+        *(settings.observer, settings.identifier, settings.sampling, settings.pack.initial_soc, cell),
+        *(sensor.voltage_resolution_v, sensor.voltage_noise_v, sensor.current_sign),
+    )
+    return _digest(hashlib.sha256(repr(parts).encode()).digest())
+
+
+class PackTypes:
+    """The types of a partition's packs.
+
+    Args:
+        record: What their estimators work on, shape (1,), dtype PACK_STATE.
+    """
+
+    def __init__(self, record: NDArray[np.void]) -> None:
+        self._record = record
+        self._known: dict[tuple[int, int], tuple[Settings, PackModel, PackType]] = {}
+
+    def of(self, settings: Settings, cell: PackModel) -> PackType:
+        """The type of packs with these settings: that of the same two objects is made once.
+
+        Args:
+            settings: Of the packs.
+            cell: A pack as one object (``CellModel.pack``).
+        """
+        key = id(settings), id(cell)
+        if key not in self._known:
+            if len(self._known) >= MOST_TYPES:
+                self._known.clear()
+            self._known[key] = settings, cell, pack_type(settings, cell, self._record)
+        return self._known[key][2]
+
+
+def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> PackType:
+    """The type of a pack with these settings.
+
+    Args:
+        settings: The pack's.
+        cell: The pack as one object (``CellModel.pack``).
+        record: What its estimator and meter work on, shape (1,), dtype PACK_STATE.
+    """
+    made = made_of(settings, cell)
+    estimator = type_estimator(settings, cell).on(record["estimator"])
+    return PackType(
+        settings=settings.pack,
+        made_of=made,
+        meaning=_digest(bytes.fromhex(pack_identity(settings, cell))),
+        estimator=estimator,
+        meter=Meter(Flow(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
+        capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
+    )
+
+
+def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
+    """An estimator of packs with these settings: of all partitions of a process the same.
+
+    Args:
+        settings: Of the packs.
+        cell: A pack as one object (``CellModel.pack``).
+    """
+    return _estimator(_Recipe(made_of(settings, cell), settings, cell))
+
+
+@lru_cache(maxsize=MOST_TYPES)
+def _estimator(recipe: _Recipe) -> Estimator:
+    return estimator_of(recipe.settings, recipe.cell)
+
+
+def _digest(sha256: bytes) -> Digest:
+    return int.from_bytes(sha256[:8]), int.from_bytes(sha256[8:16])

@@ -1,0 +1,32 @@
+"""What the hours of a fleet answer, for its page: each question asked now and then, off the event loop."""
+
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from bms_estimator.fleet.queries.duckdb_queries import ask
+from bms_estimator.model.errors import UserError
+
+ASKED = ("soh", "failing", "outliers", "honest")
+"""Of the questions."""
+LISTED = 20
+"""Rows of an answer, at most."""
+
+
+def answer(folder: Path, name: str) -> dict[str, Any]:
+    """The answer to one of ``ASKED``.
+
+    Args:
+        folder: Of the hours, as ``fleet collect`` writes it.
+        name: Of the question.
+
+    Returns:
+        ``columns``, the first ``rows``, and how many there are (``count``); or why there is none (``reason``).
+    """
+    try:
+        found = ask(folder, name)
+    except (UserError, duckdb.Error) as error:
+        return {"reason": str(error)}
+    rows = [row for row in found.rows if name != "soh" or row[found.columns.index("pack")] is None]
+    return {"columns": found.columns, "rows": rows[:LISTED], "count": len(rows)}

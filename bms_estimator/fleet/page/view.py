@@ -1,0 +1,94 @@
+"""What the page of a fleet is sent, from all that was heard. Pure: the clocks are given."""
+
+import json
+from collections import deque
+from typing import Any
+
+from pydantic import ValidationError
+
+from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.page.packs import LISTED, FleetPacks
+from bms_estimator.fleet.page.workers import OVER_S, FleetWorkers
+from bms_estimator.model.clock import iso_utc
+
+MOST_UNKNOWN = 1000
+
+
+class FleetView:
+    """All that is known; times are of one clock that never goes back [s].
+
+    Args:
+        partitions: How many there are, as long as the server has not said.
+        now_s: The clock.
+    """
+
+    def __init__(self, partitions: int, now_s: float) -> None:
+        self.packs, self.workers = FleetPacks(), FleetWorkers(partitions)
+        self._unknown: dict[str, str] = {}
+        self._since_s = now_s
+        self._counted = deque([(now_s, 0)])
+        self.listening = False
+        """There is a server; else what is known is what was."""
+        self.damaged = 0
+        """Heartbeats that were none."""
+
+    def begin(self, now_s: float) -> None:
+        """From now on all is heard, after a time when it was not."""
+        self._since_s, self.listening = now_s, True
+        self.workers.forget()
+
+    def end(self) -> None:
+        """The server is lost."""
+        self.listening = False
+
+    def hear_worker(self, data: bytes, now_s: float) -> None:
+        """Take a heartbeat."""
+        try:
+            self.workers.hear(Heartbeat.model_validate_json(data), now_s)
+        except ValidationError:
+            self.damaged += 1
+
+    def hear_unknown(self, name: str, why: str) -> None:
+        """A worker holds blocks of a pack that it does not know."""
+        self._unknown.pop(name, None)
+        self._unknown[name] = why
+        if len(self._unknown) > MOST_UNKNOWN:
+            del self._unknown[next(iter(self._unknown))]
+
+    def know(self, name: str, kind: str | None) -> None:
+        """A pack is in the table as of a type; None: it is no more."""
+        self.packs.list_pack(name, kind)
+        if kind is not None:
+            self._unknown.pop(name, None)
+
+    def text(self, now_s: float, wall_s: float) -> str:
+        """What is sent, JSON in one line."""
+        return json.dumps(self.picture(now_s, wall_s), allow_nan=False, separators=(",", ":"))
+
+    def picture(self, now_s: float, wall_s: float) -> dict[str, Any]:
+        """All at a glance: ``FleetPacks.picture``, ``FleetWorkers.picture``, the time and how long has been listened."""
+        shown = self.packs.picture(now_s, self._since_s) | self.workers.picture(now_s)
+        shown["concerns"]["unknown"] = unknown = self._named_unknown(now_s)
+        shown["attention"] += unknown["count"]
+        return shown | {
+            "time": iso_utc(wall_s),
+            "listening_s": round(now_s - self._since_s, 1),
+            "states_per_s": self._rate(now_s),
+            "damaged": self.packs.damaged + self.damaged,
+        }
+
+    def _rate(self, now_s: float) -> float | None:
+        """States a second, of late."""
+        self._counted.append((now_s, self.packs.states))
+        while len(self._counted) > 2 and self._counted[1][0] <= now_s - OVER_S:
+            self._counted.popleft()
+        before_s, states = self._counted[0]
+        return (self.packs.states - states) / (now_s - before_s) if now_s > before_s else None
+
+    def _named_unknown(self, now_s: float) -> dict[str, Any]:
+        """Those that the workers count; who was named once is named as long as there are any."""
+        count, named = self.workers.unknown(now_s)
+        if not count:
+            self._unknown.clear()
+        newest = dict.fromkeys([*reversed(self._unknown), *named])
+        return {"count": count, "packs": [[name, self._unknown.get(name, "")] for name in newest][:LISTED]}

@@ -1,0 +1,1 @@
+"""Hourly Parquet files and DuckDB queries on them."""

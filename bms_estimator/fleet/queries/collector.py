@@ -1,0 +1,190 @@
+"""From the stream ``HOURS`` to Parquet: a row is acknowledged when its file is on the disk, and comes again until then."""
+
+import asyncio
+import contextlib
+import fcntl
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import duckdb
+import nats.errors
+import structlog
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.js import JetStreamContext
+from nats.js.api import AckPolicy, ConsumerConfig
+from nats.js.errors import NotFoundError
+from pydantic import ValidationError
+
+from bms_estimator.edge.subjects import HOURS_STREAM
+from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.fleet.queries.parquet_files import compact, remove_unfinished, to_compact, write
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.errors import UserError
+
+DURABLE = "collector"
+"""The consumer: who collects goes on where the one before was."""
+PERIOD_S = 300.0
+"""A row waits at most so long for its file: more files of a day are slower to ask [s]."""
+MOST_ROWS = 10_000
+"""Of a file: they wait in memory, 5 kB each."""
+AT_ONCE = 1000
+"""Rows that are fetched at a time."""
+FETCH_S = 0.5
+"""Without any row the loop comes round so often [s]."""
+COMPACT_S = 600.0
+"""Between two looks for days whose files should be one [s]."""
+RETRY_S = 10.0
+"""After a disk, or a server, that did not take it [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+class Collector:
+    """Collects until it is told to stop.
+
+    Args:
+        nc: Connected as the tenant; it reconnects by itself.
+        folder: Of the days.
+        period_s: A row waits at most so long for its file [s].
+        clock: Of wall and monotonic time.
+
+    Attributes:
+        counters: ``rows`` written, ``files``, ``unreadable`` messages, ``faults`` of server and disk.
+    """
+
+    def __init__(self, nc: Client, folder: Path, *, period_s: float = PERIOD_S, clock: Clock | None = None) -> None:
+        self._nc, self._folder, self._period_s, self._clock = nc, folder, period_s, clock or Clock()
+        self._subscription: JetStreamContext.PullSubscription | None = None
+        self._waiting: list[tuple[Msg, Hour]] = []
+        self._first_s = self._compacted_s = self._clock.monotonic()
+        self.counters = Counter[str]()
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Collect until ``stop`` is set; what waits then is written.
+
+        Raises:
+            UserError: The server has no such stream, or has closed the connection for good.
+        """
+        while not stop.is_set():
+            await self._take(await self._fetch(stop))
+            now_s = self._clock.monotonic()
+            if len(self._waiting) >= MOST_ROWS or (self._waiting and now_s - self._first_s >= self._period_s):
+                await self._save(stop)
+            if now_s - self._compacted_s >= COMPACT_S:
+                self._compacted_s = now_s
+                await asyncio.to_thread(compact_days, self._folder, self._clock.wall())
+        if self._waiting:
+            await self._save(stop)
+
+    async def _subscribe(self) -> JetStreamContext.PullSubscription:
+        js = self._nc.jetstream()
+        wait_s = 2.0 * self._period_s + 60.0  # longer than any row waits here: none comes twice while all is well
+        config = ConsumerConfig(
+            durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=wait_s, max_ack_pending=3 * MOST_ROWS
+        )
+        try:
+            await js.add_consumer(HOURS_STREAM, config)
+            return await js.pull_subscribe_bind(DURABLE, HOURS_STREAM)
+        except NotFoundError:
+            raise UserError(
+                f"the server has no stream {HOURS_STREAM}: `bms-estimator fleet serve` makes it when it starts"
+            ) from None
+
+    async def _fetch(self, stop: asyncio.Event) -> Sequence[Msg]:
+        """What has come, at most ``AT_ONCE``; nothing while the server is away."""
+        try:
+            self._subscription = self._subscription or await self._subscribe()
+            return await self._subscription.fetch(AT_ONCE, timeout=FETCH_S)
+        except (nats.errors.TimeoutError, TimeoutError):
+            return ()
+        except nats.errors.Error as error:
+            self._subscription = None
+            if self._nc.is_closed:
+                raise UserError("the server has closed the connection: look at --creds") from None
+            await self._failed("the server gives no rows", error, stop)
+            return ()
+
+    async def _take(self, messages: Sequence[Msg]) -> None:
+        if messages and not self._waiting:
+            self._first_s = self._clock.monotonic()
+        for message in messages:
+            try:
+                row = Hour.model_validate_json(message.data)
+            except ValidationError as error:
+                await self._unreadable(message, error)
+            else:
+                self._waiting.append((message, row))
+
+    async def _unreadable(self, message: Msg, error: ValidationError) -> None:
+        """It will never be readable: it is said, and not asked for again by us; the stream keeps it as long as all."""
+        self.counters["unreadable"] += 1
+        fault = error.errors()[0]
+        reason = f"{'.'.join(map(str, fault['loc'])) or 'all of it'}: {fault['msg']}"
+        log.warning("this is no hour of a pack", subject=message.subject, reason=reason)
+        with contextlib.suppress(nats.errors.Error):  # then it comes again
+            await message.term()
+
+    async def _save(self, stop: asyncio.Event) -> None:
+        """Write what waits, and acknowledge it; what cannot be written comes again."""
+        waiting, self._waiting = self._waiting, []
+        try:
+            files = await asyncio.to_thread(write, self._folder, [row for _, row in waiting])
+        except OSError as error:
+            await self._failed("the rows cannot be written; they come again", error, stop)
+            return
+        self.counters["rows"] += len(waiting)
+        self.counters["files"] += len(files)
+        try:
+            for message, _ in waiting:
+                await message.ack()
+            await self._nc.flush()
+        except (nats.errors.Error, TimeoutError) as error:  # they come again: questions drop what stands there twice
+            await self._failed("what is written could not be acknowledged", error, stop)
+
+    async def _failed(self, what: str, error: Exception, stop: asyncio.Event) -> None:
+        self.counters["faults"] += 1
+        log.warning(what, reason=str(error) or type(error).__name__, again_in_s=RETRY_S)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), RETRY_S)
+
+
+def compact_days(folder: Path, now_s: float) -> None:
+    """Make one file of the many of days that need it; what the disk refuses is said, and tried again later.
+
+    Args:
+        folder: Of the days.
+        now_s: Wall clock [s since 1970].
+    """
+    for day in to_compact(folder, now_s):
+        try:
+            compact(day)
+        except (OSError, duckdb.Error) as error:
+            log.warning("the files of a day stay many", day=str(day), reason=str(error))
+
+
+@contextlib.contextmanager
+def only_collector(folder: Path) -> Iterator[None]:
+    """Write to ``folder`` alone, without what one that was killed has left unfinished.
+
+    Raises:
+        UserError: Another process does, or it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder / ".collector", os.O_CREAT | os.O_RDWR, 0o644)
+    except OSError as error:
+        raise UserError(f"--folder {folder}: cannot be written: {error.strerror}") from error
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"--folder {folder}: another collector writes there; end it, or choose another folder"
+            ) from None
+        remove_unfinished(folder)
+        yield
+    finally:
+        os.close(descriptor)

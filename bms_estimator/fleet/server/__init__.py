@@ -1,0 +1,1 @@
+"""Set-up of nats-server: configuration, JWT claims, credentials."""

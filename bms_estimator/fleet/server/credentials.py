@@ -1,0 +1,155 @@
+"""The folder of a fleet's keys: made where they are missing, each file for its owner alone.
+
+::
+
+    operator.nk              signs accounts; whoever has it may do all
+    claims.json              what servers are told; public, the same on all nodes
+    TENANT/account.nk        is the account
+    TENANT/<role>.nk         signs users of that role, as ``claims.Role`` has them
+    TENANT/admin.creds ...   with which programs connect: admin, worker, reader
+    TENANT/dashboard.token   MQTT's password of who reads estimates
+
+Private keys stay where they were made: other nodes need ``claims.json`` alone.
+"""
+
+import json
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+
+from bms_estimator.fleet.server import jwt_claims
+from bms_estimator.fleet.server.jwt_claims import ACCOUNT, BEARERS, OPERATOR, Key, Role, Tenant
+from bms_estimator.fleet.server.nats_config import Accounts
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.private_file import NotOursError, read_private, write_private
+from bms_estimator.settings.fleet import TenantSettings
+
+CLAIMS = "claims.json"
+_LONGEST_KEY, _LONGEST_CLAIMS = 200, 64 << 20
+"""Bytes of a file."""
+GB = 1_000_000_000
+
+
+def has_keys(folder: Path) -> bool:
+    """Whether this machine has the private keys."""
+    return (folder / "operator.nk").exists()
+
+
+def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: datetime) -> Accounts:
+    """Claims of the operator and of all tenants, with what keys are missing for them made.
+
+    Args:
+        folder: Of the keys; made where it is missing.
+        tenants: By name.
+        now: When credentials that are made are made.
+
+    Raises:
+        UserError: The folder cannot be read or written, or holds what is no key.
+    """
+    operator, system = _key(folder / "operator.nk", OPERATOR), _key(folder / "system.nk", ACCOUNT)
+    accounts = {system.public: jwt_claims.system_account(operator, system.public)}
+    for name, settings in sorted(tenants.items()):
+        tenant = _tenant(folder / name, name, settings)
+        accounts[tenant.public] = jwt_claims.account(operator, tenant)
+        _write_users(folder / name, tenant.public, now)
+    made = Accounts(jwt_claims.operator(operator, system.public), system.public, accounts)
+    _write(folder / CLAIMS, json.dumps(vars(made), indent=1).encode())
+    return made
+
+
+def read_accounts(folder: Path) -> Accounts:
+    """Claims that another machine has made.
+
+    Raises:
+        UserError: There are none, or something else.
+    """
+    path = folder / CLAIMS
+    try:
+        found = Accounts(**json.loads(_read(path, _LONGEST_CLAIMS)))
+    except (ValueError, TypeError):
+        raise UserError(f"{path}: no claims of a fleet: copy the file of the node that has the keys") from None
+    return found
+
+
+def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: datetime | None = None) -> str:
+    """What an edge shows as MQTT's password.
+
+    Args:
+        folder: Of the keys.
+        tenant: Whose pack it is.
+        pack: The only one that it may write.
+        now: Revocation looks at it.
+        expires: From when on it is refused; None: never.
+
+    Raises:
+        UserError: There are no keys of this tenant.
+    """
+    signer, account = folder / tenant / f"{Role.EDGE.value}.nk", folder / tenant / "account.nk"
+    if not signer.exists() or not account.exists():
+        known = sorted(path.parent.name for path in folder.glob("*/account.nk"))
+        there = f"there are {', '.join(known)}" if known else "start `fleet serve` with it first"
+        raise UserError(f"{folder}: no keys of a tenant {tenant}: {there}")
+    return jwt_claims.user(_read_key(signer), _read_key(account).public, Role.EDGE, pack, now, expires)
+
+
+def credentials_file(folder: Path, tenant: str, role: Role) -> Path:
+    """With which a program connects; a token where the role bears one."""
+    return folder / tenant / f"{role.value}.{'token' if role in BEARERS else 'creds'}"
+
+
+def _tenant(folder: Path, name: str, settings: TenantSettings) -> Tenant:
+    signers = {role: _key(folder / f"{role.value}.nk", ACCOUNT) for role in Role}
+    revoked = {
+        jwt_claims.user_key(signers[Role.EDGE], Role.EDGE, pack).public: int(before.timestamp())
+        for pack, before in settings.revoked.items()
+    }
+    return Tenant(
+        name=name,
+        public=_key(folder / "account.nk", ACCOUNT).public,
+        signers={role: key.public for role, key in signers.items()},
+        disk_bytes=None if settings.disk_gb is None else round(GB * settings.disk_gb),
+        revoked=revoked,
+    )
+
+
+def _write_users(folder: Path, account: str, now: datetime) -> None:
+    """What users may do stands in the account's claims, so that these need not be made again."""
+    for role in Role:
+        path = credentials_file(folder.parent, folder.name, role)
+        if role is Role.EDGE or path.exists():
+            continue
+        signer = _read_key(folder / f"{role.value}.nk")
+        token = jwt_claims.user(signer, account, role, role.value, now)
+        key = jwt_claims.user_key(signer, role, role.value)
+        _write(path, token.encode() if role in BEARERS else jwt_claims.credentials(token, key))
+
+
+def _key(path: Path, kind: int) -> Key:
+    """The key of a file, which is made where it is missing."""
+    if not path.exists():
+        _write(path, jwt_claims.new_key(kind).seed)
+    return _read_key(path)
+
+
+def _read_key(path: Path) -> Key:
+    try:
+        return jwt_claims.key_of(_read(path, _LONGEST_KEY).strip())
+    except ValueError:
+        raise UserError(f"{path}: not a key; put the right file back") from None
+
+
+def _read(path: Path, longest: int) -> bytes:
+    try:
+        return read_private(path, longest)
+    except NotOursError as error:
+        raise UserError(f"{path}: {error}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_private(path, content)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,1 @@
+"""Simulated load of a fleet."""

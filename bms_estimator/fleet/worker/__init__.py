@@ -1,0 +1,1 @@
+"""Worker: partitions, checkpoints, block processing."""

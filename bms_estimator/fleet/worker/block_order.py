@@ -1,0 +1,102 @@
+"""In which order a pack's blocks are taken, and what its edge is told: it follows from what came alone.
+
+An edge keeps each block until it is told that all before another one are safe, and sends again from the one that is
+awaited. So of what comes late, twice or too early nothing is needed.
+"""
+
+from enum import Enum
+
+import numpy as np
+
+from bms_estimator.edge.block import Block
+from bms_estimator.edge.subjects import Awaits
+from bms_estimator.fleet.worker.pack_state import MOST_LOST
+
+TOLD_EACH = 10
+"""Blocks: so often an edge hears that those before are safe."""
+ASKED_EACH = 5
+"""Blocks that came too early: so often it hears again from where to send."""
+
+MAX_PASSED = 20
+"""Missing blocks count as lost after the first one behind them has come this many times. The edge resends them all, at least 30 s
+apart, so the server refuses the missing ones, or they are damaged on the edge's disk."""
+
+
+class Order(Enum):
+    """What a block is to the order of its pack."""
+
+    NEXT = "next"
+    RESENT = "resends"
+    """It was taken."""
+    AHEAD = "gaps"
+    """One before it is missing."""
+    FORMER_STORE = "former_store"
+    """Its store is earlier than the present one."""
+
+
+def judge(d: np.void, block: Block) -> Order:
+    """Where a block stands, with what its header tells.
+
+    Args:
+        d: The pack's record of DELIVERY; updated but for ``NEXT`` itself, which ``taken`` notes.
+        block: What came.
+    """
+    store, number = int(d["store"]), int(d["awaited"])
+    if block.store < store:
+        return Order.FORMER_STORE
+    if block.store > store:
+        d["store"], number = block.store, _await(d, 1)
+    if block.oldest > number:
+        number = _lose(d, block.oldest)
+    if block.number < number:
+        return Order.RESENT
+    if block.number > number:
+        d["ahead"] += 1
+        _count_passed(d, block.number)
+        if d["passed"] < MAX_PASSED:
+            return Order.AHEAD
+        _lose(d, block.number)
+    return Order.NEXT
+
+
+def taken(d: np.void) -> None:
+    """The block that was awaited is taken; ``d`` as in ``judge``."""
+    _await(d, int(d["awaited"]) + 1)
+    d["blocks"] += 1
+
+
+def _lose(d: np.void, number: int) -> int:
+    """Count the blocks before a number as lost; returns the number."""
+    d["lost_blocks"] = min(int(d["lost_blocks"]) + number - int(d["awaited"]), MOST_LOST)
+    return _await(d, number)
+
+
+def _count_passed(d: np.void, number: int) -> None:
+    """Count the arrivals of the first block behind the missing ones."""
+    if not d["first_ahead"] or number < d["first_ahead"]:
+        d["first_ahead"], d["passed"] = number, 0
+    d["passed"] += number == d["first_ahead"]
+
+
+def _await(d: np.void, number: int) -> int:
+    """Set the number of the awaited block, reset the counts of early blocks, and return the number."""
+    d["awaited"], d["ahead"], d["first_ahead"], d["passed"] = number, 0, 0, 0
+    return number
+
+
+def answer(order: Order, d: np.void, block: Block, *, first: bool) -> Awaits | None:
+    """What the edge is told of a block.
+
+    Args:
+        order: What it was.
+        d: As in ``judge``, after the block.
+        block: What came.
+        first: Of this pack, since these partitions were taken over.
+    """
+    store, number = int(d["store"]), int(d["awaited"])
+    if order is Order.AHEAD:
+        due = first or int(d["ahead"]) % ASKED_EACH == 1
+        return Awaits(store=store, number=number, resend=True) if due else None
+    if first or block.number % TOLD_EACH == 0:
+        return Awaits(store=store, number=number, resend=False)
+    return None

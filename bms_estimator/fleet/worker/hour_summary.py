@@ -1,0 +1,197 @@
+"""From the blocks of an hour to its row.
+
+The row follows from the stream alone: whoever works a pack's blocks off once more makes the same one.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.edge.block import Block
+from bms_estimator.estimator.estimator import Estimator, TraceBlock
+from bms_estimator.estimator.identified_parameters import current_offset, relative_capacity, relative_series_resistance
+from bms_estimator.fleet.hour_row import HOUR_S, Hour
+from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, OF_HOUR, add_rows
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS
+from bms_estimator.kernels.kalman_filter.hypotheses import pack_std
+from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
+from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.settings.pack import PackSettings
+
+__all__ = ["HOUR_S", "HOUR_SUMS", "Hour", "add", "begin", "hour_of", "row"]
+
+REST_C = 0.01
+"""A pack rests while its current is at most this, in units of the current that empties it in an hour."""
+
+Sums = NDArray[np.void]
+"""Shape (1,), dtype ``HOUR_SUMS``; all zero before the first block."""
+
+
+def hour_of(block: Block) -> int:
+    """The hour a block belongs to, by the edge's clock at its last sample [hours since 1970].
+
+    A block whose last time stamp is not finite belongs to that of its store.
+    """
+    last_s = float(block.samples["time_s"][-1])
+    return int((block.store / 1e9 + (last_s if math.isfinite(last_s) else 0.0)) // HOUR_S)
+
+
+def begin(sums: Sums, record: np.void) -> None:
+    """Begin an hour: counts are of it alone, the last sample stays.
+
+    Args:
+        sums: Updated in place.
+        record: The pack's, of dtype ESTIMATOR_STATE.
+    """
+    for name in OF_HOUR:
+        sums[name] = 0
+    sums["outliers_before"], sums["searches_before"] = record["counters"]["gated"], record["filter"]["reopened"]
+
+
+def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> None:
+    """Add a block.
+
+    Args:
+        sums: Updated in place.
+        trace: What the estimator made of the block's samples.
+        block: The same.
+        estimator: Of the pack, or of any of its type: only its settings are read.
+    """
+    settings = estimator.settings[0]
+    rest_a = REST_C * float(settings["capacity_as"]) / HOUR_S
+    add_rows(sums, trace, int(sums["store"][0]) != block.store, float(settings["gap_s"]), rest_a)
+    sums["store"] = block.store
+    sums["dropped"] += block.samples.size - trace.size
+
+
+def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour:
+    """The finished hour.
+
+    Args:
+        pack: What it is, as its settings have it.
+        hour: Hours since 1970.
+        sums: Of the hour; read only.
+        estimator: With the pack's state at the hour's end; read only.
+    """
+    h, record = sums[0], estimator.record[0]
+    capacity_ah = None if isinstance(estimator.cell, FuelCellModel) else float(estimator.cell.cell.capacity_ah)
+    unknown = dict.fromkeys(Hour.model_fields)
+    values = unknown | _counted(h, record) | _measured(h) | _observed(record) | _identified(estimator)
+    named = {"pack": pack.name, "cell": pack.cell, "series": pack.series, "parallel": pack.parallel}
+    return Hour.model_validate(
+        {name: _finite(value) for name, value in values.items()} | named | {"hour": hour, "capacity_ah": capacity_ah}
+    )
+
+
+def _counted(h: np.void, record: np.void) -> dict[str, object]:
+    return {
+        "samples": int(h["samples"]),
+        "dropped": int(h["dropped"]),
+        "outliers": int(record["counters"]["gated"] - h["outliers_before"]),
+        "searches": int(record["filter"]["reopened"] - h["searches_before"]),
+        "gaps": int(h["gaps"]),
+        "lost_blocks": int(h["lost_blocks"]),
+        "seen_s": float(h["seen_s"]),
+        "rest_s": float(h["rest_s"]),
+        "charge_out_ah": float(h["out_as"]) / HOUR_S,
+        "charge_in_ah": float(h["in_as"]) / HOUR_S,
+        "energy_out_wh": float(h["out_ws"]) / HOUR_S,
+        "energy_in_wh": float(h["in_ws"]) / HOUR_S,
+        "suspects": int(record["checks"]["suspects"]),
+    }
+
+
+def _measured(h: np.void) -> dict[str, object]:
+    """Means and extremes; nothing where no sample was accepted."""
+    values: dict[str, object] = {}
+    for names, unit, count in (
+        ("voltage", "v", "samples"),
+        ("current", "a", "samples"),
+        ("temperature", "c", "temperatures"),
+    ):
+        n = int(h[count])
+        if n:
+            values[f"{names}_{unit}"] = float(h[f"sum_{unit}"]) / n
+            values[f"{names}_min_{unit}"], values[f"{names}_max_{unit}"] = (
+                float(h[f"min_{unit}"]),
+                float(h[f"max_{unit}"]),
+            )
+    if h["samples"]:
+        values["stability_margin_min"] = float(h["min_margin"])
+    if h["innovations"]:
+        values["innovation_rms_v"] = math.sqrt(h["sum_innovation_v2"] / h["innovations"])
+    return values
+
+
+def _observed(record: np.void) -> dict[str, object]:
+    """What the observer says; nothing before the first sample."""
+    s = record["observer"]
+    return {name: float(s[name]) for name in ("soc", "delta_1", "delta_2")} if s["started"] else {}
+
+
+class _Element(NamedTuple):
+    name: str
+    unit: str
+    place: int
+
+
+_ELEMENTS = (
+    _Element("r_s", "ohm", R_S),
+    _Element("r_ts", "ohm", R_TS),
+    _Element("tau_ts", "s", TAU_TS),
+    _Element("r_tl", "ohm", R_TL),
+    _Element("tau_tl", "s", TAU_TL),
+)
+
+
+def _identified(estimator: Estimator) -> dict[str, object]:
+    """What the filter says; nothing without it, and before its first sample."""
+    record, settings = estimator.record[0], estimator.settings_record[0]
+    f = record["filter"]
+    if not (estimator.identifying and f["started"]):
+        return {}
+    capacity, offset, r_s = (
+        relative_capacity(record),
+        current_offset(record),
+        relative_series_resistance(record, settings),
+    )
+    values: dict[str, object] = {
+        "soc_std": float(pack_std(f, settings["filter"])),
+        "soc_mean_std": float(f["soc_std"]),
+        "capacity_ratio": capacity.value,
+        "capacity_ratio_std": capacity.std,
+        "capacity_first_std": float(settings["filter"]["capacity_std"]),
+        "current_offset_a": offset.value,
+        "current_offset_std_a": offset.std,
+        "r_s_ratio": r_s.value,
+        "r_s_ratio_std": r_s.std,
+        "r_s_unlearned_s": r_s.unlearned_s,
+    }
+    covariance = f["covariance"][f["best"]]
+    for name, (j, k) in _CORRELATIONS.items():
+        values[name] = _correlation(covariance, j, k)
+    for element in _ELEMENTS:
+        value = float(record["elements"]["value"][element.place])
+        values[f"{element.name}_{element.unit}"] = value
+        variance = float(record["elements"]["ln_variance"][element.place])
+        values[f"{element.name}_std_{element.unit}"] = value * math.sqrt(variance)
+    return values
+
+
+_CORRELATIONS = {
+    "soc_capacity_correlation": (SOC, LN_Q),
+    "soc_offset_correlation": (SOC, OFFSET),
+    "capacity_offset_correlation": (LN_Q, OFFSET),
+}
+
+
+def _correlation(covariance: NDArray[np.float64], j: int, k: int) -> float:
+    """Of states ``j`` and ``k``; 0 where one of them is taken as known."""
+    variances = float(covariance[j, j] * covariance[k, k])
+    return float(covariance[j, k]) / math.sqrt(variances) if variances > 0.0 else 0.0
+
+
+def _finite(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,24 @@
+"""All that a worker computes with, called once before it connects: nothing compiles while the server waits for an answer."""
+
+import numpy as np
+
+from bms_estimator.edge.block import Block, encode
+from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.service.kernel_warm_up import CELL, load_kernels
+from bms_estimator.settings.pack import Settings
+
+PACK = "a pack"
+HOUR_NS = 3600 * 10**9
+
+
+def load_fleet_kernels() -> None:
+    """Load the kernels that blocks go through; a first start compiles them."""
+    cell, settings = load_cell(CELL), Settings()
+    samples = np.zeros(3, dtype=SAMPLE)
+    samples["time_s"], samples["voltage_v"] = np.arange(3.0), cell.cell.nominal_voltage_v
+    partition = Partition(0, lambda _: (settings, cell))
+    for sequence, store in enumerate((HOUR_NS, 3 * HOUR_NS), 1):  # the second finishes an hour, on another clock
+        partition.take(PACK, encode(Block(store, 1, 1, store / 1e9, samples)), sequence)
+    load_kernels()

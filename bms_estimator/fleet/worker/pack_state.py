@@ -1,0 +1,128 @@
+"""What a worker knows of one pack: which block comes next, what has flowed, the hour's sums, the estimator's record.
+
+One record of numbers, kept packed (``kernels.packed_record``) in bytes that never change: whoever holds them has the pack as it
+was.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.checkpoint.checkpoint_file import fields
+from bms_estimator.checkpoint.restore import fill
+from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
+from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
+from bms_estimator.kernels.packed_record import WORD_BYTES, mirror_of, pack, room, unpack
+from bms_estimator.kernels.records import ESTIMATOR_STATE
+
+Fields = Mapping[str, NDArray[Any]]
+"""Of a record, by their names, those of parts as ``part.field``."""
+MOST_LOST = 2**62
+"""No more lost blocks are counted."""
+
+DELIVERY = np.dtype(
+    [
+        ("store", "u8"),  # the edge's, whose blocks are awaited [ns since 1970]; 0: none came yet
+        ("awaited", "u8"),  # number of the next block
+        ("ahead", "i8"),  # blocks that came since one is missing
+        ("first_ahead", "u8"),  # lowest number of these; 0: none
+        ("passed", "i8"),  # times that it came
+        ("blocks", "i8"),  # taken
+        ("lost_blocks", "i8"),  # that never came
+        ("clock", "u8"),  # store of the last sample's block: its time stamps are since then; 0: no sample came yet
+        ("last_s", "f8"),  # the last sample's time stamp [s]
+        ("hour", "i8"),  # that is summed up now [hours since 1970]; 0: none yet
+        ("made_of", "u8", 2),  # digests of the type of the pack
+        ("meaning", "u8", 2),
+    ],
+    align=True,
+)
+FLOW = np.dtype(
+    [
+        ("charge_out_ah", "f8"),
+        ("charge_in_ah", "f8"),
+        ("energy_out_kwh", "f8"),
+        ("energy_in_kwh", "f8"),
+        ("sums", FLOW_SUMS),
+    ],
+    align=True,
+)
+"""All that has flowed (``telemetry.charge_energy.Flow``), and what ``Meter`` counts in."""
+PACK_STATE = np.dtype(
+    [("delivery", DELIVERY), ("flow", FLOW), ("hour", HOUR_SUMS), ("estimator", ESTIMATOR_STATE)], align=True
+)
+
+
+class StateError(ValueError):
+    """The bytes of a pack are none."""
+
+
+class Bench:
+    """A record on which one pack after the other is worked on.
+
+    Attributes:
+        record: Shape (1,), dtype ``PACK_STATE``.
+    """
+
+    def __init__(self, dtype: np.dtype[Any] = PACK_STATE) -> None:
+        self.record: NDArray[np.void] = np.zeros(1, dtype)
+        self._words = self.record.view(np.uint64)
+        self._mirror = mirror_of(dtype)
+        self._packed = room(self._words.size)
+
+    @property
+    def delivery(self) -> np.void:
+        """The part of dtype ``DELIVERY``."""
+        part: np.void = self.record[0]["delivery"]
+        return part
+
+    def clear(self) -> None:
+        """Lay a pack there of which nothing is known."""
+        self._words.fill(0)
+
+    def put(self, packed: bytes) -> None:
+        """Lay a pack there.
+
+        Raises:
+            StateError: It is none of this layout.
+        """
+        whole = len(packed) % WORD_BYTES == 0
+        if not (whole and unpack(np.frombuffer(packed, np.uint64), self._mirror, self._words)):
+            raise StateError(f"{len(packed)} bytes are no state of a pack")
+
+    def put_former(self, dtype: np.dtype[Any], packed: bytes) -> Fields:
+        """Lay a pack there as another version left it, as far as its fields are known, but for its estimator.
+
+        Args:
+            dtype: Of its record.
+            packed: It.
+
+        Returns:
+            The fields of its estimator, by their names.
+
+        Raises:
+            ValueError: It is none of this layout, or the layout is none of a pack.
+        """
+        former = Bench(dtype)
+        former.put(packed)
+        of_estimator, others = {}, {}
+        for name, value in fields(former.record):
+            part, _, rest = name.partition(".")
+            if part == "estimator":
+                of_estimator[rest] = value
+            else:
+                others[name] = value
+        self.clear()
+        fill(self.record, others)
+        return of_estimator
+
+    def count_lost(self, blocks: int) -> None:
+        """So many blocks of this hour never came."""
+        lost = self.record[0]["hour"]
+        lost["lost_blocks"] = min(int(lost["lost_blocks"]) + blocks, MOST_LOST)
+
+    def take(self) -> bytes:
+        """The pack as it is now."""
+        return self._packed[: pack(self._words, self._mirror, self._packed)].tobytes()

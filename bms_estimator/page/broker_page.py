@@ -1,0 +1,52 @@
+"""The page of a broker: all packs that publish there, whoever serves them."""
+
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+from bms_estimator.mqtt.subscriber import Subscriber
+from bms_estimator.mqtt.topic_cache import Heard
+from bms_estimator.page.history_query import Past
+from bms_estimator.page.pack_topics import Hub
+from bms_estimator.page.page_server import PageServer
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.page import PageSettings
+
+
+@contextlib.asynccontextmanager
+async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) -> AsyncIterator[str]:
+    """Serve while the context lasts.
+
+    Args:
+        broker: Where packs publish.
+        settings: Where the page is served.
+        folder: Where histories are, of the packs that are served on this machine.
+
+    Yields:
+        The page's address.
+
+    Raises:
+        UserError: A setting cannot be used, or the address is taken.
+    """
+    hub, past = Hub(), Past()
+    hub.say_link(f"{', '.join(broker.urls)}: not reached yet")
+
+    def heard(message: Heard) -> None:
+        if message.device not in hub.packs:
+            past.add(message.device, folder / f"{message.device}.sqlite")
+        hub.put(*message)
+        hub.hide(subscriber.hidden)
+
+    def left_out(device: str) -> None:
+        hub.drop(device)
+        past.drop(device)
+        hub.hide(subscriber.hidden)
+
+    def linked() -> None:
+        lost = subscriber.lost_since is not None
+        hub.say_link(subscriber.trouble or "the broker is lost" if lost else None)
+
+    async with PageServer(settings, hub, past, patient=False) as server:
+        subscriber = Subscriber(broker, heard, linked, left_out=left_out)
+        async with subscriber:
+            yield server.url

@@ -1,0 +1,166 @@
+"""The newest payload of each topic of each pack. No connection, no clock of its own."""
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from bms_estimator.page.event_stream import Newest
+from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
+from bms_estimator.store.minute import epoch_s
+
+PACKS = "packs"
+"""Key of the names of all packs and of the number of packs that are not shown."""
+STATE, PARAMETERS, RECENT, ELEMENTS = "state", "parameters", "recent", "elements"
+"""Topics of the estimate and of the parameters, and what there is here beside the topics of MQTT."""
+SHOWN = frozenset({STATE, PARAMETERS, "health", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY})
+ALARM = "alarm/"
+ELEMENTS_OVER_SOC = frozenset({"r_s_ohm", "r_ts_ohm", "c_ts_farad", "r_tl_ohm", "c_tl_farad"})
+RECENT_STATES = 600
+RECENT_STEP_S = 1.0
+"""Between the states that are kept for the curves of whoever opens the page later [s]."""
+MAX_AHEAD_S = 86_400.0
+"""Maximum lead of a state's time over the wall clock [s]."""
+SET_BACK_S = 60.0
+"""A state leads by a wrong clock if it leads the wall clock and the next state by more than this [s]."""
+RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
+
+_Row = tuple[float, tuple[float | None, ...]]
+"""Seconds since 1970, and what ``RECENT_FIELDS`` were."""
+
+
+class Hub(Newest):
+    """What is known of all packs.
+
+    Keys are ``<pack>/<topic>``, values JSON as text in one line.
+
+    Args:
+        wall: Wall clock, seconds since 1970.
+    """
+
+    def __init__(self, wall: Callable[[], float] = time.time) -> None:
+        super().__init__()
+        self._wall, self._hidden = wall, 0
+        self._topics: dict[str, dict[str, str]] = {}
+        self._recent: dict[str, deque[_Row]] = {}
+        self._learned: dict[str, dict[str, dict[int, tuple[float, float]]]] = {}
+
+    @property
+    def packs(self) -> list[str]:
+        """Names of the packs, as they came."""
+        return list(self._topics)
+
+    def put(self, pack: str, topic: str, value: Any) -> None:
+        """Take what a pack publishes, of the topics that are shown.
+
+        Args:
+            pack: Its name.
+            topic: Below the pack's.
+            value: The payload as JSON has it, or text; None: the topic was emptied.
+        """
+        if topic not in SHOWN and not topic.startswith(ALARM):
+            return
+        try:
+            text = _json(value)
+        except RecursionError:  # somebody else's: deeper than it could be written
+            return
+        if value is None:
+            self._forget(pack, topic)
+        else:
+            self._add(pack)[topic] = text
+        if topic == STATE and isinstance(value, dict):
+            self._remember(pack, value)
+        if topic == PARAMETERS and isinstance(value, dict):
+            self._learn(pack, value)
+        self.hand_on(f"{pack}/{topic}")
+
+    def drop(self, pack: str) -> None:
+        """Remove a pack."""
+        if self._topics.pop(pack, None) is None:
+            return
+        self._recent.pop(pack, None)
+        self._learned.pop(pack, None)
+        self._publish_packs()
+
+    def hide(self, count: int) -> None:
+        """Report the number of packs that are not shown."""
+        if count != self._hidden:
+            self._hidden = count
+            self._publish_packs()
+
+    def keys(self) -> list[str]:
+        """Return the keys that a new reader is sent."""
+        keys = super().keys()
+        for pack, topics in self._topics.items():
+            keys += [f"{pack}/{topic}" for topic in (*topics, RECENT, ELEMENTS)]
+        return keys
+
+    def text(self, key: str) -> str | None:
+        """Return the newest text of a key; None: its pack is gone."""
+        pack, slash, topic = key.partition("/")
+        if not slash:
+            return super().text(key)
+        if pack not in self._topics:
+            return None
+        if topic == RECENT:
+            return _json(_columns(self._recent.get(pack, ())))
+        if topic == ELEMENTS:
+            return _json(self._learned.get(pack, {}))
+        return self._topics[pack].get(topic, "null")
+
+    def _add(self, pack: str) -> dict[str, str]:
+        """Return the topics of a pack, which is added if it is new."""
+        if pack not in self._topics:
+            self._topics[pack] = {}
+            self._publish_packs()
+        return self._topics[pack]
+
+    def _forget(self, pack: str, topic: str) -> None:
+        """Remove a topic, and the pack with its last one."""
+        topics = self._topics.get(pack, {})
+        topics.pop(topic, None)
+        if not topics:
+            self.drop(pack)
+
+    def _publish_packs(self) -> None:
+        self.say(PACKS, _json({"names": self.packs, "hidden": self._hidden}))
+
+    def _remember(self, pack: str, state: Mapping[str, Any]) -> None:
+        """Keep what the curves show, once a second; a state that comes late or is dated far in the future is left out."""
+        try:
+            row = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
+        except (TypeError, ValueError, KeyError):  # somebody else's
+            return
+        if row[0] > self._wall() + MAX_AHEAD_S:  # all later states would be ignored
+            return
+        rows = self._recent.setdefault(pack, deque(maxlen=RECENT_STATES))
+        while rows and rows[-1][0] > max(row[0], self._wall()) + SET_BACK_S:
+            rows.pop()
+        if not rows or row[0] >= rows[-1][0] + RECENT_STEP_S:
+            rows.append(row)
+
+    def _learn(self, pack: str, report: Mapping[str, Any]) -> None:
+        """Keep what an element was, with its standard deviation, at each percent of SOC."""
+        soc, elements = _number(report.get("soc")), report.get("elements")
+        if soc is None or not 0.0 <= soc <= 1.0 or not isinstance(elements, dict):
+            return
+        for name in ELEMENTS_OVER_SOC & elements.keys():
+            of = elements[name] if isinstance(elements[name], dict) else {}
+            value, std = _number(of.get("value")), _number(of.get("std"))
+            if of.get("valid") is True and value is not None and std is not None:
+                self._learned.setdefault(pack, {}).setdefault(name, {})[round(100.0 * soc)] = value, std
+
+
+def _columns(rows: Iterable[_Row]) -> dict[str, list[float | None]]:
+    """By name."""
+    found: dict[str, list[float | None]] = {"time_s": [time_s for time_s, _ in rows]}
+    return found | {field: [values[i] for _, values in rows] for i, field in enumerate(RECENT_FIELDS)}
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, allow_nan=False, separators=(",", ":"))
+
+
+def _number(value: Any) -> float | None:
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None

@@ -1,0 +1,71 @@
+"""The server of the live page of packs: a hub, and what was."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from aiohttp import web
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.page.history_query import SPANS, Past
+from bms_estimator.page.pack_topics import Hub
+from bms_estimator.page.web_server import File, WebServer
+from bms_estimator.settings.page import PageSettings
+
+HISTORY_S = 10.0
+"""A disk that has not answered by then hangs [s]."""
+
+STATIC = Path(__file__).with_name("static")
+FILES = {
+    "/": File(STATIC / "index.html", "text/html"),
+    "/style.css": File(STATIC / "style.css", "text/css"),
+    "/page.js": File(STATIC / "page.js", "text/javascript"),
+    "/live.js": File(STATIC / "live.js", "text/javascript"),
+    "/format.js": File(STATIC / "format.js", "text/javascript"),
+    "/charts.js": File(STATIC / "charts.js", "text/javascript"),
+    "/uplot.js": File(STATIC / "uplot.js", "text/javascript"),
+    "/icon.svg": File(STATIC / "icon.svg", "image/svg+xml"),
+}
+"""All that is served, by its path."""
+
+
+class PageServer(WebServer):
+    """Serves a hub while the context lasts.
+
+    Args:
+        settings: Where, and to whom.
+        hub: What is shown.
+        past: What was.
+        opened: Called with its address once it is served.
+        patient: An address that is taken, or not there yet, is tried again; else it is an error.
+
+    Raises:
+        UserError: The token cannot be read.
+    """
+
+    def __init__(
+        self,
+        settings: PageSettings,
+        hub: Hub,
+        past: Past,
+        *,
+        opened: Callable[[str], object] = str,
+        patient: bool = True,
+    ) -> None:
+        super().__init__(settings, FILES, hub, {"/history": self._history}, opened=opened, patient=patient)
+        self._past = past
+        self._histories = asyncio.Semaphore(4)
+
+    async def _history(self, request: web.Request) -> web.StreamResponse:
+        pack, span = request.query.get("pack", ""), request.query.get("span", "")
+        if span not in SPANS:
+            raise web.HTTPBadRequest(text=f"span: must be one of {', '.join(SPANS)}\n")
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(HISTORY_S), self._histories:
+                body = await loop.run_in_executor(self._past.thread, self._past.read, pack, span)
+        except UserError as error:
+            raise web.HTTPNotFound(text=f"{error}\n") from None
+        except TimeoutError:
+            raise web.HTTPServiceUnavailable(text="the disk does not answer\n") from None
+        return web.Response(body=body, content_type="application/json", headers={"Cache-Control": "no-store"})

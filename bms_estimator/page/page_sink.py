@@ -1,0 +1,119 @@
+"""The feed of a service: its packs' snapshots as the payloads that MQTT gets, and one server for those that share an address."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Self
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.topic_cache import parsed
+from bms_estimator.page.history_query import Past
+from bms_estimator.page.pack_topics import Hub
+from bms_estimator.page.page_server import PageServer
+from bms_estimator.settings.page import PageSettings
+from bms_estimator.sinks.mqtt.messages import Message, Messages, Sent
+
+
+class PageSink:
+    """Shows one pack's snapshots.
+
+    Args:
+        pages: The servers of this process.
+        settings: Where it is shown.
+        pack: Its name.
+        history: Where its history is kept; None: nowhere.
+    """
+
+    def __init__(self, pages: "Pages", settings: PageSettings, pack: str, history: Path | None = None) -> None:
+        self._pages, self._settings, self._pack, self._history = pages, settings, pack, history
+        self._messages = Messages("", pack)
+        self._before: Snapshot | None = None
+        self._sent = Sent()
+        self._hub = Hub()
+        self._stack = contextlib.AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        """Serve."""
+        self._hub = await self._stack.enter_async_context(
+            self._pages.serving(self._settings, self._pack, self._history)
+        )
+        self._put(self._messages.greeting())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Say that nothing more will come, and part from the browsers."""
+        self._put(self._messages.farewell())
+        await self._stack.aclose()
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Take a snapshot; returns at once."""
+        now_s = asyncio.get_running_loop().time()
+        messages, self._sent = self._messages.due(self._sent, snapshot, now_s)
+        self._put(self._messages.kept(self._before, snapshot) + messages)
+        self._before = snapshot
+
+    def _put(self, messages: list[Message]) -> None:
+        root = f"{self._messages.root}/"
+        for message in messages:
+            if message.topic.startswith(root):
+                self._hub.put(self._pack, message.topic.removeprefix(root), parsed(message.payload))
+
+
+class Pages:
+    """The servers of a process, one for each address that its packs name.
+
+    Args:
+        opened: Called with the address of each once it is served.
+    """
+
+    def __init__(self, opened: Callable[[str], object] = str) -> None:
+        self._opened = opened
+        self._open: dict[str, _Page] = {}
+
+    @contextlib.asynccontextmanager
+    async def serving(self, settings: PageSettings, pack: str, history: Path | None) -> AsyncIterator[Hub]:
+        """Have a pack shown; the first one starts the server of its address, the last one ends it.
+
+        Raises:
+            UserError: Two packs name one address with different tokens, or the token cannot be read.
+        """
+        page = self._open.get(settings.listen)
+        if page is None:
+            page = self._open[settings.listen] = _Page(settings, self._opened)
+        page.packs += 1
+        try:
+            if page.settings != settings:
+                raise UserError(f"page: packs that share listen = {settings.listen} must share token_file and hosts")
+            if history:
+                page.past.add(pack, history)
+            await page.start()
+            yield page.hub
+        finally:
+            page.packs -= 1
+            if not page.packs:
+                del self._open[settings.listen]
+                await page.stop()
+
+
+class _Page:
+    """One server, and the packs that it shows."""
+
+    def __init__(self, settings: PageSettings, opened: Callable[[str], object]) -> None:
+        self.settings, self.packs = settings, 0
+        self.hub, self.past = Hub(), Past()
+        self._server = PageServer(settings, self.hub, self.past, opened=opened)
+        self._started: asyncio.Task[PageServer] | None = None
+
+    async def start(self) -> None:
+        """Once, whoever of the packs comes first."""
+        if self._started is None:
+            self._started = asyncio.ensure_future(self._server.__aenter__())
+        await asyncio.shield(self._started)
+
+    async def stop(self) -> None:
+        """End the server, where it was started."""
+        if self._started is not None:
+            await asyncio.wait([self._started])
+            await self._server.__aexit__(None, None, None)

@@ -1,0 +1,243 @@
+"""An HTTP server of pages: their files, the stream of what is new, what is asked for; nothing can be changed through it."""
+
+import asyncio
+import contextlib
+import hashlib
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple, Self, cast
+
+import structlog
+from aiohttp import web
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.page.access_control import HEADERS, Guard, guard_of
+from bms_estimator.page.event_stream import Newest, Reader
+from bms_estimator.page.listener import CONNECTIONS, Listener
+from bms_estimator.settings.page import Listen, PageSettings
+
+PING_S = 5.0
+"""A reader who hears nothing for so long hears that all is well: the page takes three times that for a lost line [s]."""
+WRITE_S = 30.0
+"""One who takes nothing for so long is gone [s]."""
+MAX_STREAMS = 32
+"""Streams at a time, of all packs together."""
+AGAIN_S = 10.0
+"""Before an address that is taken is tried again [s]."""
+CLOSING_S = 1.0
+
+ASK = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>bms_estimator</title><form action="/" method="get">
+<p><label>Token <input name="token" type="password" autofocus autocomplete="off"></label> <button>Open</button></p>
+<p>It stands in the file that token_file names where the page is served.</p></form></html>"""
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+log = structlog.get_logger(__name__)
+
+
+class File(NamedTuple):
+    """What is served as it stands."""
+
+    path: Path
+    kind: str
+    """Its media type."""
+
+
+class _Read(NamedTuple):
+    body: bytes
+    kind: str
+    tag: str
+
+
+class _Stream(NamedTuple):
+    address: str | None
+    transport: asyncio.Transport | None
+
+
+class WebServer:
+    """Serves while the context lasts.
+
+    Args:
+        settings: Where, and to whom.
+        files: What is served as it stands, by the path of its URL.
+        newest: What is streamed from ``/events``.
+        handlers: What else is answered, by path.
+        opened: Called with its address once it is served.
+        patient: An address that is taken, or not there yet, is tried again; else it is an error.
+
+    Raises:
+        UserError: The token cannot be read.
+    """
+
+    def __init__(
+        self,
+        settings: PageSettings,
+        files: Mapping[str, File],
+        newest: Newest,
+        handlers: Mapping[str, Handler],
+        *,
+        opened: Callable[[str], object] = str,
+        patient: bool = True,
+    ) -> None:
+        self._newest, self._opened, self._patient = newest, opened, patient
+        self._guard: Guard = guard_of(settings)
+        self._wanted, self._listening = settings.address, settings.address
+        self._files = {path: _read(file) for path, file in files.items()}
+        self._handlers = {**dict.fromkeys(files, self._file), "/events": self._events, **handlers}
+        self._streams: dict[Reader, _Stream] = {}
+        self._runner: web.AppRunner | None = None
+        self._listener: Listener | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def url(self) -> str:
+        """Where a browser on this machine finds it."""
+        host, port = self._listening
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 - told, and with a token only
+        return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+
+    async def __aenter__(self) -> Self:
+        """Listen.
+
+        Raises:
+            UserError: The address cannot be had, and we are not patient.
+        """
+        app = web.Application(middlewares=[self._check], client_max_size=1024)
+        app.on_response_prepare.append(_protect)
+        for path, handler in self._handlers.items():
+            app.router.add_get(path, handler)
+        self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=CLOSING_S)
+        await self._runner.setup()
+        try:
+            await self._listen(self._runner)
+        except OSError as error:
+            if not self._patient:
+                await self._runner.cleanup()
+                raise UserError(f"page.listen = {_text(self._wanted)}: {error.strerror}; name another one") from None
+            log.warning("the page is not served yet", listen=_text(self._wanted), reason=error.strerror)
+            self._task = asyncio.create_task(self._listen_later(self._runner), name="page")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Part from all browsers."""
+        if self._task:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+        self._newest.close()
+        if self._listener:
+            await self._listener.close()
+        if self._runner:
+            await self._runner.cleanup()
+
+    async def _listen(self, runner: web.AppRunner) -> None:
+        """Take the address.
+
+        Raises:
+            OSError: It cannot be had.
+        """
+        listener = Listener(cast("web.Server", runner.server))
+        port = await listener.open(self._wanted.host, self._wanted.port)
+        self._listener = listener
+        self._listening = self._wanted._replace(port=port)
+        log.info("live page", url=self.url)
+        self._opened(self.url)
+
+    async def _listen_later(self, runner: web.AppRunner) -> None:
+        while True:
+            await asyncio.sleep(AGAIN_S)
+            try:
+                return await self._listen(runner)
+            except OSError:  # said already
+                continue
+
+    @web.middleware
+    async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Exempt the connection from displacement while its request is handled."""
+        with CONNECTIONS.serving(request.transport):
+            return await self._checked(request, handler)
+
+    async def _checked(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Require a permitted host name and the token."""
+        if not self._guard.knows_host(request.headers.get("Host", "")):
+            raise web.HTTPForbidden(text="not under this name: add it to page.hosts, or --host\n")
+        shown = request.query.get("token")
+        if shown is not None and self._guard.knows_token(shown):
+            return self._let_in()
+        given = request.headers.get("Authorization", "")
+        if self._guard.knows_cookie(request.cookies.get(self._cookie, "")):
+            return await handler(request)
+        if given.startswith("Bearer ") and self._guard.knows_token(given.removeprefix("Bearer ")):
+            return await handler(request)
+        raise web.HTTPUnauthorized(text=ASK, content_type="text/html", headers={"WWW-Authenticate": "Bearer"})
+
+    @property
+    def _cookie(self) -> str:
+        """Cookies are of a host, whatever the port."""
+        return f"bms_page_{self._listening.port}"
+
+    def _let_in(self) -> web.Response:
+        """Have the browser keep a cookie, and leave the address with the token behind."""
+        response = web.Response(status=303, headers={"Location": "/"})
+        response.set_cookie(self._cookie, self._guard.cookie, max_age=31_536_000, httponly=True, samesite="Strict")
+        return response
+
+    async def _file(self, request: web.Request) -> web.StreamResponse:
+        file = self._files[request.path]
+        headers = {"ETag": file.tag, "Cache-Control": "no-cache"}
+        if request.headers.get("If-None-Match") == file.tag:
+            return web.Response(status=304, headers=headers)
+        return web.Response(body=file.body, content_type=file.kind, charset="utf-8", headers=headers)
+
+    async def _events(self, request: web.Request) -> web.StreamResponse:
+        """Stream all known texts, then changes, until either side closes."""
+        response = web.StreamResponse(
+            headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        )
+        with self._newest.reading() as reader, self._streaming(reader, request):
+            await response.prepare(request)
+            await response.write(b"retry: 1000\n\n")
+            while not reader.closed:
+                text = await reader.next(PING_S)
+                try:
+                    async with asyncio.timeout(WRITE_S):
+                        await response.write(f"data: {text or '{}'}\n\n".encode())
+                except (TimeoutError, ConnectionError):
+                    break
+        return response
+
+    @contextlib.contextmanager
+    def _streaming(self, reader: Reader, request: web.Request) -> Iterator[None]:
+        """Register a stream, closing another one if there are too many."""
+        if len(self._streams) >= MAX_STREAMS:
+            self._close_one(request.remote)
+        self._streams[reader] = _Stream(request.remote, request.transport)
+        try:
+            yield
+        finally:
+            self._streams.pop(reader, None)
+
+    def _close_one(self, newcomer: str | None) -> None:
+        """Close the oldest stream of the address with most streams; the newcomer's address is preferred in a tie."""
+        counts = Counter(stream.address for stream in self._streams.values())
+        most = max(counts, key=lambda address: (counts[address], address == newcomer))
+        reader = next(reader for reader, stream in self._streams.items() if stream.address == most)
+        transport = self._streams.pop(reader).transport
+        reader.close()
+        if transport:
+            transport.abort()  # its reader may be waiting for a client that reads nothing
+
+
+async def _protect(_: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(HEADERS)
+    response.headers.pop("Server", None)
+
+
+def _read(file: File) -> _Read:
+    body = file.path.read_bytes()
+    return _Read(body, file.kind, f'"{hashlib.sha256(body).hexdigest()[:16]}"')
+
+
+def _text(listen: Listen) -> str:
+    return f"{listen.host}:{listen.port}"

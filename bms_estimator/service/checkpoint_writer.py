@@ -1,0 +1,134 @@
+"""When the state is saved: with the first sample, as the SOC moves, once in a while, and at the end."""
+
+import asyncio
+import math
+from collections.abc import Callable
+
+import numpy as np
+import structlog
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, Ledger
+from bms_estimator.estimator import Estimator
+from bms_estimator.service.publisher import Publisher
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.lifetime_totals import Tally
+
+SAVED_SOC = 0.002
+"""How far the SOC may go from that of the checkpoint: a kill costs no more, beside what moves until the next start."""
+LOOK_S = 1.0
+"""How often it is seen how far it has gone [s]."""
+HUNG_S = 10.0
+"""A disk that has not taken the state for so long is said to hang [s]."""
+LAST_S = 5.0
+"""So long the end waits for the disk: who stops us waits for no more than a minute or so [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+class Saving:
+    """Saves what samples have taught; the disk is waited for in a thread, and nothing else waits for it.
+
+    Args:
+        checkpoint: Where to.
+        estimator: Read only.
+        publisher: Is told what becomes of it.
+        tally: What is counted over restarts.
+        restarts: Starts that found a checkpoint.
+        every_s: How often is saved at least [s].
+
+    Attributes:
+        every_s: May be changed.
+    """
+
+    def __init__(
+        self,
+        checkpoint: CheckpointFile,
+        estimator: Estimator,
+        publisher: Publisher,
+        tally: Tally,
+        *,
+        restarts: int,
+        every_s: float,
+    ) -> None:
+        self.every_s = every_s
+        self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
+        self._tally, self._restarts = tally, restarts
+        self._alarms = publisher.watch.alarms.kept  # as the disk has them
+        publisher.kept = tally.flow
+        self._saved: tuple[int, float] | None = None
+        """Samples and SOC of the state that was saved last; None: none was by this run."""
+
+    async def save_often(self) -> None:
+        """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC``, a latching alarm turns or a first sample is there."""
+        await self._write(self._mark(clean=False))  # from now on a run that leaves no word has crashed
+        loop = asyncio.get_running_loop()
+        saved_s, failed = -math.inf, False
+        while True:
+            await asyncio.sleep(min(LOOK_S, self.every_s))
+            moved = self._saved is None or abs(self._estimator.state["soc"][0] - self._saved[1]) >= SAVED_SOC
+            moved = moved or self._alarms != self._publisher.watch.alarms.kept
+            if loop.time() >= saved_s + self.every_s or (moved and not failed):
+                failed = not await self._save()
+                saved_s = loop.time()
+
+    async def save_last(self, *, clean: bool) -> None:
+        """Save as the run ends, by itself where it is ``clean``; a disk that hangs is left alone after ``LAST_S``."""
+        try:
+            async with asyncio.timeout(LAST_S):
+                await self._save(clean=clean)
+        except TimeoutError:
+            log.warning("the disk hangs: the last checkpoint is not written", file=str(self._checkpoint.path))
+
+    @property
+    def _taught(self) -> tuple[int, float]:
+        """Samples and SOC now."""
+        state = self._estimator.state[0]
+        return int(state["samples"]), float(np.nan_to_num(state["soc"]))  # a fuel cell has none, NaN equals nothing
+
+    async def _save(self, *, clean: bool = False) -> bool:
+        """Save what is not saved yet: False, it cannot be written.
+
+        What is saved already keeps its time: it would seem to be of now, and not of before nobody measured.
+        """
+        taught, ledger = self._taught, self._ledger(clean=clean)
+        if not taught[0] or taught == self._saved:
+            if clean or self._alarms != ledger.alarms:
+                return await self._write_with(ledger, lambda: self._checkpoint.mark(ledger))
+            return True
+        state = self._estimator.record.copy()
+        if not await self._write_with(ledger, lambda: self._checkpoint.save(state, ledger)):
+            self._publisher.kept = None
+            return False
+        self._publisher.checkpoint, self._saved, self._publisher.kept = "saved", taught, Flow.of(ledger.total)
+        return True
+
+    def _mark(self, *, clean: bool) -> Callable[[], None]:
+        ledger = self._ledger(clean=clean)
+        return lambda: self._checkpoint.mark(ledger)
+
+    def _ledger(self, *, clean: bool) -> Ledger:
+        return Ledger(self._restarts, self._tally.total, clean, self._publisher.watch.alarms.kept)
+
+    async def _write_with(self, ledger: Ledger, write: Callable[[], None]) -> bool:
+        """As ``_write``; then the disk has the alarms, too."""
+        written = await self._write(write)
+        if written:
+            self._alarms = ledger.alarms
+        return written
+
+    async def _write(self, write: Callable[[], None]) -> bool:
+        """Have the disk take something. False: it does not."""
+        file = str(self._checkpoint.path)
+        future = asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, write)
+        try:
+            await asyncio.wait({future}, timeout=HUNG_S)  # wait_for of Python 3.11 may swallow that we are to end
+            if not future.done():
+                self._publisher.checkpoint = "not saved: the disk hangs"
+                log.warning("checkpoint cannot be saved", file=file, error="the disk hangs")
+            await future
+            self._publisher.disk_free_mib = self._checkpoint.disk_free_mib
+        except OSError as error:
+            self._publisher.checkpoint = f"cannot be saved: {error}"
+            log.warning("checkpoint cannot be saved", file=file, error=str(error))
+            return False
+        return True

@@ -1,0 +1,85 @@
+"""The service of a pack whose samples are only sent, as ``bms-estimator edge`` starts it."""
+
+import asyncio
+from pathlib import Path
+
+import structlog
+
+from bms_estimator.edge.block_sender import Edge
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.instance_lock import alone
+from bms_estimator.process.log_setup import set_level
+from bms_estimator.process.signals import stop_on_signal, until_first_ends
+from bms_estimator.process.systemd import Notifier
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.line_source import Reports
+from bms_estimator.sources.serial.known_board_file import BoardMemory
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.source import Source
+
+UNTENDED_S = 30.0
+"""A source whose task has not turned for so long hangs [s]."""
+PAT_S = 5.0
+"""How often systemd hears how it is, unless its watchdog wants it sooner [s]."""
+REPORT_S = 3600.0
+"""How often the log says what has become of the blocks [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+async def serve_edge(
+    settings: Settings, folder: Path, *, stop: asyncio.Event | None = None, notifier: Notifier | None = None
+) -> None:
+    """Send samples until SIGINT or SIGTERM.
+
+    Args:
+        settings: The pack's settings, with ``[edge]``.
+        folder: Where blocks are kept.
+        stop: Set by someone else to end as a signal does.
+        notifier: Who hears that the loop is ready and alive.
+
+    Raises:
+        UserError: A setting that cannot be used.
+    """
+    if settings.edge is None:
+        raise UserError('edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"')
+    stop, name = stop_on_signal(stop), settings.pack.name
+    notifier = notifier or Notifier([name], doing="sending samples of")
+    set_level(name, settings.log.level)
+    source = open_reports(settings) or SerialBoard(settings.sensor, memory=BoardMemory(folder, name))
+    with alone(folder, name):
+        async with Edge(settings.edge, name, folder) as edge, source:
+            notifier.ready(name)
+            try:
+                await until_first_ends(
+                    _take(source, edge), _keep_alive(source, edge, notifier, name), _report(edge), stop.wait()
+                )
+            finally:
+                notifier.stopping(name)
+
+
+async def _take(source: Source, edge: Edge) -> None:
+    async for samples in source:
+        edge.take(samples)
+        await asyncio.sleep(0)  # a source that always has samples must not starve who sends them
+
+
+async def _keep_alive(source: SerialBoard | Reports, edge: Edge, notifier: Notifier, name: str) -> None:
+    """Pat the watchdog while somebody looks after the line, and say how it is."""
+    said = ""
+    while True:
+        if source.pulse().untended_s <= UNTENDED_S:
+            notifier.alive(name)
+        status = f"no samples: {source.message}" if source.message else f"{edge.store.waiting} blocks not sent"
+        if status != said:
+            notifier.status(name, status)
+            said = status
+        await asyncio.sleep(min(PAT_S, notifier.watchdog_s / 3.0 or PAT_S))
+
+
+async def _report(edge: Edge) -> None:
+    """Say in the log, at times, what has become of the blocks."""
+    while True:
+        await asyncio.sleep(REPORT_S)
+        log.info("blocks of samples", **edge.health().model_dump())

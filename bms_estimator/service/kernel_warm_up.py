@@ -1,0 +1,36 @@
+"""Everything a live run computes with, called once before it begins: nothing compiles once samples come."""
+
+import gc
+
+import numpy as np
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+from bms_estimator.service.live_loop import new_estimator
+from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.charge_energy import Flow, Meter
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.remaining_charge import remaining_charge
+
+CELL = "chen_mora"
+"""Any: kernels are the same for all."""
+
+
+def load_kernels() -> None:
+    """Load the kernels of decoder, estimator and reports; a first start compiles them."""
+    _ = FrameDecoder().clock_ppm
+    cell = load_cell(CELL)
+    estimator = new_estimator(Settings(), cell)
+    sample = np.zeros(1, dtype=SAMPLE)
+    sample["voltage_v"] = cell.cell.nominal_voltage_v
+    trace = estimator.run(sample)
+    Meter(Flow(), 1.0).add(trace)
+    Window().add(trace, 0.0)
+    estimator.set_soc(0.5)
+    estimator.resume(0.0)
+    parameter_report(estimator, 0.0)
+    remaining_charge(estimator, 0.0)
+    gc.collect()
+    gc.freeze()  # numba's objects stay: to look through them again and again stops the loop for 100 ms each time

@@ -1,0 +1,314 @@
+"""The live loop: source -> estimator -> window -> sinks."""
+
+import asyncio
+import contextlib
+import math
+import reprlib
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import structlog
+
+from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointFile, Ledger
+from bms_estimator.checkpoint.restore import resume
+from bms_estimator.edge.block_sender import Edge
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.model.clock import Clock, since_boot
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.payloads import RecordingHealth
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.process.signals import until_first_ends
+from bms_estimator.process.stderr_writer import stderr
+from bms_estimator.process.systemd import Notifier
+from bms_estimator.service.alarm_hooks import Hooks
+from bms_estimator.service.checkpoint_writer import Saving
+from bms_estimator.service.publisher import Publisher
+from bms_estimator.service.settings_reload import Reload
+from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
+from bms_estimator.sinks.mqtt.requests import Requests, number
+from bms_estimator.sinks.sink import Delivery, Sink
+from bms_estimator.sources.source import Pulse, Source
+from bms_estimator.telemetry.lifetime_totals import Tally, new_totals
+
+LAG_STEP_S = 0.1
+"""How often the loop's lag is measured [s]: what blocks it for longer is always seen."""
+STATUS_S = 60.0
+"""How often systemd hears of a new SOC; that samples come or cease it hears at once [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+async def run_live(
+    settings: Settings,
+    cell: PackModel,
+    *,
+    source: Source,
+    sinks: Sequence[Sink],
+    stop: asyncio.Event,
+    checkpoint: CheckpointFile | None = None,
+    requests: Requests | None = None,
+    delivery: Delivery | None = None,
+    current_zero: Callable[[], Awaitable[None]] | None = None,
+    notifier: Notifier | None = None,
+    clock: Clock | None = None,
+    reload: Reload | None = None,
+    pulse: Callable[[], Pulse] | None = None,
+    recording: Callable[[], RecordingHealth | None] = lambda: None,
+    hooks: Hooks | None = None,
+    edge: Edge | None = None,
+) -> Estimator:
+    """Estimate until the source ends or ``stop`` is set.
+
+    Args:
+        settings: The pack's settings.
+        cell: The pack as one object (``CellModel.pack``).
+        source: Where samples come from; opened and closed here.
+        sinks: Where snapshots go; opened and closed here.
+        stop: Set to end cleanly.
+        checkpoint: Where the state outlives a restart; None: it does not.
+        requests: Where this loop offers what it can answer.
+        delivery: What became of what was sent and asked.
+        current_zero: Has the board take the present current as zero; None: it cannot.
+        notifier: Who hears that the loop is ready and alive.
+        clock: The clocks.
+        reload: Where this loop offers what it can change while it runs; None: nothing is read anew.
+        pulse: Whether the source lives; None: it does not say.
+        recording: State of a recording; None where nothing is recorded.
+        hooks: What is done of alarms; opened and closed here.
+        edge: Gets all samples, too, as they come; None: they are sent nowhere. Opened and closed by who made it.
+
+    Returns:
+        The estimator as the last sample left it.
+    """
+    name, clock = settings.pack.name, clock or Clock()
+    hooks = hooks or Hooks((), name, None, None)
+    notifier = notifier or Notifier([name])
+    estimator = new_estimator(settings, cell)
+    ledger, restored = _restore(estimator, checkpoint, clock)
+    restored_s = since_boot()
+    tally = Tally(estimator, ledger.total)
+    publisher = Publisher(
+        settings,
+        cell,
+        estimator,
+        source=source,
+        sinks=sinks,
+        clock=clock,
+        restarts=ledger.restarts,
+        tally=tally,
+        checkpoint=restored,
+        delivery=delivery,
+        pulse=pulse,
+        recording=recording,
+        edge=edge.health if edge else lambda: None,
+        hooks=lambda: hooks.health,
+        on_alarm=hooks.tell,
+    )
+    _restore_alarms(publisher, ledger.alarms)
+    hooks.begin(publisher.watch.alarms.report())
+    if requests is not None:
+        _offer(requests, estimator, publisher, current_zero)
+    every_s = settings.state.checkpoint_s
+    saving = (
+        Saving(checkpoint, estimator, publisher, tally, restarts=ledger.restarts, every_s=every_s)
+        if checkpoint
+        else None
+    )
+    if reload:
+        _offer_changes(reload, publisher, saving)
+    async with contextlib.AsyncExitStack() as stack:
+        for sink in sinks:
+            await stack.enter_async_context(sink)
+        await stack.enter_async_context(source)
+        await stack.enter_async_context(hooks)
+        notifier.ready(name)
+        tasks = [
+            _estimate(source, tally, publisher, edge, lambda: since_boot() - restored_s),
+            _keep_alive(publisher, notifier, name, clock),
+            _measure_lag(publisher),
+        ]
+        if saving:
+            tasks.append(saving.save_often())
+        if reload:
+            tasks.append(_reload(reload, notifier, name))
+        clean = False
+        try:
+            await until_first_ends(*tasks, stop.wait())
+            clean = True
+        finally:  # a fault ends the loop, too
+            notifier.stopping(name)
+            if saving:  # before the sinks part, which may take seconds: who stops us may not wait for them
+                await saving.save_last(clean=clean)
+        publisher.publish_last()
+    return estimator
+
+
+def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
+    """The estimator of a pack, its kernels loaded: nothing compiles once samples come."""
+    estimator_of(settings, cell).run(np.zeros(1, dtype=SAMPLE))
+    return estimator_of(settings, cell)
+
+
+async def _estimate(
+    source: Source,
+    tally: Tally,
+    publisher: Publisher,
+    edge: Edge | None,
+    waited_s: Callable[[], float],
+) -> None:
+    """Take what the source gives; ``waited_s`` is how long it has given nothing since the state was restored [s]."""
+    estimator = tally.estimator
+    unseen_s = estimator.record["unseen_s"].copy()
+    async for block in source:
+        if estimator.state["started"][0] and not estimator.state["samples"][0]:
+            estimator.record["unseen_s"] = unseen_s + waited_s()
+        if edge:
+            edge.take(block)
+        publisher.add(block, tally.run(block))
+        await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
+
+
+async def _keep_alive(publisher: Publisher, notifier: Notifier, name: str, clock: Clock) -> None:
+    """Publish that nothing comes, and pat the watchdog while samples come or somebody still tries to have them."""
+    longest_s = notifier.watchdog_s / 3.0 or publisher.period_s
+    said, online, said_s = "", False, -math.inf
+    while True:
+        if publisher.alive:
+            notifier.alive(name)
+        publisher.log_lines_lost = stderr.lost
+        now_s, status, now_online = clock.monotonic(), publisher.status, publisher.snapshot.health.sensor_online
+        if status != said and (now_s - said_s >= STATUS_S or now_online != online):
+            notifier.status(name, status)
+            said, online, said_s = status, now_online, now_s
+        await asyncio.sleep(min(max(publisher.wait_s, 0.01), longest_s))
+        if publisher.wait_s == 0.0:
+            publisher.publish()
+
+
+async def _reload(reload: Reload, notifier: Notifier, name: str) -> None:
+    """Read the settings anew whenever somebody asks."""
+    while True:
+        await reload.asked.wait()
+        reload.asked.clear()
+        notifier.reloading(name)
+        await reload.reload()
+        notifier.ready(name)
+
+
+def _offer_changes(reload: Reload, publisher: Publisher, saving: Saving | None) -> None:
+    reload.offer("publish.rate_hz", publisher.set_rate)
+    if saving:
+        reload.offer("state.checkpoint_s", partial(setattr, saving, "every_s"))
+
+
+async def _measure_lag(publisher: Publisher) -> None:
+    """Tell the publisher how late the loop wakes: so long samples and answers may wait for what blocks it."""
+    loop = asyncio.get_running_loop()
+    while True:
+        due_s = loop.time() + LAG_STEP_S
+        await asyncio.sleep(LAG_STEP_S)
+        publisher.add_lag(loop.time() - due_s)
+
+
+def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clock) -> tuple[Ledger, str]:
+    """Go on from the checkpoint where there is a good one. Returns what the runs before have counted, and what was done."""
+    if checkpoint is None:
+        return Ledger(0, new_totals(clock.wall())), "off"
+    found = checkpoint.load()
+    outcome = found.reason
+    if not outcome:
+        wrong = resume(estimator, found.state, found.unseen_s)
+        outcome = f"{REFUSED}{wrong}" if wrong else f"restored{_soc_text(estimator)}"
+    if refused := outcome.startswith(REFUSED):
+        outcome = f"{outcome}; {checkpoint.set_aside()}"
+    say = log.warning if refused else log.info
+    say("checkpoint", file=str(checkpoint.path), outcome=outcome)
+    return found.ledger, outcome
+
+
+def _restore_alarms(publisher: Publisher, kept: str) -> None:
+    try:
+        publisher.watch.alarms.restore(kept)
+    except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
+        log.warning("the checkpoint's alarms cannot be: none is taken up", reason=str(error))
+
+
+def _soc_text(estimator: Estimator) -> str:
+    soc = float(estimator.state["soc"][0])
+    return "" if math.isnan(soc) else f": SOC {soc:.4f}"
+
+
+def _set_soc(estimator: Estimator, soc: float) -> float:
+    """Set the SOC on request.
+
+    Returns:
+        What it was.
+
+    Raises:
+        UserError: There is none.
+    """
+    if not estimator.state["started"][0]:
+        raise UserError("no sample has been taken yet")
+    before = float(estimator.state["soc"][0])
+    try:
+        estimator.set_soc(soc)
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    return before
+
+
+def _offer(
+    requests: Requests,
+    estimator: Estimator,
+    publisher: Publisher,
+    board_zero: Callable[[], Awaitable[None]] | None,
+) -> None:
+    """Offer the requests that need the loop."""
+
+    async def state(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        return {"estimate": publisher.latest.model_dump() if publisher.latest else None}
+
+    async def parameters(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        return publisher.snapshot.parameters.model_dump()
+
+    async def health(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        return publisher.snapshot.health.model_dump()
+
+    async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        soc = number(arguments, "soc", 0.0, 1.0)
+        before = _set_soc(estimator, soc)
+        log.info("SOC set on request", before=before, soc=soc)
+        return {"soc": soc, "before": before}
+
+    async def current_zero(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        if board_zero is None:
+            raise UserError("this source has no zero to be set")
+        if publisher.disturbed:
+            raise UserError(publisher.disturbed)
+        await board_zero()
+        log.info("present current taken as zero on request")
+        return {}
+
+    async def publish_rate(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        rate_hz, before = number(arguments, "rate_hz", LEAST_RATE_HZ, MOST_RATE_HZ), 1.0 / publisher.period_s
+        publisher.set_rate(rate_hz)
+        log.info("publish rate set on request", before=before, rate_hz=rate_hz)
+        return {"rate_hz": rate_hz, "before": before}
+
+    for handler in (state, parameters, health, set_soc, current_zero, publish_rate):
+        requests.offer(handler.__name__, handler)
+    requests.offer("acknowledge_alarm", partial(_acknowledge_alarm, publisher))
+
+
+async def _acknowledge_alarm(publisher: Publisher, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Somebody knows of the alarm ``name``, or of all."""
+    name, watched = arguments.get("name"), publisher.watch.alarms.names()
+    if name is not None and name not in watched:
+        raise UserError(f"name = {reprlib.repr(name)}: must be one of {', '.join(watched)}, or left out for all")
+    known = publisher.watch.acknowledge(name)
+    log.info("alarms acknowledged on request", alarms=known)
+    return {"acknowledged": known}

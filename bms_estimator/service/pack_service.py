@@ -1,0 +1,156 @@
+"""The service of one pack as ``bms-estimator run`` starts it: board, estimator, broker, checkpoint, signals."""
+
+import asyncio
+import contextlib
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import structlog
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.edge.block_sender import Edge
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.settings_plausibility import implausible
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.payloads import RecordingHealth
+from bms_estimator.page.page_sink import Pages, PageSink
+from bms_estimator.process.instance_lock import alone
+from bms_estimator.process.log_setup import set_level
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.systemd import Notifier
+from bms_estimator.service.alarm_hooks import Hooks, Say, relay_of
+from bms_estimator.service.live_loop import run_live
+from bms_estimator.service.settings_reload import Reload
+from bms_estimator.settings.alarm_limits import out_of_range, watched
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sinks.exports.influx import InfluxSink
+from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.sink import MqttSink
+from bms_estimator.sinks.sink import Delivery, Sink
+from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.serial.known_board_file import BoardMemory
+from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.source import Tap
+from bms_estimator.store.database import Database
+from bms_estimator.store.history import History
+from bms_estimator.store.outbox import Outbox
+
+log = structlog.get_logger(__name__)
+
+
+async def serve(
+    settings: Settings,
+    cell: PackModel,
+    *,
+    sinks: Sequence[Sink] = (),
+    tap: Tap | None = None,
+    stop: asyncio.Event | None = None,
+    folder: Path | None = None,
+    notifier: Notifier | None = None,
+    reload: Reload | None = None,
+    pages: Pages | None = None,
+) -> Estimator:
+    """Run until SIGINT or SIGTERM.
+
+    Args:
+        settings: The pack's settings; with ``[mqtt]`` a broker is served.
+        cell: The pack as one object (``CellModel.pack``).
+        sinks: Further sinks, such as the console.
+        tap: Gets all that the source is decoded from, with its arrival times.
+        stop: Set by someone else to end as a signal does.
+        folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
+        notifier: Who hears that the loop is ready and alive.
+        reload: Where is offered what can be changed while it runs.
+        pages: The live pages of this process.
+
+    Returns:
+        The estimator as the last sample left it.
+
+    Raises:
+        UserError: A setting that cannot be used.
+    """
+    stop = stop_on_signal(stop)
+    set_level(settings.pack.name, settings.log.level)
+    for line in [*implausible(settings, cell), *out_of_range(settings, cell)]:
+        log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
+    database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
+    delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
+    all_sinks = [*sinks, *export_sinks(settings)]
+    requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
+    memory = BoardMemory(folder, settings.pack.name) if folder else None
+    source = open_reports(settings, tap=tap) or SerialBoard(settings.sensor, tap=tap, memory=memory)
+    if database and settings.store.history_days:
+        all_sinks.append(History(database, days=settings.store.history_days))
+    outbox = Outbox(database, most=settings.store.outbox_messages)
+    edge = Edge(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
+    if reload:
+        reload.offer("log.level", partial(set_level, settings.pack.name))
+        reload.offer("mqtt.commands", requests.allow)
+    say: Say | None = None
+    if settings.mqtt is not None:
+        mqtt = MqttSink(
+            settings.mqtt,
+            settings.pack.name,
+            requests,
+            delivery,
+            outbox,
+            sample_period_s=settings.sensor.sample_period_s,
+            home_assistant=settings.home_assistant,
+            alarms=[each.name for each in watched(settings, cell)],
+        )
+        all_sinks.append(mqtt)
+        say = mqtt.say
+    hooks = Hooks(settings.alarms.hook, settings.pack.name, say, relay_of(settings, source.relay))
+    if settings.page is not None:
+        history = database.path if database and settings.store.history_days else None
+        all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
+    checkpoint = CheckpointFile(folder, settings, cell) if folder else None
+    async with contextlib.AsyncExitStack() as stack:
+        if folder:
+            stack.enter_context(alone(folder, settings.pack.name))
+        if database:
+            await stack.enter_async_context(database)
+        await stack.enter_async_context(outbox)
+        if edge:
+            await stack.enter_async_context(edge)
+        return await run_live(
+            settings,
+            cell,
+            source=source,
+            sinks=all_sinks,
+            stop=stop,
+            checkpoint=checkpoint,
+            requests=requests,
+            delivery=delivery,
+            current_zero=source.current_zero,
+            notifier=notifier,
+            reload=reload,
+            pulse=source.pulse,
+            recording=partial(recording_health, tap),
+            hooks=hooks,
+            edge=edge,
+        )
+
+
+def export_sinks(settings: Settings) -> list[Sink]:
+    """Where values go beside the broker.
+
+    Raises:
+        UserError: A file of the settings cannot be used.
+        ModuleNotFoundError: The optional package that one needs is not installed.
+    """
+    found: list[Sink] = [InfluxSink(settings.influx)] if settings.influx else []
+    if settings.prometheus:
+        from bms_estimator.sinks.exports.prometheus import PrometheusSink  # noqa: PLC0415 - needs an optional package
+
+        found.append(PrometheusSink(settings.prometheus))
+    return found
+
+
+def recording_health(tap: Tap | None) -> RecordingHealth | None:
+    """State of a recording; None where there is none."""
+    if not isinstance(tap, Recording):
+        return None
+    return RecordingHealth(on=not tap.ended.done(), bytes=tap.bytes, missed_reads=tap.missed_reads)

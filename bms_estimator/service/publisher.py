@@ -1,0 +1,286 @@
+"""Snapshots at the publish rate: from window, estimator and source to all sinks."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import structlog
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.payloads import (
+    EdgeHealth,
+    Estimate,
+    Health,
+    HookHealth,
+    Info,
+    LoopHealth,
+    RecordingHealth,
+    Snapshot,
+)
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.service.alarm_monitor import AlarmWatch
+from bms_estimator.service.latency import Latency
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sinks.sink import FRESH_PERIODS, Delivery, Sink
+from bms_estimator.sources.source import Pulse, Source
+from bms_estimator.telemetry.alarms import Change
+from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.health import dropped_text, health_report, sample_counters
+from bms_estimator.telemetry.impossible import impossible_sample
+from bms_estimator.telemetry.lifetime_totals import Tally, new_totals
+from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.publish_window import Window, WindowSummary
+from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.rest_detector import Rest
+from bms_estimator.telemetry.state import estimate_report, info_report
+
+log = structlog.get_logger(__name__)
+
+SLOW_S = 1.0
+"""Parameters, health and info are made no more often than this, whatever the publish rate [s]."""
+UNTENDED_S = 20.0
+"""A source that has not looked after its line for so long hangs: it tries a port that is missing each 10 s at least [s]."""
+
+
+class Publisher:
+    """Makes a snapshot when one is due and gives it to the sinks.
+
+    Args:
+        settings: The pack's settings.
+        cell: The pack as one object.
+        estimator: Read only.
+        source: Its counters, message and board are read.
+        sinks: Where snapshots go.
+        clock: The clocks.
+        tally: What is counted over restarts; else begins with this run.
+        restarts: Starts that found a checkpoint.
+        checkpoint: What became of the checkpoint at start.
+        delivery: What became of what was sent and asked.
+        pulse: Whether the source lives; None: it does not say.
+        recording: State of a recording; None where nothing is recorded.
+        edge: Of raw samples on their way to a fleet; None where none are sent.
+        hooks: Successes and failures of alarm hooks; None where there are none.
+        on_alarm: Hears of each alarm that is raised or ends, as soon as it does.
+
+    Attributes:
+        watch: Its alarms.
+        checkpoint: What became of the last checkpoint.
+        disk_free_mib: Where it is [MiB].
+        log_lines_lost: Since start.
+        kept: What has flowed, as the next start will find it; None: nothing will be found.
+        latest: The last estimate that there was.
+        snapshot: The last snapshot.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        cell: PackModel,
+        estimator: Estimator,
+        *,
+        source: Source,
+        sinks: Sequence[Sink],
+        clock: Clock,
+        tally: Tally | None = None,
+        restarts: int = 0,
+        checkpoint: str = "off",
+        delivery: Delivery | None = None,
+        pulse: Callable[[], Pulse] | None = None,
+        recording: Callable[[], RecordingHealth | None] = lambda: None,
+        edge: Callable[[], EdgeHealth | None] = lambda: None,
+        hooks: Callable[[], HookHealth | None] = lambda: None,
+        on_alarm: Callable[[Change], object] = lambda _: None,
+    ) -> None:
+        self._settings, self._cell, self._estimator = settings, cell, estimator
+        self._source, self._sinks, self._clock = source, sinks, clock
+        self._tally = tally or Tally(estimator, new_totals(clock.wall()))
+        self._restarts, self._delivery = restarts, delivery or Delivery()
+        self._rest = Rest(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
+        self._board: Mapping[str, str] = {}
+        self._pulse, self._recording, self._edge, self._latency = pulse, recording, edge, Latency()
+        self._hooks = hooks
+        self.checkpoint, self.log_lines_lost = checkpoint, 0
+        self.disk_free_mib: float | None = None
+        self.kept: Flow | None = None
+        self._flow = Flow()  # as it was told last
+        self.set_rate(settings.publish.rate_hz)
+        self._window = Window()
+        self.watch = AlarmWatch(settings, cell, estimator, source, clock, on_alarm, hooks)
+        self._suspects = 0  # bits of ``Suspect``, as logged
+        self._lag_s = 0.0
+        self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
+        self._due_s = self._started_s
+        self._sample_s = -math.inf  # monotonic, of the last accepted sample
+        self._impossible: str | None = None  # why the last sample that was dropped is none; None: all are good
+        self._dropped_before = self._dropped()  # by kind, when that began
+        self.latest: Estimate | None = None
+        self.snapshot = self._first_snapshot()
+
+    def set_rate(self, rate_hz: float) -> None:
+        """Publish so often from the next publication on [1/s]."""
+        publish = self._settings.publish.model_copy(update={"rate_hz": rate_hz})
+        self._settings = self._settings.model_copy(update={"publish": publish})
+        self.period_s = 1.0 / rate_hz
+        self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sensor.sample_period_s)
+
+    @property
+    def wait_s(self) -> float:
+        """Until a snapshot is overdue, which tells that no samples come [s]."""
+        return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
+
+    def add(self, block: SampleBlock, trace: TraceBlock) -> None:
+        """Take a block and what the estimator made of it; publish when it is time."""
+        if self._pulse:
+            self._latency.add(self._pulse().late_s)
+        now_s = self._clock.monotonic()
+        if trace.size:
+            self._window.add(trace, self._clock.wall(), self._source.cells)
+            self._sample_s = now_s
+        if trace.size < block.size:
+            self._impossible = impossible_sample(block, self._estimator.settings[0]) or ""
+        elif self._impossible is not None:
+            self._impossible, self._dropped_before = None, self._dropped()
+        self.watch.add(block, trace, now_s)
+        if now_s >= self._due_s:
+            self.publish()
+
+    def add_lag(self, lag_s: float) -> None:
+        """Take by how much the loop woke too late [s]."""
+        self._lag_s = max(self._lag_s, lag_s)
+
+    def publish(self) -> None:
+        """Publish now."""
+        now_s = self._clock.monotonic()
+        self._due_s += self.period_s
+        if self._due_s <= now_s:  # behind: do not catch up
+            self._due_s = now_s + self.period_s
+        self.watch.judge(now_s)
+        self.snapshot = self._next_snapshot(now_s)
+        if self.snapshot.estimate is not None:
+            self.latest = self.snapshot.estimate
+            self._rest.add(self.latest, now_s)
+        elif not self.snapshot.health.sensor_online:
+            self._rest.forget()
+        for sink in self._sinks:
+            sink.publish(self.snapshot)
+
+    def publish_last(self) -> None:
+        """Publish the end, all of it made anew."""
+        self._slow_s = -math.inf
+        self.publish()
+
+    @property
+    def alive(self) -> bool:
+        """Whether samples flow, or what brings them still tries and says why they do not."""
+        fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
+        return fresh or self._pulse is None or self._pulse().untended_s <= UNTENDED_S
+
+    @property
+    def status(self) -> str:
+        """The pack in a few words."""
+        if self.snapshot.health.sensor_message:
+            return f"no samples: {self.snapshot.health.sensor_message}"
+        soc = self.latest.soc if self.latest else None
+        return "" if soc is None else f"SOC {soc:.2f}"
+
+    @property
+    def disturbed(self) -> str | None:
+        """Why the pack is not known to be at rest; None when it is."""
+        return self.snapshot.health.sensor_message or self._rest.disturbed(self._clock.monotonic())
+
+    def _first_snapshot(self) -> Snapshot:
+        now_s = self._slow_s = self._started_s
+        parameters = parameter_report(self._estimator, self._started_wall_s)
+        return Snapshot(
+            None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info(), self.watch.alarms.report()
+        )
+
+    def _next_snapshot(self, now_s: float) -> Snapshot:
+        """The estimate of this window; of the rest, what is old enough to be made anew."""
+        _, parameters, health, info, _ = self.snapshot
+        summary, wall_s = self._window.take(), self._clock.wall()
+        estimate = self._estimate(summary, wall_s) if summary else None
+        message = self._sensor_message(now_s)
+        old = now_s - self._slow_s >= SLOW_S
+        if old:
+            self._slow_s = now_s
+            parameters, info = parameter_report(self._estimator, wall_s), self._info()
+        if old or health.sensor_online != (message is None):
+            health = self._health(now_s, message)
+            self._log_suspicions(health)
+        return Snapshot(estimate, parameters, health, info, self.watch.alarms.report())
+
+    def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
+        remaining = remaining_charge(self._estimator, window.current_a)
+        # only what outlives a kill, so that the next run goes on from there
+        self._flow = self._flow.at_least(self.kept or self._tally.flow)
+        capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
+        return estimate_report(window, remaining, self._source.counters, wall_s, self._flow, capacity_ah)
+
+    def _health(self, now_s: float, message: str | None) -> Health:
+        lag_s, self._lag_s = self._lag_s, 0.0
+        return health_report(
+            self._estimator.record[0],
+            self._estimator.settings_record[0],
+            self._source.counters,
+            now_s=self._clock.wall(),
+            uptime_s=now_s - self._started_s,
+            loop_lag_s=lag_s,
+            restarts=self._restarts,
+            checkpoint=self.checkpoint,
+            sensor_message=message,
+            delivery=self._delivery,
+            clock_ppm=self._source.clock_ppm,
+            total=self._tally.total,
+            unseen_s=self._tally.unseen_s,
+            loop=self._loop(),
+            recording=self._recording(),
+            edge=self._edge(),
+            hooks=self._hooks(),
+        )
+
+    def _log_suspicions(self, health: Health) -> None:
+        """Log that one is raised or cleared; numbers in the sentences may change."""
+        suspects = int(self._estimator.record["checks"]["suspects"][0])
+        if suspects != self._suspects:
+            self._suspects = suspects
+            log.warning("suspicion", suspects=health.suspects or "none any more")
+
+    def _loop(self) -> LoopHealth:
+        p50_s, p99_s, most_s = self._latency.take() or (None, None, None)
+        return LoopHealth(
+            latency_p50_s=p50_s,
+            latency_p99_s=p99_s,
+            latency_max_s=most_s,
+            reads_waiting=self._pulse().waiting if self._pulse else 0,
+            messages_waiting=self._delivery.waiting,
+            log_lines_lost=self.log_lines_lost,
+            disk_free_mib=self.disk_free_mib,
+        )
+
+    def _info(self) -> Info:
+        self._board = self._source.board or self._board  # one that was lost is most likely to come back
+        sensed = bool(self._estimator.record["filter"]["sensed"][0])
+        return info_report(self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed)
+
+    def _sensor_message(self, now_s: float) -> str | None:
+        """Why values are not fresh, None when they are."""
+        silent_s = now_s - self._sample_s
+        if silent_s <= self._fresh_s:
+            return None
+        if self._source.message:
+            return self._source.message
+        if math.isinf(silent_s):
+            silent_s = now_s - self._started_s
+        dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped().items()}
+        text = f"no usable sample for {silent_s:.1f} s"
+        text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
+        return f"{text}; {self._impossible}" if self._impossible else text
+
+    def _dropped(self) -> dict[str, int]:
+        """Samples that were not used, by kind."""
+        counted = sample_counters(self._estimator.state[0]).items()
+        return {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}

@@ -1,0 +1,1 @@
+"""Exports to InfluxDB and Prometheus."""

@@ -1,0 +1,241 @@
+"""Home Assistant's device discovery: one retained message that describes all entities of one pack."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple, get_args
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import Info
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
+from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Command
+from bms_estimator.sinks.home_assistant.entities import BATTERY, CELL, FUEL_CELL, OF_CELLS, Entity, cell_key, entities
+from bms_estimator.sinks.sink import FRESH_PERIODS
+
+VALUES = "home_assistant"
+"""Topic below the device's."""
+LEAST_EXPIRY_S = 30
+"""Home Assistant calls no value unavailable that is younger than this [s]."""
+ALARM_CLASSES = {
+    "soc_low": "battery",
+    "over_temperature": "heat",
+    "under_temperature": "cold",
+    "charging_below_freezing": "cold",
+}
+"""Where it is not "problem"."""
+_SEES = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
+"""An alarm that is raised stays on: what it needs may be lost after it was raised."""
+FORMER = {
+    "soc_std": "sensor",
+    "time_to_empty_s": "sensor",
+    "sensor_silent": "binary_sensor",
+    "suspicion": "binary_sensor",
+    "lock_lost": "binary_sensor",
+}
+"""What versions before this one have told of, and on which platform."""
+NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
+"""All that ``[home_assistant.names]`` may name."""
+
+
+class Described(NamedTuple):
+    """On what depends which entities there are."""
+
+    info: Info
+    cells: int = 0
+    """So many are measured."""
+    alarms: tuple[str, ...] = ()
+    commands: tuple[str, ...] = ()
+    """That are allowed."""
+    unwatched: tuple[str, ...] = ()
+    """Alarms that are not, whatever comes: other settings may have had them."""
+
+
+def check_names(settings: HomeAssistantSettings) -> None:
+    """Raises UserError: There is no such entity."""
+    unknown = sorted(set(settings.names) - NAMED)
+    if unknown:
+        raise UserError(
+            f"home_assistant.names.{unknown[0]}: there is no such entity; there are {', '.join(sorted(NAMED))}"
+        )
+
+
+def device_id(device: str) -> str:
+    """The device's name among all of Home Assistant's."""
+    return f"bms_{device}"
+
+
+def discovery_topic(settings: HomeAssistantSettings, device: str) -> str:
+    """Where the discovery message goes; an empty retained payload there removes the device."""
+    return f"{settings.discovery_prefix}/device/{device_id(device)}/config"
+
+
+def discovery(
+    settings: HomeAssistantSettings, described: Described, root: str, sample_period_s: float
+) -> dict[str, Any]:
+    """The discovery message.
+
+    Args:
+        settings: How the pack is to stand there.
+        described: What there is of it.
+        root: Topic of the device, ``bms/<device>``.
+        sample_period_s: Between two samples [s].
+    """
+    info = described.info
+    device = {
+        "identifiers": [device_id(info.device)],
+        "name": settings.name or info.device,
+        "model": info.cell,
+        "manufacturer": "bms_estimator",
+        "sw_version": info.version,
+    }
+    if info.board.get("serial"):
+        device["serial_number"] = info.board["serial"]
+    fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
+    expiry_s = max(LEAST_EXPIRY_S, math.ceil(fresh_s))
+    positive = settings.current_sign.removesuffix("_positive")
+    numbers = entities(info, described.cells).items()
+    components = {
+        **{key: _number(key, entity, root, expiry_s) for key, entity in numbers},
+        **{
+            key: _number(key, entity, root, expiry_s) | _sign(root, positive)
+            for key, entity in numbers
+            if entity.signed
+        },
+        **{f"alarm_{name}": _alarm(name, root) for name in described.alarms},
+        **{name: _COMMANDS[name](root) for name in described.commands},
+    }
+    names = settings.names | _cell_names(settings, described.cells)
+    return {
+        "device": device,
+        "origin": {"name": "bms_estimator", "sw_version": info.version},
+        "availability": [{"topic": f"{root}/availability"}, {"topic": f"{root}/sensor/availability"}],
+        "availability_mode": "all",
+        "components": {
+            key: component | _identity(info.device, key, component["platform"]) | _named(names, key)
+            for key, component in components.items()
+        }
+        | _removed(described),
+    }
+
+
+def _removed(described: Described) -> dict[str, dict[str, str]]:
+    """What it may know from before: by its platform alone it goes, what is left out stays."""
+    platforms = FORMER | {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
+    platforms |= {name: made("")["platform"] for name, made in _COMMANDS.items() if name not in described.commands}
+    return {key: {"platform": platform} for key, platform in platforms.items()}
+
+
+def _cell_names(settings: HomeAssistantSettings, cells: int) -> dict[str, str]:
+    if CELL not in settings.names:
+        return {}
+    return {cell_key(number): f"{settings.names[CELL]} {number}" for number in range(1, cells + 1)}
+
+
+def _named(names: Mapping[str, str], key: str) -> dict[str, str]:
+    name = names.get(key.removeprefix("alarm_"))
+    return {"name": name} if name else {}
+
+
+def _identity(device: str, key: str, platform: str) -> dict[str, str]:
+    """Its entity's id does not depend on its name, so that a dashboard fits in any language.
+
+    Before 2025.10 the id was ``object_id``, which later versions do not read where the other is told.
+    """
+    entity = f"{device_id(device)}_{key}"
+    return {"unique_id": entity, "default_entity_id": f"{platform}.{entity}", "object_id": entity}
+
+
+def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any]:
+    topic = f"{root}/{VALUES}"
+    options = {
+        "platform": "sensor",
+        "name": entity.name,
+        "state_topic": topic,
+        "value_template": f"{{{{ value_json.{key} }}}}",
+        "unit_of_measurement": entity.unit,
+        "device_class": entity.device_class,
+        "state_class": entity.state_class,
+        "suggested_display_precision": entity.decimals,
+        "entity_category": None if entity.main else "diagnostic",
+        "enabled_by_default": None if entity.enabled else False,
+        "expire_after": expiry_s,
+    }
+    return {option: value for option, value in options.items() if value is not None}
+
+
+def _sign(root: str, positive: str) -> dict[str, str]:
+    """What it calls positive is its only attribute."""
+    template = f"{{{{ {{'positive': '{positive}'}} | tojson }}}}"
+    return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
+
+
+def _alarm(name: str, root: str) -> dict[str, Any]:
+    """On while it is active; unavailable, and never off, while it cannot be watched."""
+    topic = f"{root}/alarm/{name}"
+    return {
+        "platform": "binary_sensor",
+        "name": name.replace("_", " ").capitalize().replace("Soc", "State of charge"),
+        "state_topic": topic,
+        "value_template": "{{ 'ON' if value_json.active else 'OFF' }}",
+        "json_attributes_topic": topic,
+        "json_attributes_template": "{{ {'reason': value_json.text, 'severity': value_json.severity} | tojson }}",
+        "availability": [{"topic": f"{root}/availability"}, {"topic": topic, "value_template": _SEES}],
+        "availability_mode": "all",
+        "device_class": ALARM_CLASSES.get(name, "problem"),
+    }
+
+
+def _set_soc(root: str) -> dict[str, Any]:
+    """It shows what was set last: to show the SOC, too, would make a row more for each change of it."""
+    return {
+        "platform": "number",
+        "name": "Set state of charge",
+        "command_topic": f"{root}/request/set_soc",
+        "command_template": '{"soc": {{ value / 100 }}}',
+        "min": 0,
+        "max": 100,
+        "step": 0.1,
+        "mode": "box",
+        "unit_of_measurement": "%",
+        "entity_category": "config",
+    }
+
+
+def _current_zero(root: str) -> dict[str, Any]:
+    return _button("Take present current as zero", f"{root}/request/current_zero") | {"entity_category": "config"}
+
+
+def _acknowledge(root: str) -> dict[str, Any]:
+    """All alarms at once."""
+    availability = {"availability": [{"topic": f"{root}/availability"}]}
+    return _button("Acknowledge alarms", f"{root}/request/acknowledge_alarm") | availability
+
+
+def _button(name: str, topic: str) -> dict[str, Any]:
+    return {"platform": "button", "name": name, "command_topic": topic, "payload_press": "{}"}
+
+
+def _publish_rate(root: str) -> dict[str, Any]:
+    return {
+        "platform": "number",
+        "name": "Publish rate",
+        "state_topic": f"{root}/info",
+        "value_template": "{{ value_json.publish_rate_hz }}",
+        "command_topic": f"{root}/request/publish_rate",
+        "command_template": '{"rate_hz": {{ value }}}',
+        "min": LEAST_RATE_HZ,
+        "max": MOST_RATE_HZ,
+        "step": 0.1,
+        "mode": "box",
+        "unit_of_measurement": "Hz",
+        "availability": [{"topic": f"{root}/availability"}],
+        "entity_category": "config",
+    }
+
+
+_COMMANDS = {
+    "set_soc": _set_soc,
+    "current_zero": _current_zero,
+    "acknowledge_alarm": _acknowledge,
+    "publish_rate": _publish_rate,
+}

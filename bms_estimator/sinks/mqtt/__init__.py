@@ -1,0 +1,1 @@
+"""Payloads over MQTT: topics, messages, requests, availability."""

@@ -1,0 +1,95 @@
+"""The two availabilities: whether they hold what we wrote there, and putting them right where they do not."""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Sequence
+
+import structlog
+
+from bms_estimator.mqtt.denied_topics import Refusals
+from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.sinks.sink import Delivery
+
+CORRECTION_S = 5.0
+"""An availability that somebody else wrote is put right no more often than this [s]."""
+BURST_S = 60.0
+"""Corrections closer than this are one burst, of which one line is logged [s]."""
+ECHO_S = 10.0
+"""A broker that has not given back ``online`` by then denies it [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+class Availability:
+    """Hears what the broker gives back.
+
+    Args:
+        own: What the availabilities must hold now; the service's own first.
+        delivery: Corrections are counted there.
+        refusals: An ``online`` that does not come back is named there.
+        wake: Called when it is time to ``correct``.
+        echo_s: Until a broker has given back ``online`` [s].
+    """
+
+    def __init__(
+        self,
+        own: Callable[[], Sequence[Message]],
+        delivery: Delivery,
+        refusals: Refusals,
+        wake: Callable[[], object],
+        echo_s: float = ECHO_S,
+    ) -> None:
+        self._own, self._delivery, self._refusals = own, delivery, refusals
+        self._wake, self._echo_s = wake, echo_s
+        self._echoed = asyncio.Event()
+        self._forged = False  # somebody else wrote there
+        self._corrected_s = -math.inf
+
+    def begin(self) -> None:
+        """A new connection, to a broker that may hold nothing: all is said anew."""
+        self._echoed.clear()
+        self._forged = False
+
+    def told(self) -> None:
+        """All has been said just now."""
+        self._forged = False
+
+    def heard(self, topic: str, payload: bytes) -> None:
+        """An availability has come: given back, or somebody else's."""
+        right = {own.topic: own.payload for own in self._own()}
+        if right.get(topic, payload) == payload:
+            self._echoed.set()
+        elif not self._forged:
+            self._forged = True
+            loop = asyncio.get_running_loop()
+            loop.call_at(max(self._corrected_s + CORRECTION_S, loop.time()), self._wake)
+
+    async def correct(self, publish: Callable[[Sequence[Message]], Awaitable[None]]) -> None:
+        """Put the availabilities right, if it is time.
+
+        Counted when the broker has taken it: one that ends says our will, and takes none.
+        """
+        now_s = asyncio.get_running_loop().time()
+        since_s = now_s - self._corrected_s
+        if not self._forged or since_s < CORRECTION_S:
+            return
+        self._forged, self._corrected_s = False, now_s
+        await publish(self._own())
+        self._delivery.corrections += 1
+        if since_s > BURST_S:
+            log.warning(
+                "somebody else wrote an availability of this pack: put right", so_far=self._delivery.corrections
+            )
+
+    async def expect_echo(self) -> None:
+        """Find out a broker that denies us without a word, as Mosquitto does with what may not be read."""
+        topic = self._own()[0].topic
+        try:
+            async with asyncio.timeout(self._echo_s):
+                await self._echoed.wait()
+        except TimeoutError:
+            if topic in self._delivery.refused_topics:
+                return
+            self._refusals.deny(topic, "it does not come back: not allowed to read it, or the broker is slow")
+            await self._echoed.wait()
+            self._refusals.allow(topic)

@@ -1,0 +1,172 @@
+"""What goes to a broker: from what it got last and a snapshot to messages. Pure: no connection, no clock."""
+
+import json
+from collections.abc import Collection, Mapping
+from functools import cache
+from typing import Any, NamedTuple
+
+from bms_estimator.model.events import events
+from bms_estimator.model.payloads import Health, Report, Snapshot
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
+from bms_estimator.sinks.home_assistant.discovery import VALUES, Described, check_names, discovery, discovery_topic
+from bms_estimator.sinks.home_assistant.entity_values import Shown, next_values
+from bms_estimator.sinks.mqtt.topics import schema
+
+AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
+"""Topics below the device's."""
+
+
+class Message(NamedTuple):
+    """One message."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+
+
+class Sent(NamedTuple):
+    """What the broker got last; at first nothing."""
+
+    snapshot: Snapshot | None = None
+    shown: Shown = Shown()
+    described: Described | None = None
+    """To Home Assistant."""
+
+
+class Messages:
+    """The messages of one pack.
+
+    Args:
+        base_topic: First part of all topics.
+        device: Name of the pack.
+        sample_period_s: Between two samples, where that may be longer than the publish period [s].
+        home_assistant: How the pack is to stand there.
+        alarms: Those that are watched: what a broker keeps of others, from other settings, is removed.
+
+    Attributes:
+        root: Of all topics.
+        commands: Those that are allowed.
+
+    Raises:
+        UserError: ``home_assistant`` names what there is not.
+    """
+
+    def __init__(
+        self,
+        base_topic: str,
+        device: str,
+        sample_period_s: float = 0.0,
+        home_assistant: HomeAssistantSettings | None = None,
+        alarms: Collection[str] = ALARMS,
+    ) -> None:
+        self._unwatched = tuple(name for name in ALARMS if name not in alarms)
+        self.root = f"{base_topic}/{device}"
+        self.commands: tuple[str, ...] = ()
+        self._home = home_assistant or HomeAssistantSettings()
+        check_names(self._home)
+        self._device, self._sample_period_s = device, sample_period_s
+        self._schema = _schema()  # takes milliseconds, and here nothing waits yet
+
+    def greeting(self) -> list[Message]:
+        """What a broker is told first."""
+        removed = [self._retained(f"alarm/{name}", b"") for name in self._unwatched]
+        return [self._retained(AVAILABILITY, b"online"), self._retained("schema", self._schema), *removed]
+
+    def farewell(self) -> list[Message]:
+        """What it is told last; the last of these is the will, too."""
+        return [self._retained(SENSOR_AVAILABILITY, b"offline"), self._retained(AVAILABILITY, b"offline")]
+
+    def availability(self, sent: Sent) -> list[Message]:
+        """What the two availabilities hold, unless somebody else writes there."""
+        sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
+        return [self._retained(AVAILABILITY, b"online"), *sensor]
+
+    def kept(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
+        """What a snapshot brings that must reach the broker, late if need be: each has its own time.
+
+        Args:
+            before: The snapshot before this one; None of the first.
+            snapshot: The snapshot.
+        """
+        happened = [self._kept("event", event) for event in events(before, snapshot)]
+        return happened + ([self._kept("state", snapshot.estimate)] if snapshot.estimate else [])
+
+    def due(self, sent: Sent, snapshot: Snapshot, now_s: float) -> tuple[list[Message], Sent]:
+        """What a snapshot brings that the broker has not got yet, beside what is ``kept``.
+
+        Args:
+            sent: What it got.
+            snapshot: The snapshot.
+            now_s: Monotonic clock [s].
+
+        Returns:
+            The messages, and what the broker has got after them.
+        """
+        _, parameters, health, info, alarms = snapshot
+        before, messages = sent.snapshot, []
+        known = bool(parameters.elements)  # not before the first sample
+        if known and (before is None or before.parameters is not parameters):
+            messages.append(self._live("parameters", _report(parameters)))
+        if before is None or before.health.sensor_online != health.sensor_online:
+            messages.append(self._sensor(health))
+        if before is None or before.health is not health:
+            messages.append(self._retained("health", _report(health)))
+        if before is None or before.info != info:
+            messages.append(self._retained("info", _report(info)))
+        described = self._described(sent, snapshot)
+        if described != sent.described:
+            payload = self._discovery(described)
+            if sent.described is None or payload != self._discovery(sent.described):
+                messages.append(Message(discovery_topic(self._home, self._device), payload, 1, retain=True))
+        known_alarms = before.alarms if before else ()
+        messages += [self._retained(f"alarm/{a.name}", _report(a)) for a in alarms if a not in known_alarms]
+        told, shown = self._home_assistant(sent.shown, snapshot, described, now_s)
+        return messages + told, Sent(snapshot, shown, described)
+
+    def _described(self, sent: Sent, snapshot: Snapshot) -> Described:
+        """Cells that were measured once stay."""
+        cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
+        known = sent.described.cells if sent.described else 0
+        alarms = tuple(alarm.name for alarm in snapshot.alarms)
+        return Described(snapshot.info, max(cells, known), alarms, self.commands, self._unwatched)
+
+    def _home_assistant(
+        self, before: Shown, snapshot: Snapshot, described: Described, now_s: float
+    ) -> tuple[list[Message], Shown]:
+        if not self._home.enabled:
+            return [], before
+        sign = 1.0 if self._home.current_sign == "discharge_positive" else -1.0
+        shown = next_values(before, snapshot, described, now_s, sign=sign)
+        return ([] if shown is before else [self._live(VALUES, _json(shown.values))]), shown
+
+    def _sensor(self, health: Health) -> Message:
+        return self._retained(SENSOR_AVAILABILITY, b"online" if health.sensor_online else b"offline")
+
+    def _discovery(self, described: Described) -> bytes:
+        """Empty, which removes the device, where Home Assistant is to know none."""
+        return _json(discovery(self._home, described, self.root, self._sample_period_s)) if self._home.enabled else b""
+
+    def _kept(self, topic: str, report: Report) -> Message:
+        return Message(f"{self.root}/{topic}", _report(report), 1, retain=False)
+
+    def _live(self, topic: str, payload: bytes) -> Message:
+        return Message(f"{self.root}/{topic}", payload, 0, retain=False)
+
+    def _retained(self, topic: str, payload: bytes) -> Message:
+        return Message(f"{self.root}/{topic}", payload, 1, retain=True)
+
+
+@cache
+def _schema() -> bytes:
+    """The same for all packs."""
+    return _json(schema())
+
+
+def _report(report: Report) -> bytes:
+    return report.model_dump_json().encode()
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()

@@ -1,0 +1,205 @@
+"""Requests that people and dashboards may make of a running service: bytes in, bytes out, over any transport.
+
+Whoever can reach the transport may ask, so what comes from there is bounded in everything: names stand in a list,
+payloads have a size, requests a rate, log lines too; a command needs the owner's leave; no handler's fault gets out.
+"""
+
+import json
+import math
+import reprlib
+import time
+from collections.abc import Awaitable, Callable, Collection, Mapping
+from typing import Any, get_args
+
+import structlog
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.settings.pack import Command
+from bms_estimator.sinks.sink import Delivery
+
+COMMANDS = get_args(Command)
+NAMES = ("state", "parameters", "health", *COMMANDS)
+"""All requests that there are."""
+MOST_PAYLOAD_BYTES = 4096
+READS_PER_MIN = 120.0
+"""Requests that change nothing, of all who ask together; as many may come at once [1/min]."""
+COMMANDS_PER_MIN = 6.0
+"""Requests that change something, granted or not [1/min]."""
+LOG_S = 60.0
+"""Of each kind of refusal no more than one line in this time; all are counted [s]."""
+MOST_SHOWN = 40
+"""So much of a foreign name goes to the log [characters]."""
+
+Handler = Callable[[Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
+"""Takes the request's arguments, returns the response's data. Raises UserError when it cannot be granted."""
+log = structlog.get_logger(__name__)
+
+
+class Requests:
+    """Handlers by name, and who may call them how often.
+
+    Args:
+        delivery: Requests are counted there, by what became of them.
+        commands: Those that are allowed.
+        monotonic: Monotonic clock [s].
+    """
+
+    def __init__(
+        self,
+        delivery: Delivery,
+        commands: Collection[Command] = (),
+        *,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._counts, self._allowed, self._monotonic = delivery.requests, commands, monotonic
+        self._handlers: dict[str, Handler] = {}
+        self._reads, self._commands = Rate(READS_PER_MIN, monotonic), Rate(COMMANDS_PER_MIN, monotonic)
+        self._logged_s: dict[str, float] = {}
+
+    def offer(self, name: str, handler: Handler) -> None:
+        """Make a request of ``NAMES`` answerable."""
+        self._handlers[name] = handler
+
+    @property
+    def allowed(self) -> tuple[Command, ...]:
+        """Commands that are allowed, in the order in which all stand."""
+        return tuple(command for command in COMMANDS if command in self._allowed)
+
+    def allow(self, commands: Collection[Command]) -> None:
+        """Allow these commands from now on, and no others."""
+        self._allowed = commands
+
+    async def respond(self, name: str, payload: bytes) -> bytes | None:
+        """The response to one request: JSON of status, data, error, transaction.
+
+        Returns:
+            None where no response is due: to a name that does not exist, and beyond the rate.
+        """
+        if name not in NAMES:
+            self.refuse("unknown", name[:MOST_SHOWN])
+            return None
+        if not (self._commands if name in COMMANDS else self._reads).take():
+            self.refuse("too_many", name)
+            return None
+        transaction = None
+        try:
+            arguments = _arguments(payload)
+            transaction = _transaction(arguments)
+            response = _response("ok", await self._handler(name)(arguments), None, transaction)
+        except UserError as error:
+            self.refuse("refused", name, reason=str(error))
+            return _response("error", None, str(error), transaction)
+        except Exception as error:  # noqa: BLE001  counted and logged: who asks must not be able to end the service
+            self.refuse("failed", name, exc_info=error)
+            return _response("error", None, "a fault of the service's own, which its log describes", transaction)
+        self._counts["granted"] += 1
+        return response
+
+    def refuse(self, kind: str, name: str, **why: Any) -> None:
+        """Count a request that is not granted; log the first of a burst.
+
+        Args:
+            kind: Under what it is counted.
+            name: Of the request.
+            why: Goes to the log.
+        """
+        self._counts[kind] += 1
+        now_s = self._monotonic()
+        if now_s - self._logged_s.get(kind, -math.inf) >= LOG_S:
+            self._logged_s[kind] = now_s
+            log.warning("request not granted", kind=kind, request=name, so_far=self._counts[kind], **why)
+
+    def _handler(self, name: str) -> Handler:
+        """Who answers.
+
+        Raises:
+            UserError: It is not allowed, or not offered here.
+        """
+        if name in COMMANDS and name not in self._allowed:
+            raise UserError(f"{name}: not allowed; the pack file's mqtt.commands names what is")
+        if name not in self._handlers:
+            raise UserError(f"{name}: cannot be asked here")
+        return self._handlers[name]
+
+
+class Rate:
+    """So many in a minute, at once or spread.
+
+    Args:
+        per_minute: How many.
+        monotonic: Monotonic clock [s].
+    """
+
+    def __init__(self, per_minute: float, monotonic: Callable[[], float]) -> None:
+        self._most, self._monotonic = per_minute, monotonic
+        self._left, self._at_s = per_minute, monotonic()
+
+    def take(self) -> bool:
+        """Whether one more is within the rate; if so it is counted."""
+        now_s = self._monotonic()
+        self._left = min(self._left + (now_s - self._at_s) * self._most / 60.0, self._most)
+        self._at_s = now_s
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True
+
+
+def number(arguments: Mapping[str, Any], name: str, low: float, high: float) -> float:
+    """The number ``name`` of a request's arguments.
+
+    Raises:
+        UserError: It is missing, no number, or outside ``low``..``high``.
+    """
+    value = arguments.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise UserError(f"{name} = {reprlib.repr(value)}: must be a number from {low:g} to {high:g}")
+    return float(value)
+
+
+def _response(status: str, data: Mapping[str, Any] | None, error: str | None, transaction: str | int | None) -> bytes:
+    response = {"status": status, "data": data, "error": error, "transaction": transaction}
+    return json.dumps(response, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _arguments(payload: bytes) -> Mapping[str, Any]:
+    """A request's payload: a JSON object of finite numbers, or nothing.
+
+    Raises:
+        UserError: It is something else, or too long.
+    """
+    if len(payload) > MOST_PAYLOAD_BYTES:
+        raise UserError(f"a request's payload must not be longer than {MOST_PAYLOAD_BYTES} bytes")
+    if not payload:
+        return {}
+    try:
+        arguments = json.loads(payload, parse_float=_finite, parse_constant=_finite)
+    except (ValueError, RecursionError):
+        raise UserError("a request's payload must be a JSON object or empty") from None
+    if not isinstance(arguments, dict):
+        raise UserError("a request's payload must be a JSON object or empty")
+    return arguments
+
+
+def _finite(token: str) -> float:
+    """A number of a request; Python's JSON knows NaN, and takes 1e999 for infinity.
+
+    Raises:
+        UserError: It is not finite.
+    """
+    number = float(token)
+    if not math.isfinite(number):
+        raise UserError(f"{token[:MOST_SHOWN]}: numbers of a request must be finite")
+    return number
+
+
+def _transaction(arguments: Mapping[str, Any]) -> str | int | None:
+    """What the response repeats, so that who asked knows it again.
+
+    Raises:
+        UserError: It is neither a string nor an integer.
+    """
+    transaction = arguments.get("transaction")
+    if transaction is not None and (isinstance(transaction, bool) or not isinstance(transaction, str | int)):
+        raise UserError("transaction: must be a string or an integer")
+    return transaction

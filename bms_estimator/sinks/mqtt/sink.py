@@ -1,0 +1,216 @@
+"""The MQTT sink: what a pack says to a broker that may come and go, and what it hears from there.
+
+``publish`` puts what must reach the broker in the outbox, and the snapshot in a slot for one; tasks take them from
+there when the broker does. The loop never waits. What is said stands in ``messages``, what may be asked in ``requests``,
+how a broker is reached in ``link``.
+"""
+
+import asyncio
+import contextlib
+import secrets
+from collections.abc import Collection, Sequence
+from typing import Self
+
+import structlog
+
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.broker_config import brokers, check
+from bms_estimator.mqtt.connection import Connect, Connection, Hello, Received
+from bms_estimator.mqtt.denied_topics import Refusals
+from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.queue_sender import Backlog
+from bms_estimator.mqtt.reconnect_loop import Link
+from bms_estimator.process.backoff import FIRST_DELAY_S
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.sinks.mqtt.availability import ECHO_S, Availability
+from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, Message, Messages, Sent
+from bms_estimator.sinks.mqtt.requests import MOST_SHOWN, Requests
+from bms_estimator.sinks.sink import Delivery
+from bms_estimator.store.outbox import Outbox
+
+BIRTH_DELAY_S = 2.0
+"""Home Assistant says it is online some time before it listens [s]."""
+HANDOVER_S = 2.0
+"""At the end: how long what still waits in the outbox may take [s]."""
+CLOSING_S = 3.0
+"""How long the last messages may take in all [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+class MqttSink:
+    """Publishes snapshots of one pack and answers requests.
+
+    Args:
+        settings: The brokers.
+        device: Name of the pack in the topics.
+        requests: Answers requests.
+        delivery: Where it is counted what became of what was sent.
+        outbox: What must reach the broker.
+        connect: Makes a connection; over TCP when left out.
+        sample_period_s: Between two samples, where that may be longer than the publish period [s].
+        home_assistant: How the pack is to stand there.
+        alarms: Those that are watched.
+        first_delay_s: Before a lost broker, or one that refuses for now, is tried once more [s].
+        birth_delay_s: From Home Assistant's birth message to the retained messages [s].
+        echo_s: Until a broker has given back ``online`` [s].
+
+    Raises:
+        UserError: A URL or a file of ``settings`` cannot be used.
+    """
+
+    def __init__(
+        self,
+        settings: MqttSettings,
+        device: str,
+        requests: Requests,
+        delivery: Delivery,
+        outbox: Outbox,
+        *,
+        connect: Connect | None = None,
+        sample_period_s: float = 0.0,
+        home_assistant: HomeAssistantSettings | None = None,
+        alarms: Collection[str] = ALARMS,
+        first_delay_s: float = FIRST_DELAY_S,
+        birth_delay_s: float = BIRTH_DELAY_S,
+        echo_s: float = ECHO_S,
+    ) -> None:
+        self._requests, self._delivery = requests, delivery
+        self._refusals = Refusals(delivery, self._say_again, first_delay_s)
+        self._backlog = Backlog(outbox, delivery, self._refusals, first_delay_s)
+        self._birth_delay_s = birth_delay_s
+        self._messages = Messages(settings.base_topic, device, sample_period_s, home_assistant, alarms)
+        self._birth_topic = (home_assistant or HomeAssistantSettings()).status_topic
+        identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.farewell()[-1]
+        hello = Hello(identifier, will, lambda kind, topic: requests.refuse(kind, topic[:MOST_SHOWN]))
+        for warning in check(settings):
+            log.warning("a secret that is none", reason=warning)
+        self._link = Link(brokers(settings), hello, connect or Dial(settings), self._serve, delivery, first_delay_s)
+        self._slot: Snapshot | None = None
+        self._before: Snapshot | None = None  # the last one that was taken
+        self._sent = Sent()  # only the sending task sets it
+        self._again = True  # the broker may hold nothing: send all of it
+        self._wake = asyncio.Event()
+        self._availability = Availability(
+            lambda: self._messages.availability(self._sent), delivery, self._refusals, self._wake.set, echo_s
+        )
+        self._task: asyncio.Task[None] | None = None
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Take a snapshot; returns at once."""
+        if self._task is not None and self._task.done():
+            self._task.result()  # only a fault of ours ends it: let it be seen
+        self._backlog.put(self._messages.kept(self._before, snapshot))
+        self._slot = self._before = snapshot
+        self._wake.set()
+
+    def say(self, topic: str, payload: bytes) -> None:
+        """Publish a message of somebody else at QoS 1; it waits for a broker that is away, as states do."""
+        self._backlog.put([Message(topic, payload, 1, retain=False)])
+
+    async def __aenter__(self) -> Self:
+        """Start reaching for the broker."""
+        self._task = asyncio.create_task(self._link.run(), name="mqtt")
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        """Publish what is pending and ``offline``, then part from the broker; one that does not take it publishes the will."""
+        if self._task is None:
+            return
+        self._link.closing.set()
+        self._wake.set()
+        done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
+        if not done:
+            self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._task
+
+    async def _serve(self, connection: Connection) -> None:
+        """Send and receive until the connection is lost or the sink closes."""
+        self._again = True
+        self._refusals.begin()
+        self._availability.begin()
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                others = [tasks.create_task(self._receive(connection))]
+                await self._subscribe(connection)
+                others += [
+                    tasks.create_task(self._availability.expect_echo()),
+                    tasks.create_task(self._backlog.send(connection)),
+                ]
+                await self._send(connection)
+                for task in others:
+                    task.cancel()
+        finally:
+            self._refusals.end()
+
+    async def _subscribe(self, connection: Connection) -> None:
+        """Subscribe, and say what the broker refuses.
+
+        At QoS 0: Mosquitto counts what it keeps back as too long among the messages in flight, where at QoS 1 it stays.
+        """
+        availabilities = [self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)]
+        refused = await connection.subscribe(self._topic("request/+"), [*availabilities, self._birth_topic])
+        for topic, why in refused.items():
+            self._refusals.deny(topic, f"not allowed to read it: {why}")
+
+    async def _publish(self, connection: Connection, messages: Sequence[Message]) -> None:
+        """Publish one after the other."""
+        for message in messages:
+            self._refusals.answered(message, await connection.publish(message))
+
+    async def _send(self, connection: Connection) -> None:
+        """Send what is live until the sink closes, then say goodbye."""
+        self._wake.set()
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            if self._again:
+                self._again, self._sent = False, Sent()
+                self._availability.told()
+                await self._publish(connection, self._messages.greeting())
+            await self._availability.correct(lambda messages: self._publish(connection, messages))
+            snapshot, self._slot = self._slot, None
+            if snapshot is not None:
+                now_s = asyncio.get_running_loop().time()
+                self._messages.commands = self._requests.allowed
+                messages, self._sent = self._messages.due(self._sent, snapshot, now_s)
+                await self._publish(connection, messages)
+            if self._link.closing.is_set():
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(HANDOVER_S):
+                        await self._backlog.emptied()
+                await self._publish(connection, self._messages.farewell())
+                return
+
+    async def _receive(self, connection: Connection) -> None:
+        """Answer requests, hear Home Assistant's birth, watch over the availabilities."""
+        while True:
+            message = await connection.receive()
+            if message.topic == self._birth_topic:
+                if message.payload == b"online" and not message.retain:
+                    asyncio.get_running_loop().call_later(self._birth_delay_s, self._say_again)
+            elif message.topic in (self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)):
+                if not message.retain:  # what the broker kept from earlier is not news
+                    self._availability.heard(message.topic, message.payload)
+            else:
+                await self._answer(connection, message)
+
+    async def _answer(self, connection: Connection, message: Received) -> None:
+        name = message.topic.rsplit("/", 1)[-1]
+        if message.retain:  # it would be granted again with each connection
+            self._requests.refuse("retained", name[:MOST_SHOWN])
+            return
+        response = await self._requests.respond(name, message.payload)
+        if response is not None:  # so the name is one of ours
+            # not at QoS 1: in a flood the broker's word that it has it comes late, and who waits for that reads nothing
+            await connection.publish(Message(self._topic(f"response/{name}"), response, 0, retain=False))
+
+    def _say_again(self) -> None:
+        """Send all retained messages again with the next snapshot."""
+        self._again = True
+
+    def _topic(self, name: str) -> str:
+        return f"{self._messages.root}/{name}"

@@ -1,0 +1,37 @@
+"""What is published on which topic, and the version of it all.
+
+``PAYLOAD_VERSION`` goes up by one when a topic or a field vanishes, or a field gets another type, unit or meaning: what a
+reader relied on. What is added does not raise it: a reader passes over what it does not know.
+``tests/sinks/mqtt/test_payloads.py`` remembers every field and its type.
+"""
+
+from typing import Any, NamedTuple
+
+from bms_estimator.model.events import Event
+from bms_estimator.model.payloads import PAYLOAD_VERSION, Alarm, Estimate, Health, Info, ParameterReport, Report
+
+
+class Topic(NamedTuple):
+    """A topic whose payload is a model."""
+
+    model: type[Report]
+    qos: int
+    retain: bool
+    when: str
+
+
+TOPICS = {
+    "state": Topic(Estimate, 1, retain=False, when="each publish period with samples; late after an outage"),
+    "event": Topic(Event, 1, retain=False, when="when it happens; late after an outage"),
+    "parameters": Topic(ParameterReport, 0, retain=False, when="each second, from the first sample on"),
+    "health": Topic(Health, 1, retain=True, when="each second, and when the sensor comes or goes"),
+    "info": Topic(Info, 1, retain=True, when="on change"),
+    "alarm": Topic(Alarm, 1, retain=True, when="on change"),
+}
+"""By name; alarms stand below ``alarm/``, each on its own."""
+
+
+def schema() -> dict[str, Any]:
+    """Topic ``schema``: the version, and the JSON schema of each topic's payload."""
+    schemas = {name: topic.model.model_json_schema() for name, topic in TOPICS.items()}
+    return {"payload_version": PAYLOAD_VERSION} | schemas

@@ -1,0 +1,71 @@
+"""The live view of the pack that this process serves: it shows what is published, though it comes by no broker."""
+
+from collections.abc import Callable, Iterable
+from typing import Self
+
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.topic_cache import Published
+from bms_estimator.sinks.mqtt.messages import Message, Messages, Sent
+from bms_estimator.sinks.terminal.live_view import LiveView
+
+BASE_TOPIC = "bms"
+"""Nobody sees these topics."""
+
+
+class ConsoleSink:
+    """Shows snapshots as a subscriber would see them. ``publish`` returns at once, however long stdout is blocked.
+
+    Args:
+        log: Log lines to show below, the last ones.
+        hint: A line that stays at the foot of the screen.
+        true_soc: The pack's SOC 0..1 at the last sample, where somebody knows it.
+        clock: The clocks.
+    """
+
+    def __init__(
+        self,
+        *,
+        log: Iterable[str] = (),
+        hint: str = "",
+        true_soc: Callable[[], float | None] = lambda: None,
+        clock: Clock | None = None,
+    ) -> None:
+        self._clock = clock or Clock()
+        self._published = Published(BASE_TOPIC)
+        self._view = LiveView(self._published.devices, log=log, hint=hint, true_soc=true_soc, wall=self._clock.wall)
+        self._messages: Messages | None = None
+        self._before: Snapshot | None = None
+        self._sent = Sent()
+
+    async def __aenter__(self) -> Self:
+        """Take the screen."""
+        await self._view.__aenter__()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Give the screen back."""
+        await self._view.__aexit__(None, None, None)
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Show a snapshot.
+
+        Raises:
+            OSError: Standard output could not be written.
+        """
+        for message in self._said(snapshot):
+            heard = self._published.take(message.topic, message.payload, self._clock.wall())
+            if heard is not None:
+                self._view.hear(heard)
+        self._view.show()
+
+    def _said(self, snapshot: Snapshot) -> list[Message]:
+        """What a broker would get."""
+        greeting: list[Message] = []
+        if self._messages is None:
+            self._messages = Messages(BASE_TOPIC, snapshot.info.device)
+            greeting = self._messages.greeting()
+        kept = self._messages.kept(self._before, snapshot)
+        due, self._sent = self._messages.due(self._sent, snapshot, self._clock.monotonic())
+        self._before = snapshot
+        return [*greeting, *kept, *due]

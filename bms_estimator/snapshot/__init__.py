@@ -1,1 +1,0 @@
-"""From estimator and counters to what is published."""

@@ -1,0 +1,376 @@
+"""``replay``: its summary, its table, and what it says of files that cannot be replayed."""
+
+import csv
+import gzip
+import io
+import json
+import math
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyarrow import BufferOutputStream, parquet
+from pyarrow.csv import read_csv
+
+from bms_estimator import estimate, load_capture, load_cell
+from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
+from tests.command_line import run
+
+SUMMARY = {
+    "samples",
+    "duration_s",
+    "soc_initial",
+    "soc_final",
+    "soc_std_final",
+    "soc_rms_difference_to_coulomb",
+    "innovation_rms_v",
+    "voltage_rms_error_v",
+    "lock_lost",
+    "k_final",
+    "samples_per_s",
+    "wall_s",
+}
+COLUMNS = [
+    "time_s",
+    "voltage_v",
+    "current_a",
+    "soc",
+    "voltage_estimate_v",
+    "innovation_v",
+    "nussbaum_gain",
+    "k",
+    "soc_std",
+    "r_s_ohm",
+    "r_ts_ohm",
+    "tau_ts_s",
+    "r_tl_ohm",
+    "tau_tl_s",
+]
+SAMPLES = 600
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Ten minutes at rest and under 1 A in turns."""
+    path = tmp_path / "small.csv"
+    rows = [(t, 0.0, 3.9) if t // 60 % 2 == 0 else (t, 1.0, 3.82) for t in range(SAMPLES)]
+    lines = [f"{time},{current},{voltage}" for time, current, voltage in rows]
+    path.write_text("\n".join(["time_s,current_a,voltage_v", *lines]) + "\n")
+    return path
+
+
+def columns_of_csv(path):
+    data = path.read_bytes()
+    text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
+    header, *rows = csv.reader(text.splitlines())
+    values = np.array([[float(cell) for cell in row] for row in rows])
+    return dict(zip(header, values.T, strict=True))
+
+
+def columns_of_parquet(path):
+    table = parquet.read_table(path)
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def test_a_real_capture_comes_to_one_json_object(data, capsys):
+    capture = data / "leaf" / "hppc_25c_from_full.csv.gz"
+    code, out, err = run(capsys, "replay", capture, "--cell", "leaf", "--json")
+    assert (code, err) == (0, "")
+    result = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} in the summary"))
+    assert out.count("\n") == 1
+    assert set(result) >= SUMMARY
+    assert result["lock_lost"] is False
+    assert result["suspects"] == []
+    with gzip.open(capture, "rt") as file:
+        times = [float(line.split(",")[0]) for line in file if line[0].isdigit()]
+    assert result["samples"] + sum(result["dropped"].values()) == len(times)
+    assert result["duration_s"] == pytest.approx(times[-1] - times[0])
+    assert result["soc_initial"] > 0.97
+    assert result["soc_final"] < 0.05
+    assert result["soc_rms_difference_to_coulomb"] < 0.005
+    assert result["innovation_rms_v"] < 0.005
+    assert result["voltage_rms_error_v"] < 0.005
+    assert 0.0 < result["soc_std_final"] < 0.05
+
+
+@pytest.mark.parametrize("name", ["out.csv", "out.csv.gz", "out.parquet"])
+def test_estimates_sample_by_sample_agree_with_the_summary(name, capture, tmp_path, capsys):
+    out = tmp_path / name
+    code, text, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--json")
+    assert (code, err) == (0, "")
+    columns = columns_of_parquet(out) if name.endswith(".parquet") else columns_of_csv(out)
+    assert set(columns) >= set(COLUMNS)
+    result = json.loads(text)
+    assert {len(values) for values in columns.values()} == {result["samples"]} == {SAMPLES}
+    assert np.array_equal(columns["time_s"], np.arange(SAMPLES))
+    assert np.array_equal(np.unique(columns["current_a"]), [0.0, 1.0])
+    assert columns["soc"][0] == result["soc_initial"]
+    assert columns["soc"][-1] == result["soc_final"]
+    assert columns["soc_std"][-1] == result["soc_std_final"]
+    assert columns["k"][-1] == result["k_final"]
+    assert math.sqrt(np.mean(columns["innovation_v"] ** 2)) == pytest.approx(result["innovation_rms_v"])
+
+
+def test_csv_and_parquet_hold_the_same_to_the_last_bit(capture, tmp_path, capsys):
+    for name in ("a.csv", "a.parquet"):
+        assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", tmp_path / name)[0] == 0
+    first, second = columns_of_csv(tmp_path / "a.csv"), columns_of_parquet(tmp_path / "a.parquet")
+    assert list(first) == list(second)
+    for name, values in first.items():
+        assert np.array_equal(values, second[name], equal_nan=True), name
+
+
+def test_the_given_soc_is_where_it_starts(capture, capsys):
+    started = []
+    for soc in ("0.3", "0.7"):
+        code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", soc, "--json")
+        assert code == 0
+        started.append(json.loads(out)["soc_initial"])
+    assert started == pytest.approx([0.3, 0.7], abs=0.15)  # the first voltage counts, too
+    code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", "1.5")
+    assert code == 2
+    assert "'--soc'" in err
+
+
+def test_for_people(capture, capsys):
+    code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650")
+    assert code == 0
+    assert "small.csv" in out
+    assert f"{SAMPLES}" in out
+    assert "mV" in out
+    assert "kept" in out
+
+
+def test_what_a_person_can_mend_ends_with_code_2_and_names_it(capture, tmp_path, capsys):
+    wrong = tmp_path / "wrong.csv"
+    wrong.write_text(capture.read_text().replace("voltage_v", "volts"))
+    words = tmp_path / "words.csv"
+    words.write_text("time_s,current_a,voltage_v\n0,0,3.9\n1,none,3.9\n")
+    missing, other = tmp_path / "missing.csv", tmp_path / "other.csv"
+    other.write_text("kept as it is\n")
+    cell = ("--cell", "ncr18650")
+    for arguments, named in [
+        ((missing, *cell), ["missing.csv: no such file"]),
+        ((missing, *cell, "--out", other, "--force"), ["missing.csv: no such file"]),
+        ((capture, *cell, "--out", other), ["other.csv: exists already; --force replaces it"]),
+        ((capture, "--cell", "nonsense"), ["nonsense", "ncr18650"]),
+        ((capture, "--cell", ""), ["a cell of no name", "ncr18650"]),
+        ((wrong, *cell), ["wrong.csv", "voltage_v"]),
+        ((words, *cell), ["words.csv", "line 3", "current_a", "none"]),
+        ((capture,), ["--cell", "--pack"]),
+        ((capture, "--cell", "nmc"), ["nmc is a generic cell", "--capacity-ah"]),
+        ((capture, *cell, "--capacity-ah", "-3"), ["capacity_ah = -3.0", "above 0"]),
+        ((capture, *cell, "--capacity-ah", "nan"), ["--capacity-ah", "no decimal number"]),
+        ((capture, *cell, "--out", tmp_path / "out.xlsx"), ["out.xlsx", ".csv", ".parquet"]),
+        ((capture, *cell, "--out", tmp_path / "no" / "out.csv"), ["out.csv", "No such file"]),
+        ((capture, *cell, "--mqtt", "nonsense"), ["--mqtt", "nonsense"]),
+    ]:
+        code, out, err = run(capsys, "replay", *arguments)
+        assert (code, out) == (2, ""), arguments
+        assert [name for name in named if name not in err] == [], err
+        assert "Traceback" not in err
+    assert other.read_text() == "kept as it is\n"
+
+
+@pytest.mark.parametrize("given", ["option", "pack", "option over pack"])
+def test_generic_cell_has_the_capacity_that_is_given(given, capture, tmp_path, capsys):
+    pack, out = tmp_path / "pack.toml", tmp_path / "out.csv"
+    in_file = {"pack": "capacity_ah = 3\n", "option over pack": "capacity_ah = 50\n"}.get(given, "")
+    pack.write_text(f'[pack]\ncell = "nmc"\n{in_file}')
+    option = () if given == "pack" else ("--capacity-ah", "3")
+    assert run(capsys, "replay", capture, "--pack", pack, "--soc", "0.6", *option, "--out", out)[0] == 0
+    drawn_ah = columns_of_csv(out)["soc_coulomb"][[0, -1]] @ [3.0, -3.0]
+    assert drawn_ah == pytest.approx(SAMPLES / 2 / 3600, rel=0.02)  # 1 A for half of the time
+
+
+def test_the_capture_is_never_written_over(capture, tmp_path, capsys):
+    before, link = capture.read_bytes(), tmp_path / "link.csv"
+    link.symlink_to(capture)
+    for out in (capture, link):
+        code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--force")
+        assert code == 2
+        assert "is what is read" in err
+    assert capture.read_bytes() == before
+
+
+def test_a_cut_gzip_is_named(capture, tmp_path, capsys):
+    whole, cut = tmp_path / "whole.csv.gz", tmp_path / "cut.csv.gz"
+    with gzip.open(whole, "wb") as packed, capture.open("rb") as plain:
+        shutil.copyfileobj(plain, packed)
+    cut.write_bytes(whole.read_bytes()[:-20])
+    assert run(capsys, "replay", whole, "--cell", "ncr18650", "--json")[0] == 0
+    code, _, err = run(capsys, "replay", cut, "--cell", "ncr18650", "--json")
+    assert code == 2
+    assert "cut.csv.gz: gzip data damaged or cut short" in err
+
+
+def test_estimates_from_before_outlive_a_capture_that_cannot_be_read(capture, tmp_path, capsys):
+    out, wrong = tmp_path / "out.csv", tmp_path / "wrong.csv"
+    assert run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out)[0] == 0
+    before = out.read_bytes()
+    wrong.write_text("time_s,voltage_v\n0,3.7\n")
+    assert run(capsys, "replay", wrong, "--cell", "ncr18650", "--out", out, "--force")[0] == 2
+    assert out.read_bytes() == before
+
+
+def test_a_capture_without_a_usable_sample_is_an_error(tmp_path, capsys):
+    empty = tmp_path / "nan.csv"
+    empty.write_text("time_s,current_a,voltage_v\n0,0.1,nan\n1,0.1,9.9\n")
+    code, out, err = run(capsys, "replay", empty, "--cell", "ncr18650", "--json")
+    assert (code, out) == (2, "")
+    assert "nan.csv: no usable sample; dropped: 1 not finite, 1 outside the cell's range" in err
+
+
+def test_what_is_in_another_unit_is_guessed(capture, tmp_path, capsys):
+    """All of it, or what is above a few milliamperes."""
+    rows = read_csv(capture).to_pylist()
+    head = ",".join(rows[0])
+    tables = {
+        "volt.csv": ("voltage_v", "are these millivolts?"),
+        "ampere.csv": ("current_a", "are these milliamperes?"),
+    }
+    for name, (column, guess) in tables.items():
+        lines = [",".join(str(1e3 * v if k == column else v) for k, v in row.items()) for row in rows]
+        (tmp_path / name).write_text("\n".join([head, *lines]))
+        _, out, err = run(capsys, "replay", tmp_path / name, "--cell", "chen_mora")
+        assert guess in " ".join((out + err).split())
+
+
+def test_a_temperature_that_is_none_or_was_not_measured_is_said(tmp_path, capsys):
+    for cell_c, words in (
+        (297.0, "10 values that no cell has: the band is wider"),
+        (math.nan, "not measured: the band is wider"),
+    ):
+        table = tmp_path / "warm.csv"
+        lines = [f"{j},0.1,3.8,{cell_c}" for j in range(10)]
+        table.write_text("\n".join(["time_s,current_a,voltage_v,temperature_c", *lines]))
+        _, out, _ = run(capsys, "replay", table, "--cell", "ncr18650")
+        assert words in " ".join(out.split())
+
+
+def test_time_that_runs_backwards_is_said(tmp_path, capsys):
+    backwards = tmp_path / "backwards.csv"
+    backwards.write_text("time_s,current_a,voltage_v\n" + "".join(f"{9 - j},0.1,3.8\n" for j in range(10)))
+    code, out, _ = run(capsys, "replay", backwards, "--cell", "ncr18650")
+    assert code == 0
+    assert re.search(r"clock set back +9 times: are the rows in the order of time\?", out)
+    assert re.search(r"duration +0.0 s", out)
+
+
+def test_a_folder_is_no_capture(tmp_path, capsys):
+    code, _, err = run(capsys, "replay", tmp_path, "--cell", "ncr18650")
+    assert code == 2
+    assert f"{tmp_path}: is a directory" in err
+
+
+def test_a_real_capture_gives_what_estimate_gives_to_the_last_bit(data, tmp_path, capsys):
+    capture, out = data / "leaf" / "cc_1c.csv.gz", tmp_path / "out.csv"
+    assert run(capsys, "replay", capture, "--cell", "leaf", "--soc", 0.2, "--out", out)[0] == 0
+    found = estimate(load_capture(capture), load_cell("leaf"), initial_soc=0.2)
+    for name, values in columns_of_csv(out).items():
+        assert np.array_equal(values, found[name], equal_nan=True), name
+
+
+def packed(path):
+    return gzip.compress(path.read_bytes())
+
+
+def raw(path):
+    """The same samples as a board of text lines was recorded."""
+    recorded = path.with_name("small.bms")
+    with CaptureWriter(recorded, CaptureHeader(mode="text")) as writer:
+        for line in path.read_text().splitlines()[1:]:
+            time_s, current_a, voltage_v = line.split(",")
+            writer.write(float(time_s), f"{voltage_v},{current_a}\n".encode())
+    return recorded.read_bytes()
+
+
+def test_documented_replays_of_the_captures_that_come_with_the_tests_run_as_they_stand(monkeypatch, capsys):
+    root = Path(__file__).parents[3]
+    text = "".join((root / name).read_text() for name in ("README.md", "docs/cli.md"))
+    commands = re.findall(r"bms-estimator (replay tests/data/.+)", text)
+    assert commands
+    monkeypatch.chdir(root)
+    for command in commands:
+        assert run(capsys, *command.split())[0] == 0, command
+
+
+def as_parquet(path):
+    buffer = BufferOutputStream()
+    parquet.write_table(read_csv(path), buffer)
+    return buffer.getvalue().to_pybytes()
+
+
+def replay_stdin(monkeypatch, capsys, data, *arguments):
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(data)))
+    return run(capsys, "replay", "-", "--cell", "ncr18650", *arguments)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [Path.read_bytes, packed, as_parquet, raw, lambda path: gzip.compress(raw(path))],
+    ids=["CSV", "CSV.gz", "Parquet", "raw", "raw.gz"],
+)
+def test_a_capture_comes_from_stdin_as_from_a_file(form, capture, monkeypatch, capsys):
+    code, out, err = replay_stdin(monkeypatch, capsys, form(capture), "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["samples"] == SAMPLES
+
+
+def test_a_closed_stdin_is_told(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdin", None)
+    assert run(capsys, "replay", "-", "--cell", "ncr18650") == (
+        2,
+        "",
+        "error: stdin: closed; nothing can be read from it\n",
+    )
+
+
+def test_what_is_wrong_on_stdin_is_named_without_a_path(monkeypatch, capsys):
+    for data, said in [
+        (b"time_s,current_a,voltage_v\n0,none,3.7\n", "stdin: line 2: current_a = 'none': must be a number"),
+        (b"", "stdin: empty: the first line must name the columns"),
+        (b"\x1f\x8b\x08 no gzip", "stdin: gzip data damaged or cut short"),
+    ]:
+        code, out, err = replay_stdin(monkeypatch, capsys, data)
+        assert (code, out) == (2, "")
+        assert err.startswith(f"error: {said}")
+
+
+def currents(capsys, out, *arguments):
+    """What the estimator took, with the command line's arguments."""
+    code, _, err = run(capsys, "replay", *arguments, "--out", out, "--force")
+    assert (code, err) == (0, "")
+    return np.unique(columns_of_csv(out)["current_a"]).tolist()
+
+
+def test_the_sign_of_a_tables_current_is_given_by_the_pack_or_the_option(capture, tmp_path, capsys):
+    out, pack = tmp_path / "out.csv", tmp_path / "pack.toml"
+    pack.write_text('[sensor]\ncurrent_sign = "charge_positive"\n')
+    charge, discharge = (("--current-sign", f"{sign}_positive") for sign in ("charge", "discharge"))
+    assert currents(capsys, out, capture, "--cell", "ncr18650") == [0.0, 1.0]
+    assert currents(capsys, out, capture, "--cell", "ncr18650", *charge) == [-1.0, 0.0]
+    assert currents(capsys, out, capture, "--pack", pack) == [-1.0, 0.0]
+    assert currents(capsys, out, capture, "--pack", pack, *discharge) == [0.0, 1.0]
+
+
+def test_the_battery_data_format_keeps_its_sign_whatever_the_board_has(capture, tmp_path, capsys):
+    bdf, out, pack = tmp_path / "small.bdf", tmp_path / "out.csv", tmp_path / "pack.toml"
+    bdf.write_text(capture.read_text().replace("time_s,current_a,voltage_v", "Test Time / s,Current / A,Voltage / V"))
+    for sign in ("charge_positive", "discharge_positive"):
+        pack.write_text(f'[sensor]\ncurrent_sign = "{sign}"\n')
+        assert currents(capsys, out, bdf, "--pack", pack) == [-1.0, 0.0]
+    assert currents(capsys, out, bdf, "--pack", pack, "--current-sign", "discharge_positive") == [0.0, 1.0]
+
+
+def test_a_recording_of_another_protocol_than_that_of_the_settings_is_named(tmp_path, capsys):
+    capture, pack = tmp_path / "meter.bmsraw", tmp_path / "pack.toml"
+    with CaptureWriter(capture, CaptureHeader("junctek", "/dev/ttyUSB0", 115_200, "charge_positive")) as writer:
+        writer.write(0.0, b":r50=1,34,5166,1030,109337,11738441,62100651,48663,125,0,99,0,644,9117,\r\n")
+    pack.write_text("")
+    code, _, err = run(capsys, "replay", capture, "--pack", pack)
+    assert code == 2
+    assert "recorded from protocol 'junctek', and sensor.protocol is 'binary'" in err

@@ -1,0 +1,38 @@
+"""Samples gathered into blocks: none lost, none twice, however they come."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bms_estimator.edge.batching import Gathering
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+
+
+def samples(times_s: np.ndarray) -> SampleBlock:
+    made = np.zeros(times_s.size, dtype=SAMPLE)
+    made["time_s"] = times_s
+    return made
+
+
+def test_a_minute_at_one_a_second_is_sixty_samples() -> None:
+    gathering = Gathering(60.0)
+    blocks = [block for t in range(181) for block in gathering.add(samples(np.array([float(t)])), t + 0.5)]
+    assert [block.samples.size for block in blocks] == [60, 60, 60]
+    assert [block.arrival_s for block in blocks] == [59.5, 119.5, 179.5]
+    assert [block.samples.size for block in gathering.cut()] == [1]
+    assert gathering.cut() == []
+
+
+@given(st.lists(st.lists(st.floats(0.0, 30.0), max_size=40), max_size=20), st.integers(1, 7))
+def test_what_comes_goes_on_in_order(reads: list[list[float]], most: int) -> None:
+    gathering, time_s, given_s, blocks = Gathering(20.0, most), 0.0, [], []
+    for steps in reads:
+        times_s = time_s + np.cumsum(steps)
+        time_s = times_s[-1] if times_s.size else time_s
+        given_s.append(times_s)
+        blocks += gathering.add(samples(times_s), time_s)
+    blocks += gathering.cut()
+    assert all(1 <= block.samples.size <= most for block in blocks)
+    assert all(np.ptp(block.samples["time_s"]) < 20.0 for block in blocks)
+    gone = [block.samples["time_s"] for block in blocks]
+    assert np.concatenate([*gone, []]).tolist() == np.concatenate([*given_s, []]).tolist()

@@ -1,0 +1,274 @@
+"""An edge and the real server: whatever breaks, the samples that come in the order of their blocks are those taken."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import nats
+import numpy as np
+import pytest
+
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import decode
+from bms_estimator.edge.block_sender import Edge
+from bms_estimator.edge.subjects import Awaits
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import EdgeHealth
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.settings.edge import EdgeSettings
+from tests.fleet.engine import Engine, running
+from tests.fleet.receiver import Receiver
+from tests.mosquitto import Broker, Listener
+from tests.mqtt.proxy import Proxy
+from tests.patience import LONG_S
+
+WALL_S = 1.7e9
+SETTINGS = {"block_s": 60.0, "store_mib": 1.0}
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
+    with running(tmp_path_factory.mktemp("engine"), partitions=4) as engine:
+        yield engine
+
+
+@pytest.fixture
+async def receiver(engine: Engine, request: pytest.FixtureRequest) -> AsyncIterator[Receiver]:
+    """Of a pack of its own for each test."""
+    async with Receiver(engine.url, request.node.name.replace("[", "_").rstrip("]")[:64]) as receiver:
+        yield receiver
+
+
+class Feed:
+    """An edge, and samples at one a second by clocks that the test turns."""
+
+    def __init__(self, receiver: Receiver, folder: Path, url: str, **settings: float) -> None:
+        self.now_s, self._count, self._reads = 0.0, 0, list[SampleBlock]()
+        self.receiver, self._random = receiver, np.random.default_rng(1)
+        self.edge = Edge(
+            EdgeSettings(url=url, **SETTINGS | settings),
+            receiver.pack,
+            folder,
+            clock=Clock(wall=lambda: WALL_S + self.now_s),
+            steady=lambda: self.now_s,
+            first_delay_s=0.05,
+            retry_s=0.05,
+            handover_s=LONG_S,
+        )
+
+    def give(self, minutes: float) -> None:
+        for _ in range(round(60 * minutes)):
+            sample = np.zeros(1, dtype=SAMPLE)
+            sample["time_s"], sample["voltage_v"] = self.now_s, 3.0 + 1e-6 * self._count
+            sample["current_a"], sample["temperature_c"] = self._random.normal(), np.nan
+            self.edge.take(sample)
+            sample["time_s"] += WALL_S
+            self._reads.append(sample)
+            self._count, self.now_s = self._count + 1, self.now_s + 1.0
+
+    @property
+    def count(self) -> int:
+        return self._count
+
+    async def all_came(self) -> None:
+        """All that was given, without the block that is open: to the last bit, once and in order."""
+        ended = self._count - len(self.edge._gathering)
+        await self.receiver.until(ended)
+        assert same(self.receiver.samples, np.concatenate(self._reads[:ended]))
+
+
+def same(some: SampleBlock, others: SampleBlock) -> bool:
+    """To the last bit; what lies between the columns is no part of a sample."""
+    return all(some[name].tobytes() == others[name].tobytes() for name in SAMPLE.names or ())
+
+
+def url(engine: Engine) -> str:
+    return f"mqtt://127.0.0.1:{engine.mqtt_port}"
+
+
+async def until(condition) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - counters have no event
+            await asyncio.sleep(0.01)
+
+
+async def test_samples_come_in_blocks_and_the_last_one_at_a_clean_stop(
+    receiver: Receiver, engine: Engine, tmp_path: Path
+) -> None:
+    feed = Feed(receiver, tmp_path, url(engine))
+    async with feed.edge:
+        feed.give(30.5)
+        await receiver.until(30 * 60)
+        await until(lambda: feed.edge.store.oldest > 20)  # the worker has said so
+    await feed.all_came()
+    assert [block.number for block in receiver.blocks] == list(range(1, 32))
+    assert {block.samples.size for block in receiver.blocks[:-1]} == {60}
+    assert receiver.blocks[-1].arrival_s == WALL_S + feed.now_s - 1.0
+    assert (receiver.resends, receiver.gaps, feed.edge.store.dropped) == (0, 0, 0)
+
+
+async def test_a_link_that_is_cut_costs_nothing(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+    async with Proxy(engine.mqtt_port) as network:
+        feed = Feed(receiver, tmp_path, network.url)
+        async with feed.edge:
+            feed.give(5)
+            await feed.all_came()
+            for _ in range(3):
+                network.leave()
+                feed.give(40)
+                await until(lambda: not feed.edge.store.connected)
+                network.away = False
+                feed.give(1)
+                await feed.all_came()
+        assert feed.edge.delivery.losses == 3
+
+
+async def test_a_store_that_must_be_later_than_the_clock_goes_on_at_the_same_pace(
+    receiver: Receiver, engine: Engine, tmp_path: Path
+) -> None:
+    feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:9")  # nobody is there
+    async with feed.edge:
+        feed.give(2)
+        later = Awaits(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
+        await until(lambda: feed.edge.store._settled.kept.next == 2)  # on disk
+        feed.edge.store.heard(later)
+        await until(lambda: feed.edge.store.last_s > WALL_S + 1e8)
+        feed.give(4)
+        async with asyncio.timeout(LONG_S):
+            first, second, third = [decode((await feed.edge.store.take(1))[0].message.payload) for _ in range(3)]
+    assert (first.number, first.store > later.store) == (1, True)
+    assert (first.samples["time_s"] == 0.0).all()  # they had been placed by then
+    assert second.samples["time_s"].tolist() == [*np.arange(60.0)]
+    assert third.samples["time_s"].tolist() == [*np.arange(60.0, 120.0)]
+
+
+async def test_a_server_that_is_killed_in_mid_send_costs_nothing(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=4) as engine:
+        async with Receiver(engine.url, "pack") as receiver:
+            feed = Feed(receiver, tmp_path, url(engine))
+            async with feed.edge:
+                for kill in range(2):
+                    feed.give(200)
+                    await receiver.until((205 * kill + 1) * 60)
+                    await asyncio.to_thread(engine.kill, 0)
+                    feed.give(5)
+                    await asyncio.to_thread(engine.start, 0)
+                feed.give(1)
+                await feed.all_came()
+
+
+async def test_an_edge_that_begins_anew_sends_what_is_not_safe_and_goes_on(
+    receiver: Receiver, engine: Engine, tmp_path: Path
+) -> None:
+    feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:1")
+    async with feed.edge:
+        feed.give(50)
+    given = feed._reads
+    again = Feed(receiver, tmp_path, url(engine))
+    again.now_s, again._count, again._reads = feed.now_s, feed.count, given
+    async with again.edge:
+        again.give(10)
+        await again.all_came()
+    await again.all_came()
+    assert [block.number for block in receiver.blocks] == list(range(1, 61))
+
+
+async def test_what_the_stream_has_lost_is_sent_again(receiver: Receiver, engine: Engine, tmp_path: Path) -> None:
+    """As when a leader is killed that has acknowledged what nobody else has."""
+    receiver.lose = {5, 6, 14, 30}
+    feed = Feed(receiver, tmp_path, url(engine))
+    async with feed.edge:
+        feed.give(40)
+        await feed.all_came()
+    assert receiver.lose == set()
+    assert receiver.gaps > 0
+
+
+async def test_an_edge_without_room_says_from_where_on_it_has_blocks(
+    receiver: Receiver, engine: Engine, tmp_path: Path
+) -> None:
+    async with Proxy(engine.mqtt_port) as network:
+        network.away = True
+        feed = Feed(receiver, tmp_path, network.url, store_mib=0.1)
+        async with feed.edge:
+            for _ in range(3):
+                feed.give(60)
+                await until(lambda: not feed.edge.store._waiting)
+            dropped = feed.edge.store.dropped
+            network.away = False
+            await receiver.until(180 * 60 - 60 - 60 * dropped)
+    await receiver.until(feed.count - 60 * dropped)
+    assert dropped > 0
+    assert receiver.gaps == 0
+    assert receiver.blocks[0].oldest == receiver.blocks[0].number == dropped + 1
+    assert same(receiver.samples, np.concatenate(feed._reads[60 * dropped :]))
+
+
+async def test_garbage_from_who_is_no_worker_changes_nothing(
+    receiver: Receiver, engine: Engine, tmp_path: Path
+) -> None:
+    feed = Feed(receiver, tmp_path, url(engine))
+    async with feed.edge:
+        feed.give(3)
+        await feed.all_came()
+        store = receiver.blocks[0].store
+        garbage = [b"", b"\xff\x00", b"{}", b'{"store": -1, "number": 1, "resend": false}', b"9" * 10_000, b"[" * 9_000]
+        garbage += [f'{{"store": {n}, "number": {n}, "resend": true}}'.encode() for n in (10**30, 10**400)]
+        for payload in garbage:
+            await receiver.say(payload)
+        await receiver.say(Awaits(store=1, number=1, resend=True))
+        await receiver.say(Awaits(store=store, number=1, resend=False))
+        await until(lambda: feed.edge.unread == len(garbage))
+        feed.give(3)
+        await feed.all_came()
+
+
+async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
+    """What hears there says which blocks are safe, and from where to send again."""
+    edge = Edge(EdgeSettings(url=broker.url), "pack", tmp_path, handover_s=LONG_S)
+    async with Listener(broker, "raw/#") as heard, edge:
+        samples = np.zeros(600, dtype=SAMPLE)
+        samples["time_s"] = np.arange(600.0)
+        edge.take(samples)
+        await heard.wait("raw/pack", lambda data: decode(data).number == 9)
+        store = decode(heard.all("raw/pack")[0]).store
+        before = len(heard.messages)
+        await heard.publish("edge/pack/awaits", Awaits(store=store, number=7, resend=True).model_dump_json(), qos=1)
+        again = decode(await heard.wait("raw/pack", skip=before))
+        await heard.wait("raw/pack", lambda data: decode(data).number == 9, skip=before)
+        assert (again.number, again.oldest) == (7, 7)
+        await until(lambda: not edge.store.waiting)  # the broker's acknowledgement is on its way
+        assert edge.health() == EdgeHealth(blocks_kept=3, blocks_unsent=0, blocks_dropped=0, trouble=None)
+
+
+async def test_a_source_that_is_silent_holds_no_samples_back(
+    receiver: Receiver, engine: Engine, tmp_path: Path
+) -> None:
+    feed = Feed(receiver, tmp_path, url(engine), block_s=1.0)
+    async with feed.edge:
+        feed.give(1 / 60)
+        await receiver.until(1)
+
+
+async def test_a_server_that_lets_nobody_in_is_named(engine: Engine, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"^edge.password_file = /none: cannot be read"):
+        Edge(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
+
+
+async def test_the_server_keeps_what_came_from_an_edge_by_its_pack(
+    receiver: Receiver, engine: Engine, tmp_path: Path
+) -> None:
+    feed = Feed(receiver, tmp_path, url(engine))
+    async with feed.edge:
+        feed.give(2)
+        await receiver.until(60)
+    async with contextlib.AsyncExitStack() as stack:
+        nc = await nats.connect(engine.url)
+        stack.push_async_callback(nc.close)
+        found = await nc.jetstream().stream_info(
+            subjects.RAW_STREAM, subjects_filter=subjects.kept(0).replace("0", "*", 1)
+        )
+        assert found.state.subjects
+        assert sum(name.endswith(f".raw.{receiver.pack}") for name in found.state.subjects) == 1

@@ -1,0 +1,167 @@
+"""The real program beside a pack: killed in mid-send, ended cleanly, and with no kernel loaded."""
+
+import asyncio
+import contextlib
+import itertools
+import json
+import signal
+import sys
+from asyncio.subprocess import Process
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+from bms_estimator.edge.block_sender import Edge
+from bms_estimator.model.cell import load_cell
+from bms_estimator.service.pack_service import serve
+from bms_estimator.settings.edge import EdgeSettings
+from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.health import sample_counters
+from tests.command_line import PROGRAM, run
+from tests.fleet.engine import Engine, running
+from tests.fleet.receiver import Receiver
+from tests.patience import LONG_S
+from tests.serial_line import Line
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
+    with running(tmp_path_factory.mktemp("engine"), partitions=4) as engine:
+        yield engine
+
+
+class Board:
+    """Prints a line at a time; no voltage comes twice."""
+
+    def __init__(self, line: Line) -> None:
+        self._line, self._number = line, itertools.count(1)
+
+    async def speak(self) -> None:
+        with contextlib.suppress(OSError):
+            self._line.heard()  # a line that nobody has opened is not to hold anybody up
+        while True:
+            with contextlib.suppress(BlockingIOError):
+                self._line.write(b"%.4f,0.10,25.0\r\n" % (3.0 + 1e-4 * next(self._number)))
+            await asyncio.sleep(0.01)
+
+
+def pack_file(folder: Path, line: Line, port: int) -> Path:
+    path = folder / "pack.toml"
+    path.write_text(f"""
+[pack]
+name = "pack"
+[sensor]
+port = "{line.path}"
+protocol = "text"
+[edge]
+url = "mqtt://127.0.0.1:{port}"
+block_s = 1.0
+""")
+    return path
+
+
+@contextlib.asynccontextmanager
+async def program(*command: object, stderr: IO[bytes]) -> AsyncIterator[Process]:
+    process = await asyncio.create_subprocess_exec(
+        *map(str, command), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL, stderr=stderr
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+
+
+async def test_what_a_killed_edge_had_ended_comes_once_and_one_that_is_asked_to_end_sends_all(
+    tmp_path: Path, line: Line, engine: Engine
+) -> None:
+    line.plug()
+    pack, said = pack_file(tmp_path, line, engine.mqtt_port), tmp_path / "log"
+    board = asyncio.create_task(Board(line).speak())
+    async with Receiver(engine.url, "pack") as receiver:
+        with said.open("wb") as log:
+            async with program(PROGRAM, "edge", pack, stderr=log) as process:
+                await receiver.until(1)
+                process.kill()
+            before = said.stat().st_size
+            async with program(sys.executable, "-X", "importtime", PROGRAM, "edge", pack, stderr=log) as process:
+                async with asyncio.timeout(LONG_S):  # blocks of the first may still come while the second imports
+                    while b"store of blocks" not in said.read_bytes()[before:]:  # noqa: ASYNC110 - another process does it
+                        await asyncio.sleep(0.02)
+                await receiver.until(sum(block.samples.size for block in receiver.blocks) + 1)
+                process.send_signal(signal.SIGTERM)
+                assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+        board.cancel()
+        lines = said.read_text().splitlines()
+        state = next(json.loads(each) for each in reversed(lines) if "store of blocks" in each)
+        voltages = receiver.samples["voltage_v"].tolist()
+    assert voltages == sorted(set(voltages))
+    assert (receiver.samples["time_s"][1:] >= receiver.samples["time_s"][:-1]).all()
+    assert [block.number for block in receiver.blocks] == list(range(1, len(receiver.blocks) + 1))
+    assert {block.store for block in receiver.blocks} == {state["made_s"] * 10**9}
+    imported = {each.rpartition("|")[2].strip() for each in lines if each.startswith("import time:")}
+    assert "bms_estimator.edge.block_sender" in imported
+    assert not [name for name in imported if name.split(".")[0] in ("numba", "scipy") or ".kernels" in name]
+
+
+async def test_run_sends_what_it_estimates_from(tmp_path: Path, line: Line, engine: Engine) -> None:
+    line.plug()
+    board, stop = asyncio.create_task(Board(line).speak()), asyncio.Event()
+    edge = {"url": f"mqtt://127.0.0.1:{engine.mqtt_port}", "block_s": 1.0}
+    settings = Settings.model_validate(
+        {"pack": {"name": "both"}, "sensor": {"port": str(line.path), "protocol": "text"}, "edge": edge}
+    )
+    async with Receiver(engine.url, "both") as receiver:
+        service = asyncio.create_task(serve(settings, load_cell("chen_mora"), stop=stop, folder=tmp_path))
+        await receiver.until(1)
+        stop.set()
+        estimator = await asyncio.wait_for(service, LONG_S)
+        counters = sample_counters(estimator.state[0])
+        samples = counters["samples"] + sum(n for name, n in counters.items() if name.startswith("dropped_"))
+        async with Edge(EdgeSettings.model_validate(edge), "both", tmp_path):  # has what a busy machine had no time for
+            await receiver.until(samples)
+        assert receiver.samples.size == samples
+    board.cancel()
+
+
+def test_a_pack_that_is_sent_nowhere_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text("[pack]\n")
+    code, _, said = run(capsys, "edge", path)
+    assert code == 2
+    assert 'edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"' in said
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ('url = "http://a"', "edge.url = 'http://a': must be mqtt://host:port"),
+        ("block_s = 0", "edge.block_s = 0: Input should be greater than or equal to 1"),
+        ('key_file = "a"', "edge.key_file = a: of no use without edge.cert_file"),
+    ],
+)
+def test_settings_that_cannot_be_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, said: str
+) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text(f'[sensor]\nport = "/dev/none"\n[edge]\n{table}\n')
+    code, _, err = run(capsys, "edge", path)
+    assert code == 2
+    assert said in err
+
+
+def test_config_check_looks_at_what_opens_the_servers_door(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, token = tmp_path / "pack.toml", tmp_path / "token"
+    path.write_text(f'[edge]\nusername = "a"\npassword_file = "{token}"\n')
+    assert run(capsys, "config", "check", path)[::2] == (
+        2,
+        f"error: edge.password_file = {token}: cannot be read: No such file or directory\n",
+    )
+    token.write_text("secret")
+    token.chmod(0o644)
+    code, _, said = run(capsys, "config", "check", path)
+    assert code == 0
+    assert f"edge.password_file = {token}: every user of this machine may read it" in said

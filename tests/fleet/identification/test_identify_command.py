@@ -1,0 +1,96 @@
+"""``fleet identify``: packs' samples out of the real server's stream, their new cells back to it."""
+
+import asyncio
+import csv
+
+import nats
+import numpy as np
+import pytest
+
+from bms_estimator.cli.options.pack_options import load_pack
+from bms_estimator.edge.block import Block, encode
+from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET, raw
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.packs.pack_bucket import put
+from bms_estimator.fleet.packs.pack_row import stored
+from tests.command_line import run
+from tests.fleet.engine import running
+from tests.fleet.identification.test_reidentify import KIND, WRONG, pack_samples
+
+STORE = 1_700_000_000 * 10**9
+
+
+async def fill(url):
+    samples = pack_samples(8, rests=False)  # as a drive
+    async with await nats.connect(url) as nc:
+        await make_streams(nc, partitions=1)
+        await put(nc, CELLS_BUCKET, {"own": WRONG.encode()})
+        rows = {name: stored(KIND) for name in ("house", "silent", "young")}
+        await put(nc, PACKS_BUCKET, rows | {"wrong": b"{"})
+        for number, rows in enumerate(np.array_split(samples, 100), 1):
+            data = encode(Block(STORE, number, 1, STORE * 1e-9 + rows["time_s"][-1], rows))
+            await nc.publish(raw("house"), data)
+            if number < 10:
+                await nc.publish(raw("young"), data)
+        await nc.flush()
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("engine"), partitions=1) as engine:
+        asyncio.run(fill(engine.url))
+        yield engine.url
+
+
+def test_packs_are_identified_and_the_better_cells_put(url, tmp_path, capsys):
+    listed, out = tmp_path / "list.csv", tmp_path / "identified"
+    listed.write_text("rank,pack\n1,young\n2,silent\n3,wrong\n4,house\n")
+    asked = [
+        "fleet",
+        "identify",
+        "house",
+        "--from-file",
+        listed,
+        "--out",
+        out,
+        "--put",
+        "--processes",
+        1,
+        "--server",
+        url,
+    ]
+    code, said, err = run(capsys, *asked)
+    assert (code, err) == (0, "")
+    assert "1 of 4 packs have a better cell" in said
+    with (out / "results.csv").open() as file:
+        rows = {row["pack"]: row for row in csv.DictReader(file)}
+    assert rows["house"]["better"] == "True"
+    assert float(rows["house"]["rms_v"]) < 0.5 * float(rows["house"]["rms_before_v"])
+    assert rows["young"]["reason"].endswith("h of samples: at least 6 h are needed")
+    assert rows["silent"]["reason"] == "the server keeps no sample of it in this span"
+    assert rows["wrong"]["reason"].startswith("its row is wrong")
+    assert [path.name for path in out.glob("*.toml")] == ["house.toml"]
+    run(capsys, "fleet", "packs", "show", "house", "--out", tmp_path / "shown", "--server", url)
+    settings, model = load_pack(tmp_path / "shown" / "pack.toml")
+    assert (settings.pack.cell, settings.pack.capacity_ah) == ("of-house.toml", None)
+    assert model.cell.capacity_ah == pytest.approx(KIND.parallel * float(rows["house"]["capacity_ah"]))
+    assert "results.csv: exists already" in run(capsys, *asked)[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "name at least one pack, or give --from-file LIST"),
+        (["house", "nobody"], "nobody: not in the table of packs"),
+        (["--from-file", "/nowhere"], "--from-file /nowhere: cannot be read"),
+    ],
+)
+def test_what_cannot_be_asked_is_said(url, tmp_path, capsys, arguments, said):
+    code, _, err = run(capsys, "fleet", "identify", *arguments, "--out", tmp_path / "out", "--server", url)
+    assert (code, said in err) == (2, True)
+
+
+def test_a_cluster_that_cannot_be_used_is_said(url, tmp_path, capsys):
+    asked = ["fleet", "identify", "house", "--scheduler", "tcp://127.0.0.1:1", "--out", tmp_path / "out"]
+    code, _, err = run(capsys, *asked, "--server", url)
+    assert (code, err.startswith("error: --scheduler tcp://127.0.0.1:1: ")) == (2, True)

@@ -1,0 +1,104 @@
+"""``fleet packs`` against the real server."""
+
+import asyncio
+
+import nats
+import pytest
+
+from bms_estimator.cli.options.pack_options import load_pack
+from bms_estimator.edge.subjects import PACKS_BUCKET
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.packs.pack_bucket import write_bucket
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_file import cell_text
+from tests.command_line import run
+from tests.fleet.engine import running
+from tests.free_port import free_port
+
+TABLE = "pack,cell,capacity_ah,series,protocol\nboat,own.toml,,2,\nhouse,lfp,280.0,16,jk\n"
+
+
+async def connected(url, work):
+    async with await nats.connect(url) as nc:
+        await work(nc)
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("engine")) as engine:
+        asyncio.run(connected(engine.url, lambda nc: make_streams(nc, partitions=1)))
+        yield engine.url
+
+
+@pytest.fixture
+def table(url, tmp_path):
+    asyncio.run(connected(url, lambda nc: write_bucket(nc, PACKS_BUCKET, {}, remove=True)))
+    (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
+    path = tmp_path / "packs.csv"
+    path.write_text(TABLE)
+    return path
+
+
+def test_a_table_is_loaded_listed_and_loaded_again(url, table, capsys):
+    code, out, err = run(capsys, "fleet", "packs", "load", table, "--server", url)
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{table}: 2 packs of 2 kinds: 2 new")
+    code, out, err = run(capsys, "fleet", "packs", "list", "--server", url)
+    assert (code, out, err) == (0, "pack,cell,capacity_ah,series,protocol\nboat,own,,2,\nhouse,lfp,280.0,16,jk\n", "")
+    again = table.with_name("again.csv")
+    again.write_text(out)
+    assert (
+        run(capsys, "fleet", "packs", "load", again, "--server", url)[1]
+        == f"{again}: 2 packs of 2 kinds: 2 as before\n"
+    )
+
+
+def test_rows_go_when_asked_and_by_name(url, table, capsys):
+    run(capsys, "fleet", "packs", "load", table, "--server", url)
+    less = table.with_name("less.csv")
+    less.write_text("pack,cell\nshed,ncr18650\n")
+    said = run(capsys, "fleet", "packs", "load", less, "--server", url)[1]
+    assert said == f"{less}: 1 packs of 1 kinds: 1 new, 2 not in the table, kept (--remove lets them go)\n"
+    assert run(capsys, "fleet", "packs", "load", less, "--remove", "--server", url)[1].endswith(
+        "1 as before, 2 removed\n"
+    )
+    code, _, err = run(capsys, "fleet", "packs", "remove", "shed", "boat", "--server", url)
+    assert (code, err) == (2, "error: boat: not in the table of packs; `fleet packs list` prints it\n")
+    assert run(capsys, "fleet", "packs", "remove", "shed", "--server", url) == (0, "1 removed\n", "")
+    assert run(capsys, "fleet", "packs", "list", "--server", url)[1] == "pack\n"
+
+
+def test_a_pack_is_shown_as_a_pack_file_that_replay_reads(url, table, tmp_path, capsys):
+    run(capsys, "fleet", "packs", "load", table, "--server", url)
+    code, out, err = run(capsys, "fleet", "packs", "show", "house", "--server", url)
+    assert (code, err) == (0, "")
+    assert 'name = "house"' in out
+    assert 'protocol = "jk"' in out
+    folder = tmp_path / "boat"
+    run(capsys, "fleet", "packs", "show", "boat", "--out", folder, "--server", url)
+    settings, model = load_pack(folder / "pack.toml")
+    assert (settings.pack.name, model.cell.series_count) == ("boat", 2)
+
+
+def test_a_wrong_row_is_said_and_the_others_listed(url, table, capsys):
+    asyncio.run(connected(url, lambda nc: write_bucket(nc, PACKS_BUCKET, {"a": b"{", "b": b'{"cell":"ncr18650"}'})))
+    code, out, err = run(capsys, "fleet", "packs", "list", "--server", url)
+    assert (code, out) == (0, "pack,cell\nb,ncr18650\n")
+    assert err.startswith("warning: a: its row is wrong: Invalid JSON")
+    code, _, err = run(capsys, "fleet", "packs", "show", "a", "--server", url)
+    assert (code, err.startswith("error: a: its row is wrong: ")) == (2, True)
+
+
+def test_what_cannot_be_used_is_said_before_anything_is_written(url, table, capsys):
+    table.write_text("pack,cell\nhouse,lfp\n")
+    code, _, err = run(capsys, "fleet", "packs", "load", table, "--server", url)
+    assert (code, f"{table}: line 2: lfp is a generic cell: give its capacity" in err) == (2, True)
+    table.write_text("pack,cell\nhouse,ncr18650\n")
+    port = free_port()
+    code, _, err = run(capsys, "fleet", "packs", "load", table, "--server", f"nats://127.0.0.1:{port}")
+    assert (code, err) == (
+        2,
+        f"error: --server nats://127.0.0.1:{port}: nobody listens there\n",
+    )
+    code, _, err = run(capsys, "fleet", "packs", "list", "--creds", table.with_name("no"), "--server", url)
+    assert (code, "cannot be read" in err) == (2, True)

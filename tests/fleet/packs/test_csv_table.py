@@ -1,0 +1,190 @@
+"""The table of packs: what is read, and what is said of what cannot be."""
+
+import pytest
+
+from bms_estimator.fleet.packs.csv_table import check_models, read_table, table_lines
+from bms_estimator.fleet.packs.pack_registry import NOT_TOLD, KnownPacks
+from bms_estimator.fleet.packs.pack_row import COLUMNS, PackKind, PackRow, known_cells, settings_of, stored
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_file import cell_text
+from bms_estimator.model.errors import UserError
+
+LFP = PackKind(cell="lfp", capacity_ah=100.0, series=16, voltage_resolution_v=0.01)
+ROW = "house,lfp,100,16"
+
+
+@pytest.fixture
+def table(tmp_path):
+    path = tmp_path / "packs.csv"
+
+    def write(text, encoding="utf-8"):
+        path.write_bytes(text.encode(encoding))
+        return path
+
+    return write
+
+
+def wrong(path):
+    with pytest.raises(UserError) as caught:
+        read_table(path)
+    return str(caught.value).replace(f"{path}: ", "")
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_packs_are_read_with_either_separator_and_a_byte_order_mark(table, separator, encoding, end):
+    text = "pack,cell,capacity_ah,series\nhouse,lfp,100,16\n\n boat , nmc ,1.5e2,\n"
+    read = read_table(table(text.replace(",", separator).replace("\n", end), encoding))
+    assert {name: line.kind for name, line in read.packs.items()} == {
+        "house": PackKind(cell="lfp", capacity_ah=100.0, series=16),
+        "boat": PackKind(cell="nmc", capacity_ah=150.0),
+    }
+    assert [line.number for line in read.packs.values()] == [2, 4]
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("a b,lfp,1,1", "line 2, column pack = 'a b': must be 1 to 64 letters, digits, _ and -"),
+        (",lfp,1,1", "line 2, column pack = ''"),
+        ("house,,1,1", "line 2, column cell: is empty; give lfp, nmc"),
+        ("house,../x,1,1", "line 2, column cell = '../x': String should match pattern"),
+        ("house,x.toml,1,1", "line 2, column cell = 'x.toml': no such file beside the table"),
+        ("house,lfp,-6.6,1", "line 2, column capacity_ah = '-6.6': Input should be greater than 0 (what one"),
+        ("house,lfp,1e999,1", "line 2, column capacity_ah = '1e999'"),
+        ("house,lfp,nan,1", "line 2, column capacity_ah = 'nan': must be a number"),
+        ("house,lfp,1,1.5", "line 2, column series = '1.5'"),
+        ("house,lfp,1,0", "line 2, column series = '0': Input should be greater than or equal to 1"),
+        ("house,lfp,1_0,1", "line 2, column capacity_ah = '1_0': must be a number"),
+        ('house,lfp,"1,5",1', "line 2, column capacity_ah = '1,5': must be a number, with a point and not a comma"),
+        ("house,lfp,1", "line 2, 3 values in 4 columns; give one for each, empty for the default"),
+        (f"{ROW}\n{ROW}", "line 3, column pack = 'house': is on line 2 already; take one away"),
+        ('house,"lfp,1,1', "a quote that is opened must be closed"),
+        ("", "no row below the line of column names"),
+    ],
+)
+def test_what_is_wrong_is_said_with_line_and_column(table, row, said):
+    assert said in wrong(table(f"pack,cell,capacity_ah,series\n{row}\n"))
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("pack,cell,capacity", "line 1: column 'capacity' is unknown; is capacity_ah meant?"),
+        ("pack,cell,zzz", f"line 1: column 'zzz' is unknown; there are {', '.join(COLUMNS)}"),
+        ("pack,cell,cell", "line 1: column cell is there twice"),
+        ("pack,series", "line 1: no column cell; there must be one"),
+        ("", "line 1: no column pack"),
+    ],
+)
+def test_wrong_columns_are_said(table, header, said):
+    assert said in wrong(table(f"{header}\n{ROW}\n"))
+
+
+def test_a_table_in_another_encoding_or_none_is_said(table, tmp_path):
+    assert "not UTF-8 (byte 15); save it as CSV in UTF-8" in wrong(table("pack,cell\nhouseé,lfp\n", "latin-1"))
+    assert "cannot be read: No such file" in wrong(tmp_path / "none.csv")
+
+
+def test_of_many_errors_the_first_are_shown(table):
+    lines = wrong(table("pack,cell\n" + "a b,lfp\n" * 100)).splitlines()
+    assert len(lines) == 21
+    assert lines[-1] == "and 80 more"
+
+
+def test_a_cell_file_beside_the_table_is_found_under_its_name(table, tmp_path):
+    (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
+    path = table("pack,cell\nhouse,own.toml\n")
+    read = read_table(path)
+    assert read.packs["house"].kind == PackKind(cell="own")
+    assert read.cell_files == {"own": tmp_path / "own.toml"}
+    check_models(path, read, {"own": (tmp_path / "own.toml").read_text()})
+    with pytest.raises(UserError, match=r"packs\.csv: line 2: own: no cell file of this name was loaded"):
+        check_models(path, read, {})
+
+
+def test_a_kind_without_a_cell_is_said_once(table):
+    path = table("pack,cell\na,lfp\nb,lfp\nc,ncr18650\n")
+    with pytest.raises(UserError, match="line 2, and 1 more of its kind: lfp is a generic cell: give its capacity"):
+        check_models(path, read_table(path), {})
+
+
+def test_settings_are_those_of_a_pack_file_with_the_same_values():
+    row = PackRow(pack="house", cell="lfp", capacity_ah=280.0, series=16, protocol="jk", current_dead_band_a=0.2)
+    settings = settings_of(row)
+    assert (settings.pack.name, settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == (
+        "house",
+        "lfp",
+        280.0,
+        16,
+    )
+    assert (settings.sensor.voltage_resolution_v, settings.sampling.period_s) == (0.01, 1.0)
+    assert settings.sampling.current_dead_band_a == 0.2
+
+
+def test_all_cells_of_the_package_can_be_named():
+    for name in known_cells():
+        assert PackKind(cell=name).cell == name
+
+
+def test_a_table_is_written_as_it_is_read(table):
+    kinds = {"b": LFP, "a": PackKind(cell="ncr18650", protocol="jbd")}
+    read = read_table(table("".join(table_lines(kinds))))
+    assert {name: line.kind for name, line in read.packs.items()} == kinds
+
+
+def test_packs_of_one_kind_share_settings_and_model():
+    known = KnownPacks()
+    for i in range(1000):
+        known.set_row(f"p{i}", stored(LFP.model_copy(update={"series": 14 + i % 5})))
+    made = [known(f"p{i}") for i in range(1000)]
+    assert len({id(one) for one in made}) == 5
+    settings, model = made[0]
+    assert model.cell.series_count == settings.pack.series == 14
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "its row is wrong: Invalid JSON"),
+        (b"[]", "its row is wrong: "),
+        (b'{"cell":"lfp","capacity_ah":"x"}', "its row is wrong: capacity_ah: must be a number, without quotes"),
+        (b'{"cell":"lfp","more":1}', "its row is wrong: more: Extra inputs are not permitted"),
+        (b'{"cell":"lfp"}', "lfp is a generic cell: give its capacity"),
+        (b'{"cell":"lfp","capacity_ah":1e-300}', ""),
+        (b'{"cell":"own"}', "own: no cell file of this name was loaded"),
+        (b'{"cell":"broken"}', "cell broken: not valid TOML"),
+        (b'{"cell":"/etc/passwd"}', "its row is wrong: cell: "),
+        (b'{"cell":"pem_30w","capacity_ah":1}', "pem_30w is a fuel cell, which has no capacity"),
+        (b'{"cell":"lfp","capacity_ah":1,"initial_soc":2}', "its row is wrong: initial_soc: "),
+        (b"\xff\xfe", "its row is wrong: "),
+        (b'{"cell":"ncr18650","voltage_noise_v":1e300}', "no estimator can be made of its values: "),
+    ],
+)
+def test_whatever_is_wrong_makes_a_pack_unknown_with_the_reason(data, reason):
+    known = KnownPacks()
+    known.set_cell("broken", b"= 1")
+    known.set_row("house", data)
+    assert known("house") is None or reason == ""
+    assert known.reason("house").startswith(reason)
+
+
+def test_a_pack_becomes_known_with_its_row_and_its_cell():
+    known = KnownPacks()
+    assert known("house") is None
+    assert known.reason("house") == NOT_TOLD
+    assert known.set_row("house", stored(PackKind(cell="own", series=2)))
+    assert not known.set_row("house", stored(PackKind(cell="own", series=2)))
+    assert known("house") is None
+    assert known.set_cell("own", cell_text(load_cell("ncr18650")).encode())
+    assert known.made_of({"own", "other"}) == {"house"}
+    assert known.made_of({"other"}) == known.made_of(()) == set()
+    assert known.reason("house") == ""
+    assert known("house")[1].cell.series_count == 2
+    assert known.set_cell("own", None)
+    assert not known.set_cell("own", None)
+    assert known("house") is None
+    assert known.set_row("house", None)
+    assert known.reason("house") == NOT_TOLD
+    assert not known.set_row("house", None)

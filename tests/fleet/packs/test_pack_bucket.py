@@ -1,0 +1,106 @@
+"""The table of packs on the real server, and what a worker sees of it."""
+
+import asyncio
+
+import nats
+import pytest
+
+from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
+from bms_estimator.fleet.nats.stream_reader import BATCH, StreamError
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.packs.pack_bucket import PackBucket, Written, read_bucket, remove_keys, write_bucket
+from bms_estimator.fleet.packs.pack_row import PackKind, stored
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_file import cell_text
+from tests.fleet.engine import connected, running
+from tests.patience import LONG_S
+
+LFP = stored(PackKind(cell="lfp", capacity_ah=100.0, series=16))
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("engine")) as engine:
+        yield engine
+
+
+@pytest.fixture
+async def nc(engine):
+    async with await connected(engine.url) as nc:
+        await make_streams(nc, partitions=1)
+        for bucket in (PACKS_BUCKET, CELLS_BUCKET):
+            await write_bucket(nc, bucket, {}, remove=True)
+        yield nc
+
+
+async def test_only_what_differs_is_written_and_rows_go_only_when_asked(nc):
+    values = {f"p{i}": LFP for i in range(2 * BATCH + 5)}
+    assert await write_bucket(nc, PACKS_BUCKET, values) == Written(len(values), 0, 0, 0, 0)
+    assert await read_bucket(nc, PACKS_BUCKET) == values
+    other = {"p0": LFP, "p1": b"{}", "more": LFP}
+    assert await write_bucket(nc, PACKS_BUCKET, other) == Written(
+        new=1, changed=1, same=1, removed=0, left=len(values) - 2
+    )
+    assert await write_bucket(nc, PACKS_BUCKET, other, remove=True) == Written(0, 0, 3, len(values) - 2, 0)
+    assert await read_bucket(nc, PACKS_BUCKET) == other
+    await remove_keys(nc, PACKS_BUCKET, ["more"])
+    assert (await read_bucket(nc, PACKS_BUCKET)).keys() == {"p0", "p1"}
+
+
+async def test_a_worker_sees_all_rows_and_then_what_changes(nc):
+    await write_bucket(nc, PACKS_BUCKET, {"a": LFP, "b": b"{broken", "c": stored(PackKind(cell="own"))})
+    bucket = PackBucket(nc)
+    assert await bucket.refresh() >= {"a", "b", "c"}
+    assert await bucket.refresh() == set()
+    assert bucket.packs("a")
+    assert bucket.packs("b") is None
+    assert bucket.packs("c") is None
+    assert bucket.packs.reason("b").startswith("its row is wrong: ")
+    await write_bucket(nc, CELLS_BUCKET, {"own": cell_text(load_cell("ncr18650")).encode()})
+    assert await bucket.refresh() == {"c"}
+    assert bucket.packs("c")
+    await write_bucket(nc, PACKS_BUCKET, {"b": LFP})
+    await remove_keys(nc, PACKS_BUCKET, ["a"])
+    assert await bucket.refresh() == {"a", "b"}
+    assert bucket.packs("a") is None
+    assert bucket.packs("b")
+
+
+async def test_what_changed_is_told_though_the_table_is_lost_meanwhile_and_made_anew(nc):
+    await write_bucket(nc, PACKS_BUCKET, {"a": stored(PackKind(cell="own")), "b": LFP, "c": LFP})
+    bucket = PackBucket(nc)
+    await bucket.refresh()
+    await nc.jetstream().delete_stream(f"KV_{PACKS_BUCKET}")
+    await write_bucket(nc, CELLS_BUCKET, {"own": cell_text(load_cell("ncr18650")).encode()})
+    with pytest.raises(StreamError, match="KV_packs: the server lacks"):
+        await bucket.refresh()
+    await make_streams(nc, partitions=1)
+    await write_bucket(nc, PACKS_BUCKET, {"b": b"{broken"})  # of a number that there was
+    assert await bucket.refresh() == {"a", "b"}
+    assert bucket.packs("a")
+    assert bucket.packs("b") is None
+
+
+async def test_following_goes_on_where_the_server_was_killed(engine, nc):
+    news = asyncio.Queue()
+    bucket = PackBucket(nc)
+    await bucket.refresh()
+    follower = asyncio.create_task(bucket.follow(news.put_nowait))
+    try:
+        await write_bucket(nc, PACKS_BUCKET, {"a": LFP})
+        assert await asyncio.wait_for(news.get(), LONG_S) == {"a"}
+        engine.kill(0)
+        engine.start(0)
+        async with await nats.connect(engine.url) as other:
+            await write_bucket(other, PACKS_BUCKET, {"b": LFP})
+        assert await asyncio.wait_for(news.get(), LONG_S) == {"b"}
+        assert bucket.packs("b")
+    finally:
+        follower.cancel()
+
+
+async def test_a_server_without_streams_is_said(tmp_path):
+    with running(tmp_path) as engine:
+        async with await nats.connect(engine.url) as nc:
+            with pytest.raises(StreamError, match="refuses to read KV_packs"):
+                await read_bucket(nc, PACKS_BUCKET)

@@ -1,0 +1,43 @@
+"""Hindsight beside the truth, on a real capture that comes with the tests."""
+
+import numpy as np
+import pytest
+
+from bms_estimator import load_capture, load_cell
+from bms_estimator.fleet.queries.duckdb_queries import ask
+from bms_estimator.fleet.queries.parquet_files import write
+from tests.benchmarks.hindsight import judged, limits, slots
+
+SLOT_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def packs(data):
+    """A Nissan Leaf, entered at four places with an SOC wrong by 0.2 each way; truth is the charge counted from full."""
+    cell, whole = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
+    drawn_as = np.r_[0.0, np.cumsum(whole["current_a"][:-1] * np.diff(whole["time_s"]))]
+    soc = 1.0 - drawn_as / (3600.0 * cell.cell.capacity_ah)
+    starts = [(first, wrong) for first in (0, 2000, 4000, 6000) for wrong in (-0.2, 0.2)]
+    return [
+        slots(f"p{n}", cell, whole.rows[first:], soc[first:], float(np.clip(soc[first] + wrong, 0.0, 1.0)), SLOT_S)
+        for n, (first, wrong) in enumerate(starts)
+    ]
+
+
+def test_a_real_cell_is_judged_in_hindsight_as_by_the_truth(packs, tmp_path):
+    write(tmp_path, [known.hour for pack in packs for known in pack])
+    (whole, *_) = ask(tmp_path, "honest", limits=limits(SLOT_S)).records
+    there = np.abs([x for pack in packs for x in judged(pack)]) <= 2.0
+    assert whole["packs"] == len(packs)
+    assert whole["within_2_std"] == pytest.approx(there.mean(), abs=0.1)
+    assert whole["low"] > 0.5
+
+
+def test_a_real_band_that_is_far_too_narrow_is_seen(packs, tmp_path):
+    narrow = [
+        known.hour.model_copy(update={"soc_mean_std": (known.hour.soc_mean_std or 0.0) / 8.0})
+        for pack in packs
+        for known in pack
+    ]
+    write(tmp_path, narrow)
+    assert ask(tmp_path, "honest", limits=limits(SLOT_S)).records[0]["within_2_std"] < 0.6

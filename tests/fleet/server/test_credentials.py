@@ -1,0 +1,367 @@
+"""Who may do what, asked of the real server: edges, workers and readers of two tenants, and who is none of them."""
+
+import asyncio
+import os
+import signal
+import stat
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import aiomqtt
+import nats
+import numpy as np
+import pytest
+from nats.aio.client import Client
+from nats.errors import Error as NatsError
+
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import Block, encode
+from bms_estimator.fleet.nats.streams import consumer, make_streams
+from bms_estimator.fleet.server import credentials
+from bms_estimator.fleet.server.jwt_claims import Role
+from bms_estimator.fleet.server.nats_config import Accounts, configuration
+from bms_estimator.fleet.worker.worker import Options, work
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.settings.fleet import TenantSettings
+from tests.command_line import run
+from tests.fleet.engine import Engine, running
+from tests.patience import LONG_S
+
+NOW = datetime.now(UTC) - timedelta(minutes=1)
+TENANTS = {"acme": TenantSettings(), "other": TenantSettings()}
+
+
+@dataclass
+class Fleet:
+    """A server with two tenants, each with its streams."""
+
+    engine: Engine
+    keys: Path
+
+    def token(self, pack: str, tenant: str = "acme", made: datetime = NOW, expires: datetime | None = None) -> str:
+        return credentials.edge_token(self.keys, tenant, pack, made, expires)
+
+    def edge(self, token: str, **more: object) -> aiomqtt.Client:
+        port = self.engine.mqtt_port
+        return aiomqtt.Client("127.0.0.1", port, username="any", password=token, timeout=LONG_S, **more)  # type: ignore[arg-type]
+
+    @asynccontextmanager
+    async def program(self, role: Role, tenant: str = "acme") -> AsyncIterator[tuple[Client, list[str]]]:
+        """A connection by credentials, and what the server has said against it."""
+        refused: list[str] = []
+
+        async def hear(error: Exception) -> None:
+            refused.append(str(error))
+
+        file = credentials.credentials_file(self.keys, tenant, role)
+        nc = await nats.connect(
+            self.engine.url, user_credentials=file, error_cb=hear, allow_reconnect=False, connect_timeout=LONG_S
+        )
+        try:
+            yield nc, refused
+        finally:
+            await nc.close()
+
+    def reload(self, accounts: Accounts) -> None:
+        """Let the server read other claims."""
+        self.engine.accounts_changed(accounts)
+        self.engine.conf(0).write_text(configuration(self.engine.nodes[0]))
+        os.kill(self.engine.pid(0), signal.SIGHUP)
+
+    async def kept(self, tenant: str = "acme") -> list[tuple[str, bytes]]:
+        """What the stream of a tenant has: (pack, block)."""
+        async with self.program(Role.READER, tenant) as (nc, _):
+            js = nc.jetstream(timeout=LONG_S)
+            last = (await js.stream_info(subjects.RAW_STREAM)).state.last_seq
+            found = [await js.get_msg(subjects.RAW_STREAM, seq) for seq in range(1, last + 1)]
+            return [((message.subject or "").rpartition(".")[2], message.data or b"") for message in found]
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    folder = tmp_path_factory.mktemp("fleet")
+    keys = folder / "keys"
+    accounts = credentials.make_accounts(keys, TENANTS, NOW)
+    with running(folder, accounts=accounts) as engine:
+        made = Fleet(engine, keys)
+        asyncio.run(_make_streams(made))
+        yield made
+
+
+async def _make_streams(fleet: Fleet) -> None:
+    for tenant in TENANTS:
+        async with fleet.program(Role.ADMIN, tenant) as (nc, refused):
+            await make_streams(nc, partitions=4, raw_bytes=1 << 30)
+            assert refused == []
+
+
+async def is_let_in(client: aiomqtt.Client) -> bool:
+    try:
+        async with client:
+            return True
+    except aiomqtt.MqttError:
+        return False
+
+
+async def connect_with(url: str, token: str) -> None:
+    """By the protocol of programs, with the token of an edge."""
+    nc = Client()
+    try:
+        await nc.connect(
+            url,
+            user_jwt_cb=token.encode,
+            signature_cb=lambda _: b"",
+            allow_reconnect=False,
+            connect_timeout=LONG_S,
+        )
+    finally:
+        if nc._transport:
+            nc._transport.close()
+        await nc.close()
+
+
+async def is_put_out(client: aiomqtt.Client, act: Callable[[], None]) -> bool:
+    """Whether the server ends the connection after ``act``."""
+    try:
+        async with asyncio.timeout(LONG_S), client:
+            act()
+            await anext(client.messages)
+    except aiomqtt.MqttError:
+        return True
+    return False
+
+
+async def are_refused(nc: Client, refused: list[str], *publications: str) -> None:
+    """Publish what must not be, until the server has said so of each."""
+    for subject in publications:
+        await nc.publish(subject, b"evil")
+    async with asyncio.timeout(LONG_S):
+        while len(refused) < len(publications):
+            await nc.flush()
+    await nc.flush()
+    assert len(refused) == len(publications), refused
+
+
+FOREIGN = (
+    "raw/p2",
+    "raw/p1/x",
+    "p/1/raw/p2",
+    *(f"p/{partition}/raw/p1" for partition in range(4)),
+    "edge/p1/awaits",
+    "edge/p2/awaits",
+    "bms/p1/state",
+    "hours/p1",
+    "$MQTT/msgs/edge/p2/awaits",
+    "$MQTT/rmsgs/edge/p2/awaits",
+    "$JS/API/STREAM/DELETE/RAW",
+    "$KV/packs/p1",
+)
+UNHEARD = ("edge/p2/awaits", "raw/#", "bms/#", "fleet/#", "#", "+/#", "$MQTT/sub/#", "$MQTT/msgs/#", "$JS/#", "$KV/#")
+
+
+async def test_an_edge_writes_its_own_subject_and_hears_what_is_awaited_of_it(fleet: Fleet) -> None:
+    async with fleet.program(Role.ADMIN) as (admin, _), fleet.edge(fleet.token("p1"), identifier="one") as edge:
+        everything = await admin.subscribe(">")
+        await admin.flush()
+        for topic in UNHEARD:
+            assert [code.value >= 0x80 for code in await edge.subscribe(topic, qos=1)] == [True], topic
+        assert [code.value for code in await edge.subscribe("edge/p1/awaits", qos=1)] == [1]
+        await edge.publish("raw/p1", b"first", qos=1)
+        for topic in FOREIGN:
+            await edge.publish(topic, b"evil", qos=1)  # acknowledged, and dropped
+        await edge.publish("raw/p1", b"last", qos=1)
+        heard = []
+        while not heard or heard[-1][1] != b"last":
+            message = await everything.next_msg(LONG_S)
+            heard.append((message.subject, message.data))
+        assert [pair for pair in heard if b"evil" in pair[1]] == []
+        await admin.publish(subjects.awaits("p1"), b"yours")
+        async with asyncio.timeout(LONG_S):
+            message = await anext(edge.messages)
+        assert (message.topic.value, message.payload) == ("edge/p1/awaits", b"yours")
+    assert await fleet.kept() == [("p1", b"first"), ("p1", b"last")]
+
+
+async def test_a_will_elsewhere_does_not_come(fleet: Fleet) -> None:
+    before = await fleet.kept()
+    will = aiomqtt.Will("raw/p2", b"evil", qos=1)
+    client = fleet.edge(fleet.token("p1"), will=will)
+    if await is_let_in(client):
+        async with fleet.edge(fleet.token("p1"), will=will) as edge:
+            edge._client._sock_close()
+    async with fleet.edge(fleet.token("p3")) as edge:
+        await edge.publish("raw/p3", b"later", qos=1)
+    assert await fleet.kept() == [*before, ("p3", b"later")]
+
+
+async def test_tenants_do_not_see_each_other(fleet: Fleet) -> None:
+    async with fleet.program(Role.READER, "other") as (other, _), fleet.program(Role.WORKER) as (worker, _):
+        estimates = await other.subscribe("bms.>")
+        await other.flush()
+        await worker.publish(subjects.published("p1", "state"), b"of acme")
+        await worker.flush()
+        async with fleet.program(Role.WORKER, "other") as (theirs, _):
+            await theirs.publish(subjects.published("p1", "state"), b"of other")
+        assert (await estimates.next_msg(LONG_S)).data == b"of other"
+    async with fleet.edge(fleet.token("p1", "other")) as edge:
+        await edge.publish("raw/p1", b"theirs", qos=1)
+    assert await fleet.kept("other") == [("p1", b"theirs")]
+    assert b"theirs" not in [data for _, data in await fleet.kept()]
+
+
+async def test_a_worker_may_do_its_work_and_no_more(fleet: Fleet) -> None:
+    async with fleet.edge(fleet.token("work")) as edge, fleet.program(Role.WORKER) as (nc, refused):
+        await edge.publish("raw/work", b"block", qos=1)
+        js = nc.jetstream()
+        states = await js.object_store(subjects.STATES_BUCKET)
+        await states.put("p1.1", b"state")
+        assert (await states.get("p1.1")).data == b"state"
+        await states.delete("p1.1")
+        checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
+        revision = await checkpoints.put("p1", b"1")
+        await checkpoints.update("p1", b"2", revision)
+        assert (await js.publish(subjects.hours("p1"), b"{}", headers={"Nats-Msg-Id": "p1.1"})).seq
+        await nc.publish(subjects.worker("w1"), b"{}")
+        inbox = await nc.subscribe(nc.new_inbox())
+        for partition in range(4):
+            await nc.publish(
+                f"$JS.API.CONSUMER.MSG.NEXT.RAW.{consumer(partition)}", b'{"batch":1,"group":"w"}', inbox.subject
+            )
+        assert (await inbox.next_msg(LONG_S)).subject.startswith("p.")
+        packs = await (await js.key_value(subjects.PACKS_BUCKET)).watchall()
+        assert await packs.updates(LONG_S) is None
+        assert refused == []
+        streams = ("$JS.API.STREAM.DELETE.RAW", "$JS.API.STREAM.PURGE.RAW")
+        await are_refused(nc, refused, "raw.p1", "p.1.raw.p1", "$KV.packs.p1", *streams)
+
+
+def test_the_worker_that_there_is_works_with_its_credentials(
+    fleet: Fleet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "packs.csv").write_text("pack,cell\nreal,ncr18650\n")
+    server = ("--server", fleet.engine.url, "--creds", credentials.credentials_file(fleet.keys, "acme", Role.ADMIN))
+    assert run(capsys, "fleet", "packs", "load", tmp_path / "packs.csv", *server)[::2] == (0, "")
+    before = fleet.engine.log(0).read_text().count("Violation")
+    asyncio.run(_work(fleet))
+    assert fleet.engine.log(0).read_text().count("Violation") == before
+
+
+async def _work(fleet: Fleet) -> None:
+    samples = np.zeros(60, dtype=SAMPLE)
+    samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(60), 3.9, 25.0
+    block = encode(Block(store=1, number=1, oldest=1, arrival_s=60.0, samples=samples))
+    stop = asyncio.Event()
+    file = credentials.credentials_file(fleet.keys, "acme", Role.WORKER)
+    working = asyncio.create_task(work(Options(fleet.engine.url, "one", file), stop))
+    async with (
+        asyncio.timeout(LONG_S),
+        fleet.program(Role.READER) as (reader, _),
+        fleet.edge(fleet.token("real")) as edge,
+    ):
+        states = await reader.subscribe(subjects.published("real", "state"))
+        await reader.flush()
+        await edge.subscribe("edge/real/awaits")
+        await edge.publish("raw/real", block, qos=1)
+        assert b"soc" in (await states.next_msg(LONG_S)).data
+        awaited = subjects.Awaits.model_validate_json(str((await anext(edge.messages)).payload, "utf-8"))
+        assert (awaited.store, awaited.number) == (1, 2)
+        stop.set()
+        await working
+        checkpoints = await reader.jetstream().key_value(subjects.CHECKPOINTS_BUCKET)
+        assert [key for key in await checkpoints.keys() if key != "p1"]
+
+
+async def test_who_reads_changes_nothing(fleet: Fleet) -> None:
+    async with fleet.program(Role.READER) as (nc, refused):
+        js = nc.jetstream()
+        assert (await js.stream_info(subjects.RAW_STREAM)).config.name == subjects.RAW_STREAM
+        hours = await js.pull_subscribe(subjects.hours(), "collector", stream=subjects.HOURS_STREAM)
+        assert (await hours.consumer_info()).name == "collector"
+        assert refused == []
+        consumers = ("$JS.API.CONSUMER.DELETE.RAW.p1", "$JS.API.CONSUMER.MSG.NEXT.RAW.p1")
+        await are_refused(nc, refused, "raw.p1", "bms.p1.state", "edge.p1.awaits", "$KV.checkpoints.p1", *consumers)
+
+
+async def test_dashboards_read_estimates_over_mqtt(fleet: Fleet) -> None:
+    token = credentials.credentials_file(fleet.keys, "acme", Role.DASHBOARD).read_text()
+    async with fleet.edge(token) as dashboard, fleet.program(Role.WORKER) as (worker, _):
+        assert [code.value for code in await dashboard.subscribe("bms/#", qos=1)] == [1]
+        assert [code.value >= 0x80 for code in await dashboard.subscribe("raw/#", qos=1)] == [True]
+        await dashboard.publish("bms/p1/state", b"evil", qos=1)
+        await worker.publish(subjects.published("p1", "state"), b"true")
+        async with asyncio.timeout(LONG_S):
+            assert (await anext(dashboard.messages)).payload == b"true"
+
+
+async def test_tokens_that_are_not_valid_are_refused(fleet: Fleet, tmp_path: Path) -> None:
+    credentials.make_accounts(tmp_path, TENANTS, NOW)
+    day, good = timedelta(days=1), fleet.token("p1")
+    head, _, signature = good.split(".")
+    worker = credentials.credentials_file(fleet.keys, "acme", Role.WORKER).read_text().splitlines()[1]
+    refused = {
+        "none": "",
+        "expired": fleet.token("p1", made=NOW - 2 * day, expires=NOW - day),
+        "of another operator": credentials.edge_token(tmp_path, "acme", "p1", NOW),
+        "of another pack": f"{head}.{fleet.token('p2').split('.')[1]}.{signature}",
+        "a worker's": worker,
+    }
+    assert {name: await is_let_in(fleet.edge(token)) for name, token in refused.items()} == dict.fromkeys(
+        refused, False
+    )
+    assert await is_let_in(fleet.edge(fleet.token("p1", expires=datetime.now(UTC) + day)))
+    with pytest.raises(NatsError, match="Authorization"):
+        await connect_with(fleet.engine.url, good)
+
+
+async def test_who_is_revoked_is_put_out_and_comes_back_with_a_new_token(fleet: Fleet) -> None:
+    stolen, others = fleet.token("stolen"), fleet.token("p1")
+    revoked = TENANTS | {
+        "acme": TenantSettings(revoked={"stolen": NOW + timedelta(seconds=1)}),
+        "new": TenantSettings(),
+    }
+    accounts = credentials.make_accounts(fleet.keys, revoked, NOW)
+    assert await is_put_out(fleet.edge(stolen), lambda: fleet.reload(accounts))
+    assert not await is_let_in(fleet.edge(stolen))
+    assert await is_let_in(fleet.edge(fleet.token("stolen", made=NOW + timedelta(seconds=2))))
+    assert await is_let_in(fleet.edge(others))
+    assert await is_let_in(fleet.edge(fleet.token("p1", "new")))
+
+
+def test_private_keys_are_for_their_owner_and_shown_nowhere(fleet: Fleet) -> None:
+    files = [path for path in fleet.keys.rglob("*") if path.is_file()]
+    assert len(files) > 20
+    assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
+    assert {stat.S_IMODE(path.stat().st_mode) for path in fleet.keys.rglob("*") if path.is_dir()} == {0o700}
+    seeds = [path.read_text() for path in files if path.suffix == ".nk"]
+    told = fleet.engine.log(0).read_text() + fleet.engine.conf(0).read_text() + (fleet.keys / "claims.json").read_text()
+    assert [seed for seed in seeds if seed in told] == []
+    assert fleet.token("p1") not in told
+
+
+def test_keys_are_made_once_and_claims_are_the_same_on_each_start(tmp_path: Path) -> None:
+    first = credentials.make_accounts(tmp_path, TENANTS, NOW)
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    assert credentials.make_accounts(tmp_path, TENANTS, NOW + timedelta(days=1)) == first
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == files
+    assert credentials.read_accounts(tmp_path) == first
+
+
+def test_what_is_no_key_is_named_without_showing_it(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"no keys of a tenant acme: start `fleet serve`"):
+        credentials.edge_token(tmp_path, "acme", "p1", NOW)
+    with pytest.raises(UserError, match=r"claims\.json: cannot be read"):
+        credentials.read_accounts(tmp_path)
+    (tmp_path / "claims.json").write_text("{}")
+    with pytest.raises(UserError, match="copy the file of the node that has the keys"):
+        credentials.read_accounts(tmp_path)
+    credentials.make_accounts(tmp_path, TENANTS, NOW)
+    with pytest.raises(UserError, match="there are acme, other"):
+        credentials.edge_token(tmp_path, "nobody", "p1", NOW)
+    (tmp_path / "acme" / "edge.nk").write_text("SAADEFECT")
+    with pytest.raises(UserError, match=r"edge\.nk: not a key") as wrong:
+        credentials.edge_token(tmp_path, "acme", "p1", NOW)
+    assert "DEFECT" not in str(wrong.value)

@@ -1,0 +1,209 @@
+"""Attacks with the token of one edge on the real server: they cost nothing but that edge's own blocks."""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import nats
+import pytest
+from nats.aio.client import Client
+from structlog.testing import capture_logs
+
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import decode
+from bms_estimator.estimator.estimator import estimator_of
+from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES, make_streams, pack_blocks
+from bms_estimator.fleet.packs.pack_bucket import write_bucket
+from bms_estimator.fleet.server.jwt_claims import Role
+from bms_estimator.fleet.worker.block_order import MAX_PASSED
+from bms_estimator.fleet.worker.worker import Options, work
+from tests.fleet.engine import running
+from tests.fleet.tenant import Tenant, heavy_block, numbered, one_tenant
+from tests.fleet.workers import KIND, Heartbeats, block, end_states, know, until
+from tests.patience import LONG_S
+
+PARTITIONS = 4
+RAW_BYTES = 8 << 20
+FLOOD = 40
+"""Blocks, each of which costs a worker a tenth of a second."""
+OLD = "p.*.raw.*"
+"""Subject of ``RAW`` in the version before, where the server mapped what edges published."""
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[Tenant]:
+    with one_tenant(tmp_path) as tenant:
+        asyncio.run(tenant.make_streams(PARTITIONS, 1 << 30))
+        yield tenant
+
+
+async def stored(nc: Client) -> dict[str, int]:
+    """Number of messages of each subject in ``RAW``."""
+    info = await nc.jetstream().stream_info(subjects.RAW_STREAM, subjects_filter=">")
+    return dict(info.state.subjects or {})
+
+
+def subject(pack: str) -> str:
+    return subjects.kept(subjects.partition_of(pack, PARTITIONS), pack)
+
+
+async def test_invented_subjects_and_foreign_partitions_are_refused(fleet: Tenant) -> None:
+    reader = await fleet.program(Role.READER)
+    async with fleet.edge("attacker") as edge:
+        for partition in (*range(PARTITIONS), "x", "invented", "64"):
+            await edge.publish(f"p/{partition}/raw/attacker", b"evil", qos=1)
+        for i in range(200):
+            await edge.publish(f"p/{i}x/raw/attacker", b"evil", qos=1)
+            await edge.publish(f"raw/invented{i}", b"evil", qos=1)
+        codes = [(await edge.subscribe(f"edge/attacker/{i}", qos=1))[0].value for i in range(20)]
+        await edge.publish("raw/attacker", b"own", qos=1)
+    assert await stored(reader) == {subject("attacker"): 1}
+    assert set(codes) == {0x80}
+    await reader.close()
+
+
+async def test_junk_evicts_no_block_of_another_pack(fleet: Tenant) -> None:
+    await fleet.make_streams(PARTITIONS, RAW_BYTES)
+    reader = await fleet.program(Role.READER)
+    async with fleet.edge("honest") as edge:
+        for _ in range(5):
+            await edge.publish("raw/honest", b"block", qos=1)
+    junk = bytes(MAX_BLOCK_BYTES // 2)
+    async with fleet.edge("attacker") as edge:
+        for _ in range(2 * RAW_BYTES // len(junk)):
+            await edge.publish("raw/attacker", junk, qos=1)
+    kept = await stored(reader)
+    assert kept == {subject("honest"): 5, subject("attacker"): pack_blocks(RAW_BYTES)}
+    await reader.close()
+
+
+async def test_a_message_larger_than_a_block_is_not_stored(fleet: Tenant) -> None:
+    reader = await fleet.program(Role.READER)
+    async with fleet.edge("attacker") as edge:
+        await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES + 1), qos=1)
+        await edge.publish("raw/attacker", bytes(MAX_BLOCK_BYTES - 1024), qos=1)
+    assert await stored(reader) == {subject("attacker"): 1}
+    await reader.close()
+
+
+async def test_a_block_that_the_server_refuses_is_not_sent_for_ever(fleet: Tenant) -> None:
+    admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
+    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND})
+    answers = await reader.subscribe(subjects.published("p1", "state"))
+    await reader.flush()
+    async with Heartbeats(reader) as heard, worker(fleet), fleet.edge("p1") as edge:
+        await edge.publish("raw/p1", block("p1", 1), qos=1)
+        await answers.next_msg(LONG_S)
+        for _ in range(MAX_PASSED):  # as an edge that is asked for block 2 each time
+            await edge.publish("raw/p1", bytes(MAX_BLOCK_BYTES + 1), qos=1)
+            await edge.publish("raw/p1", block("p1", 3), qos=1)
+        await answers.next_msg(LONG_S)
+        await until_counted(heard, "lost_blocks", 1)
+    await admin.close()
+    await reader.close()
+
+
+async def test_a_stream_of_the_version_before_takes_the_limits_and_keeps_its_blocks(tmp_path: Path) -> None:
+    with running(tmp_path) as engine:
+        nc = await nats.connect(engine.url)
+        await nc.jetstream().add_stream(name=subjects.RAW_STREAM, subjects=[OLD], metadata={"bms.partitions": "4"})
+        await nc.jetstream().publish(subject("p1"), b"before")
+        await make_streams(nc, partitions=PARTITIONS, raw_bytes=RAW_BYTES)
+        await nc.jetstream().publish(subjects.raw("p1"), b"after")
+        assert await stored(nc) == {subject("p1"): 2}
+        await nc.close()
+
+
+@asynccontextmanager
+async def worker(fleet: Tenant) -> AsyncIterator[None]:
+    """A worker that runs meanwhile."""
+    stop = asyncio.Event()
+    working = asyncio.create_task(work(Options(fleet.engine.url, "w", fleet.file(Role.WORKER)), stop))
+    try:
+        yield
+    finally:
+        stop.set()
+        await working
+
+
+async def until_counted(heard: Heartbeats, name: str, count: int) -> None:
+    """Wait until the worker's counter has reached a value."""
+    await heard.until(lambda last: any(each.counters.get(name, 0) >= count for each in last.values()))
+
+
+@pytest.mark.parametrize(
+    ("samples", "seconds", "reason"),
+    [
+        (65_535, 65_535.0, "65535 samples: at most 20000"),
+        (20_000, 3.0, "20000 samples in 3 s: at most 1000 a second, and 7000 more"),
+    ],
+)
+async def test_715_kb_of_dense_blocks_are_refused_and_honest_packs_go_on(
+    fleet: Tenant, samples: int, seconds: float, reason: str
+) -> None:
+    admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
+    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND, "attacker": KIND})
+    states = await reader.subscribe(subjects.published("*", "state"))
+    await reader.flush()
+    dense = heavy_block(samples, seconds / samples)
+    count = 715_000 // len(dense)
+    async with fleet.edge("attacker") as attacker, fleet.edge("p1") as honest:
+        for number in range(1, count + 1):
+            await attacker.publish("raw/attacker", numbered(dense, number), qos=1)
+        await honest.publish("raw/p1", block("p1", 1), qos=1)
+    with capture_logs() as logs:
+        async with Heartbeats(reader) as heard, worker(fleet):
+            assert (await states.next_msg(LONG_S)).subject == subjects.published("p1", "state")
+            await until_counted(heard, "too_dense", count)
+    refused = [line for line in logs if line["event"] == "a block is refused"]
+    assert [(line["pack"], line["reason"]) for line in refused] == [("attacker", reason)]
+    await admin.close()
+    await reader.close()
+
+
+async def test_a_flood_of_blocks_delays_its_own_pack_alone_and_loses_nothing(fleet: Tenant) -> None:
+    admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
+    known = await know(admin, ["p1", "attacker"])
+    assert subject("p1").split(".")[1] == subject("attacker").split(".")[1]
+    states = await reader.subscribe(subjects.published("*", "state"))
+    await reader.flush()
+    heavy = heavy_block(20_000, 1.0)
+    async with fleet.edge("attacker") as attacker, fleet.edge("p1") as honest:
+        for number in range(1, FLOOD + 1):
+            await attacker.publish("raw/attacker", numbered(heavy, number), qos=1)
+        await honest.publish("raw/p1", block("p1", 1), qos=1)
+    async with worker(fleet):
+        before = 0
+        while (await states.next_msg(LONG_S)).subject != subjects.published("p1", "state"):
+            before += 1
+        assert before < FLOOD // 2
+    async with Heartbeats(reader) as heard, worker(fleet):  # goes on from the checkpoint of the one before
+        await until_counted(heard, "blocks", FLOOD + 1)
+        await until_counted(heard, "deferred", FLOOD // 2)
+    state = (await end_states(admin, known, PARTITIONS))[subjects.partition_of("attacker", PARTITIONS)].state(
+        "attacker"
+    )
+    assert state is not None
+    estimator = estimator_of(*(known("attacker") or ()))
+    for _ in range(FLOOD):
+        estimator.run(decode(heavy).samples)
+    assert state["estimator"].tobytes() == estimator.record.tobytes()
+    await admin.close()
+    await reader.close()
+
+
+async def test_a_worker_refuses_a_block_in_the_wrong_partition(fleet: Tenant) -> None:
+    admin = await fleet.program(Role.ADMIN)
+    await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": KIND})
+    wrong = (subjects.partition_of("p1", PARTITIONS) + 1) % PARTITIONS
+    await admin.jetstream().update_stream(  # as of the version before
+        name=subjects.RAW_STREAM, subjects=[OLD], metadata={"bms.partitions": str(PARTITIONS)}, allow_direct=True
+    )
+    await admin.jetstream().publish(subjects.kept(wrong, "p1"), block("p1", 1))
+    with capture_logs() as logs:
+        async with worker(fleet):
+            await until(lambda: [line for line in logs if line["event"] == "a block is refused"], lambda: logs)
+    (refused,) = [line for line in logs if line["event"] == "a block is refused"]
+    assert (refused["partition"], refused["reason"]) == (wrong, "the pack belongs to another partition")
+    await admin.close()

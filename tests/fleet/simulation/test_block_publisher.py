@@ -1,0 +1,95 @@
+"""Simulated edges against the real server: their blocks come into the stream, and again when a worker asks."""
+
+import asyncio
+import contextlib
+from collections import Counter
+from pathlib import Path
+
+import nats
+import pytest
+
+from bms_estimator.edge.block import decode
+from bms_estimator.edge.subjects import RAW_STREAM, Awaits, awaits, raw
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
+from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
+from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
+from bms_estimator.settings.pack import MqttSettings
+from tests.command_line import run
+from tests.fleet.engine import running
+from tests.patience import LONG_S
+
+PACKS, BLOCKS, AGAIN = 20, 4, 3
+
+
+async def sent(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]], int]:
+    """Let the edges send; a worker asks one of them for its third block again, once it has seen all.
+
+    Returns:
+        What they say, how often each block came, and how often the worker has asked.
+    """
+    fleet = SimulatedFleet(PACKS, seed=3, begin_ns=1_700_000_000 * 10**9)
+    edges = SimulatedEdges(fleet, start_s=1.7e9, speed=1.0, last=BLOCKS)  # long ago: all of them are due
+    seen: Counter[tuple[str, int]] = Counter()
+    nc = await nats.connect(url)
+    await make_streams(nc, partitions=4)
+    coming = await nc.subscribe(raw("*"))
+    await nc.flush()
+    stop = asyncio.Event()
+    sending = asyncio.create_task(
+        run_edges(fleet, edges, MqttSettings(url=mqtt), connections=2, stop=stop, said=str, quiet_s=LONG_S)
+    )
+    asks = Awaits(store=int(fleet.store[0]), number=AGAIN, resend=True).model_dump_json().encode()
+
+    async def see(timeout_s: float) -> None:
+        message = await coming.next_msg(timeout=timeout_s)
+        seen[message.subject.split(".")[1], decode(message.data).number] += 1
+
+    while len(seen) < PACKS * BLOCKS:
+        await see(LONG_S)
+    before, asked = seen[fleet.names[0], AGAIN], 0  # more than once where an acknowledgement was late
+    async with asyncio.timeout(LONG_S):
+        while seen[fleet.names[0], AGAIN] == before or not edges.again:
+            await nc.publish(awaits(fleet.names[0]), b"no answer")
+            await nc.publish(awaits(fleet.names[0]), asks)
+            asked += 1
+            with contextlib.suppress(TimeoutError):  # an edge may miss it, and hears the same once in so long
+                while seen[fleet.names[0], AGAIN] == before or not edges.again:
+                    await see(RESEND_S)
+    stop.set()
+    report = await sending
+    js = nc.jetstream(timeout=LONG_S)
+    async with asyncio.timeout(LONG_S):  # it is seen before it is stored
+        while (await js.stream_info(RAW_STREAM)).state.messages < PACKS * BLOCKS + 1:  # noqa: ASYNC110 - nobody tells
+            await asyncio.sleep(0.02)
+    await nc.close()
+    return report, seen, asked
+
+
+def test_every_block_comes_into_the_stream_and_one_that_is_asked_for_comes_again(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=4) as engine:
+        report, seen, asked = asyncio.run(sent(engine.url, f"mqtt://127.0.0.1:{engine.mqtt_port}"))
+    assert set(seen) == {(f"sim-{i:06d}", n) for i in range(PACKS) for n in range(1, BLOCKS + 1)}
+    assert seen["sim-000000", AGAIN] >= 2
+    assert 1 <= report.resends <= asked  # asked once, unless the machine is busy: then one may be late, or lost
+    assert report.again >= 1
+
+
+def test_the_command_writes_table_and_truth_and_refuses_what_cannot_be(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    simulate = ("fleet", "simulate", "--packs", 4)
+    table, truth = tmp_path / "packs.csv", tmp_path / "truth.csv"
+    assert run(capsys, *simulate, "--table", table, "--truth", truth)[0] == 0
+    rows = table.read_text().splitlines()
+    assert rows[0].startswith("pack,cell,capacity_ah,series,parallel")
+    assert rows[1:3] == ["sim-000000,lfp,100.0,16,1,0.01,0.1,1", "sim-000001,nmc,10.0,14,2,0.01,0.05,1"]
+    assert len(truth.read_text().splitlines()) == 5
+    for arguments, said in (
+        ((), "--mqtt mqtt://host:port"),
+        (("--mqtt", "http://nowhere"), "--mqtt http://nowhere"),
+        (("--table", tmp_path / "no" / "packs.csv"), "cannot be written"),
+        (("--prefix", "a b", "--table", table), "--prefix a b: only letters"),
+    ):
+        code, _, err = run(capsys, *simulate, *arguments)
+        assert (code, said in err) == (2, True), err

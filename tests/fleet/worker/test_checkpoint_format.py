@@ -1,0 +1,204 @@
+"""The bytes of a partition: whole, damaged, and of another version."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bms_estimator.fleet.worker import checkpoint_format
+from bms_estimator.fleet.worker.block_order import MAX_PASSED
+from bms_estimator.fleet.worker.checkpoint_format import (
+    CHUNK_BYTES,
+    PRESENT,
+    CheckpointError,
+    Former,
+    Snapshot,
+    dtype_of,
+    layout_of,
+    read_checkpoint,
+)
+from bms_estimator.fleet.worker.deferred import Span
+from bms_estimator.fleet.worker.pack_state import PACK_STATE, Bench
+from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.payloads import Estimate
+from tests.estimator.simulated_cell import pulses
+from tests.fleet.an_edge import SAMPLES, Stream, blocks_of, deliver, table
+
+names = st.text(max_size=10)
+snapshots = st.builds(
+    Snapshot,
+    st.integers(0, 63),
+    st.integers(0, 2**63),
+    st.dictionaries(names, st.integers(0)),
+    st.dictionaries(names, st.binary(max_size=40)),
+    st.dictionaries(
+        names, st.builds(Former, st.just(layout_of(np.dtype([("x", "<f8", (2,))]))), st.binary(max_size=9))
+    ),
+    st.dictionaries(names, st.builds(Span, st.integers(0, 2**63), st.integers(0, 2**63))),
+)
+
+
+def whole(snapshot: Snapshot) -> bytes:
+    return b"".join(snapshot.chunks())
+
+
+@given(snapshots)
+def test_all_that_a_snapshot_holds_comes_back(snapshot: Snapshot) -> None:
+    assert read_checkpoint(whole(snapshot)) == snapshot
+
+
+def test_many_packs_come_in_chunks() -> None:
+    packs = {f"pack{n}": bytes([n % 256]) * 1000 for n in range(3000)}
+    snapshot = Snapshot(0, 9, packs=packs)
+    chunks = list(snapshot.chunks())
+    assert len(chunks) == 3
+    assert max(map(len, chunks)) < CHUNK_BYTES + 10_000
+    assert read_checkpoint(b"".join(chunks)) == snapshot
+
+
+@given(snapshots, st.data())
+@settings(max_examples=200)
+def test_whatever_is_damaged_is_said_and_no_other_exception(snapshot: Snapshot, data) -> None:
+    good = whole(snapshot)
+    bad = bytearray(good)
+    at = data.draw(st.integers(0, len(good) - 1))
+    change = data.draw(st.sampled_from(["flip", "cut", "append", "drop"]))
+    if change == "flip":
+        bad[at] ^= 1 << data.draw(st.integers(0, 7))
+    elif change == "cut":
+        del bad[at:]
+    elif change == "drop":
+        del bad[at : at + data.draw(st.integers(1, 20))]
+    else:
+        bad += data.draw(st.binary(min_size=1))
+    with pytest.raises(CheckpointError):
+        read_checkpoint(bytes(bad))
+
+
+def test_no_byte_can_be_another_unseen() -> None:
+    good = whole(Snapshot(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
+    for at in range(len(good)):
+        with pytest.raises(CheckpointError):
+            read_checkpoint(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
+
+
+def test_blocks_that_an_earlier_version_kept_are_read_from_the_stream_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = [checkpoint_format._entry(0, "known", b"12345678"), checkpoint_format._entry(255, "unknown", b"block")]
+    monkeypatch.setattr(Snapshot, "_entries", lambda *_: iter(entries))
+    read = read_checkpoint(whole(Snapshot(3, 7, packs={"known": b"", "unknown": b""})))
+    assert (read.packs, read.deferred) == ({"known": b"12345678"}, {"unknown": Span(1, 7)})
+
+
+@pytest.mark.parametrize("data", [b"", b"BMSFLEET", b"x" * 100])
+def test_bytes_that_are_no_checkpoint_are_refused(data: bytes) -> None:
+    with pytest.raises(CheckpointError, match="checkpoint"):
+        Partition.restore(0, table, data)
+
+
+def test_one_of_another_partition_is_refused() -> None:
+    with pytest.raises(CheckpointError, match="of partition 3, not of 4"):
+        Partition.restore(4, table, whole(Snapshot(3, 0)))
+
+
+def test_one_of_a_format_to_come_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoint_format, "FORMAT", 2)
+    later = whole(Snapshot(3, 0))
+    monkeypatch.undo()
+    with pytest.raises(CheckpointError, match="is of format 2, this version reads 1: start the version that wrote it"):
+        read_checkpoint(later)
+
+
+def test_a_layout_is_what_it_was_made_of() -> None:
+    dtype = dtype_of(PRESENT)
+    assert layout_of(dtype) == PRESENT
+    assert dtype == PACK_STATE
+
+
+@pytest.mark.parametrize("layout", ["", "7", "[1]", '[["a","f8"]]', '[["a","O",[]]]', '[["a","<f8",[99999999]]]'])
+def test_a_layout_that_is_none_is_refused(layout: str) -> None:
+    with pytest.raises(ValueError, match=r".+"):
+        dtype_of(layout)
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return pulses(soc=0.9, hours=1.0)[0]
+
+
+class TestAnotherVersion:
+    """Knew no ``fit_age_s``, had a counter more, and its fields in another order."""
+
+    @pytest.fixture
+    def before(self, samples):
+        """A partition of this version, and its bytes as the other version would have written them."""
+        stream = Stream(Partition(5, table))
+        deliver(stream, "a", blocks_of(samples[:3000]))
+        state = stream.partition.state("a")
+        described = json.loads(PRESENT)
+        (estimator,) = (part for name, part, _ in described if name == "estimator")
+        estimator[:] = [each for each in reversed(estimator) if each[0] != "fit_age_s"]
+        described[0][1].append(["once_known", "<i8", []])
+        dtype = np.dtype(checkpoint_format._fields(described))
+        bench = Bench(dtype)
+        for part in dtype.names:
+            for name in set(dtype[part].names) & set(PACK_STATE[part].names):
+                bench.record[part][name] = state[part][name]
+        bench.record["delivery"]["once_known"] = 7
+        former = Former(layout_of(dtype), bench.take())
+        snapshot = stream.partition.snapshot()
+        return stream, whole(replace(snapshot, packs={}, former={"a": former}))
+
+    def test_is_taken_over_by_the_names_of_its_fields_with_the_next_block(self, before, samples) -> None:
+        stream, data = before
+        went_on = stream.partition
+        took_over = Partition.restore(5, table, data)
+        next_block = blocks_of(samples)[150]
+        sequence = took_over.sequence + 1
+        was, now = (
+            Estimate.model_validate_json(each.take("a", next_block, sequence).state) for each in (went_on, took_over)
+        )
+        assert now.soc == pytest.approx(was.soc, abs=0.005)
+        assert now.soc_std < 0.05
+        assert now.charge_out_ah == pytest.approx(was.charge_out_ah)
+        assert took_over.counters["taken_over"] == 1
+        assert took_over.snapshot().former == {}
+
+    def test_stays_as_it_is_until_then(self, before, samples) -> None:
+        _, data = before
+        partition = Partition.restore(5, table, data)
+        blocks = blocks_of(samples)
+        assert partition.take("a", blocks[3], partition.sequence + 1).state is None
+        assert partition.take("a", blocks[155], partition.sequence + 1).awaits.number == 3000 // SAMPLES + 1
+        assert partition.counters["packs"] == 1
+        assert partition.snapshot().former == read_checkpoint(data).former
+        again = Partition.restore(5, table, whole(partition.snapshot()))
+        assert again.take("a", blocks[150], again.sequence + 1).state
+
+    def test_goes_on_without_a_block_that_never_comes(self, before, samples) -> None:
+        _, data = before
+        partition = Partition.restore(5, table, data)
+        behind = blocks_of(samples)[151]
+        states = [partition.take("a", behind, partition.sequence + 1).state for _ in range(MAX_PASSED)]
+        assert [state is None for state in states] == (MAX_PASSED - 1) * [True] + [False]
+        assert partition.counters["lost_blocks"] == 1
+        assert partition.snapshot().former == {}
+
+    def test_goes_on_where_the_block_behind_the_missing_one_is_refused(self, before, samples, monkeypatch) -> None:
+        _, data = before
+        partition = Partition.restore(5, table, data)
+        behind, following = blocks_of(samples)[151:153]
+        with monkeypatch.context() as refusing:
+            refusing.setattr("bms_estimator.fleet.worker.partition.density_fault", lambda _: "too many samples")
+            for _ in range(MAX_PASSED):
+                partition.take("a", behind, partition.sequence + 1)
+        assert partition.take("a", following, partition.sequence + 1).state
+        assert (partition.counters["lost_blocks"], partition.counters["too_dense"]) == (1, 1)
+
+    def test_whose_bytes_are_none_of_its_layout_begins_anew(self, samples) -> None:
+        former = Former(layout_of(np.dtype([("x", "<f8")])), b"1234567")
+        partition = Partition.restore(5, table, whole(Snapshot(5, 0, former={"a": former})))
+        assert partition.take("a", blocks_of(samples)[0], 1).state
+        assert partition.counters["damaged_states"] == 1

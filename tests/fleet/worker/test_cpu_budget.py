@@ -1,0 +1,49 @@
+"""The budget of processor time of each pack."""
+
+import pytest
+
+from bms_estimator.fleet.worker import cpu_budget
+from bms_estimator.fleet.worker.cpu_budget import BURST_S, MAX_CHARGE_S, SHARE, CpuBudget
+
+FULL = round(BURST_S / MAX_CHARGE_S) + 1
+"""Charges of the maximum that exhaust a budget."""
+
+
+class Time:
+    """A clock that is set."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_a_pack_that_has_used_its_time_waits_for_it_and_no_other_does() -> None:
+    time = Time()
+    budget = CpuBudget(time)
+    for _ in range(FULL):
+        assert not budget.is_exhausted("flood")
+        budget.charge("flood", 100.0)
+    assert budget.is_exhausted("flood")
+    assert not budget.is_exhausted("honest")
+    time.now_s = (FULL * MAX_CHARGE_S - BURST_S) / SHARE + 0.1
+    assert not budget.is_exhausted("flood")
+
+
+def test_a_source_of_1000_hz_stays_within_its_budget() -> None:
+    time = Time()
+    budget = CpuBudget(time)
+    for number in range(600):
+        time.now_s = 7.0 * number
+        assert not budget.is_exhausted("fast")
+        budget.charge("fast", 0.035)  # 7,000 samples of 5 us each
+
+
+def test_idle_packs_are_not_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cpu_budget, "MAX_PACKS", 10)
+    time = Time()
+    budget = CpuBudget(time)
+    for number in range(100):
+        time.now_s += 1.0
+        budget.charge(f"p{number}", 0.01)
+    assert len(budget._spent) <= 11

@@ -1,0 +1,29 @@
+"""What is done before a worker connects, so that nothing stops it later."""
+
+import subprocess
+import sys
+
+from bms_estimator.fleet.worker import kernel_warm_up
+from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
+
+KINDS = """
+from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
+from bms_estimator.kernels import flow, hour, sparse, window
+load_fleet_kernels()
+print([len(kernel.signatures) for kernel in (sparse.pack, sparse.unpack, flow.add_flow, hour.add_rows, window.add_window)])
+"""
+
+
+def test_a_block_and_the_row_of_an_hour_go_through_it(monkeypatch) -> None:
+    made = []
+    take = kernel_warm_up.Partition.take
+    monkeypatch.setattr(kernel_warm_up.Partition, "take", lambda *args: made.append(take(*args)) or made[-1])
+    load_fleet_kernels()
+    assert all(each.state and each.parameters for each in made)
+    assert len(made[-1].hours) == 1
+
+
+def test_each_kernel_is_there_for_one_kind_of_arguments() -> None:
+    """In a process of its own: others here may have called them with arrays of other kinds."""
+    done = subprocess.run([sys.executable, "-c", KINDS], check=True, capture_output=True, text=True)
+    assert done.stdout == "[1, 1, 1, 1, 1]\n"

@@ -1,0 +1,80 @@
+"""Who may see the page: settings, names, token."""
+
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.page.access_control import Guard, guard_of
+from bms_estimator.settings.page import PageSettings, parse_listen
+
+TOKEN = "0123456789abcdef"
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port", "loopback"),
+    [
+        ("127.0.0.1:8765", "127.0.0.1", 8765, True),
+        ("[::1]:80", "::1", 80, True),
+        ("localhost:1", "localhost", 1, True),
+        ("0.0.0.0:8765", "0.0.0.0", 8765, False),
+        ("pi.local:8765", "pi.local", 8765, False),
+    ],
+)
+def test_an_address_is_read(text, host, port, loopback):
+    listen = parse_listen(text)
+    assert (listen.host, listen.port, listen.loopback) == (host, port, loopback)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "8765", "127.0.0.1", "127.0.0.1:x", "127.0.0.1:99999", "a@b:1", "a:1/x", "::1:80", "x..y:80"]
+)
+def test_what_is_no_address_is_refused(text):
+    with pytest.raises(ValueError, match="host:port"):
+        PageSettings(listen=text)
+
+
+def test_beyond_this_machine_a_token_is_needed():
+    with pytest.raises(ValueError, match=r'listen = "0\.0\.0\.0:8765" is open to other machines: name a token_file'):
+        PageSettings(listen="0.0.0.0:8765")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [(None, "cannot be read: No such file"), (b"short\n", "has 5 letters, must have 16"), (b"\xff" * 20, "not UTF-8")],
+)
+def test_a_token_that_cannot_be_is_said(tmp_path, text, said):
+    file = tmp_path / "token"
+    if text is not None:
+        file.write_bytes(text)
+    with pytest.raises(UserError, match=said):
+        guard_of(PageSettings(listen="0.0.0.0:8765", token_file=file))
+
+
+def test_a_token_is_known_with_its_newline_off(tmp_path):
+    (tmp_path / "token").write_text(f"{TOKEN}\n")
+    guard = guard_of(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
+    assert guard.knows_token(TOKEN)
+    assert not any(guard.knows_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
+    assert not guard.knows_token("\udcff" * 16)  # as aiohttp has a header that is no UTF-8
+    assert not guard.knows_cookie("\udcff" * 64)
+    assert guard.knows_cookie(guard.cookie)
+    assert not guard.knows_cookie(TOKEN)
+    assert TOKEN not in guard.cookie
+
+
+@pytest.mark.parametrize(
+    ("host", "known"),
+    [
+        ("127.0.0.1:8765", True),
+        ("[::1]:8765", True),
+        ("localhost", True),
+        ("LOCALHOST:8765", True),
+        ("192.168.1.20:8765", True),
+        ("bms.example.org", True),
+        ("evil.example.org:8765", False),
+        ("localhost.evil.example.org", False),
+        ("", False),
+        ("[", False),
+    ],
+)
+def test_only_names_of_ours_are_answered(host, known):
+    assert Guard(["bms.example.org"]).knows_host(host) is known

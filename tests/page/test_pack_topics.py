@@ -1,0 +1,185 @@
+"""What the page's hub keeps: the newest of each topic, for readers of any speed."""
+
+import json
+import sys
+from typing import Any
+
+import pytest
+
+from bms_estimator.page.event_stream import MESSAGE_BYTES, Reader
+from bms_estimator.page.pack_topics import RECENT_STATES, Hub
+from bms_estimator.store.minute import epoch_s
+
+TIME = "2026-11-22T16:00:{:06.3f}Z"
+
+
+def state(second: float, **fields: object) -> dict[str, object]:
+    return {"time": TIME.format(second), "voltage_v": 13.0 + second} | fields
+
+
+async def read(reader: Reader) -> dict[str, Any]:
+    return json.loads(await reader.next(1.0))
+
+
+async def test_who_comes_finds_what_came_last_of_all_packs():
+    hub = Hub()
+    hub.put("attic", "state", state(0.0))
+    hub.put("attic", "state", state(1.0))
+    hub.put("cellar", "availability", "online")
+    with hub.reading() as reader:
+        found = await read(reader)
+    assert hub.packs == ["attic", "cellar"]
+    assert found["attic/state"] == state(1.0)
+    assert found["cellar/availability"] == "online"
+    assert found["attic/recent"]["voltage_v"] == [13.0, 14.0]
+
+
+async def test_a_slow_reader_finds_the_newest_alone_however_much_came():
+    hub = Hub()
+    with hub.reading() as reader:
+        for number in range(10_000):
+            hub.put("attic", "state", state(number % 60, frames_received=number))
+            hub.put("attic", "health", {"uptime_s": number})
+        assert len(reader._waiting) == 3
+        assert await read(reader) == {
+            "attic/state": state(39, frames_received=9999),
+            "attic/health": {"uptime_s": 9999},
+            "packs": {"names": ["attic"], "hidden": 0},
+        }
+        assert await reader.next(0.0) == ""
+    assert hub.readers == 0
+
+
+async def test_of_a_pack_that_has_emptied_its_topics_nothing_is_kept():
+    hub = Hub()
+    hub.put("attic", "availability", "online")
+    hub.put("attic", "state", state(0.0))
+    hub.put("attic", "parameters", {"soc": 0.5, "elements": {"r_s_ohm": {"value": 1.0, "std": 0.1, "valid": True}}})
+    for topic in ("state", "parameters", "availability"):
+        assert hub.packs == ["attic"]
+        hub.put("attic", topic, None)
+    assert hub.packs == []
+    hub.put("attic", "availability", "online")
+    with hub.reading() as reader:
+        found = await read(reader)
+    assert found["attic/recent"]["time_s"] == []
+    assert found["attic/elements"] == {}
+
+
+def test_what_is_too_deep_to_be_written_is_left_out():
+    hub, deep = Hub(), 0
+    for _ in range(sys.getrecursionlimit() + 1):
+        deep = [deep]
+    hub.put("attic", "state", deep)
+    assert hub.packs == []
+
+
+async def test_a_reader_ends_when_the_hub_closes():
+    hub = Hub()
+    with hub.reading() as reader:
+        hub.close()
+        assert await reader.next(60.0) == ""
+        assert reader.closed
+
+
+@pytest.mark.parametrize("topic", ["schema", "home_assistant", "home_assistant/problems", "response/state", "x"])
+async def test_what_is_not_shown_is_not_kept(topic):
+    hub = Hub()
+    hub.put("attic", topic, {"a": 1})
+    assert hub.packs == []
+
+
+async def test_a_topic_that_was_emptied_is_gone_and_readers_hear_of_it():
+    hub = Hub()
+    hub.put("attic", "availability", "online")
+    hub.put("attic", "alarm/soc_low", {"active": True})
+    with hub.reading() as reader:
+        await read(reader)
+        hub.put("attic", "alarm/soc_low", None)
+        assert await read(reader) == {"attic/alarm/soc_low": None}
+    with hub.reading() as reader:
+        assert "attic/alarm/soc_low" not in await read(reader)
+
+
+async def test_curves_have_a_point_each_second_and_a_bounded_number():
+    hub = Hub()
+    for tenth in range(100):
+        hub.put("attic", "state", state(tenth / 10.0))
+    with hub.reading() as reader:
+        assert (await read(reader))["attic/recent"]["voltage_v"] == [13.0 + s for s in range(10)]
+    for number in range(2 * RECENT_STATES):
+        hub.put("attic", "state", {"time": f"2026-11-23T{number // 3600:02}:{number // 60 % 60:02}:{number % 60:02}Z"})
+    with hub.reading() as reader:
+        assert len((await read(reader))["attic/recent"]["time_s"]) == RECENT_STATES
+
+
+@pytest.mark.parametrize(
+    "payload", ["text", 3, [], {}, {"time": 3}, {"time": "x"}, {"time": TIME.format(1), "soc": "x"}]
+)
+@pytest.mark.parametrize("topic", ["state", "parameters", "health", "alarm/x"])
+async def test_what_others_may_publish_is_borne(topic, payload):
+    hub = Hub()
+    hub.put("attic", topic, payload)
+    with hub.reading() as reader:
+        assert (await read(reader))[f"attic/{topic}"] == payload
+
+
+async def test_elements_are_kept_by_percent_of_soc_where_they_are_valid():
+    hub = Hub()
+
+    def report(soc, value, *, valid=True):
+        return {"soc": soc, "elements": {"r_s_ohm": {"value": value, "std": 0.001, "valid": valid}, "e_o_v": None}}
+
+    for soc, value, valid in [(0.5, 0.01, True), (0.501, 0.02, True), (0.7, 0.03, True), (0.8, 0.04, False)]:
+        hub.put("attic", "parameters", report(soc, value, valid=valid))
+    hub.put("attic", "parameters", {"soc": 7.0, "elements": {}})
+    with hub.reading() as reader:
+        learned = (await read(reader))["attic/elements"]
+    assert learned == {"r_s_ohm": {"50": [0.02, 0.001], "70": [0.03, 0.001]}}
+
+
+@pytest.mark.parametrize("ahead", ["9999-01-01T00:00:00.000Z", "2026-11-23T23:00:00.000Z"])
+async def test_a_state_dated_in_the_future_does_not_stop_the_curves(ahead: str) -> None:
+    hub = Hub(lambda: epoch_s(TIME.format(0.0)))
+    hub.put("attic", "state", state(0.0))
+    hub.put("attic", "state", state(1.0) | {"time": ahead})
+    hub.put("attic", "state", state(2.0))
+    with hub.reading() as reader:
+        assert (await read(reader))["attic/recent"]["voltage_v"] == [13.0, 15.0]
+
+
+async def test_a_message_to_a_reader_is_bounded_and_the_rest_comes_next() -> None:
+    hub = Hub()
+    for number in range(100):
+        hub.put("attic", f"alarm/{number}", "x" * 10_000)
+    found, sizes = dict[str, object](), list[int]()
+    with hub.reading() as reader:
+        while text := await reader.next(0.0):
+            sizes.append(len(text))
+            found |= json.loads(text)
+    assert max(sizes) < 1.1 * MESSAGE_BYTES
+    assert len(sizes) > 1
+    assert sum(key.startswith("attic/alarm/") for key in found) == 100
+
+
+async def test_a_pack_that_is_dropped_is_named_no_more() -> None:
+    hub = Hub()
+    for pack in ("attic", "cellar"):
+        hub.put(pack, "availability", "online")
+    with hub.reading() as reader:
+        assert (await read(reader))["packs"] == {"names": ["attic", "cellar"], "hidden": 0}
+        hub.put("attic", "state", state(0.0))
+        hub.drop("attic")
+        hub.hide(7)
+        assert await read(reader) == {"packs": {"names": ["cellar"], "hidden": 7}}
+
+
+async def test_the_link_is_said_once_for_each_change():
+    hub = Hub()
+    hub.say_link("no broker")
+    with hub.reading() as reader:
+        assert (await read(reader))["link"] == {"up": False, "reason": "no broker"}
+        hub.say_link("no broker")
+        assert await reader.next(0.0) == ""
+        hub.say_link(None)
+        assert (await read(reader))["link"] == {"up": True, "reason": None}

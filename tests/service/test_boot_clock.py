@@ -1,0 +1,59 @@
+"""How long nobody measured: across restarts of the service and of the machine."""
+
+import ctypes
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, Ledger
+from bms_estimator.model.cell import load_cell
+from bms_estimator.process.boot_clock import Moment, moment, synchronised
+from bms_estimator.service.live_loop import new_estimator
+from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.lifetime_totals import new_totals
+
+CELL, SETTINGS = load_cell("chen_mora"), Settings()
+SAVED = Moment(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, boot="one")
+
+
+@pytest.mark.parametrize(
+    ("changes", "unseen_s"),
+    [
+        ({"boot_s": 5007.0, "wall_s": 1_800_000_000.0}, 7.0),  # the wall clock was set meanwhile
+        ({"boot_s": 5007.0, "synchronised": False}, 7.0),
+        ({"boot": "two", "boot_s": 20.0, "wall_s": 1_700_003_600.0}, 3600.0),
+        ({"boot": "two", "boot_s": 20.0, "wall_s": 1_700_000_005.0, "synchronised": False}, math.inf),
+        ({"boot": "two", "boot_s": 20.0, "wall_s": 1_600_000_000.0}, math.inf),
+        ({"boot": "", "boot_s": 5007.0, "synchronised": False}, math.inf),
+    ],
+)
+def test_a_checkpoint_is_as_old_as_the_clock_that_can_be_trusted_says(
+    tmp_path: Path, changes: dict[str, float | str | bool], unseen_s: float
+) -> None:
+    estimator = new_estimator(SETTINGS, CELL)
+    estimator.step(0.0, 0.1, 3.8)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record, Ledger(0, new_totals(0.0)))
+    later = replace(SAVED, **changes)
+    assert CheckpointFile(tmp_path, SETTINGS, CELL, lambda: later).load().unseen_s == unseen_s
+
+
+def test_a_wall_clock_that_was_wrong_when_it_was_saved_tells_nothing_after_a_reboot() -> None:
+    later = replace(SAVED, boot="two", wall_s=SAVED.wall_s + 5.0)
+    assert later.since(replace(SAVED, synchronised=False)) == math.inf
+
+
+def test_a_clock_is_right_when_the_kernel_says_so_whoever_sets_it() -> None:
+    """The C library's ntp_gettime tells the same, without the settings."""
+    assert synchronised() == (ctypes.CDLL(None).ntp_gettime(ctypes.create_string_buffer(128)) != 5)
+
+
+def test_the_machine_tells_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("BMS_BOOT_ID", raising=False)
+    first, second = moment(), moment()
+    assert first.boot == second.boot
+    assert len(first.boot) == 32
+    assert 0.0 <= second.since(first) < math.inf
+    monkeypatch.setenv("BMS_BOOT_ID", "0123")
+    assert moment().boot == "0123"

@@ -1,0 +1,393 @@
+import asyncio
+import json
+import socket
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.sample import SAMPLE, SampleStatus
+from bms_estimator.process.systemd import Notifier
+from bms_estimator.service.live_loop import LAG_STEP_S, new_estimator, run_live
+from bms_estimator.settings.pack import IdentifierSettings, PackSettings, PublishSettings, SensorSettings, Settings
+from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.sink import Delivery
+from bms_estimator.telemetry.rest_detector import WATCHED_S
+from tests.collector import Collector
+from tests.patience import LONG_S
+from tests.scripted_source import ScriptedSource
+
+CELL = load_cell("chen_mora")
+SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), publish=PublishSettings(rate_hz=10.0))
+
+
+@dataclass
+class Run:
+    source: ScriptedSource
+    sink: Collector
+    requests: Requests
+    task: asyncio.Task[Estimator]
+    stop: asyncio.Event
+    delivery: Delivery
+
+    async def ask(self, name: str, **arguments: Any) -> Any:
+        """The data of the response; UserError where there is an error."""
+        response = await self.requests.respond(name, json.dumps(arguments).encode())
+        assert response
+        answer = json.loads(response)
+        if answer["error"]:
+            raise UserError(answer["error"])
+        return answer["data"]
+
+    async def end(self) -> Estimator:
+        self.source.finish()
+        return await asyncio.wait_for(self.task, LONG_S)
+
+
+@asynccontextmanager
+async def running(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
+    source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), Delivery()
+    requests = Requests(delivery, ("set_soc", "current_zero"))
+    edges = {"requests": requests, "delivery": delivery}
+    task = asyncio.create_task(run_live(settings, cell, source=source, sinks=[sink], stop=stop, **edges, **options))
+    try:
+        yield Run(source, sink, requests, task, stop, delivery)
+    finally:
+        stop.set()
+        await asyncio.wait_for(task, LONG_S)
+
+
+def estimates(sink: Collector) -> list[Estimate]:
+    return [s.estimate for s in sink.snapshots if s.estimate]
+
+
+async def test_voltage_current_and_power_are_means_of_the_publish_window() -> None:
+    async with running() as run:
+        run.source.give(*((0.01 * i, float(i % 2), 3.8 + 0.1 * (i % 2)) for i in range(100)))
+        await run.end()
+    (window,) = estimates(run.sink)
+    assert window.voltage_v == pytest.approx(3.85)
+    assert window.current_a == pytest.approx(0.5)
+    assert window.power_w == pytest.approx(3.9 / 2)  # the mean of products, not the product of means
+    assert window.sample_rate_hz == pytest.approx(100.0)
+    assert window.frames_received == 100
+
+
+async def test_a_run_in_blocks_leaves_the_state_of_single_steps() -> None:
+    rng = np.random.default_rng(3)
+    rows = [(0.01 * i, float(rng.normal(0.1, 0.05)), float(rng.normal(3.8, 0.01))) for i in range(500)]
+    async with running() as run:
+        for i in range(0, 500, 7):
+            run.source.give(*rows[i : i + 7])
+        live = await run.end()
+    alone = new_estimator(SETTINGS, CELL)
+    for row in rows:
+        alone.step(*row)
+    assert live.record.tobytes() == alone.record.tobytes()
+
+
+async def test_samples_that_cannot_be_used_are_dropped_counted_and_published() -> None:
+    async with running() as run:
+        run.source.give((0.0, 0.1, 3.8))
+        run.source.give(
+            (0.1, np.nan, 3.8),
+            (0.2, 0.1, np.inf),
+            (0.3, 0.1, 0.0),  # a glitch
+            (0.4, 400.0, 3.8),
+            (0.5, 0.1, 3.8, np.nan, int(SampleStatus.VOLTAGE_SATURATED)),
+            (0.6, 0.1, 3.8),
+            (0.6, 0.1, 3.8),
+            (20.0, 0.1, 3.8, np.nan, int(SampleStatus.GAP)),
+        )
+        await run.sink.until(lambda s: s.health.samples["gaps"] == 1)
+        await run.end()
+    counted = run.sink.snapshots[-1].health.samples
+    assert counted == {
+        "samples": 3,
+        "dropped_not_finite": 2,
+        "dropped_range": 2,
+        "dropped_repeated": 1,
+        "dropped_saturated": 1,
+        "time_steps_back": 0,
+        "gaps": 1,
+    }
+    for snapshot in run.sink.snapshots:
+        for part in (*snapshot[:4], *snapshot.alarms):
+            assert part is None or "NaN" not in part.model_dump_json()
+
+
+async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> None:
+    async with running() as run:
+        run.source.give((0.0, 0.1, 3.8))
+        await run.sink.until(lambda s: s.health.sensor_online)
+        silent = await run.sink.until(lambda s: s.health.samples["samples"] == 1 and not s.health.sensor_online)
+        assert silent.estimate is None
+        assert "no usable sample" in (silent.health.sensor_message or "")
+        seen = len(run.sink.snapshots)
+        run.source.give((1.0, 0.1, 380.0))
+        told = await run.sink.until(lambda s: "dropped" in (s.health.sensor_message or ""), skip=seen)
+        assert "dropped since: 1 outside the cell's range" in (told.health.sensor_message or "")
+        run.source.give((2.0, 0.1, 3.8))
+        await run.sink.until(lambda s: s.health.sensor_online, skip=seen)
+        later = await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
+        assert "dropped" not in (later.health.sensor_message or "")
+
+
+@pytest.mark.parametrize("sensor", [SensorSettings(sample_rate_hz=1), SensorSettings(protocol="text")])
+async def test_a_board_slower_than_the_publications_stays_online(sensor: SensorSettings) -> None:
+    slow = SETTINGS.model_copy(update={"sensor": sensor})
+    now_s = 0.0
+    async with running(slow, clock=Clock(monotonic=lambda: now_s)) as run:
+        for tick in range(20):
+            if tick % 5 == 0:  # once a second
+                run.source.give((now_s, 0.1, 3.8))
+            now_s += 0.2  # the next publication is overdue, sample or no sample
+            await run.sink.until(lambda _: True, skip=len(run.sink.snapshots))
+        online = [s.health.sensor_online for s in run.sink.snapshots]
+        assert all(online[online.index(True) :])
+        now_s += 3.0
+        await run.sink.until(lambda s: not s.health.sensor_online, skip=len(online))
+
+
+async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> None:
+    async with running() as run:
+        for second in range(3):
+            run.source.give(*((second + 0.01 * i, 0.1, 0.0) for i in range(100)))
+            await run.sink.until(lambda s: s.health.samples["dropped_range"] == 100 * (second + 1))  # noqa: B023
+        await run.end()
+    health = run.sink.snapshots[-1].health
+    assert not health.sensor_online
+    assert "outside the cell's range" in (health.sensor_message or "")
+
+
+async def test_the_rate_of_the_boards_clock_is_published_once_it_is_known() -> None:
+    async with running() as run:
+        assert (await run.sink.until(lambda _: True)).health.clock_ppm is None
+        run.source.clock_ppm = 3012.5
+        await run.sink.until(lambda s: s.health.clock_ppm == 3012.5)
+
+
+async def test_the_source_says_why_nothing_comes() -> None:
+    async with running() as run:
+        run.source.message = "waiting for /dev/ttyUSB0: it does not exist"
+        said = await run.sink.until(lambda s: s.health.sensor_message == run.source.message)
+    assert said.estimate is None
+
+
+async def test_a_step_of_the_wall_clock_changes_time_stamps_only() -> None:
+    offset = 0.0
+
+    def wall() -> float:
+        return 1_700_000_000.0 + offset
+
+    async with running(clock=Clock(wall=wall)) as run:
+        run.source.give((0.0, 0.1, 3.8))
+        await run.sink.until(lambda s: s.estimate is not None)
+        offset = -7200.0
+        seen = len(run.sink.snapshots)
+        run.source.give((0.1, 0.1, 3.8))
+        after = await run.sink.until(lambda s: s.estimate is not None, skip=seen)
+        state = await run.end()
+    assert after.estimate
+    assert after.estimate.publish_time.startswith("2023-11-14T20:13:20")
+    assert after.health.sensor_online
+    assert state.state["time_steps_back"][0] == 0
+
+
+async def test_requests_reach_the_running_estimator() -> None:
+    async with running() as run:
+        await run.sink.until(lambda _: True)
+        with pytest.raises(UserError, match="no sample"):
+            await run.ask("set_soc", soc=0.8)
+        run.source.give((0.0, 0.1, 3.8))
+        await run.sink.until(lambda s: s.estimate is not None)
+        assert (await run.ask("set_soc", soc=0.8))["before"] == pytest.approx(0.5, abs=0.02)
+        for wrong in ({}, {"soc": 1.5}, {"soc": "0.5"}, {"soc": True}):
+            with pytest.raises(UserError, match=r"soc = .*must be a number from 0 to 1"):
+                await run.ask("set_soc", **wrong)
+        assert (await run.ask("state"))["estimate"]["soc"] == pytest.approx(0.5, abs=0.02)
+        assert set((await run.ask("parameters"))["a"]) == {f"a{i}" for i in range(1, 22)}
+        assert (await run.ask("health"))["samples"]["samples"] == 1
+        state = await run.end()
+    assert state.state["soc"][0] == 0.8
+
+
+async def test_health_on_request_and_on_its_topic_tell_the_true_drops_and_what_was_asked() -> None:
+    async with running() as run:
+        await run.sink.until(lambda _: True)
+        run.delivery.drops = 7
+        run.delivery.refused_topics = ["bms/pack/request/+"]
+        run.source.give((0.0, 0.1, 3.8))  # health is made anew when the sensor comes
+        published = await run.sink.until(lambda s: s.health.sensor_online)
+        asked = await run.ask("health")
+    assert published.health.publish_drops == asked["publish_drops"] == 7
+    assert asked["refused_topics"] == ["bms/pack/request/+"]
+    assert run.delivery.requests == {"granted": 1}
+
+
+@pytest.mark.parametrize("again", [{}, {"serial": "A1", "firmware": "1.1"}])
+async def test_a_board_that_says_nothing_for_a_while_is_still_the_one_that_is_known(again: dict[str, str]) -> None:
+    async with running() as run:
+        run.source.board = {"serial": "A1", "firmware": "1.0"}
+        run.source.give((0.0, 0.1, 3.8))
+        await run.sink.until(lambda s: bool(s.info.board))
+        run.source.board = {}
+        seen = len(run.sink.snapshots)
+        at_s = run.sink.snapshots[-1].health.uptime_s
+        await run.sink.until(lambda s: s.health.uptime_s > at_s + 1.0, skip=seen)
+        run.source.board = again
+        await run.end()
+    boards = [s.info.board for s in run.sink.snapshots[seen:]]
+    assert {} not in boards
+    assert boards[-1] == (again or {"serial": "A1", "firmware": "1.0"})
+
+
+class Zeroed:
+    """What has the board take the present current as zero, and a clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.times, self.now_s = 0, 0.0
+        self.clock = Clock(monotonic=lambda: self.now_s)
+
+    async def __call__(self) -> None:
+        self.times += 1
+
+    async def watch(self, run: Run, rows: list[tuple[float, float]]) -> None:
+        """A second for each (current, voltage), from the first publication on."""
+        while not run.sink.snapshots:
+            self.now_s += 0.1
+            await asyncio.sleep(0.01)
+        for current_a, voltage_v in rows:
+            self.now_s += 1.0
+            seen = len(run.sink.snapshots)
+            run.source.give((self.now_s, current_a, voltage_v))
+            await run.sink.until(lambda s: s.estimate is not None, skip=seen)
+
+
+AT_REST = [(0.03, 3.8)] * (round(WATCHED_S) + 2)
+
+
+async def test_the_present_current_is_taken_as_zero_when_the_pack_was_at_rest() -> None:
+    zero = Zeroed()
+    async with running(current_zero=zero, clock=zero.clock) as run:
+        await zero.watch(run, AT_REST)
+        assert await run.ask("current_zero") == {}
+    assert zero.times == 1
+
+
+@pytest.mark.parametrize(
+    ("rows", "why"),
+    [
+        ([], "no usable sample"),
+        (AT_REST[:5], "watched for"),
+        ([*AT_REST, (4.5, 3.8)], "current flows: 4.5 A"),
+        ([(0.3, 3.8)] * len(AT_REST), "current flows: 0.3 A"),
+        ([*AT_REST, (0.03, 3.7), (0.03, 3.7)], "the voltage moved by 0.1 V"),
+    ],
+)
+async def test_the_present_current_is_not_taken_as_zero_while_it_flows(
+    rows: list[tuple[float, float]], why: str
+) -> None:
+    zero = Zeroed()
+    async with running(current_zero=zero, clock=zero.clock) as run:
+        await zero.watch(run, rows)
+        with pytest.raises(UserError, match=why):
+            await run.ask("current_zero")
+    assert zero.times == 0
+
+
+async def test_what_was_seen_before_the_board_was_silent_is_no_rest() -> None:
+    zero = Zeroed()
+    async with running(current_zero=zero, clock=zero.clock) as run:
+        await zero.watch(run, AT_REST)
+        zero.now_s += WATCHED_S
+        await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
+        await zero.watch(run, AT_REST[:2])
+        with pytest.raises(UserError, match="watched for"):
+            await run.ask("current_zero")
+    assert zero.times == 0
+
+
+async def test_a_source_without_a_zero_says_so() -> None:
+    async with running() as run:
+        await run.sink.until(lambda _: True)
+        with pytest.raises(UserError, match="no zero"):
+            await run.ask("current_zero")
+
+
+async def test_a_parameter_says_where_it_comes_from_and_a_negative_capacitance_why_it_is_missing() -> None:
+    known = {"pack": PackSettings(initial_soc=0.001), "identifier": IdentifierSettings(soc_std=0.005)}
+    nearly_empty = SETTINGS.model_copy(update=known)
+    async with running(nearly_empty) as run:
+        run.source.give((0.0, 0.0, 2.5))
+        run.source.finish()
+        await run.task
+        parameters = run.sink.snapshots[-1].parameters
+    assert parameters.a["a16"].value == CELL.a[16]
+    assert (parameters.a["a1"].source, parameters.a["a1"].std, parameters.a["a1"].valid) == ("configured", None, False)
+    missing = parameters.elements["c_ts_farad"]
+    assert missing.value is None
+    assert "is not above delta_1" in (missing.reason or "")
+
+
+async def test_systemd_hears_ready_watchdog_and_stopping(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.setblocking(False)
+        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
+        heard: list[str] = []
+
+        async def hear(wanted: str, times: int) -> None:
+            while heard.count(wanted) < times:
+                heard.append((await asyncio.get_running_loop().sock_recv(systemd, 4096)).decode())
+
+        async with asyncio.timeout(LONG_S):
+            async with running(notifier=Notifier([SETTINGS.pack.name], environment)) as run:
+                await hear("WATCHDOG=1", times=3)
+                await run.end()
+            await hear("STOPPING=1", times=1)
+    assert heard[0].startswith("READY=1\nSTATUS=")
+
+
+async def test_a_source_that_never_waits_does_not_starve_the_sinks() -> None:
+    class Endless(ScriptedSource):
+        async def __aiter__(self) -> AsyncIterator[Any]:
+            block = np.zeros(10, dtype=SAMPLE)
+            block["voltage_v"] = 3.8
+            while True:
+                block["time_s"] = block["time_s"][-1] + 0.01 * np.arange(1, 11)
+                yield block
+
+    stop, sink = asyncio.Event(), Collector()
+    running = asyncio.create_task(run_live(SETTINGS, CELL, source=Endless(), sinks=[sink], stop=stop))
+    await sink.until(lambda _: len(estimates(sink)) >= 3)
+    stop.set()
+    await asyncio.wait_for(running, LONG_S)
+
+
+async def test_a_fault_of_the_source_is_raised_not_swallowed() -> None:
+    class Broken(ScriptedSource):
+        async def __aiter__(self) -> AsyncIterator[Any]:
+            raise ZeroDivisionError
+            yield
+
+    with pytest.raises(ZeroDivisionError):
+        await run_live(SETTINGS, CELL, source=Broken(), sinks=[], stop=asyncio.Event())
+
+
+async def test_how_long_something_blocked_the_loop_is_published() -> None:
+    async with running() as run:
+        await run.sink.until(lambda _: True)
+        time.sleep(0.4)  # noqa: ASYNC251 - blocks the loop, as a slow disk or terminal would
+        await run.sink.until(lambda s: s.health.loop_lag_s > 0.4 - LAG_STEP_S)
+        await run.end()

@@ -1,0 +1,28 @@
+"""What is logged of what is published."""
+
+from structlog.testing import capture_logs
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.input_faults import Suspect
+from bms_estimator.service.publisher import Publisher
+from bms_estimator.settings.pack import Settings
+from tests.scripted_source import ScriptedSource
+
+
+def test_a_suspicion_is_logged_when_it_is_raised_and_when_it_is_cleared_whatever_number_it_names() -> None:
+    now_s, cell = 0.0, load_cell("chen_mora")
+    estimator = Estimator(cell, initial_soc=0.5)
+    estimator.step(0.0, 0.0, 3.8, temperature_c=25.0)
+    clock = Clock(monotonic=lambda: now_s)
+    publisher = Publisher(Settings(), cell, estimator, source=ScriptedSource(), sinks=[], clock=clock)
+    said = []
+    for temperature_c, suspects in ((41.0, Suspect.TEMPERATURE), (42.0, Suspect.TEMPERATURE), (30.0, 0), (30.0, 0)):
+        now_s += 2.0
+        estimator.record["checks"]["suspects"] = int(suspects)
+        estimator.record["filter"]["temperature_c"] = temperature_c
+        with capture_logs() as lines:
+            publisher.publish()
+        said.append([str(line["suspects"])[:30] for line in lines])
+    assert said == [["['no data at 41 C, the cell fi"], [], ["none any more"], []]

@@ -1,0 +1,234 @@
+"""States and alarms in a real InfluxDB, and what becomes of them when it is away or refuses."""
+
+import asyncio
+import socket
+import threading
+from collections.abc import Iterator
+from datetime import datetime
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import structlog
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.settings.exports import InfluxSettings
+from bms_estimator.sinks.exports.influx import BATCH, MOST_WAITING, InfluxSink
+from bms_estimator.sinks.exports.line_protocol import lines
+from tests.influxdb import INFLUXD, InfluxDB
+from tests.sinks.service import until
+from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW
+
+LOW = SOC_LOW.model_copy(update={"text": 'charge "it" soon, \\now\nor never'})
+
+
+def at(second: int, **changes: Any) -> Snapshot:
+    assert ONE.estimate
+    time = f"2024-05-01T12:{second // 60:02}:{second % 60:02}.250Z"
+    return ONE._replace(estimate=ONE.estimate.model_copy(update={"time": time} | changes))
+
+
+@pytest.fixture(scope="module")
+def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
+    if INFLUXD is None:
+        pytest.skip("influxd is not installed (apt-get install influxdb)")
+    server = InfluxDB(tmp_path_factory.mktemp("influxdb")).start()
+    yield server
+    server.stop()
+
+
+def sink(url: str, **options: Any) -> InfluxSink:
+    told = {"url": url, "database": "bms", "every_s": 0.1} | options
+    return InfluxSink(InfluxSettings(**told), first_delay_s=0.1)
+
+
+async def test_what_is_written_can_be_queried(influxdb: InfluxDB) -> None:
+    async with sink(influxdb.url) as writing:
+        state = at(0, voltage_v=51.25, cells_v=[3.25, None, 3.5])
+        writing.publish(state._replace(alarms=(LOW,)))
+        await until(lambda: not writing.waiting)
+        [row] = await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state")
+        assert row["device"] == "pack"
+        assert row["time"] == 1000 * datetime.fromisoformat("2024-05-01T12:00:00.250Z").timestamp()
+        assert (row["voltage_v"], row["lock"], row["crc_errors"]) == (51.25, state.estimate.lock, 3.0)
+        assert (row["cells_v_0"], row["cells_v_2"]) == (3.25, 3.5)
+        assert "cells_v_1" not in row
+        assert "temperature_c" not in row
+        [alarm] = await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_alarm")
+        assert (alarm["name"], alarm["severity"], alarm["active"], alarm["limit"]) == ("soc_low", "warning", True, 10.0)
+        assert alarm["text"] == 'charge "it" soon, \\now or never'
+
+
+async def test_what_comes_while_the_server_is_away_is_written_when_it_is_back(influxdb: InfluxDB) -> None:
+    async with sink(influxdb.url) as writing:
+        await asyncio.to_thread(influxdb.stop)
+        with structlog.testing.capture_logs() as logs:
+            for second in range(100, 110):
+                writing.publish(at(second))
+            await until(lambda: logs)
+            await asyncio.to_thread(influxdb.start)
+            await until(lambda: not writing.waiting)
+        events = [entry["event"] for entry in logs]
+        assert events[0] == "influxdb takes nothing"
+        assert events.count("influxdb takes lines again") == 1
+        rows = await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state WHERE time >= '2024-05-01T12:01:40Z'")
+        assert len(rows) == 10
+    assert writing.dropped == 0
+
+
+async def test_at_the_end_what_waits_is_written(influxdb: InfluxDB) -> None:
+    async with sink(influxdb.url, every_s=3600.0) as writing:
+        writing.publish(at(600, frames_received=777))
+    assert writing.waiting == 0
+    assert await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state WHERE frames_received = 777")
+
+
+class Answers(BaseHTTPRequestHandler):
+    """Answers as it is told, and keeps what it was asked."""
+
+    def do_POST(self) -> None:
+        server: Any = self.server
+        server.asked.append((self.path, dict(self.headers), self.rfile.read(int(self.headers["Content-Length"]))))
+        status, text = server.answers[0] if len(server.answers) == 1 else server.answers.pop(0)
+        self.send_response(status)
+        self.send_header("Location", "/elsewhere")
+        self.send_header("Content-Length", str(len(text)))
+        self.end_headers()
+        self.wfile.write(text)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[Any]:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Answers) as server:
+        told: Any = server
+        told.asked, told.answers = [], [(204, b"")]
+        told.url = f"http://127.0.0.1:{server.server_port}"
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+        thread.start()
+        yield told
+        server.shutdown()
+        thread.join()
+
+
+async def test_influxdb_2_is_asked_as_it_wants_to_be(server: Any, tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("secret\n")
+    settings = InfluxSettings(url=server.url + "/in/", bucket="b c", org="home", token_file=token, every_s=0.1)
+    async with InfluxSink(settings) as writing:
+        writing.publish(at(0))
+        await until(lambda: server.asked)
+    path, headers, body = server.asked[0]
+    assert path == "/in/api/v2/write?bucket=b+c&org=home&precision=ms"
+    assert headers["Authorization"] == "Token secret"
+    assert body.decode() == "\n".join(lines(None, at(0)))
+
+
+async def test_what_is_never_taken_is_given_up_and_all_else_is_tried_again(server: Any) -> None:
+    server.answers = [(302, b""), (503, b"busy"), (400, b"bad \x1b line"), (204, b"")]
+    async with sink(server.url) as writing:
+        with structlog.testing.capture_logs() as logs:
+            writing.publish(at(0))
+            await until(lambda: writing.dropped)
+            writing.publish(at(1))
+            await until(lambda: not writing.waiting)
+    bodies = [body for _, _, body in server.asked]
+    assert bodies[0] == bodies[1] == bodies[2] != bodies[3]
+    assert writing.dropped == 1
+    reasons = [entry["reason"] for entry in logs if "reason" in entry]
+    assert [reason[:3] for reason in reasons] == ["302", "503", "400"]
+    assert all(reason.isprintable() for reason in reasons)
+
+
+async def test_what_waits_is_bounded_and_goes_out_in_batches(server: Any) -> None:
+    server.answers = [(503, b"")]
+    async with sink(server.url) as writing:
+        writing.publish(at(0))
+        await until(lambda: server.asked)
+        for second in range(1, MOST_WAITING + 2 * BATCH):
+            writing.publish(at(second % 3600))
+        assert writing.waiting <= MOST_WAITING + BATCH
+        assert writing.dropped >= BATCH - 1
+        server.answers = [(204, b"")]
+        await until(lambda: not writing.waiting)
+    assert max(body.count(b"\n") + 1 for _, _, body in server.asked) <= BATCH
+
+
+async def test_a_server_that_never_answers_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts
+        async with sink(f"http://127.0.0.1:{silent.getsockname()[1]}") as writing:
+            for second in range(20):
+                writing.publish(at(second))
+        assert writing.waiting == 20
+
+
+async def test_an_answer_that_breaks_off_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def answer() -> None:
+            connection, _ = listening.accept()
+            with connection:
+                connection.sendall(b"HTTP/1.1 503 Busy\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n")
+                connection.shutdown(socket.SHUT_WR)
+                while connection.recv(65_536):
+                    pass
+
+        with structlog.testing.capture_logs() as logs:
+            async with sink(f"http://127.0.0.1:{listening.getsockname()[1]}") as writing:
+                answered = asyncio.create_task(asyncio.to_thread(answer))
+                writing.publish(at(0))
+                await answered
+                await until(lambda: logs)
+                writing.publish(at(1))
+        assert logs[0]["reason"].startswith("503 Busy")
+        assert writing.waiting == 2
+
+
+async def test_a_name_that_no_host_can_have_stops_nobody() -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with sink("http://influx..local:8086") as writing:
+            writing.publish(at(0))
+            await until(lambda: logs)
+            writing.publish(at(1))
+    assert "label empty or too long" in logs[0]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ({"bucket": "b", "username": "me"}, "of no use with bucket"),
+        ({"org": "o"}, "of no use without bucket"),
+        ({"url": "http://me:secret@house"}, "url"),
+        ({"url": "udp://house"}, "url"),
+    ],
+)
+def test_settings_that_cannot_be(told: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        InfluxSettings(**({"database": "bms"} | told))
+
+
+def test_a_file_that_cannot_be_used_is_said_at_start(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"influx\.token_file = .*none: cannot be read: No such file"):
+        InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "none"))
+    (tmp_path / "token").write_text("t\N{EURO SIGN}ken", encoding="utf-8")
+    with pytest.raises(UserError, match=r"influx\.token_file = .*token: must hold ASCII"):
+        InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "token"))
+    (tmp_path / "ca").write_text("nonsense")
+    with pytest.raises(UserError, match=r"influx\.ca_file = .*: no certificates"):
+        InfluxSink(InfluxSettings(url="https://house", bucket="b", ca_file=tmp_path / "ca"))
+
+
+def test_a_window_without_samples_and_alarms_that_stay_are_no_lines() -> None:
+    assert lines(None, NOTHING_YET) == []
+    raised = NOTHING_YET._replace(alarms=(LOW,))
+    [line] = lines(NOTHING_YET, raised)
+    assert line.startswith(
+        "bms_alarm,device=pack,name=soc_low,severity=warning active=true,watched=true,value=9.5,limit=10.0,text="
+    )
+    assert lines(raised, raised) == []

@@ -1,0 +1,142 @@
+"""What Prometheus fetches: real requests, read back by the library's parser and judged by promtool where that is."""
+
+import asyncio
+import shutil
+import socket
+import subprocess
+import threading
+import urllib.request
+from typing import Any
+
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import Estimate, Health, Snapshot
+from bms_estimator.settings.exports import PrometheusSettings
+from tests.free_port import free_port
+from tests.patience import LONG_S
+from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW, STACK, snapshot
+
+pytest.importorskip("prometheus_client", reason="prometheus-client is not installed: pip install prometheus-client")
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from bms_estimator.sinks.exports.prometheus import PrometheusSink
+from bms_estimator.sinks.exports.prometheus_metrics import COUNTERS, KINDS, LEFT_OUT, OWN_NAMES, RATIOS, named
+
+PROMTOOL = shutil.which("promtool")
+
+
+def full() -> Snapshot:
+    """With cells, energy and an alarm."""
+    assert ONE.estimate
+    told = {"cells_v": [3.25, None, 3.5], "energy_out_kwh": 1.5, "time_to_empty_s": 60.0, "temperature_c": 21.5}
+    return ONE._replace(estimate=ONE.estimate.model_copy(update=told), alarms=(SOC_LOW,))
+
+
+async def fetched(snapshot: Snapshot | None) -> str:
+    settings = PrometheusSettings(listen=f"127.0.0.1:{free_port()}")
+    async with PrometheusSink(settings) as sink:
+        if snapshot is not None:
+            sink.publish(snapshot)
+
+        def get() -> str:
+            with urllib.request.urlopen(f"http://{settings.listen}/metrics") as response:
+                return response.read().decode()
+
+        return await asyncio.to_thread(get)
+
+
+def values(text: str) -> dict[tuple[str, ...], float]:
+    """By name and labels other than the device."""
+    found = {}
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            labels = dict(sample.labels)
+            assert labels.pop("device") == "pack"
+            found[sample.name, *labels.values()] = sample.value
+    return found
+
+
+async def test_a_scrape_has_the_values_in_base_units() -> None:
+    text = await fetched(full())
+    told = values(text)
+    assert told["bms_voltage_volts",] == 3.8
+    assert told["bms_soc_ratio",] == pytest.approx(0.5)
+    assert told["bms_energy_out_joules_total",] == 1.5 * 3.6e6
+    assert told["bms_temperature_celsius",] == 21.5
+    assert told["bms_crc_errors_total",] == 3.0
+    assert told["bms_line_total", "frames_received"] == 2.0
+    assert (told["bms_cell_volts", "1"], told["bms_cell_volts", "3"]) == (3.25, 3.5)
+    assert ("bms_cell_volts", "2") not in told
+    assert told["bms_alarm", "soc_low", "warning"] == 1.0
+    assert told["bms_sensor_online",] == 1.0
+    assert "# TYPE bms_energy_out_joules_total counter" in text
+    assert "positive on discharge" in text
+    if PROMTOOL:
+        judge = [PROMTOOL, "check", "metrics"]
+        judged = await asyncio.to_thread(subprocess.run, judge, input=text, capture_output=True, text=True)
+        assert (judged.returncode, judged.stderr) == (0, "")
+
+
+async def test_what_is_not_known_or_not_fresh_is_not_there() -> None:
+    assert values(await fetched(None)) == {}
+    for stale in (NOTHING_YET, snapshot("no board")):
+        told = values(await fetched(stale))
+        assert not {"bms_voltage_volts", "bms_soc_ratio"} & {name for name, *_ in told}
+        assert ("bms_uptime_seconds",) in told
+    assert values(await fetched(snapshot("no board")))["bms_sensor_online",] == 0.0
+    assert ("bms_soc_ratio",) not in values(await fetched(STACK))
+
+
+async def test_an_address_that_is_taken_is_said() -> None:
+    settings = PrometheusSettings(listen=f"127.0.0.1:{free_port()}")
+    async with PrometheusSink(settings):
+        with pytest.raises(UserError, match="each pack needs an address of its own"):
+            await PrometheusSink(settings).__aenter__()
+
+
+def test_the_tables_name_fields_that_there_are() -> None:
+    fields = set(Estimate.model_fields) | set(Health.model_fields)
+    assert {*RATIOS, *COUNTERS, *LEFT_OUT, *KINDS, *OWN_NAMES} <= fields
+
+
+def test_a_field_s_unit_becomes_that_of_prometheus() -> None:
+    assert named("remaining_energy_wh") == ("bms_remaining_energy_joules", 3600.0)
+    assert named("rss_mib") == ("bms_rss_bytes", 1048576.0)
+    assert named("innovation_v") == ("bms_innovation_volts", 1.0)
+    assert named("nussbaum_gain") == ("bms_nussbaum_gain", 1.0)
+    assert named("adaptation_gain_hz") == ("bms_adaptation_gain_hertz", 1.0)
+
+
+@pytest.mark.parametrize(
+    "listen", ["9108", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:65536", "a b:1", "http://x:1", "x..y:1"]
+)
+def test_an_address_that_is_none_is_refused(listen: str) -> None:
+    with pytest.raises(ValueError, match=r"listen|port|label empty"):
+        PrometheusSettings(listen=listen)
+
+
+def test_addresses_of_both_kinds() -> None:
+    told: Any = [PrometheusSettings(listen=listen) for listen in ("127.0.0.1:9108", "[::1]:1")]
+    assert [(each.host, each.port) for each in told] == [("127.0.0.1", 9108), ("::1", 1)]
+
+
+async def test_a_slow_name_service_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, answer, found = threading.Event(), threading.Event(), socket.getaddrinfo
+
+    def slow(*arguments: Any, **options: Any) -> Any:
+        asked.set()
+        assert answer.wait(LONG_S)
+        return found(*arguments, **options)
+
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
+
+    async def turn() -> None:
+        await asyncio.to_thread(asked.wait, LONG_S)
+        answer.set()
+
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(turn())
+        async with PrometheusSink(PrometheusSettings(listen=f"127.0.0.1:{free_port()}")):
+            pass

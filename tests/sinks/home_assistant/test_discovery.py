@@ -1,0 +1,344 @@
+"""What Home Assistant is told: few changes, never too late."""
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.fuel_cell_fit import KEYS
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import Alarm, Parameter, Snapshot
+from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.settings.home_assistant import HomeAssistantSettings
+from bms_estimator.sinks.home_assistant.discovery import Described, discovery
+from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from tests.sinks.snapshots import ONE, STACK
+
+ROOT = "bms/pack"
+HOME = HomeAssistantSettings()
+
+
+def described(found: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The components of a discovery message, without those that it removes."""
+    return {key: component for key, component in found["components"].items() if set(component) != {"platform"}}
+
+
+COMPONENTS = described(discovery(HOME, Described(ONE.info), ROOT, 0.0))
+SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
+MOST_ROWS_PER_MIN = 20
+
+
+OF_STACK = described(discovery(HOME, Described(STACK.info), ROOT, 0.0))
+
+
+def with_values(**values: float | None) -> Snapshot:
+    assert ONE.estimate
+    return ONE._replace(estimate=ONE.estimate.model_copy(update=values))
+
+
+def noisy(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, Snapshot]]:
+    """A load that steps every twenty seconds, as an 18650's board measures it, and what follows from it."""
+    rng, soc, load_a = np.random.default_rng(5), 0.9, 0.0
+    for i in range(round(seconds / period_s)):
+        now_s = i * period_s
+        if i % round(20.0 / period_s) == 0:
+            load_a = float(rng.uniform(0.0, 3.0))
+        soc -= load_a * period_s / 3600.0 / 2.7
+        current_a = load_a + float(rng.normal(0.0, 0.02))
+        voltage_v = 3.2 + soc - 0.07 * load_a + float(rng.normal(0.0, 0.003))
+        yield (
+            now_s,
+            with_values(
+                voltage_v=voltage_v,
+                current_a=current_a,
+                power_w=voltage_v * current_a,
+                temperature_c=25.0 + float(rng.normal(0.0, 0.1)),
+                soc_percent=100.0 * soc + float(rng.normal(0.0, 0.05)),
+                remaining_capacity_ah=2.7 * soc,
+                remaining_energy_wh=2.7 * soc * 3.6,
+                time_to_empty_s=3600.0 * 2.7 * soc / current_a if current_a > 0.0 else None,
+                innovation_v=float(rng.normal(0.0, 0.003)),
+                frames_lost=i // 50,
+            ),
+        )
+
+
+CELLS = 4
+MOVED = ("soc_std", "time_to_empty_s", "time_to_full_s", "cell_lowest", "cell_lowest_v")
+"""What entities are made of that have other names."""
+
+
+def restless(seconds: float, period_s: float = 0.1, one: Snapshot = ONE) -> Iterator[tuple[float, Snapshot]]:
+    """Every value is another one each time."""
+    assert one.estimate
+    names = [key for key in (*SHOWN, *MOVED) if hasattr(one.estimate, key)]
+    for i in range(round(seconds / period_s)):
+        elements = {key: e.model_copy(update={"value": float(i)}) for key, e in one.parameters.elements.items()}
+        health = {"capacity": Parameter(value=float(i), std=float(i), valid=True, source="identified")}
+        parameters = one.parameters.model_copy(update={"elements": elements, "state_of_health": health})
+        estimate = one.estimate.model_copy(update=dict.fromkeys(names, i) | {"cells_v": [float(i)] * CELLS})
+        yield i * period_s, one._replace(estimate=estimate, parameters=parameters)
+
+
+def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str, dict[str, object]]]:
+    """When Home Assistant is told what on which of its topics."""
+    messages, sent = Messages("bms", "pack"), Sent()
+    for now_s, each in stream:
+        due, sent = messages.due(sent, each, now_s)
+        for message in due:
+            if message.topic.startswith(f"{ROOT}/home_assistant"):
+                yield now_s, message.topic, json.loads(message.payload)
+
+
+def rows(
+    stream: Iterator[tuple[float, Snapshot]], components: dict[str, dict[str, object]] = COMPONENTS
+) -> list[float]:
+    """When the recorder of Home Assistant writes a row: for each change of state or attribute of an entity it shows."""
+    last: dict[str, object] = {}
+    written = []
+    shown = {key for key, component in components.items() if component.get("enabled_by_default", True)}
+    for now_s, topic, payload in told(stream):
+        for key in shown & set(payload):
+            assert components[key]["state_topic"] == topic
+            if key in last and last[key] != payload[key]:
+                written.append(now_s)
+            last[key] = payload[key]
+    assert shown <= set(last)
+    return written
+
+
+@pytest.mark.parametrize("stream", [noisy, restless])
+def test_home_assistant_records_at_most_20_rows_in_any_minute(
+    stream: Callable[[float], Iterator[tuple[float, Snapshot]]],
+) -> None:
+    components = described(discovery(HOME, Described(ONE.info, CELLS), ROOT, 0.0)) if stream is restless else COMPONENTS
+    written = np.array(rows(stream(900.0), components))
+    assert written.size > 100
+    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
+
+
+def test_a_fuel_cell_makes_no_more() -> None:
+    written = np.array(rows(restless(900.0, one=STACK), OF_STACK))
+    assert written.size > 100
+    assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
+
+
+def test_of_a_fuel_cell_home_assistant_shows_what_it_has_and_what_is_learned() -> None:
+    values = next(payload for _, topic, payload in told(iter([(0.0, STACK)])))
+    numbers = {key for key, component in OF_STACK.items() if component["platform"] == "sensor"}
+    assert numbers == set(values)
+    assert {key for key, value in values.items() if value is None} == {"temperature_c"}
+    assert set(KEYS) <= numbers
+    assert values["r_ohm"] == pytest.approx(0.1677, abs=1e-3)
+    assert OF_STACK["r_ohm"]["unit_of_measurement"] == "Ω"
+
+
+def test_noise_alone_makes_no_rows() -> None:
+    rng = np.random.default_rng(2)
+    stream = (
+        (float(i), with_values(voltage_v=3.705 + float(rng.normal(0.0, 0.002)), current_a=float(rng.normal(0.0, 0.01))))
+        for i in range(600)
+    )
+    assert rows(stream) == []
+
+
+@pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.0, 4.0, 10.0])
+def test_values_never_expire_while_estimates_come(rate_hz: float) -> None:
+    info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
+    components = discovery(HOME, Described(info), ROOT, 0.0)["components"].values()
+    expiry_s = min(c["expire_after"] for c in components if "expire_after" in c)
+    rng = np.random.default_rng(3)
+    late_s = [float(rng.uniform(0.0, 0.9 / rate_hz)) for _ in range(round(600 * rate_hz))]
+    stream = ((i / rate_hz + late, ONE) for i, late in enumerate(late_s))
+    times_s = [now_s for now_s, topic, _ in told(stream) if topic == f"{ROOT}/home_assistant"]
+    assert times_s[-1] > 550.0
+    assert max(np.diff(times_s)) < expiry_s
+
+
+def test_values_expire_when_no_estimate_comes() -> None:
+    silent = ONE._replace(estimate=None)
+    times_s = [t for t, _, _ in told((float(i), silent if i else ONE) for i in range(60))]
+    assert times_s == [0.0]
+
+
+def test_a_change_comes_within_five_seconds_when_it_is_the_first_for_long() -> None:
+    stream = ((float(i), with_values(current_a=0.0 if i < 43 else 3.0)) for i in range(60))
+    changed_s = next(t for t, _, payload in told(stream) if payload.get("current_a") == 3.0)
+    assert changed_s <= 48.0
+
+
+def test_values_are_rounded_to_what_they_resolve() -> None:
+    values = with_values(voltage_v=3.7049999, soc_percent=56.7890123, remaining_energy_wh=1.23456789)
+    payload = next(p for _, _, p in told(iter([(0.0, values)])))
+    assert (payload["voltage_v"], payload["soc_percent"], payload["remaining_energy_wh"]) == (3.7, 56.8, 1.2)
+    assert payload["temperature_c"] is None
+
+
+def test_no_entity_has_more_attributes_than_the_reason() -> None:
+    for component in COMPONENTS.values():
+        assert not component["state_topic"].endswith(("/health", "/state", "/parameters"))
+        if "json_attributes_template" in component:
+            assert set(component["json_attributes_template"].split("'")[1::2]) <= {
+                "reason",
+                "severity",
+                "positive",
+                "discharge",
+            }
+
+
+def test_raw_observer_values_are_disabled_until_the_user_wants_them() -> None:
+    raw = {
+        "delta_1",
+        "delta_2",
+        "adaptive_gain_k",
+        "nussbaum_gain",
+        "adaptation_gain_hz",
+        "innovation_v",
+        "sample_rate_hz",
+        "r_ts_ohm",
+    }
+    assert not SHOWN & raw
+    assert raw < set(COMPONENTS)
+    assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_h", "r_s_ohm"} <= SHOWN
+
+
+def test_discovery_describes_every_entity_with_both_availabilities() -> None:
+    found = discovery(HOME, Described(ONE.info), ROOT, 0.0)
+    assert (found["device"]["identifiers"], found["device"]["serial_number"]) == (["bms_pack"], "A1")
+    assert found["origin"]["name"] == "bms_estimator"
+    assert found["availability_mode"] == "all"
+    assert [a["topic"] for a in found["availability"]] == ["bms/pack/availability", "bms/pack/sensor/availability"]
+    soc, current = COMPONENTS["soc_percent"], COMPONENTS["current_a"]
+    assert (soc["device_class"], soc["unit_of_measurement"], soc["expire_after"]) == ("battery", "%", 30)
+    assert "'positive': 'discharge'" in current["json_attributes_template"]
+    assert "device_class" not in COMPONENTS["r_s_ohm"]
+    assert len({component["unique_id"] for component in COMPONENTS.values()}) == len(COMPONENTS)
+
+
+@pytest.mark.parametrize(("rate_hz", "sample_period_s", "expire_s"), [(0.1, 1.0, 30), (10.0, 1.0, 30), (1.0, 25.0, 75)])
+def test_a_value_expires_after_three_periods_and_half_a_minute_at_least(
+    rate_hz: float, sample_period_s: float, expire_s: int
+) -> None:
+    info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
+    components = discovery(HOME, Described(info), ROOT, sample_period_s)["components"].values()
+    assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
+
+
+def discoveries(*snapshots: Snapshot, commands: tuple[str, ...] = (), **settings: Any) -> list[dict[str, Any]]:
+    """All that is told while ``snapshots`` come."""
+    messages, sent = Messages("bms", "pack", home_assistant=HomeAssistantSettings(**settings)), Sent()
+    messages.commands = commands
+    found = []
+    for i, each in enumerate(snapshots):
+        due, sent = messages.due(sent, each, 10.0 * i)
+        found += [json.loads(m.payload or "null") for m in due if m.topic.endswith("/device/bms_pack/config")]
+    return found
+
+
+def test_cells_are_there_from_the_first_sample_that_has_them_and_stay() -> None:
+    cells = with_values(cells_v=[3.3, None, 3.31], cell_lowest=1, cell_lowest_v=3.3)
+    before, after = discoveries(ONE, cells, ONE)
+    new = set(after["components"]) - set(before["components"])
+    assert new == {
+        "cell_lowest",
+        "cell_lowest_v",
+        "cell_highest",
+        "cell_highest_v",
+        *(f"cell_{n}_v" for n in (1, 2, 3)),
+    }
+    cell = after["components"]["cell_2_v"]
+    assert (cell["entity_category"], cell["enabled_by_default"], cell["name"]) == ("diagnostic", False, "Cell 2")
+
+
+def test_commands_are_there_where_they_are_allowed() -> None:
+    [none] = discoveries(ONE)
+    assert {c["platform"] for c in described(none).values()} == {"sensor"}
+    [some] = discoveries(ONE, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate"))
+    platforms = {key: c["platform"] for key, c in some["components"].items() if "command_topic" in c}
+    assert platforms == {
+        "set_soc": "number",
+        "current_zero": "button",
+        "acknowledge_alarm": "button",
+        "publish_rate": "number",
+    }
+
+
+def test_what_is_not_there_any_more_is_removed() -> None:
+    messages = Messages("bms", "pack", alarms=[name for name in ALARMS if name != "soc_low"])
+    messages.commands = ("set_soc",)
+    due, _ = messages.due(Sent(), ONE, 0.0)
+    [found] = [json.loads(m.payload) for m in due if m.topic.endswith("/device/bms_pack/config")]
+    removed = {key: c["platform"] for key, c in found["components"].items() if key not in described(found)}
+    assert removed == {
+        "alarm_soc_low": "binary_sensor",
+        "current_zero": "button",
+        "acknowledge_alarm": "button",
+        "publish_rate": "number",
+        # of versions before
+        "soc_std": "sensor",
+        "time_to_empty_s": "sensor",
+        "sensor_silent": "binary_sensor",
+        "suspicion": "binary_sensor",
+        "lock_lost": "binary_sensor",
+    }
+
+
+def test_alarms_are_there_that_are_watched_and_hold_though_the_sensor_is_silent() -> None:
+    alarm = Alarm(
+        name="soc_low",
+        severity="warning",
+        active=False,
+        latched=False,
+        since=None,
+        value=None,
+        limit=None,
+        unit=None,
+        text="",
+    )
+    [found] = discoveries(ONE._replace(alarms=(alarm,)))
+    component = found["components"]["alarm_soc_low"]
+    assert (component["platform"], component["device_class"]) == ("binary_sensor", "battery")
+    assert component["state_topic"] == "bms/pack/alarm/soc_low"
+    of_service, of_alarm = component["availability"]
+    assert of_service == {"topic": "bms/pack/availability"}
+    assert (of_alarm["topic"], component["availability_mode"]) == ("bms/pack/alarm/soc_low", "all")
+    assert of_alarm["value_template"] == ("{{ 'online' if value_json.watched or value_json.active else 'offline' }}")
+
+
+def test_the_names_are_home_assistants_or_the_users_and_the_ids_the_same_in_any_language() -> None:
+    cells = with_values(cells_v=[3.3])
+    [english] = discoveries(cells)
+    [german] = discoveries(cells, name="Hausbatterie", names={"voltage_v": "Klemmenspannung", "cell_v": "Zelle"})
+    parts, named = described(english), described(german)
+    assert {key for key, component in parts.items() if "name" not in component} == {
+        "voltage_v",
+        "current_a",
+        "power_w",
+        "temperature_c",
+        "soc_percent",
+    }
+    assert [named[key]["name"] for key in ("voltage_v", "cell_1_v")] == ["Klemmenspannung", "Zelle 1"]
+    assert (german["device"]["name"], english["device"]["name"]) == ("Hausbatterie", "pack")
+    ids = [{component["default_entity_id"] for component in each.values()} for each in (parts, named)]
+    assert ids[0] == ids[1]
+
+
+def test_an_unknown_name_is_refused_with_what_there_is() -> None:
+    with pytest.raises(UserError, match=r"home_assistant\.names\.volts: there is no such entity; .*voltage_v"):
+        discoveries(names={"volts": "Spannung"})
+
+
+def test_charging_may_be_positive() -> None:
+    messages = Messages("bms", "pack", home_assistant=HomeAssistantSettings(current_sign="charge_positive"))
+    due, _ = messages.due(Sent(), with_values(current_a=2.0, power_w=8.0, voltage_v=4.0), 0.0)
+    values = next(json.loads(m.payload) for m in due if m.topic == f"{ROOT}/home_assistant")
+    assert (values["current_a"], values["power_w"], values["voltage_v"]) == (-2.0, -8.0, 4.0)
+
+
+def test_of_a_pack_that_it_is_not_to_know_home_assistant_is_told_nothing_but_that() -> None:
+    messages = Messages("bms", "pack", home_assistant=HomeAssistantSettings(enabled=False, discovery_prefix="ha"))
+    due, _ = messages.due(Sent(), ONE, 0.0)
+    told = [m for m in due if "home_assistant" in m.topic or not m.topic.startswith("bms/")]
+    assert [(m.topic, m.payload, m.retain) for m in told] == [("ha/device/bms_pack/config", b"", True)]

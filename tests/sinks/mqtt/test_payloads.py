@@ -1,0 +1,101 @@
+"""What readers rely on does not change unsaid, and the document made from the models says what is sent."""
+
+import json
+from typing import Any
+
+import pytest
+
+from bms_estimator.model.payloads import PAYLOAD_VERSION
+from bms_estimator.sinks.mqtt.asyncapi import ARGUMENTS, document
+from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from bms_estimator.sinks.mqtt.requests import COMMANDS, NAMES
+from bms_estimator.sinks.mqtt.topics import TOPICS
+from tests.command_line import run
+from tests.sinks.mqtt.payload_record import broken, now, recorded
+from tests.sinks.snapshots import NOW, ONE, SOC_LOW
+
+DOCUMENT = document("bms")
+WRITE = "make payloads writes tests/sinks/mqtt/payloads.json anew"
+
+
+def test_no_field_vanishes_or_changes_its_type_in_the_same_version() -> None:
+    before, after = recorded(), now()
+    lost = broken(before["fields"], after["fields"])
+    if after["payload_version"] == before["payload_version"]:
+        assert lost == [], "readers rely on these: raise PAYLOAD_VERSION in bms_estimator/model/payloads.py"
+    assert after["payload_version"] >= before["payload_version"]
+
+
+def test_all_fields_are_remembered() -> None:
+    before, after = recorded(), now()
+    assert after["payload_version"] == before["payload_version"], WRITE
+    assert sorted(set(after["fields"]) - set(before["fields"])) == [], WRITE
+
+
+def test_a_field_that_is_gone_or_of_another_type_is_found() -> None:
+    fields = now()["fields"]
+    assert broken(fields, fields | {"state.new": "number"}) == []
+    assert broken(fields, fields | {"state.voltage_v": "string"}) == ["state.voltage_v: was number, is string"]
+    assert broken(fields, {name: kind for name, kind in fields.items() if name != "parameters.a.*.std"}) == [
+        "parameters.a.*.std: was null, number, is gone"
+    ]
+
+
+def test_the_version_is_published() -> None:
+    messages = Messages("bms", "pack")
+    said = {
+        m.topic.removeprefix("bms/pack/"): m.payload for m in (*messages.greeting(), *messages.due(Sent(), ONE, NOW)[0])
+    }
+    assert json.loads(said["info"])["payload_version"] == PAYLOAD_VERSION
+    assert json.loads(said["schema"])["payload_version"] == PAYLOAD_VERSION
+
+
+def test_every_message_goes_out_as_the_table_of_topics_says() -> None:
+    messages, told = Messages("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
+    sent = {
+        m.topic.removeprefix("bms/pack/"): m for m in (*messages.kept(None, told), *messages.due(Sent(), told, NOW)[0])
+    }
+    assert sent["alarm/soc_low"].qos == TOPICS["alarm"].qos
+    assert sent["alarm/soc_low"].retain
+    for name in set(TOPICS) - {"alarm"}:
+        assert (sent[name].qos, sent[name].retain) == (TOPICS[name].qos, TOPICS[name].retain), name
+        TOPICS[name].model.model_validate_json(sent[name].payload)
+
+
+def references(node: Any) -> list[str]:
+    if isinstance(node, dict):
+        return [node["$ref"]] if "$ref" in node else [found for inner in node.values() for found in references(inner)]
+    return [found for inner in node for found in references(inner)] if isinstance(node, list) else []
+
+
+def test_all_that_the_document_points_at_is_in_it() -> None:
+    for reference in references(DOCUMENT):
+        node = DOCUMENT
+        for key in reference.removeprefix("#/").split("/"):
+            node = node[key]
+    assert {operation["action"] for operation in DOCUMENT["operations"].values()} == {"send", "receive"}
+
+
+def test_the_document_has_every_topic_with_its_own_fields() -> None:
+    addresses = {channel["address"] for channel in DOCUMENT["channels"].values()}
+    for name in ("state", "sensor/availability", "alarm/{alarm}", *(f"request/{name}" for name in NAMES)):
+        assert f"bms/{{device}}/{name}" in addresses
+    schemas = DOCUMENT["components"]["schemas"]
+    for topic in TOPICS.values():
+        assert set(schemas[topic.model.__name__]["properties"]) == set(topic.model.model_fields)
+    for channel in DOCUMENT["channels"].values():
+        assert all(f"{{{parameter}}}" in channel["address"] for parameter in channel["parameters"])
+
+
+def test_it_says_what_each_command_takes() -> None:
+    assert set(ARGUMENTS) == set(COMMANDS)
+    payloads = {name: DOCUMENT["components"]["messages"][f"request_{name}"]["payload"] for name in NAMES}
+    assert payloads["set_soc"]["required"] == ["soc"]
+    assert payloads["acknowledge_alarm"]["required"] == []
+    assert set(payloads["state"]["properties"]) == {"transaction"}
+
+
+def test_the_command_prints_it(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "asyncapi", "--base-topic", "site/bms")
+    assert code == 0
+    assert json.loads(out) == document("site/bms")

@@ -1,0 +1,188 @@
+"""What a broker means is said in words, in log and health."""
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import structlog
+
+from bms_estimator.mqtt.queue_sender import WINDOW
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.sink import MqttSink
+from bms_estimator.sinks.sink import Delivery
+from bms_estimator.store.outbox import Outbox
+from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mqtt.proxy import Proxy
+from tests.patience import LONG_S
+from tests.sinks.service import STATE, Sink, assert_all_in_order, numbers, state, until
+from tests.sinks.snapshots import ONE, snapshot
+
+WRONG = "Not authorized (135): name or password wrong"
+
+
+def started(folder: Path, extra: str) -> Broker:
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    return Broker(folder, extra).start()
+
+
+@pytest.fixture
+def locked_broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = started(tmp_path, "allow_anonymous false")
+    yield broker
+    broker.stop()
+
+
+@pytest.mark.parametrize("knows_5", [True, False])
+async def test_a_wrong_password_is_called_that_and_is_nowhere_itself(
+    locked_broker: Broker, tmp_path: Path, knows_5: bool
+) -> None:
+    (tmp_path / "password").write_text("s3cret")
+    (tmp_path / "password").chmod(0o600)
+    delivery = Delivery()
+    async with Proxy(locked_broker.port, knows_5=knows_5) as proxy:
+        settings = MqttSettings(url=proxy.url, username="meter", password_file=tmp_path / "password")
+        with structlog.testing.capture_logs() as logs:
+            async with MqttSink(settings, "pack", Requests(delivery), delivery, Outbox(None, most=4)):
+                await until(lambda: delivery.trouble)
+    assert [line["event"] for line in logs] == ["broker not reachable"]
+    assert logs[0]["reason"].startswith(WRONG)
+    health = snapshot(delivery=delivery).health
+    assert health.broker_trouble == logs[0]["reason"]
+    assert "s3cret" not in f"{logs} {health}"
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (142, "Session taken over (142): another client has the same name"),
+        (139, "Server shutting down (139)"),
+        (151, "Quota exceeded (151): the broker allows no more"),
+        (141, "Keep alive timeout (141): it heard nothing from here for too long"),
+    ],
+)
+async def test_a_broker_that_says_why_it_ends_a_connection_is_quoted(broker: Broker, code: int, said: str) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
+            await live.wait("bms/pack/schema")
+            network.end(code)
+            await until(lambda: sink.delivery.losses)
+            assert logs[1]["event"] == "broker lost"
+            assert sink.delivery.losses == 1
+            network.away = False
+            await until(lambda: len(live.all("bms/pack/schema")) == 2)
+    assert logs[1]["reason"] == said
+
+
+@pytest.fixture
+def narrow_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Takes no message above 4 kB and answers one at a time."""
+    broker = started(tmp_path, "allow_anonymous true\nmax_packet_size 4000\nmax_inflight_messages 1")
+    yield broker
+    broker.stop()
+
+
+async def test_what_is_longer_than_the_broker_takes_is_named_and_does_not_end_the_connection(
+    narrow_broker: Broker,
+) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Listener(narrow_broker) as live, Sink(narrow_broker.url, most_kept=1000) as sink:
+            for number in range(100):
+                sink.mqtt.publish(state(number))
+            await until(lambda: sink.delivery.waiting == 0)
+            await live.wait_json(STATE, lambda s: s["frames_received"] == 99)
+            assert "bms/pack/schema" in sink.delivery.refused_topics
+            assert sink.delivery.losses == 0
+    assert_all_in_order(numbers(live), 100)
+    assert {line["reason"] for line in logs if "topic" in line} == {
+        "not allowed to write it: longer than the 4000 bytes that the broker takes"
+    }
+
+
+QUICK: Any = {"most_kept": 1000, "first_delay_s": 0.02}
+RETAINED = {
+    "bms/pack/availability",
+    "bms/pack/schema",
+    "bms/pack/sensor/availability",
+    "bms/pack/health",
+    "bms/pack/info",
+    "homeassistant/device/bms_pack/config",
+}
+
+
+@pytest.mark.parametrize("code", [131, 151])
+async def test_what_is_refused_for_now_comes_later_in_order(broker: Broker, code: int) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, **QUICK) as sink:
+            for number in range(50):
+                sink.mqtt.publish(state(number))
+            await until(lambda: sink.delivery.waiting == 0)
+            network.refuses = code
+            for number in range(50, 100):
+                sink.mqtt.publish(state(number))
+            await until(lambda: network.refused.count(STATE) > WINDOW + 2)  # so the oldest alone is tried
+            assert STATE in sink.delivery.refused_topics
+            network.refuses = 0
+            await until(lambda: sink.delivery.waiting == 0)
+    assert_all_in_order(numbers(live), 100)
+    assert (sink.delivery.drops, sink.delivery.losses) == (0, 0)
+    assert len([line for line in logs if line.get("topic") == STATE]) == 1
+
+
+async def test_what_is_retained_and_refused_for_now_is_said_again_after_a_pause(broker: Broker) -> None:
+    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
+        network.refuses = 151
+        sink.mqtt.publish(ONE)
+        await until(lambda: set(sink.delivery.refused_topics) >= RETAINED)
+        assert set(network.refused) >= RETAINED
+        network.refuses = 0
+        async with asyncio.timeout(LONG_S):
+            while sink.delivery.refused_topics:
+                sink.mqtt.publish(ONE)
+                await asyncio.sleep(0.01)
+        for topic in RETAINED:
+            await live.wait(topic)
+
+
+async def test_what_is_retained_and_refused_for_long_is_not_said_with_each_snapshot(broker: Broker) -> None:
+    async with Proxy(broker.port) as network, Sink(network.url, first_delay_s=LONG_S) as sink:
+        network.refuses = 151
+        for _ in range(20):
+            before = network.refused.count("bms/pack/health")
+            sink.mqtt.publish(snapshot())
+            await until(lambda: network.refused.count("bms/pack/health") > before)  # noqa: B023 - at once
+        assert network.refused.count("bms/pack/info") == network.refused.count("bms/pack/schema") == 1
+        network.leave()  # or what waits for the pause holds the end up
+        await until(lambda: sink.delivery.losses)
+
+
+@pytest.mark.parametrize("code", [135, 153])
+async def test_what_is_refused_for_good_is_given_up(broker: Broker, code: int) -> None:
+    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url, most_kept=1000) as sink:
+        await live.wait("bms/pack/schema")
+        network.refuses = code
+        for number in range(50):
+            sink.mqtt.publish(state(number))
+        await until(lambda: sink.delivery.waiting == 0)
+        assert network.refused.count(STATE) == 50
+        assert sink.delivery.drops == 50 + network.refused.count("bms/pack/event")
+        assert STATE in sink.delivery.refused_topics
+
+
+async def test_nothing_but_our_lines_is_said_of_a_broken_line(
+    broker: Broker, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
+            for _ in range(3):
+                before, losses = len(live.messages), sink.delivery.losses
+                sink.mqtt.publish(ONE)
+                await live.wait(STATE, skip=before)
+                network.leave()
+                await until(lambda: sink.delivery.losses > losses)  # noqa: B023 - at once
+                network.away = False
+    assert {line["event"] for line in logs} <= {"broker connected", "broker lost", "broker not reachable"}
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,150 @@
+"""Requests: bytes in, bytes out; whatever comes in, something sane comes out and nothing ends."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+import structlog
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.sinks.mqtt.requests import (
+    COMMANDS_PER_MIN,
+    LOG_S,
+    MOST_PAYLOAD_BYTES,
+    NAMES,
+    READS_PER_MIN,
+    Requests,
+)
+from bms_estimator.sinks.sink import Delivery
+
+
+class Asked:
+    """Requests with a clock that the test sets, and handlers that note their calls."""
+
+    def __init__(self, *commands: Any) -> None:
+        self.delivery, self.now_s, self.granted = Delivery(), 0.0, list[str]()
+        self.requests = Requests(self.delivery, commands, monotonic=lambda: self.now_s)
+        for name in NAMES:
+            self.requests.offer(name, self._handler(name))
+
+    def _handler(self, name: str) -> Any:
+        async def echo(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+            if arguments.get("refuse"):
+                raise UserError("refused")
+            if arguments.get("fail"):
+                raise ZeroDivisionError
+            self.granted.append(name)
+            return {"x": arguments.get("x")}
+
+        return echo
+
+    async def __call__(self, name: str, payload: bytes = b"") -> Any:
+        response = await self.requests.respond(name, payload)
+        return None if response is None else json.loads(response, parse_constant=pytest.fail)
+
+
+@pytest.mark.parametrize(
+    ("payload", "status", "transaction"),
+    [
+        (b'{"transaction": "t1", "x": 2}', "ok", "t1"),
+        (b"", "ok", None),
+        (b'{"transaction": 7, "refuse": true}', "error", 7),
+        (b"[1, 2]", "error", None),
+        (b"\xff\xfe not json", "error", None),
+        (b"[" * 4000, "error", None),
+        (b'{"transaction": NaN}', "error", None),
+        (b'{"transaction": [1e999], "x": 1}', "error", None),
+        (b'{"transaction": "t2", "x": -Infinity}', "error", None),
+        (b'{"transaction": 1.5}', "error", None),
+        (b'{"transaction": true}', "error", None),
+        (b'{"transaction": {"a": 1}}', "error", None),
+    ],
+)
+async def test_a_request_is_answered(payload: bytes, status: str, transaction: object) -> None:
+    asked = Asked()
+    response = await asked("state", payload)
+    assert set(response) == {"status", "data", "error", "transaction"}
+    assert (response["status"], response["transaction"]) == (status, transaction)
+    assert (response["data"] is None) == (status == "error")
+    assert (response["error"] is None) == (status == "ok")
+    assert asked.delivery.requests == {"granted" if status == "ok" else "refused": 1}
+
+
+async def test_a_fault_of_a_handler_is_answered_and_counted_and_never_raised() -> None:
+    asked = Asked()
+    response = await asked("state", b'{"fail": true, "transaction": "t"}')
+    assert (response["status"], response["transaction"]) == ("error", "t")
+    assert asked.delivery.requests == {"failed": 1}
+
+
+async def test_data_that_is_no_json_is_a_fault_of_the_handler() -> None:
+    asked = Asked()
+
+    async def broken(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        return {"soc": float("nan")}
+
+    asked.requests.offer("state", broken)
+    assert (await asked("state"))["status"] == "error"
+
+
+@pytest.mark.parametrize("name", ["", "reboot", "State", "state/", "é", "x" * 65_000])
+async def test_a_name_that_does_not_exist_gets_no_response_and_is_counted(name: str) -> None:
+    asked = Asked()
+    with structlog.testing.capture_logs() as logs:
+        assert await asked(name) is None
+    assert asked.delivery.requests == {"unknown": 1}
+    assert len(str(logs)) < 300
+
+
+async def test_a_payload_of_more_than_4_kb_is_refused_unread() -> None:
+    asked = Asked()
+    padded = b'{"x": 1}' + b" " * MOST_PAYLOAD_BYTES
+    assert (await asked("state", padded[:MOST_PAYLOAD_BYTES]))["status"] == "ok"
+    assert "4096 bytes" in (await asked("state", padded))["error"]
+
+
+async def test_commands_are_off_unless_the_owner_named_them() -> None:
+    for name in ("set_soc", "current_zero"):
+        asked = Asked()
+        assert "mqtt.commands" in (await asked(name))["error"]
+        assert asked.granted == []
+        asked = Asked(name)
+        await asked("set_soc")
+        await asked("current_zero")
+        assert asked.granted == [name]
+
+
+async def test_commands_are_few_a_minute_and_do_not_wait_for_those_who_only_read() -> None:
+    asked = Asked("set_soc")
+    for _ in range(1000):
+        await asked("set_soc")
+        await asked("state")
+    assert asked.granted.count("set_soc") == COMMANDS_PER_MIN
+    assert asked.granted.count("state") == READS_PER_MIN
+    asked.now_s = 30.0
+    for _ in range(1000):
+        await asked("set_soc")
+    assert asked.granted.count("set_soc") == 1.5 * COMMANDS_PER_MIN
+    assert asked.delivery.requests["too_many"] == 3000 - len(asked.granted)
+
+
+async def test_a_burst_is_one_line_in_the_log_and_the_next_burst_another() -> None:
+    asked = Asked("set_soc")
+    with structlog.testing.capture_logs() as logs:
+        for _ in range(10_000):
+            await asked("current_zero")
+            await asked("nonsense")
+        assert [line["kind"] for line in logs] == ["refused", "unknown", "too_many"]
+        asked.now_s = LOG_S
+        await asked("nonsense")
+    assert logs[-1]["so_far"] == 10_001
+
+
+@given(name=st.sampled_from(NAMES) | st.text(), payload=st.binary() | st.text().map(str.encode))
+async def test_whatever_is_asked_nothing_is_raised(name: str, payload: bytes) -> None:
+    asked = Asked("set_soc", "current_zero")
+    await asked(name, payload)
+    assert sum(asked.delivery.requests.values()) == 1

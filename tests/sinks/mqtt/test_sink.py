@@ -1,0 +1,437 @@
+import asyncio
+import json
+import subprocess
+from collections.abc import AsyncIterator, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import pytest
+import structlog
+from aiomqtt import ProtocolVersion
+
+from bms_estimator.demo.broker import DemoBroker
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.events import events
+from bms_estimator.mqtt.broker_config import brokers, check
+from bms_estimator.mqtt.client import PATIENCE, Client
+from bms_estimator.mqtt.connection import Connection, Hello
+from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING, Inbox
+from bms_estimator.mqtt.reconnect_loop import Link
+from bms_estimator.process.backoff import LONGEST_DELAY_S
+from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.sinks.mqtt.availability import CORRECTION_S
+from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.sink import MqttSink
+from bms_estimator.sinks.sink import Delivery
+from bms_estimator.store.outbox import Outbox
+from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mqtt.proxy import Proxy
+from tests.patience import LONG_S
+from tests.sinks.service import Sink, until
+from tests.sinks.snapshots import ONE, snapshot
+
+MOST_KEPT = 4
+AT_START = len(events(None, ONE))
+RETAINED = ("info", "availability", "sensor/availability", "schema", "health")
+DISCOVERY = "homeassistant/device/bms_pack/config"
+HELLO = Hello("test", Message("bms/pack/availability", b"offline", 1, retain=True), lambda *_: None)
+DYNAMIC_SECURITY = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
+
+
+async def never(_: Connection) -> None:
+    raise AssertionError("there is no broker")
+
+
+@pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])
+async def url(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[str]:
+    """The broker's, directly or as one that does not know MQTT 5."""
+    async with Proxy(broker.port, knows_5=request.param == "MQTT 5") as proxy:
+        yield proxy.url
+
+
+async def test_topics_and_retained_flags_are_as_documented(broker: Broker, url: str) -> None:
+    async with Listener(broker) as live, Sink(url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait("bms/pack/home_assistant")  # the last of all
+        async with Listener(broker) as late:
+            for topic in RETAINED:
+                await late.wait(f"bms/pack/{topic}")
+            await late.wait(DISCOVERY)
+            kept = {name for name, _, retain in late.messages if retain}
+    assert kept == {f"bms/pack/{topic}" for topic in RETAINED} | {DISCOVERY}
+    assert live.all("bms/pack/availability") == [b"online", b"offline"]
+    assert live.all("bms/pack/sensor/availability") == [b"online", b"offline"]
+    seen = {name for name, _, _ in live.messages}
+    assert {"bms/pack/state", "bms/pack/parameters", "bms/pack/home_assistant"} <= seen
+    assert sink.delivery == Delivery()
+
+
+async def test_retained_messages_are_sent_again_when_home_assistant_is_born(broker: Broker) -> None:
+    async with Listener(broker) as live, Sink(broker.url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(DISCOVERY)
+        before = len(live.messages)
+        await live.publish("homeassistant/status", b"online")
+        while len(live.all(DISCOVERY)) < 2:
+            sink.mqtt.publish(ONE)
+            await asyncio.sleep(0.05)
+        for topic in RETAINED:
+            await live.wait(f"bms/pack/{topic}", skip=before)
+        await live.wait("bms/pack/home_assistant", skip=before)
+
+
+async def test_a_broker_that_comes_late_goes_and_comes_back_is_served_and_drops_are_counted(tmp_path: Path) -> None:
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    broker = Broker(tmp_path)
+    async with Sink(broker.url) as sink:
+        for _ in range(5):
+            sink.mqtt.publish(ONE)
+        assert (sink.delivery.drops, sink.delivery.waiting) == (AT_START + 5 - MOST_KEPT, MOST_KEPT)
+        for _ in range(2):  # persistence is off: each start has forgotten everything
+            broker.start()
+            try:
+                async with Listener(broker) as live:
+                    sink.mqtt.publish(snapshot(delivery=sink.delivery))
+                    for topic in (*RETAINED, "state"):
+                        await live.wait(f"bms/pack/{topic}")
+                    health = await live.wait_json("bms/pack/health")
+                    assert health["publish_drops"] >= 1
+            finally:
+                await asyncio.to_thread(broker.stop)
+
+
+async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)  # never started
+    async with Sink(broker.url) as sink:
+        for _ in range(1000):
+            sink.mqtt.publish(ONE)
+    assert sink.delivery.drops == AT_START + 1000 - MOST_KEPT
+
+
+async def test_a_connection_that_comes_after_it_was_given_up_leaves_nothing_to_the_loop(broker: Broker) -> None:
+    """The thread that connects goes on when its task is cancelled, and a loop may be about to close."""
+    client = Client({"hostname": "127.0.0.1", "port": broker.port}, ProtocolVersion.V5, HELLO, PATIENCE)
+    before = asyncio.all_tasks()
+    client.abandon()
+    await asyncio.to_thread(client._client_connect)
+    await asyncio.sleep(0)  # what the thread left to the loop runs
+    assert client._client.socket() is None
+    assert asyncio.all_tasks() == before
+
+
+async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path: Path) -> None:
+    pauses: list[float] = []
+
+    class Impatient(Link):
+        async def _pause(self, delay_s: float) -> None:
+            pauses.append(delay_s)
+            if len(pauses) == 12:
+                self.closing.set()
+
+    settings = MqttSettings(url=Broker(tmp_path).url)
+    await Impatient(brokers(settings), HELLO, Dial(settings), never, Delivery()).run()
+    assert max(pauses) <= LONGEST_DELAY_S == 30.0
+    assert pauses[0] <= 5.0 < pauses[3]
+    assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"
+
+
+async def test_after_a_half_open_connection_the_availability_is_online(broker: Broker) -> None:
+    async with Proxy(broker.port) as network, Listener(broker) as live, Sink(network.url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(DISCOVERY)
+        network.cut()
+        async with asyncio.timeout(LONG_S):
+            await network.half_open_ended.wait()  # else not before one and a half keep-alives
+        before = len(live.messages)
+        sink.mqtt.publish(ONE)
+        await live.wait("bms/pack/state", skip=before)
+        async with Listener(broker) as late:
+            assert await late.wait("bms/pack/availability") == b"online"
+        assert live.all("bms/pack/availability") == [b"online", b"offline", b"online"]
+        assert sink.delivery.corrections == 0, "the will came before the new online"
+
+
+@pytest.mark.parametrize("forged", [b"offline", b"", b"nonsense"])
+@pytest.mark.parametrize("topic", ["bms/pack/availability", "bms/pack/sensor/availability"])
+async def test_an_availability_that_somebody_else_wrote_is_put_right(
+    broker: Broker, url: str, topic: str, forged: bytes
+) -> None:
+    async with Listener(broker) as live, Sink(url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(DISCOVERY)
+        await live.publish(topic, forged, qos=1, retain=True)
+        await until(lambda: live.all(topic) == [b"online", forged, b"online"])
+        async with Listener(broker) as late:
+            assert await late.wait(topic) == b"online"
+    assert sink.delivery.corrections == 1
+
+
+async def test_a_broker_that_ends_and_publishes_our_will_is_not_somebody_else(broker: Broker) -> None:
+    with structlog.testing.capture_logs() as logs:
+
+        def connections() -> int:
+            return sum(line["event"] == "broker connected" for line in logs)
+
+        async with Sink(broker.url) as sink:
+            async with Listener(broker) as live:
+                sink.mqtt.publish(ONE)
+                await live.wait(f"bms/pack/{RETAINED[-1]}")  # the last of them all
+            await asyncio.to_thread(broker.stop)
+            await until(lambda: any(line["event"] == "broker not reachable" for line in logs))
+            await asyncio.to_thread(broker.start)
+            await until(lambda: connections() == 2)
+    assert sink.delivery.corrections == 0
+    assert not [line for line in logs if "somebody else" in line["event"]]
+
+
+async def test_somebody_who_keeps_writing_an_availability_is_not_answered_each_time(broker: Broker) -> None:
+    loop = asyncio.get_running_loop()
+    async with Listener(broker) as live, Sink(broker.url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait(DISCOVERY)
+        began_s = loop.time()
+        for _ in range(200):
+            await live.publish("bms/pack/availability", b"offline", qos=1, retain=True)
+        await until(
+            lambda: (heard := live.all("bms/pack/availability")).count(b"offline") == 200 and heard[-1] == b"online"
+        )
+        async with Listener(broker) as late:
+            assert await late.wait("bms/pack/availability") == b"online"
+    assert 1 <= sink.delivery.corrections <= 1 + (loop.time() - began_s) / CORRECTION_S
+
+
+async def test_a_request_comes_back_as_a_response(broker: Broker, url: str) -> None:
+    async with Listener(broker) as live, Sink(url) as sink:
+        sink.mqtt.publish(ONE)
+        await live.wait("bms/pack/availability")
+        await live.publish("bms/pack/request/health", b'{"transaction": 7}', qos=1)
+        response = await live.wait_json("bms/pack/response/health")
+    assert response == {"status": "ok", "data": {"name": "health"}, "error": None, "transaction": 7}
+
+
+async def test_a_retained_request_that_waited_is_not_granted(broker: Broker, url: str) -> None:
+    async with Listener(broker) as live:
+        await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
+        async with Sink(url) as sink:
+            await live.wait("bms/pack/availability")
+            await live.publish("bms/pack/request/state", b"{}", qos=1)
+            await live.wait("bms/pack/response/state")
+    assert sink.asked == ["state"]
+    assert sink.delivery.requests == {"retained": 1, "granted": 1}
+
+
+async def test_a_retained_request_is_not_granted_while_connected_either(broker: Broker) -> None:
+    async with Listener(broker) as live, Sink(broker.url) as sink:
+        await live.wait("bms/pack/availability")
+        await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
+        await live.publish("bms/pack/request/state", b"{}", qos=1)
+        await live.wait("bms/pack/response/state")
+    assert sink.asked == ["state"]
+    assert sink.delivery.requests == {"retained": 1, "granted": 1}
+
+
+@pytest.mark.parametrize("name_bytes", [50_000, 65_535 - len("bms/pack/request/")])
+async def test_no_topic_of_a_request_ends_the_service(broker: Broker, url: str, name_bytes: int) -> None:
+    async with Listener(broker, "bms/pack/response/#") as live, Sink(url) as sink:
+        async with Listener(broker, "bms/pack/availability") as started:
+            await started.wait("bms/pack/availability")
+        for name in ("x" * name_bytes, "é" * (name_bytes // 2), "nonsense"):
+            await live.publish(f"bms/pack/request/{name}", b"{}", qos=1)
+        await live.publish("bms/pack/request/state", b"{}", qos=1)
+        await live.wait("bms/pack/response/state")
+        assert len(live.messages) == 1
+    assert sink.delivery.requests["granted"] == sink.delivery.requests["unknown"] == 1
+
+
+async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None:
+    gate = asyncio.Event()
+
+    async def slow(_: Mapping[str, Any]) -> Mapping[str, Any]:
+        await gate.wait()
+        return {}
+
+    async with Listener(broker, "bms/pack/response/#") as live, Sink(url) as sink:
+        sink.requests.offer("current_zero", slow)
+        async with Listener(broker, "bms/pack/availability") as started:
+            await started.wait("bms/pack/availability")
+        with structlog.testing.capture_logs() as logs:
+            await live.publish("bms/pack/request/current_zero", qos=1)
+            for _ in range(20):
+                await live.publish("bms/pack/request/state", b"x" * 1_000_000, qos=1)
+            for _ in range(3 * MOST_WAITING):
+                await live.publish("bms/pack/request/state", b"x" * 4000, qos=1)
+            await until(lambda: sink.delivery.requests["overflow"] > MOST_WAITING)
+            gate.set()
+            await live.wait("bms/pack/response/current_zero")
+        assert len(logs) < 10
+        while not live.all("bms/pack/response/health"):  # the first may still find no room
+            await live.publish("bms/pack/request/health", qos=1)
+            await asyncio.sleep(0.1)
+
+
+def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
+    delivery = Delivery()
+    inbox = Inbox(Requests(delivery).refuse, MOST_BYTES, MOST_WAITING)
+    for length in (MOST_BYTES - 1, 200_000_000) * (2 * MOST_WAITING):
+        payload = bytes(1) * min(length, 2 * MOST_BYTES)
+        inbox.put_nowait(aiomqtt.Message("t", payload, 1, retain=False, mid=1, properties=None))
+    waiting = [inbox.get_nowait() for _ in range(inbox.qsize())]
+    assert sum(len(message.payload) for message in waiting) <= MOST_WAITING * MOST_BYTES
+    assert delivery.requests == {"too_long": 2 * MOST_WAITING, "overflow": MOST_WAITING}
+
+
+async def test_a_fault_of_ours_is_offline_for_the_broker_and_raised(broker: Broker) -> None:
+    async with Listener(broker) as live:
+        sink = await Sink(broker.url).__aenter__()
+        await live.wait("bms/pack/availability")
+        sink.mqtt.publish(ONE._replace(info=None))  # type: ignore[arg-type]
+        await live.wait("bms/pack/availability", lambda p: p == b"offline")
+        with pytest.raises(ExceptionGroup) as fault:
+            await sink.__aexit__()
+    assert fault.value.split(AttributeError)[1] is None
+
+
+async def test_the_demo_s_broker_which_knows_no_mqtt_5_is_served() -> None:
+    async with DemoBroker() as broker, aiomqtt.Client("127.0.0.1", broker.port) as client, Sink(broker.url) as sink:
+        await client.subscribe([("bms/pack/state", 0), ("bms/pack/response/state", 1)])
+        sink.mqtt.publish(ONE)
+        async with asyncio.timeout(LONG_S):
+            assert (await anext(client.messages)).topic.value == "bms/pack/state"
+            await client.publish("bms/pack/request/state", qos=1)
+            assert (await anext(client.messages)).topic.value == "bms/pack/response/state"
+
+
+@pytest.fixture
+def mute_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Its access list gives the estimator no right at all, which Mosquitto says to who writes by MQTT 5 only."""
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    (tmp_path / "acl").write_text("topic read nothing\n")
+    broker = Broker(tmp_path, f"allow_anonymous true\nacl_file {tmp_path / 'acl'}").start()
+    yield broker
+    broker.stop()
+
+
+async def test_a_broker_that_denies_everything_without_a_word_is_found_out(mute_broker: Broker) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Proxy(mute_broker.port, knows_5=False) as proxy, Sink(proxy.url, echo_s=0.5) as sink:
+            await until(lambda: sink.delivery.refused_topics)
+            assert snapshot(delivery=sink.delivery).health.refused_topics == ["bms/pack/availability"]
+    assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/availability"]
+
+
+async def test_each_retained_topic_that_must_not_be_written_is_named_once_where_the_broker_says_so(
+    mute_broker: Broker,
+) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Sink(mute_broker.url) as sink:
+            sink.mqtt.publish(ONE)
+            await until(lambda: len(sink.delivery.refused_topics) > len(RETAINED) + 2)
+            sink.mqtt.publish(snapshot())
+    named = [line["topic"] for line in logs if line["log_level"] == "warning"]
+    assert sorted(named) == sorted([*(f"bms/pack/{topic}" for topic in (*RETAINED, "state", "event")), DISCOVERY])
+    assert sink.delivery.refused_topics == named
+
+
+async def test_a_broker_that_gives_back_late_is_not_called_one_that_refuses_for_good(broker: Broker) -> None:
+    with structlog.testing.capture_logs() as logs:
+        async with Sink(broker.url, echo_s=0.0) as sink, Listener(broker) as live:
+            await live.wait("bms/pack/availability")
+            await until(lambda: not sink.delivery.refused_topics)
+    assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/availability"]
+
+
+@pytest.fixture
+def refusing_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Says that requests must not be read."""
+    if MOSQUITTO is None or DYNAMIC_SECURITY is None:
+        pytest.skip("mosquitto with its dynamic security is not installed (apt-get install mosquitto)")
+    acls = [
+        {"acltype": "subscribeLiteral", "topic": "bms/+/request/#", "priority": 1, "allow": False},
+        {"acltype": "subscribePattern", "topic": "bms/pack/request/+", "priority": 1, "allow": False},
+        {"acltype": "subscribePattern", "topic": "#", "priority": 0, "allow": True},
+    ]
+    rights = {
+        "defaultACLAccess": {"publishClientSend": True, "publishClientReceive": True, "subscribe": True},
+        "groups": [{"groupname": "all", "roles": [{"rolename": "most"}]}],
+        "roles": [{"rolename": "most", "acls": acls}],
+        "anonymousGroup": "all",
+        "clients": [],
+    }
+    (tmp_path / "rights.json").write_text(json.dumps(rights))
+    (tmp_path / "rights.json").chmod(0o600)
+    extra = f"allow_anonymous true\nplugin {DYNAMIC_SECURITY}\nplugin_opt_config_file {tmp_path / 'rights.json'}"
+    broker = Broker(tmp_path, extra).start()
+    yield broker
+    broker.stop()
+
+
+@pytest.mark.parametrize("knows_5", [True, False])
+async def test_a_topic_that_the_broker_refuses_is_named_in_log_and_health(
+    refusing_broker: Broker, knows_5: bool
+) -> None:
+    async with Proxy(refusing_broker.port, knows_5=knows_5) as proxy, Listener(refusing_broker) as live:
+        with structlog.testing.capture_logs() as logs:
+            async with Sink(proxy.url) as sink:
+                await live.wait("bms/pack/availability")
+                sink.mqtt.publish(snapshot(delivery=sink.delivery))
+                health = await live.wait_json("bms/pack/health")
+    assert health["refused_topics"] == ["bms/pack/request/+"]
+    assert [line["topic"] for line in logs if line["log_level"] == "warning"] == ["bms/pack/request/+"]
+
+
+@pytest.fixture
+def secure_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Wants a name, a password and TLS; certificate and password stand in its folder."""
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    key, certificate, passwords = (tmp_path / name for name in ("key.pem", "cert.pem", "passwords"))
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes",
+         "-keyout", key, "-out", certificate, "-days", "2", "-subj", "/CN=localhost",
+         "-addext", "subjectAltName=IP:127.0.0.1,DNS:localhost"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "meter", "s3cret"], check=True, capture_output=True)
+    (tmp_path / "secret").write_text("s3cret\n")
+    locks = f"allow_anonymous false\npassword_file {passwords}\ncertfile {certificate}\nkeyfile {key}"
+    broker = Broker(tmp_path, locks).start()
+    yield broker
+    broker.stop()
+
+
+async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp_path: Path) -> None:
+    certificate = tmp_path / "cert.pem"
+    settings = MqttSettings(
+        url=f"mqtts://127.0.0.1:{secure_broker.port}",
+        username="meter",
+        password_file=tmp_path / "secret",
+        ca_file=certificate,
+    )
+    tls = aiomqtt.TLSParameters(ca_certs=str(certificate))
+    async with (
+        Listener(secure_broker, "bms/#", username="meter", password="s3cret", tls_params=tls) as live,
+        MqttSink(settings, "pack", Requests(Delivery()), Delivery(), Outbox(None, most=MOST_KEPT)) as mqtt,
+    ):
+        mqtt.publish(ONE)
+        await live.wait("bms/pack/state")
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"url": "mqtt://host:99999"}, "mqtt.url"),
+        ({"url": f"mqtt://{'a' * 64}.local"}, "mqtt.url = mqtt://a+.local: .*too long"),
+        ({"url": "mqtt://broker..local"}, r"mqtt.url = mqtt://broker\.\.local: .*empty"),
+        ({"url": "mqtt://[::1"}, r"mqtt.url = mqtt://\[::1: "),
+        ({"password_file": Path("/nonexistent/password")}, "mqtt.password_file = /nonexistent/password"),
+        ({"url": "mqtts://host", "ca_file": Path("/nonexistent/ca.pem")}, "mqtt.ca_file = /nonexistent/ca.pem"),
+    ],
+)
+def test_settings_that_cannot_reach_a_broker_are_named(changes: dict[str, Any], named: str) -> None:
+    with pytest.raises(UserError, match=named):
+        check(MqttSettings(**changes))
