@@ -22,7 +22,9 @@ def test_the_examples_of_the_document_are_true(monkeypatch):
     assert (failed, tried > 20) == (0, True)
 
 
-@pytest.mark.parametrize("program", ["import bms_estimator", "from bms_estimator.cli import main; main(['--help'])"])
+@pytest.mark.parametrize(
+    "program", ["import bms_estimator", "from bms_estimator.cli.main import main; main(['--help'])"]
+)
 def test_the_package_and_its_help_do_not_wait_for_numba(program):
     watched = f"import atexit, sys; atexit.register(lambda: print('numba' in sys.modules, file=sys.stderr)); {program}"
     ended = subprocess.run([sys.executable, "-c", watched], capture_output=True, timeout=LONG_S, check=True, text=True)

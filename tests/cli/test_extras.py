@@ -27,7 +27,7 @@ def test_a_missing_package_is_named(
     package: str,
     extra: str,
 ) -> None:
-    for module in [*KINDS.values(), "can_map"]:
+    for module in [*KINDS.values(), "fieldbus.can_signals"]:
         monkeypatch.delitem(sys.modules, f"bms_estimator.sources.{module}", raising=False)
     monkeypatch.setitem(sys.modules, package, None)
     pack = tmp_path / "pack.toml"

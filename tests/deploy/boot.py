@@ -21,7 +21,7 @@ PYTHON = f"""#!/bin/sh
 export PYTHONPATH=/opt/project:/opt/packages PYTHONDONTWRITEBYTECODE=1 LD_LIBRARY_PATH=/opt/python/lib
 exec /opt/python/bin/python{sys.version_info.major}.{sys.version_info.minor} -P -c \\
 """
-PROGRAM = f"""{PYTHON}    'from bms_estimator.cli import main; main()' "$@"
+PROGRAM = f"""{PYTHON}    'from bms_estimator.cli.main import main; main()' "$@"
 """
 CLOCK = f"""{PYTHON}    '
 import ctypes

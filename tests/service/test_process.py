@@ -47,8 +47,8 @@ import os, threading
 hangs = threading.Event()
 os.fsync = lambda _: hangs.wait()
 from bms_estimator.cli.main import main
-from bms_estimator.service import saving
-saving.HUNG_S = saving.LAST_S = 0.1
+from bms_estimator.service import checkpoint_writer
+checkpoint_writer.HUNG_S = checkpoint_writer.LAST_S = 0.1
 main()
 """
 """The program on a disk that never answers once something is to be on it."""
@@ -56,7 +56,7 @@ main()
 
 STARTING = """
 import os, signal
-from bms_estimator.cli import run
+from bms_estimator.cli.live import run
 from bms_estimator.cli.main import main
 def load_kernels():
     os.kill(os.getpid(), signal.SIGHUP)

@@ -29,7 +29,11 @@ COUNTED = {
     BmsFault.NOISE: ("noise_bytes",),
 }
 """Where a fault shows."""
-FASTER = {"dialects.asked.PACE_S": 0.1, "dialects.asked.GAP_S": 0.01, "serial_board.TALK_S": 0.02}
+FASTER = {
+    "protocols.base.polled_protocol.PACE_S": 0.1,
+    "protocols.base.polled_protocol.GAP_S": 0.01,
+    "sources.serial.serial_source.TALK_S": 0.02,
+}
 """Than a BMS is asked, to spare time."""
 
 
@@ -86,7 +90,7 @@ async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happen
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for constant, value in FASTER.items():
-        monkeypatch.setattr(f"bms_estimator.sources.{constant}", value)
+        monkeypatch.setattr(f"bms_estimator.{constant}", value)
     protocol, path = name.removesuffix("-pb"), tmp_path / "line.bms"
     bms = SimulatedBms(name, swinging, cells=CELLS)
     header = header_of(SensorSettings.model_validate({"protocol": protocol}))

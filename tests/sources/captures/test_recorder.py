@@ -130,11 +130,11 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end_of_the_process(tmp_path: Pat
     script = """
 import sys, threading
 from pathlib import Path
-from bms_estimator.sources import raw_capture, recording
+from bms_estimator.sources.captures import raw_capture, recorder
 
-recording.END_S = 0.01
+recorder.END_S = 0.01
 raw_capture.CaptureWriter.write = lambda *_: threading.Event().wait()
-with recording.Recording(Path(sys.argv[1]), raw_capture.CaptureHeader()) as recorded:
+with recorder.Recording(Path(sys.argv[1]), raw_capture.CaptureHeader()) as recorded:
     recorded.write(0.0, b"3.7,0.1\\n")
 print(recorded.fault)
 """
