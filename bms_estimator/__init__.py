@@ -4,8 +4,9 @@ What others may build on is here, see docs/api.md; all else may change from one 
 """
 
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
+
+from bms_estimator.version import __version__
 
 if TYPE_CHECKING:
     from bms_estimator.calibration.elements.identify import identify
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from bms_estimator.sources.captures.replay import load_capture
 
 __all__ = ["Estimator", "__version__", "estimate", "identify", "load_capture", "load_cell", "validate"]
-__version__ = version("bms_estimator")
 
 _HOME = {
     "Estimator": "estimator",

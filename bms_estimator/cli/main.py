@@ -8,9 +8,9 @@ from pathlib import Path
 
 import typer
 
-from bms_estimator import __version__
 from bms_estimator.cli.lazy_group import Entry, LazyGroup
 from bms_estimator.model.errors import UserError
+from bms_estimator.version import __version__
 
 COMMANDS = {
     "run": Entry("bms_estimator.cli.live.run:run", "Estimate live from a board and publish."),

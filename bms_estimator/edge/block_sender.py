@@ -25,6 +25,7 @@ from bms_estimator.model.payloads import EdgeHealth
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, Hello
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.denied_topics import Refusals
 from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.mqtt.queue_sender import Sending
@@ -32,7 +33,6 @@ from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.pack import MqttSettings
-from bms_estimator.sinks.sink import Delivery
 from bms_estimator.store.database import RETRY_S, Database
 
 MIB = 1 << 20

@@ -19,9 +19,8 @@ from bms_estimator.edge.batching import Gathered
 from bms_estimator.edge.block import with_oldest
 from bms_estimator.edge.block_table import LATEST_S, NS, Read, Settle, Settled
 from bms_estimator.edge.subjects import Awaits
-from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.mqtt.message import Message, Waiting
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.outbox_queue import Waiting
 
 MOST_WAITING = 500_000
 """Samples that wait in memory for a disk that takes none: 20 MB, five days at a sample a second."""

@@ -8,6 +8,9 @@ from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
+FRESH_PERIODS = 3
+"""Values are stale when no sample was accepted for so many periods of publishing or of sampling, whichever are longer."""
+
 PAYLOAD_VERSION = 1
 """Of all that is published; ``sinks/mqtt/topics.py`` says when it goes up."""
 

@@ -19,9 +19,9 @@ from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from bms_estimator.mqtt.connection import Hello, LinkError, Received, Refusal
+from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.reason_codes import UNSUPPORTED_VERSION, is_final, words
 from bms_estimator.mqtt.receive_queue import Inbox
-from bms_estimator.sinks.mqtt.messages import Message
 
 PARTING_S = 1.0
 """A connection that broke cannot be ended in good order [s]."""

@@ -5,8 +5,8 @@ from contextlib import AbstractAsyncContextManager
 from typing import NamedTuple, Protocol
 
 from bms_estimator.mqtt.broker_config import Broker
+from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING
-from bms_estimator.sinks.mqtt.messages import Message
 
 
 class LinkError(Exception):

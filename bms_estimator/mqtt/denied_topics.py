@@ -6,9 +6,9 @@ from collections.abc import Callable
 import structlog
 
 from bms_estimator.mqtt.connection import Refusal
+from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.message import Message
 from bms_estimator.process.backoff import Pauses
-from bms_estimator.sinks.mqtt.messages import Message
-from bms_estimator.sinks.sink import Delivery
 
 log = structlog.get_logger(__name__)
 

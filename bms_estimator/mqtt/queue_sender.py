@@ -1,15 +1,14 @@
 """What must reach the broker, sent oldest first, several messages on their way at a time."""
 
 import asyncio
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 from bms_estimator.mqtt.connection import Connection
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.denied_topics import Refusals
 from bms_estimator.process.backoff import Pauses
-from bms_estimator.sinks.mqtt.messages import Message
-from bms_estimator.sinks.sink import Delivery
-from bms_estimator.store.outbox import Outbox, Waiting
+from bms_estimator.mqtt.message import Waiting
 
 WINDOW = 16
 """Messages on their way to a broker that has not acknowledged them: below the 20 that brokers allow, so that the live
@@ -128,24 +127,3 @@ class Sending:
     def _count(self) -> None:
         self._delivery.drops = self._outbox.dropped + self._refused
         self._delivery.waiting = self._outbox.waiting
-
-
-class Backlog(Sending):
-    """Fills and empties an outbox.
-
-    Args:
-        outbox: The outbox.
-        delivery: As ``Sending`` has it.
-        refusals: As ``Sending`` has it.
-        first_delay_s: As ``Sending`` has it [s].
-    """
-
-    def __init__(self, outbox: Outbox, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
-        super().__init__(outbox, delivery, refusals, first_delay_s)
-        self._filled = outbox
-
-    def put(self, messages: Iterable[Message]) -> None:
-        """Keep messages until the broker has them; returns at once."""
-        for message in messages:
-            self._filled.put(message)
-        self._count()

@@ -8,8 +8,8 @@ import structlog
 
 from bms_estimator.mqtt.broker_config import Broker
 from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.process.backoff import FIRST_DELAY_S, Pauses
-from bms_estimator.sinks.sink import Delivery
 
 LASTING_S = 10.0
 """A connection that ends sooner is taken as an attempt that failed [s]."""

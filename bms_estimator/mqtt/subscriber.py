@@ -11,12 +11,12 @@ import structlog
 from bms_estimator.model.clock import Clock
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.mqtt.topic_cache import Device, Heard, Published
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.pack import MqttSettings
-from bms_estimator.sinks.sink import Delivery
 
 MOST_WAITING = 2000
 """Messages that wait to be read: a broker sends all that is retained at once, some twenty of each device."""

@@ -8,12 +8,13 @@ from typing import Self
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.topic_cache import parsed
 from bms_estimator.page.history_query import Past
 from bms_estimator.page.pack_topics import Hub
 from bms_estimator.page.page_server import PageServer
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.sinks.mqtt.messages import Message, Messages, Sent
+from bms_estimator.sinks.mqtt.messages import Messages, Sent
 
 
 class PageSink:

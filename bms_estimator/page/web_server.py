@@ -14,7 +14,7 @@ from aiohttp import web
 from bms_estimator.model.errors import UserError
 from bms_estimator.page.access_control import HEADERS, Guard, guard_of
 from bms_estimator.page.event_stream import Newest, Reader
-from bms_estimator.page.listener import CONNECTIONS, Listener
+from bms_estimator.process.listener import CONNECTIONS, Listener
 from bms_estimator.settings.page import Listen, PageSettings
 
 PING_S = 5.0

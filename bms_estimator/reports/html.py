@@ -3,9 +3,9 @@
 from html import escape
 from pathlib import Path
 
-from bms_estimator import __version__
 from bms_estimator.reports.report_items import Figure, Item, Table, Verdict, label, name
 from bms_estimator.reports.thesis_report import Report
+from bms_estimator.version import __version__
 
 BADGE = {
     Verdict.FITTED: "fitted",

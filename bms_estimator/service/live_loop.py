@@ -21,6 +21,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.process.signals import until_first_ends
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import Notifier
@@ -30,7 +31,7 @@ from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.settings_reload import Reload
 from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.sinks.mqtt.requests import Requests, number
-from bms_estimator.sinks.sink import Delivery, Sink
+from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Pulse, Source
 from bms_estimator.telemetry.lifetime_totals import Tally, new_totals
 

@@ -14,6 +14,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_plausibility import implausible
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.page.page_sink import Pages, PageSink
 from bms_estimator.process.instance_lock import alone
 from bms_estimator.process.log_setup import set_level
@@ -27,7 +28,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.exports.influx import InfluxSink
 from bms_estimator.sinks.mqtt.requests import Requests
 from bms_estimator.sinks.mqtt.sink import MqttSink
-from bms_estimator.sinks.sink import Delivery, Sink
+from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.captures.recorder import Recording
 from bms_estimator.sources.factory import open_reports
 from bms_estimator.sources.serial.known_board_file import BoardMemory

@@ -11,6 +11,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import (
+    FRESH_PERIODS,
     EdgeHealth,
     Estimate,
     Health,
@@ -21,10 +22,11 @@ from bms_estimator.model.payloads import (
     Snapshot,
 )
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.service.alarm_monitor import AlarmWatch
 from bms_estimator.service.latency import Latency
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sinks.sink import FRESH_PERIODS, Delivery, Sink
+from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Pulse, Source
 from bms_estimator.telemetry.alarms import Change
 from bms_estimator.telemetry.charge_energy import Flow

@@ -8,12 +8,12 @@ from typing import Self
 
 from bms_estimator.mqtt.broker_config import brokers
 from bms_estimator.mqtt.connection import Connection, Hello
+from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.simulation.virtual_adc import Reading
-from bms_estimator.sinks.mqtt.messages import Message
-from bms_estimator.sinks.sink import Delivery
 
 INTERVAL_S = 2.0
 """So often the node asks the BMS [s]."""

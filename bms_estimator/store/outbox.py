@@ -9,9 +9,9 @@ import contextlib
 from collections import deque
 from typing import Self
 
-from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.mqtt.message import Message, Waiting
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.outbox_queue import PAGE, Queue, Waiting
+from bms_estimator.store.outbox_queue import PAGE, Queue
 from bms_estimator.store.outbox_table import Outcome, Work, look
 
 FLUSH_S = 1.0

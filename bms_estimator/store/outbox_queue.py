@@ -8,9 +8,8 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import NamedTuple
 
-from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.mqtt.message import Message, Waiting
 from bms_estimator.store.number_ranges import Runs
 
 MEMORY_MOST = 4096
@@ -21,14 +20,6 @@ PAGE = 1000
 
 LOWEST = -(1 << 62)
 """Below all numbers, here and on disk."""
-
-
-class Waiting(NamedTuple):
-    """A message on its way to the broker."""
-
-    number: int
-    """Rises by one with each message."""
-    message: Message
 
 
 @dataclass

@@ -5,9 +5,8 @@ import sqlite3
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.mqtt.message import Message, Waiting
 from bms_estimator.store.number_ranges import Runs
-from bms_estimator.store.outbox_queue import Waiting
 
 FARTHEST = 1 << 40
 """No number is as far from 0 in ten thousand years; one that is, is of a row that is damaged."""

@@ -11,7 +11,7 @@ from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import Suspect
 from bms_estimator.model.payloads import EdgeHealth, Health, HookHealth, LoopHealth, RecordingHealth, Totals
-from bms_estimator.sinks.sink import Delivery
+from bms_estimator.mqtt.delivery_stats import Delivery
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
 _SAMPLE_COUNTERS = [

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator import __version__
 from bms_estimator.kernels.observer.records import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
@@ -17,6 +16,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import Flow
 from bms_estimator.telemetry.publish_window import WindowSummary
 from bms_estimator.telemetry.remaining_charge import RemainingCharge
+from bms_estimator.version import __version__
 
 
 def finite(value: float) -> float | None:

@@ -38,6 +38,7 @@ from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.topic_cache import Published
 from bms_estimator.protocols.base.device_protocol import Dialect
 from bms_estimator.protocols.devices import daly, jbd, jk
@@ -50,7 +51,6 @@ from bms_estimator.protocols.firmware.protocol import BoardDialect
 from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.pack import SensorSettings, Settings, load_settings
 from bms_estimator.sinks.mqtt.requests import Requests, number
-from bms_estimator.sinks.sink import Delivery
 from bms_estimator.sinks.terminal import text_line
 from bms_estimator.sinks.terminal.panels import View
 from bms_estimator.sinks.terminal.scene import Scene

@@ -13,9 +13,10 @@ import aiomqtt
 import pytest
 
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import Described, discovery
-from bms_estimator.sinks.mqtt.messages import Message, Messages, Sent
+from bms_estimator.sinks.mqtt.messages import Messages, Sent
 from bms_estimator.telemetry.rest_detector import WATCHED_S
 from tests.home_assistant.conftest import DASHBOARD
 from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant

@@ -13,13 +13,13 @@ from structlog.testing import capture_logs
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.cli.main import main
 from bms_estimator.model.errors import UserError
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import Notifier
 from bms_estimator.service.live_loop import run_live
 from bms_estimator.service.settings_reload import Reload, reload_on_hangup
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks.mqtt.requests import Requests
-from bms_estimator.sinks.sink import Delivery
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, edited
 from tests.collector import Collector
 from tests.patience import LONG_S

@@ -7,8 +7,8 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
 from bms_estimator.model.payloads import Alarm, LoopHealth, Snapshot
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sinks.sink import Delivery
 from bms_estimator.telemetry.charge_energy import Flow
 from bms_estimator.telemetry.health import health_report
 from bms_estimator.telemetry.lifetime_totals import new_totals

@@ -1,6 +1,6 @@
 """The order of what waits, without a disk."""
 
-from bms_estimator.sinks.mqtt.messages import Message
+from bms_estimator.mqtt.message import Message
 from bms_estimator.store.outbox_queue import LOWEST, PAGE, Queue
 
 

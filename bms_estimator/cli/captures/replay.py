@@ -32,12 +32,12 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import Requests
 from bms_estimator.sinks.mqtt.sink import MqttSink
-from bms_estimator.sinks.sink import Delivery
 from bms_estimator.sinks.trace_file import TableSink, table_sink
 from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
 from bms_estimator.sources.captures.stdin import standard_input

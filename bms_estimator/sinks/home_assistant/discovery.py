@@ -5,12 +5,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, get_args
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Info
+from bms_estimator.model.payloads import FRESH_PERIODS, Info
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Command
 from bms_estimator.sinks.home_assistant.entities import BATTERY, CELL, FUEL_CELL, OF_CELLS, Entity, cell_key, entities
-from bms_estimator.sinks.sink import FRESH_PERIODS
 
 VALUES = "home_assistant"
 """Topic below the device's."""

@@ -4,12 +4,12 @@ from typing import Any
 
 from pydantic.json_schema import models_json_schema
 
-from bms_estimator import __version__
 from bms_estimator.model.payloads import PAYLOAD_VERSION
 from bms_estimator.settings.pack import DEVICE_NAME, LEAST_RATE_HZ, MOST_RATE_HZ
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.sinks.mqtt.requests import MOST_PAYLOAD_BYTES, NAMES
 from bms_estimator.sinks.mqtt.topics import TOPICS
+from bms_estimator.version import __version__
 
 Document = dict[str, Any]
 

@@ -6,9 +6,9 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import structlog
 
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.denied_topics import Refusals
-from bms_estimator.sinks.mqtt.messages import Message
-from bms_estimator.sinks.sink import Delivery
+from bms_estimator.mqtt.message import Message
 
 CORRECTION_S = 5.0
 """An availability that somebody else wrote is put right no more often than this [s]."""

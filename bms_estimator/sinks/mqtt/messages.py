@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads import Health, Report, Snapshot
+from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import VALUES, Described, check_names, discovery, discovery_topic
@@ -15,15 +16,6 @@ from bms_estimator.sinks.mqtt.topics import schema
 
 AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
 """Topics below the device's."""
-
-
-class Message(NamedTuple):
-    """One message."""
-
-    topic: str
-    payload: bytes
-    qos: int
-    retain: bool
 
 
 class Sent(NamedTuple):

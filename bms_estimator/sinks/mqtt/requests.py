@@ -14,8 +14,8 @@ from typing import Any, get_args
 import structlog
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.settings.pack import Command
-from bms_estimator.sinks.sink import Delivery
 
 COMMANDS = get_args(Command)
 NAMES = ("state", "parameters", "health", *COMMANDS)

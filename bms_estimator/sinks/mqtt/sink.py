@@ -8,7 +8,7 @@ how a broker is reached in ``link``.
 import asyncio
 import contextlib
 import secrets
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Self
 
 import structlog
@@ -16,18 +16,19 @@ import structlog
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, Hello, Received
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.denied_topics import Refusals
+from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import Dial
-from bms_estimator.mqtt.queue_sender import Backlog
+from bms_estimator.mqtt.queue_sender import Sending
 from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks.mqtt.availability import ECHO_S, Availability
-from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, Message, Messages, Sent
+from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, Messages, Sent
 from bms_estimator.sinks.mqtt.requests import MOST_SHOWN, Requests
-from bms_estimator.sinks.sink import Delivery
 from bms_estimator.store.outbox import Outbox
 
 BIRTH_DELAY_S = 2.0
@@ -214,3 +215,24 @@ class MqttSink:
 
     def _topic(self, name: str) -> str:
         return f"{self._messages.root}/{name}"
+
+
+class Backlog(Sending):
+    """Fills and empties an outbox.
+
+    Args:
+        outbox: The outbox.
+        delivery: As ``Sending`` has it.
+        refusals: As ``Sending`` has it.
+        first_delay_s: As ``Sending`` has it [s].
+    """
+
+    def __init__(self, outbox: Outbox, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
+        super().__init__(outbox, delivery, refusals, first_delay_s)
+        self._filled = outbox
+
+    def put(self, messages: Iterable[Message]) -> None:
+        """Keep messages until the broker has them; returns at once."""
+        for message in messages:
+            self._filled.put(message)
+        self._count()

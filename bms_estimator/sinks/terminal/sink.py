@@ -5,8 +5,9 @@ from typing import Self
 
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.topic_cache import Published
-from bms_estimator.sinks.mqtt.messages import Message, Messages, Sent
+from bms_estimator.sinks.mqtt.messages import Messages, Sent
 from bms_estimator.sinks.terminal.live_view import LiveView
 
 BASE_TOPIC = "bms"

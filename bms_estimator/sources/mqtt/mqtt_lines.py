@@ -12,11 +12,11 @@ from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError, Received
+from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.protocols.base.report_line import CONNECTED
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import MqttSettings, Settings
-from bms_estimator.sinks.mqtt.messages import Message
 from bms_estimator.sources.line_source import Bringer, NothingComesError
 from bms_estimator.sources.mqtt.sample_assembler import Assembly
 

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.payloads import Alarm
+from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.sinks.mqtt.messages import Message, Messages, Sent
+from bms_estimator.sinks.mqtt.messages import Messages, Sent
 from bms_estimator.sinks.mqtt.topics import schema
 from tests.sinks.snapshots import NOTHING_YET, NOW, ONE, snapshot
 

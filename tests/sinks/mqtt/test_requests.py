@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.sinks.mqtt.requests import (
     COMMANDS_PER_MIN,
     LOG_S,
@@ -18,7 +19,6 @@ from bms_estimator.sinks.mqtt.requests import (
     READS_PER_MIN,
     Requests,
 )
-from bms_estimator.sinks.sink import Delivery
 
 
 class Asked:

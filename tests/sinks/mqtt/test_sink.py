@@ -16,16 +16,16 @@ from bms_estimator.model.events import events
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.client import PATIENCE, Client
 from bms_estimator.mqtt.connection import Connection, Hello
+from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING, Inbox
 from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.process.backoff import LONGEST_DELAY_S
 from bms_estimator.settings.pack import MqttSettings
 from bms_estimator.sinks.mqtt.availability import CORRECTION_S
-from bms_estimator.sinks.mqtt.messages import Message
 from bms_estimator.sinks.mqtt.requests import Requests
 from bms_estimator.sinks.mqtt.sink import MqttSink
-from bms_estimator.sinks.sink import Delivery
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy

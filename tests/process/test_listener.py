@@ -13,9 +13,9 @@ import structlog
 
 from bms_estimator.page import listener as of_listener
 from bms_estimator.page.history_query import Past
-from bms_estimator.page.listener import CONNECTIONS, Connections, Listener
 from bms_estimator.page.pack_topics import Hub
 from bms_estimator.page.page_server import PageServer
+from bms_estimator.process.listener import CONNECTIONS, Connections, Listener
 from bms_estimator.settings.page import PageSettings
 from tests.idle_connections import DESCRIPTORS, attacked, few_descriptors
 from tests.patience import LONG_S

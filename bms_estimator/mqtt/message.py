@@ -1,0 +1,20 @@
+"""Messages for a broker."""
+
+from typing import NamedTuple
+
+
+class Message(NamedTuple):
+    """One message."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+
+
+class Waiting(NamedTuple):
+    """A message on its way to the broker."""
+
+    number: int
+    """Rises by one with each message."""
+    message: Message
