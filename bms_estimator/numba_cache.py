@@ -33,6 +33,7 @@ COMPILED_IN = (
     *(
         _PACKAGE / file
         for file in (
+            "model/arrays.py",
             "model/sample.py",
             "model/input_faults.py",
             "protocols/firmware/clock_drift.py",

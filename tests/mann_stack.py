@@ -9,12 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop
+from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
-
-Floats = NDArray[np.float64]
 
 CELLS, AREA_CM2, THICK_CM = 14, 20.0, 0.0178
 XI_1, XI_3, XI_4 = -0.948, 7.6e-5, -1.93e-4

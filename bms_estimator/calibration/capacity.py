@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.capture_checks import GAP_CHARGE, GAP_STEPS
 from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, coldness
@@ -24,13 +23,12 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.kernels.cell_model.open_loop import hysteresis
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, arrhenius, on_grid
 from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import IdentifierSettings
-
-Floats = NDArray[np.float64]
 
 LARGEST_STD = 0.1
 """An anchor whose SOC is less certain is none."""

@@ -11,16 +11,14 @@ from functools import lru_cache
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, Parameter
-
-Floats = NDArray[np.float64]
 
 KNOWN = 0.3
 """A parameter with a larger relative standard deviation is not told by the data."""

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.capture_checks import contradictions, soc_outside
 from bms_estimator.calibration.cleaning.clean_capture import whole_load
@@ -12,11 +11,10 @@ from bms_estimator.calibration.ocv.overpotential import overpotential
 from bms_estimator.calibration.ocv.relaxation_test import REST_CURRENT_C
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-
-Floats = NDArray[np.float64]
 
 LOW_SOC = 0.1
 """Below it the form of the elements fails for every cell; errors are given with and without."""

@@ -34,7 +34,7 @@ from bms_estimator.kernels.kalman_filter.hypotheses import (
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, believed, guard, judge, keep, wait, watch_sign
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD, watch_steps
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 FIT_EVERY_S = 120.0

@@ -3,9 +3,6 @@
 import math
 from enum import IntEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bms_estimator.kernels.cell_model.chen_mora import soc_from_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.kernels.identifier import UNSEEN_MOST, identify, restart_filter, start_filter
@@ -14,15 +11,13 @@ from bms_estimator.kernels.kalman_filter.hypotheses import is_temperature, pack_
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
 from bms_estimator.kernels.observer.learning_law import begin_learning, learning_step, take_as_rest
 from bms_estimator.kernels.observer.observer import count_charge, observer_step, start
-from bms_estimator.kernels.observer.records import Record
 from bms_estimator.kernels.observer.series_resistance import (
     begin_series_resistance,
     series_resistance,
     series_resistance_step,
 )
+from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
-
-Records = NDArray[np.void]
 
 
 class Verdict(IntEnum):

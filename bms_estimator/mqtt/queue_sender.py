@@ -7,8 +7,8 @@ from typing import Protocol
 from bms_estimator.mqtt.connection import Connection
 from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.denied_topics import Refusals
-from bms_estimator.process.backoff import Pauses
 from bms_estimator.mqtt.message import Waiting
+from bms_estimator.process.backoff import Pauses
 
 WINDOW = 16
 """Messages on their way to a broker that has not acknowledged them: below the 20 that brokers allow, so that the live

@@ -3,17 +3,13 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.reports.procedure import Capture, Protocol, kind_of
 from bms_estimator.reports.report_items import Verdict
 from bms_estimator.reports.simulated_experiment import SensorChain, captures, experiments, pack
 from bms_estimator.reports.thesis_claims import claim
-
-Floats = NDArray[np.float64]
 
 FINE, COARSE = SensorChain(16), SensorChain(10)
 """The dSpace board of the thesis, and an Arduino."""

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
 from bms_estimator.reports import printed_values
@@ -14,8 +13,6 @@ from bms_estimator.reports.report_items import Figure, Verdict
 from bms_estimator.reports.simulation import SOC_GRID
 from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot, products_plot
 from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
-
-Floats = NDArray[np.float64]
 
 PER_FIGURE = 4
 """Loads in one figure, as in Fig. 32."""

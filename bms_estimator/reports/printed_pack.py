@@ -4,10 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
 from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values
 from bms_estimator.reports.report_items import Figure, Verdict
@@ -15,8 +15,6 @@ from bms_estimator.reports.simulation import element, mean_error_percent
 from bms_estimator.reports.simulation_figures import NO_VALUES, condition_plot, elements_plot, products_plot
 from bms_estimator.reports.svg_plot import plot
 from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
-
-Floats = NDArray[np.float64]
 
 A = printed_values.tables_8_to_10()
 EMPTY_SOC = 0.02

@@ -1,11 +1,9 @@
 """The numbers as the thesis prints them, misprints included."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Bounds
-
-Floats = NDArray[np.float64]
 
 CHEN_MORA_ROUNDED = (0.30, 29.0, 0.04, 6.0, 155.0, 0.04, 752.0, 13.0, 703.0, 6050.0, 27.0, 4475.0, 0.1, 24.0, 0.07)
 """a1..a15, "Chen and Mora's Values" and initial values of Tables 2 and 3."""

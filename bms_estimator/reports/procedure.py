@@ -13,7 +13,6 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv.points import pooled
@@ -36,12 +35,11 @@ from bms_estimator.calibration.thesis.series_resistance import (
 )
 from bms_estimator.calibration.thesis.soc_lookup import soc_by_interpolation
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import ObserverSettings
-
-Floats = NDArray[np.float64]
 
 LOWEST_SOC = 0.05
 """Validation ends here: below, the elements and the open-circuit voltage run off (E14)."""

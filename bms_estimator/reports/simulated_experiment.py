@@ -9,15 +9,12 @@ through a divider, the current through a +-10 A sensor; noise is half a step eit
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, terminal_voltage
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.reports import printed_values
 from bms_estimator.reports.procedure import Capture, Kind
-
-Floats = NDArray[np.float64]
 
 VOLTAGE_RANGE_V = 30.0
 """Of the divider. The thesis's 0-25 V sensor would saturate: the curve of Table 8 begins at 25.40 V."""

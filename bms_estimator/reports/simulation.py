@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
@@ -22,12 +21,11 @@ from bms_estimator.calibration.thesis.series_resistance import (
 )
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts, simulate_cell
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Bounds, CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.reports import printed_values
 from bms_estimator.settings.pack import ObserverSettings
-
-Floats = NDArray[np.float64]
 
 STEP_S = 0.01
 """The thesis's 100 Hz."""

@@ -4,12 +4,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun
 from bms_estimator.calibration.thesis.prediction import Prediction
 from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
+from bms_estimator.model.arrays import Floats
 from bms_estimator.reports.report_items import Figure, Verdict
 from bms_estimator.reports.simulation import (
     FINAL_SOC,
@@ -21,8 +21,6 @@ from bms_estimator.reports.simulation import (
 )
 from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
 from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
-
-Floats = NDArray[np.float64]
 
 NO_VALUES = "The thesis prints no value of the figure: compared with nothing."
 WHOLE = np.linspace(0.0, 1.0, 1001)

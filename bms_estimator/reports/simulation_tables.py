@@ -2,11 +2,9 @@
 
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bms_estimator.estimator.stability_conditions import lemma_conditions
 from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values
 from bms_estimator.reports.report_items import Table, Verdict, number, percent
@@ -22,8 +20,6 @@ from bms_estimator.reports.simulation import (
     mean_error_percent,
 )
 from bms_estimator.reports.theorem_4_1_2 import measure
-
-Floats = NDArray[np.float64]
 
 
 def table_1(_: Simulation) -> Table:

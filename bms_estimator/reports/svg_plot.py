@@ -6,9 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from bms_estimator.model.arrays import Floats
 
 INK = "#1d2733"
 FAINT = "#8a97a6"

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Bounds, CellModel
 from bms_estimator.reports.simulation import (
     discharge,
@@ -20,8 +20,6 @@ from bms_estimator.reports.simulation import (
     table_5_cell,
     with_bounds,
 )
-
-Floats = NDArray[np.float64]
 
 C_RATES = (1.0, 0.1, 0.01)
 """The smallest is a hundred hours from full to empty."""

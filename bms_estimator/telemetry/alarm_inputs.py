@@ -7,8 +7,8 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.settings.alarm_limits import Quantity
-from bms_estimator.telemetry.alarm_state import Floats
 
 Counts = NDArray[np.int64]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)

@@ -9,8 +9,8 @@ import numpy as np
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.observer.records import TRACE
 from bms_estimator.kernels.step import GAP_RATIO
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
-from bms_estimator.telemetry.alarm_state import Floats
 
 WAITING_ROWS = 256
 """Initial capacity of a buffer [rows]."""

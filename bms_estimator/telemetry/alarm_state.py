@@ -5,11 +5,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.settings.alarm_limits import Watched
-
-Floats = NDArray[np.float64]
 
 
 class Raising(NamedTuple):

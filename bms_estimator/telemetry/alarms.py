@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import Suspect
 from bms_estimator.model.payloads import Alarm
@@ -20,7 +21,7 @@ from bms_estimator.settings.alarm_limits import NEEDED, Quantity, Watched
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarm_inputs import LOST, Inputs, counted
 from bms_estimator.telemetry.alarm_samples import Steps, Waiting
-from bms_estimator.telemetry.alarm_state import AlarmState, Floats, Raising, Turn
+from bms_estimator.telemetry.alarm_state import AlarmState, Raising, Turn
 from bms_estimator.telemetry.alarm_text import alarm_text
 
 SENSOR_SUSPECTS = Suspect.SIGN_OF_CURRENT | Suspect.OFFSET | Suspect.OUTLIERS | Suspect.VOLTAGE | Suspect.CURRENT

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -19,12 +18,12 @@ from bms_estimator.estimator.filter_settings import CURVE_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, REFERENCE_C
 from bms_estimator.kernels.kalman_filter.mixture import combine, copy
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, SOC
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
 from tests.estimator.anywhere.score import Score, score
 
-Floats = NDArray[np.float64]
 Change = Callable[[np.void], None]
 
 KINDS = {

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -30,6 +29,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import IdentifierSettings
@@ -39,8 +39,6 @@ from tests.benchmarks.recipes import GROUPS, Group, charge_ah, chosen, runs
 from tests.estimator.anywhere import cycles
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import Score, score
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats, ocv
+from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
+from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 EKF_VOLTAGE_SIGMA_V = 0.005

@@ -14,12 +14,13 @@ from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, f
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.fuel_cell_settings import MEMORY_S
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop
+from bms_estimator.model.arrays import Record
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.captures.curves import read_polarisation
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from tests import mann_stack
-from tests.mann_stack import CURVE_A, Record
+from tests.mann_stack import CURVE_A
 
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"

@@ -5,14 +5,12 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model.chen_mora import INVERSE_ERROR_V, OCV_POINTS
 from bms_estimator.kernels.observer.mittag_leffler import SERIES_LIMIT, SERIES_TERMS, TABLE_POINTS
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS, OBSERVER_STATE, TRACE
+from bms_estimator.model.arrays import Records
 from bms_estimator.model.sample import SAMPLE
-
-Records = NDArray[np.void]
 
 SOURCE = Path(__file__).with_name("uas_step.c")
 COMPILER = ["cc", "-O3", "-march=native", "-std=gnu11", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared"]
@@ -58,7 +56,7 @@ def header() -> str:
     return "\n".join(lines + [structure(name, record) for name, record in records.items()]) + "\n"
 
 
-def structure(name: str, record: "np.dtype[np.void]") -> str:
+def structure(name: str, record: np.dtype[np.void]) -> str:
     """One record type in C, and the compiler's oath that it has the same size."""
     members = []
     for field in record.names or ():

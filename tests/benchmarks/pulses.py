@@ -14,10 +14,9 @@ from rich.table import Table
 from scipy.ndimage import median_filter
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import FROM_START, GROUPS, WRONG, Group, cell_file, chosen, load
-
-Floats = NDArray[np.float64]
 
 LEAST_C, HELD_SHARE = 0.2, 0.1
 LONGEST_S, SLOW_S = 1.6, 0.5

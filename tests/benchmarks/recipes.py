@@ -8,13 +8,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.sources.captures.replay import load_capture
-
-Floats = NDArray[np.float64]
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 PROGRAM = Path(sys.executable).with_name("bms-estimator")

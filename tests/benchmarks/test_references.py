@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE
 from tests.benchmarks.side_by_side.references import (
     pulse_resistance,
@@ -14,8 +14,6 @@ from tests.benchmarks.side_by_side.references import (
     with_jump,
 )
 from tests.benchmarks.side_by_side.trials import Block
-
-Floats = NDArray[np.float64]
 
 CAPACITY_AH = 3.0
 R_S, R_TS, TAU_TS, R_TL, TAU_TL = 0.08, 0.02, 20.0, 0.03, 300.0

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import GROUPS, chosen, runs
@@ -22,8 +23,6 @@ from tests.estimator.anywhere.score import score
 
 NAMES = ("PF 25 C, US06", "PF 0 C", "NCR", "NCR, constant current", "LFP 25 C (its own file)")
 SEED = 1
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,12 @@
 """What in a capture contradicts the cell it is said to come from, in words and numbers."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.clean_capture import Load
 from bms_estimator.calibration.ocv.relaxation_test import REST_CURRENT_C, SOC_SLACK, runs
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
-
-Floats = NDArray[np.float64]
 
 LEAST_CURRENT_C = 0.1
 """A capture whose current never exceeds this C-rate says nothing of the resistances: it is for `ocv` [1/h]."""

@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.ocv.relaxation_test import REST_CURRENT_C, without_glitches
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-
-Floats = NDArray[np.float64]
 
 NEIGHBOURS = 2
 """Samples on either side that a glitch is told by."""

@@ -1,13 +1,11 @@
 """What captures do not tell of a cell: that of the shipped generic cell whose open-circuit voltage is most like it."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.elements.initial_elements import RestElements
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells, load_cell
-
-Floats = NDArray[np.float64]
 
 INSIDE = 0.1, 0.95
 """SOC at which curves are compared: their ends are steep."""

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.capture_checks import contradictions, step_resistance, without_excitation
 from bms_estimator.calibration.cleaning.clean_capture import Load, whole_load
@@ -37,11 +36,10 @@ from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import r_s, soc_from_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, weak_share
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-
-Floats = NDArray[np.float64]
 
 SHOWN_SOC = (0.2, 0.5, 0.8)
 """SOCs at which the resistances are reported."""

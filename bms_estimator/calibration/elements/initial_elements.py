@@ -7,15 +7,12 @@ exponentials, whose sizes and time constants are the two RC branches: (2.2), (2.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, without_glitches
 from bms_estimator.model.cell import Capacitance, Resistance
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-
-Floats = NDArray[np.float64]
 
 FAST = np.geomspace(0.003, 0.05, 12)
 SLOW = np.geomspace(0.08, 0.7, 10)

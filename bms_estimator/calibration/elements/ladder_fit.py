@@ -25,9 +25,8 @@ from bms_estimator.calibration.ocv.overpotential import arrhenius, hats
 from bms_estimator.calibration.ocv.relaxation_test import runs
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, WEAK_J
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
-
-Floats = NDArray[np.float64]
 
 SOC_NODES = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.65, 0.85, 1.0])
 """Of the resistances."""

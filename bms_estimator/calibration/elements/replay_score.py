@@ -5,14 +5,12 @@ forty times what the truth lies outside. Neither a wider nor a narrower band tha
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.clean_capture import Load
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SAMPLE
-
-Floats = NDArray[np.float64]
 
 CUTS = (0.2, 0.5)
 """Parts of the charge moved after which a replay begins."""

@@ -1,15 +1,13 @@
 """a1..a15 of the two branches that a ladder amounts to at 25 C, (2.5)-(2.9)."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from bms_estimator.calibration.ocv.overpotential import hats
 from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import LN_TAUS, SHORT
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Capacitance, Ladder, Resistance
-
-Floats = NDArray[np.float64]
 
 SOC = np.linspace(0.02, 1.0, 50)
 """Where the curves are to be near the ladder's."""

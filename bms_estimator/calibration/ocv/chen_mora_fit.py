@@ -7,13 +7,11 @@ is offered for comparison: parameters that lean on each other do not average wel
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear
 
 from bms_estimator.calibration.ocv.points import Points, check_points
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import ChenMoraOcv
-
-Floats = NDArray[np.float64]
 
 NAMES = ("a16", "a17", "a18", "a19", "a20", "a21")
 LOWER = np.array([1e-6, 5.0, 1e-6, -np.inf, -np.inf, -np.inf])

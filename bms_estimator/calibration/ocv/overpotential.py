@@ -1,15 +1,13 @@
 """The overpotential of a cell under a measured current, with parameters frozen: by its ladder, else by (2.2)-(2.9)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.clean_capture import Load
 from bms_estimator.kernels.cell_model.open_loop import branch_currents, hysteresis, two_branches
 from bms_estimator.kernels.cell_model.rc_ladder import GAS_J, HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
 from bms_estimator.kernels.kalman_filter.records import Noise
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
-
-Floats = NDArray[np.float64]
 
 KELVIN = 273.15
 

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.ocv.relaxation_test import LEAST_POINTS, RelaxationTest
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
-
-Floats = NDArray[np.float64]
 
 RELAXED_V = 0.002
 """What rests of a warm cell are off as a whole [V]: hours follow after the quarter of an hour that is extrapolated."""

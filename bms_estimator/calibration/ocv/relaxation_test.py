@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-
-Floats = NDArray[np.float64]
 
 GLITCH_FRACTION = 0.5
 """A voltage off the median by more than this fraction is a fault of the instrument: no Li-ion cell swings so far."""

@@ -13,10 +13,9 @@ from scipy.ndimage import gaussian_filter1d, median_filter
 
 from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
 from bms_estimator.calibration.ocv.relaxation_test import SOC_SLACK, mean_temperature_c, resting_samples, runs
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-
-Floats = NDArray[np.float64]
 
 LEAST_S = 7.0 * 3600.0
 """A slow curve takes at least so long [s]: a whole one at C/7. At C/10 half of the difference is some 20 mV."""

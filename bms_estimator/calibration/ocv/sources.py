@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.ocv.overpotential import steady_drop
 from bms_estimator.calibration.ocv.points import Points, joined, points_of
@@ -24,11 +23,10 @@ from bms_estimator.calibration.ocv.slow_curve import (
 )
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, arrhenius
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Ladder
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-
-Floats = NDArray[np.float64]
 
 STARTS_ALIKE_V = 0.02
 """Captures whose first rests differ by less start at the same SOC: a full charge ends no more alike, per cell [V]."""

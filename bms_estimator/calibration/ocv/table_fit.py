@@ -15,16 +15,14 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, PchipInterpolator
 from scipy.optimize import lsq_linear
 
 from bms_estimator.calibration.ocv.overpotential import hats
 from bms_estimator.calibration.ocv.points import Points, check_points, rms_v, with_ends
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import TableOcv
-
-Floats = NDArray[np.float64]
 
 KNOTS: Floats = np.unique(
     np.r_[np.arange(0.0, 0.06, 0.015), np.arange(0.06, 0.25, 0.03), np.arange(0.25, 0.96, 0.045), 0.97, 0.985, 0.993, 1]

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.capture_checks import contradictions
 from bms_estimator.calibration.cleaning.clean_capture import Load, whole_load
@@ -17,11 +16,10 @@ from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
 from bms_estimator.calibration.thesis.series_resistance import LOWEST_SOC
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, ROOM_C, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.cell_model.rc_ladder import weak_share
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, Resistance
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-
-Floats = NDArray[np.float64]
 
 SMALLEST_ERROR_V = 1e-5
 """Lower limit of the error that is written [V]."""

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
 from bms_estimator.calibration.thesis.prediction import predict
@@ -18,11 +17,10 @@ from bms_estimator.calibration.thesis.series_resistance import (
     series_resistance,
 )
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import ObserverSettings
-
-Floats = NDArray[np.float64]
 
 VOLTAGE_STEP_V = 1e-3
 """Resolution of the voltage when the capture's is not known [V]."""

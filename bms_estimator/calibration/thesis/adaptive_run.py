@@ -8,15 +8,13 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.thesis.parameter_average import Settled, averaged, settled
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.margins import crossing, delta
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-
-Floats = NDArray[np.float64]
 
 SNAPSHOTS = 3000
 """a_i(t) is kept this often over a run, and at each of its first samples."""

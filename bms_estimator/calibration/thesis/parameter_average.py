@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
-
-Floats = NDArray[np.float64]
 
 SETTLED_SHARE = 0.99
 """Share of the samples after t_int whose error must be within the bound."""

@@ -12,11 +12,10 @@ from bms_estimator.calibration.ocv.relaxation_test import soc_by_counting, witho
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-
-Floats = NDArray[np.float64]
 
 EMPTY = 0.0
 """SOC where a prediction ends: below it the curves of the model mean nothing."""

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.thesis.prediction import Prediction, open_circuit
 from bms_estimator.kernels.observer.series_resistance import BINS, SMALLEST_CURRENT_C
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Resistance
 from bms_estimator.model.errors import UserError
-
-Floats = NDArray[np.float64]
 
 LOWEST_SOC = 0.1
 """(4.2) is not fitted below this SOC: the elements leave their form there."""

@@ -1,13 +1,11 @@
 """SOC by interpolation in the open-circuit curve, thesis 7.1."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.thesis.prediction import Prediction, open_circuit
 from bms_estimator.kernels.cell_model.chen_mora import r_s
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
-
-Floats = NDArray[np.float64]
 
 GRID = np.linspace(0.0, 1.0, 4001)
 

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.validate import validate
@@ -18,14 +17,13 @@ from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import learned_cell
 from bms_estimator.fleet.packs.pack_row import PackKind, cell_of, settings_of
 from bms_estimator.kernels.cell_model.chen_mora import r_s
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.device_resolution import Sampling
-
-Floats = NDArray[np.float64]
 
 TRAINING = 2.0 / 3.0
 """Part of the time whose samples identify; the others judge."""

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bms_estimator.edge.subjects import Awaits
-from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, Floats, SimulatedFleet, Whole
+from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet, Whole
+from bms_estimator.model.arrays import Floats
 
 RESEND_S = 5.0
 """A worker that is behind asks for the same block again before it can have it: it is sent once in so long [s]."""

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from bms_estimator.kernels.step import GAP_RATIO, Records
+from bms_estimator.kernels.step import GAP_RATIO
+from bms_estimator.model.arrays import Records
 from bms_estimator.numba_cache import njit
 
 FLOW_SUMS = np.dtype(

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from bms_estimator.kernels.observer.records import Record
-from bms_estimator.kernels.step import GAP_RATIO, Records
+from bms_estimator.kernels.step import GAP_RATIO
+from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
 HOUR_SUMS = np.dtype(

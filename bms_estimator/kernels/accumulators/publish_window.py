@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.kernels.step import Records
+from bms_estimator.model.arrays import Records
 from bms_estimator.numba_cache import njit
 
 WINDOW_SUMS = np.dtype(

@@ -7,11 +7,10 @@ Parameters stand at their own index: ``a[1]`` is a1, ``a[0]`` is unused. Voltage
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
-Floats = NDArray[np.float64]
 State = tuple[float, float, float]
 """SOC (0..1), v_ts [V], v_tl [V]."""
 

@@ -17,8 +17,7 @@ slowly from the same C, because it takes the chord of Tafel's curve for its slop
 
 import math
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 NAMES = (

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats
 from bms_estimator.kernels.cell_model.current_interpolation import held_current
 from bms_estimator.kernels.cell_model.fuel_cell import advance, give_file, output, settle
+from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 

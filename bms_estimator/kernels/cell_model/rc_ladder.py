@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats
+from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 TAU_S = (1.0, 6.0, 30.0, 120.0, 500.0, 2000.0)

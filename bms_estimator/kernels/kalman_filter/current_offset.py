@@ -9,7 +9,7 @@ sensor shows at all, behind its steps and its dead band, is seen from the smalle
 
 from bms_estimator.kernels.kalman_filter.ekf import observe
 from bms_estimator.kernels.kalman_filter.records import OFFSET
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 REST_C, REST_S = 0.01, 60.0

@@ -5,7 +5,7 @@
 
 import math
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats, ocv
+from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, REFERENCE_C, TAUS, TREND, on_grid, resistances
 from bms_estimator.kernels.kalman_filter.noise import add_process_noise, bias_variance, resistance_std
 from bms_estimator.kernels.kalman_filter.ocv_correction import learned_v, per_node_v, place
@@ -23,7 +23,7 @@ from bms_estimator.kernels.kalman_filter.records import (
     STATES,
     X,
 )
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 NARROWEST, WIDEST = 0.02, 0.3

@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats
-from bms_estimator.kernels.observer.records import PARAMETERS, Record
+from bms_estimator.kernels.observer.records import PARAMETERS
+from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 BINS = 25

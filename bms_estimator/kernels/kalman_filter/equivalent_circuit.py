@@ -22,7 +22,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
 from bms_estimator.kernels.kalman_filter.noise import resistance_std
 from bms_estimator.kernels.kalman_filter.ocv_correction import learned_v
 from bms_estimator.kernels.kalman_filter.records import HYST, LN_R, LN_R0, OFFSET, SOC, X
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)

@@ -6,7 +6,7 @@
 import math
 
 from bms_estimator.kernels.cell_model.chen_mora import ocv
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 FAST_S = 10.0

@@ -5,7 +5,7 @@
 
 import math
 
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 LOAD_S = 600.0

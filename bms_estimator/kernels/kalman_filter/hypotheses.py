@@ -57,7 +57,7 @@ from bms_estimator.kernels.kalman_filter.records import (
 )
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
 from bms_estimator.kernels.kalman_filter.temperature import warm
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 WINDOW_S = 0.99

@@ -22,7 +22,7 @@ from bms_estimator.kernels.kalman_filter.gap_charge import first_load
 from bms_estimator.kernels.kalman_filter.hypotheses import clear, seed, start
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.model.input_faults import Suspect
 from bms_estimator.numba_cache import njit
 

@@ -6,7 +6,7 @@
 import math
 
 from bms_estimator.kernels.kalman_filter.records import SOC, STATES
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 UNLIKELY = -9.0

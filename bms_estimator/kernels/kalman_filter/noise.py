@@ -5,7 +5,7 @@
 
 import math
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats, ocv
+from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
     REFERENCE_C,
@@ -30,7 +30,7 @@ from bms_estimator.kernels.kalman_filter.records import (
     SOC,
     X,
 )
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 FLOOR_C = 0.1

@@ -13,10 +13,9 @@ place in it: Smith, Self and Cheeseman 1990).
 
 import math
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats
 from bms_estimator.kernels.cell_model.rc_ladder import on_grid
 from bms_estimator.kernels.kalman_filter.records import NODE, NODES
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 ALIKE_SOC = 0.6

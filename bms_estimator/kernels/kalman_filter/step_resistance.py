@@ -13,7 +13,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, resistances
 from bms_estimator.kernels.kalman_filter.ekf import HUBER
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import LONGEST_S
 from bms_estimator.kernels.kalman_filter.records import LN_R, SOC
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 UNHELD, HELD, STEPPED = range(3)

@@ -7,7 +7,7 @@ import math
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, REFERENCE_C, resistances
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0, X
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 HEAT_J = 22.0

@@ -6,8 +6,8 @@ file's. ``x`` holds v_ts and v_tl of (2.2), (2.3) [V], and ``dx`` their derivati
 
 import math
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats, c_tl, c_ts, ocv, r_s, r_tl, r_ts
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_tl, r_ts
+from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 NAMES = ("r_s", "r_ts", "tau_ts", "r_tl", "tau_tl")

@@ -9,7 +9,7 @@ import math
 from bms_estimator.kernels.cell_model.current_interpolation import held_current
 from bms_estimator.kernels.observer.learning_model import advance, give, output, settle, write
 from bms_estimator.kernels.observer.observer import change_of_lock, update_margins
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 LEARN_EVERY_S = 0.999

@@ -7,9 +7,8 @@ import math
 from enum import IntEnum
 
 from bms_estimator.kernels.cell_model import fuel_cell
-from bms_estimator.kernels.cell_model.chen_mora import Floats
 from bms_estimator.kernels.observer import chen_mora_sensitivity
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 

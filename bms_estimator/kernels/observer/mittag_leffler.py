@@ -20,7 +20,7 @@ import math
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from bms_estimator.kernels.cell_model.chen_mora import Floats
+from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 SERIES_TERMS = 24

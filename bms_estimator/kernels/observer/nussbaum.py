@@ -4,7 +4,7 @@ import math
 from enum import IntEnum
 
 from bms_estimator.kernels.observer.mittag_leffler import mittag_leffler
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 

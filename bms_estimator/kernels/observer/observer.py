@@ -11,7 +11,7 @@ from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_t
 from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, held_current
 from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 SMALLEST_LOOP = 0.1

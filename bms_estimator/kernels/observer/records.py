@@ -3,15 +3,10 @@
 State is data: what a step changes, what a checkpoint stores, what a test compares bit by bit.
 """
 
-from typing import Any
-
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.kernels.observer.mittag_leffler import SERIES_TERMS, TABLE_POINTS
-
-Record = Any
-"""An element of a structured array inside a kernel: numba knows its fields, the type checker does not."""
 
 PARAMETERS = 16
 """a1..a15 at their own index; index 0 is unused."""

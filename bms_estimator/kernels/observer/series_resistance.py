@@ -10,7 +10,7 @@ import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_tl, r_ts, rc_step
 from bms_estimator.kernels.observer.observer import floor
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 BINS = 100

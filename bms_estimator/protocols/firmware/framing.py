@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record, Records
 from bms_estimator.model.sample import LEAST_C, MOST_C, SampleStatus
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.clock_drift import CLOCK_WINDOWS, forget_clock, take_arrival
@@ -25,7 +25,6 @@ from bms_estimator.protocols.firmware.scaling import (
 )
 
 Bytes = NDArray[np.uint8]
-Records = NDArray[np.void]
 
 MESSAGE_SAMPLE = int(MessageType.SAMPLE)
 MESSAGE_HELLO = int(MessageType.HELLO)

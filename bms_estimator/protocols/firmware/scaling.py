@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.kernels.observer.records import Record
+from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.messages import MODULUS
 

@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
-
-Floats = NDArray[np.float64]
 
 COLUMNS = ("soc", "ocv_v", "hysteresis_v")
 

@@ -7,8 +7,8 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import IN_MID_LOAD, cell_file, charge_ah
@@ -24,7 +24,6 @@ from tests.benchmarks.side_by_side.references import (
 from tests.benchmarks.side_by_side.trials import Block, Trial, at_temperature, block, starts
 from tests.estimator.anywhere.score import score
 
-Floats = NDArray[np.float64]
 Starts = Iterable[tuple[float, CellModel]]
 
 WRONG_SOC, LEARNED_AT = 0.2, 0.1

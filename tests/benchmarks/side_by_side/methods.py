@@ -10,7 +10,6 @@ from importlib.util import find_spec
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.ocv.relaxation_test import soc_by_counting
 from bms_estimator.calibration.thesis.adapt_steps import Start, steps_2_and_3
@@ -20,13 +19,13 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import fitted_parameter
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
 from tests.benchmarks.baselines import fixed_ekf, joint_ekf, rls_arx, simulate_arx
 
-Floats = NDArray[np.float64]
 Reader = Callable[[Estimator, CellModel], Floats]
 
 LOWEST_SOC = 0.1

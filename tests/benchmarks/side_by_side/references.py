@@ -8,15 +8,13 @@ than two time constants, and which two a fit finds depends on how long it looks:
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from bms_estimator.calibration.ocv.relaxation_test import resting_samples, runs
+from bms_estimator.model.arrays import Floats
 from tests.benchmarks.pulses import AROUND, pulses
 from tests.benchmarks.side_by_side.trials import Block
-
-Floats = NDArray[np.float64]
 
 LEAST_REST_S, WINDOW_S = 600.0, 1200.0
 LEAST_MOVED = 0.02

@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.markup import escape
 from rich.table import Table
 from scipy.stats import rankdata
 
+from bms_estimator.model.arrays import Floats
 from tests.benchmarks.side_by_side.measure import (
     FIT,
     JUMP,
@@ -23,8 +23,6 @@ from tests.benchmarks.side_by_side.measure import (
     Reference,
 )
 from tests.benchmarks.side_by_side.methods import FILE, METHODS
-
-Floats = NDArray[np.float64]
 
 TABLES = {
     VOLTAGE: ("voltage RMS of the capture held back, open loop [mV]", 1),

@@ -8,17 +8,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.elements.two_branch_fit import sections
 from bms_estimator.calibration.ocv.relaxation_test import without_glitches
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius, weak_share
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import LEAF, LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_PULSES, Recipe, load
-
-Floats = NDArray[np.float64]
 
 WRONG_BY = (2.0, 0.5)
 """Resistances of the start over those of the cell file."""

@@ -13,11 +13,11 @@ from scipy.optimize import nnls
 
 from bms_estimator.calibration.ocv.sources import REST_SHARE_STD
 from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.estimator.anywhere.truth import (
     GRID,
-    Floats,
     Truth,
     curve_of,
     impedance,

@@ -16,11 +16,12 @@ from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.records import LN_Q
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, rising
 from tests.estimator.anywhere.score import Score, score
-from tests.estimator.anywhere.truth import GRID, Floats, curve_of, measured_curve, simulate, smooth
+from tests.estimator.anywhere.truth import GRID, curve_of, measured_curve, simulate, smooth
 from tests.estimator.anywhere.use import drive
 
 CAPACITY_AH = 3.0

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.hypotheses import pack_std
 from bms_estimator.kernels.step import Verdict
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
-
-Floats = NDArray[np.float64]
 
 BLOCK_S = 600.0
 """Over which innovations are summed: errors of the model that stay so long are those that the SOC suffers from."""

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from bms_estimator.model.arrays import Floats
 
 LONGEST_S = 60.0
 """A pause counts as no longer."""

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.numba_cache import njit
-
-Floats = NDArray[np.float64]
 
 GRID = np.linspace(0.0, 1.0, 401)
 """SOC of all that is given along it."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.estimator.anywhere.truth import Floats
+from bms_estimator.model.arrays import Floats
 
 LEVEL_S = 20.0
 DAY_S = 86400
