@@ -11,9 +11,9 @@ from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.kalman_filter.hypotheses import tell
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, keep
-from bms_estimator.kernels.observer.records import TRACE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.kernels.step import Verdict
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.sample import SampleBlock

@@ -6,11 +6,11 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.filter_settings import filter_settings, unmeasured_s
 from bms_estimator.estimator.fuel_cell_settings import fuel_cell_settings
 from bms_estimator.estimator.learning_settings import learning_settings
-from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, emf
+from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, PARAMETERS, emf
 from bms_estimator.kernels.cell_model.current_interpolation import PERIODS
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, series_coefficients
 from bms_estimator.kernels.observer.nussbaum import Nussbaum
-from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS, PARAMETERS
+from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel

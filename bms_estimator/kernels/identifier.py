@@ -19,21 +19,12 @@ from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     told_by_steps,
 )
 from bms_estimator.kernels.kalman_filter.frozen_sensor import watch_frozen
-from bms_estimator.kernels.kalman_filter.hypotheses import (
-    ONE_STD,
-    WINDOW_S,
-    clear,
-    count_on,
-    follow_temperature,
-    gather,
-    pass_time,
-    seed,
-    start,
-    update_all,
-)
-from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, believed, guard, judge, keep, wait, watch_sign
+from bms_estimator.kernels.kalman_filter.hypotheses import ONE_STD, update_all
+from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, believed, guard, judge, wait, watch_sign
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD, watch_steps
+from bms_estimator.kernels.kalman_filter.window import WINDOW_S, count_on, gather, pass_time
+from bms_estimator.kernels.start import restart_filter
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
@@ -41,45 +32,8 @@ FIT_EVERY_S = 120.0
 """One element is fitted this often, each in its turn [s of samples]."""
 LEAST_BINS = 3
 """Three parameters of an element need so many bins of SOC."""
-UNSEEN_MOST = 0.3
-"""How far the SOC may have gone while nobody measured, at most, std."""
 EXCITING_C = 0.05
 """A load of so much, RMS over 10 min, tells of the resistances [C]."""
-
-
-@njit(cache=True)
-def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """Begin at the SOC of the observer's first sample."""
-    start(s.filter, p.filter, s.observer.soc, current_a, temperature_c)
-    s.unlearned_s[:] = math.inf
-    take_first(s, p, current_a, voltage_v)
-
-
-@njit(cache=True)
-def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, voltage_v: float) -> None:
-    """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, to ``soc_std``; the load before is not known."""
-    f = s.filter
-    f.current_a, f.step.phase = current_a, UNHELD
-    follow_temperature(f)
-    seed(f, p.filter, f.soc, min(soc_std, UNSEEN_MOST))
-    clear(f)
-    s.checks.slow_v = 0.0
-    s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
-    if not s.checks.suspects & UNUSABLE:
-        s.checks.last_v = 0.0
-        take_first(s, p, current_a, voltage_v)
-
-
-@njit(cache=True)
-def take_first(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
-    """The first sample is an update by itself."""
-    f = s.filter
-    keep(s.checks, f)
-    gather(f, current_a, voltage_v)
-    s.checks.mean_a = current_a
-    update_all(f, p.filter)
-    equivalent(f, p.filter, s.elements)
-    s.observer.soc = f.soc
 
 
 @njit(cache=True)

@@ -4,18 +4,18 @@ import math
 from enum import IntEnum
 
 from bms_estimator.kernels.cell_model.chen_mora import soc_from_ocv
-from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.kernels.identifier import UNSEEN_MOST, identify, restart_filter, start_filter
+from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
+from bms_estimator.kernels.identifier import identify
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
-from bms_estimator.kernels.kalman_filter.hypotheses import is_temperature, pack_std
+from bms_estimator.kernels.kalman_filter.hypotheses import pack_std
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
-from bms_estimator.kernels.observer.learning_law import begin_learning, learning_step, take_as_rest
+from bms_estimator.kernels.observer.learning_law import learning_step
 from bms_estimator.kernels.observer.observer import count_charge, observer_step, start
 from bms_estimator.kernels.observer.series_resistance import (
-    begin_series_resistance,
     series_resistance,
     series_resistance_step,
 )
+from bms_estimator.kernels.start import after_restart, begin, sense
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
@@ -35,8 +35,6 @@ _NOT_FINITE = int(Verdict.NOT_FINITE)
 _OUT_OF_RANGE = int(Verdict.OUT_OF_RANGE)
 _REPEATED = int(Verdict.REPEATED)
 _SATURATED = int(Verdict.SATURATED)
-GAP_RATIO = 3.0
-"""A step this many times as long as the one before may be a gap: slow sampling is none."""
 _SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED
 
 
@@ -134,39 +132,6 @@ def is_gap(s: Record, p: Record, dt_s: float) -> bool:
     if gap:
         s.gaps += 1
     return gap
-
-
-@njit(cache=True)
-def begin(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """The first sample of all, of filter and learning law. Records as in ``step``."""
-    s.learning.temperature_c = math.nan
-    sense(s.learning, temperature_c)
-    if p.identify:
-        start_filter(s, p, current_a, voltage_v, temperature_c)
-    if p.learning.enabled:
-        begin_learning(s, p, voltage_v)
-    if p.series_resistance:
-        begin_series_resistance(s, p)
-
-
-@njit(cache=True)
-def sense(m: Record, temperature_c: float) -> None:
-    """Keep the last temperature that a cell can have; ``m`` is a record of LEARNING_STATE."""
-    if is_temperature(temperature_c):
-        m.temperature_c = temperature_c
-
-
-@njit(cache=True)
-def after_restart(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """The first sample of a new clock: nobody knows how long nobody measured. Records as in ``step``."""
-    if p.identify:
-        if is_temperature(temperature_c):
-            s.filter.temperature_c, s.filter.sensed = temperature_c, 1
-        elif not s.filter.sensed:
-            s.filter.temperature_c = REFERENCE_C
-        restart_filter(s, p, UNSEEN_MOST, current_a, voltage_v)
-    if p.learning.enabled:
-        take_as_rest(s, p, voltage_v)
 
 
 @njit(cache=True)

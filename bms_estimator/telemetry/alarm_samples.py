@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.observer.records import TRACE
-from bms_estimator.kernels.step import GAP_RATIO
+from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
 

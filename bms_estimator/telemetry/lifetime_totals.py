@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.step import GAP_RATIO
+from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads import Totals
 from bms_estimator.model.sample import SampleBlock

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import PackModel

@@ -14,7 +14,7 @@ from table import Row
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels import step as kernel
-from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings

@@ -26,7 +26,7 @@ from bms_estimator.kernels.cell_model import chen_mora as elements
 from bms_estimator.kernels.observer import learning_law
 from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
 from bms_estimator.kernels.observer.observer import integral_of_exponential
-from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Record
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.pack import ObserverSettings
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError

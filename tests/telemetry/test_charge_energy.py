@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.observer.records import TRACE
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.telemetry.charge_energy import Flow, Meter
 
 GAP_S = 5.0

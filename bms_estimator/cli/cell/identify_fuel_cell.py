@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.cli.options.capture_options import name_of, unlike
-from bms_estimator.kernels.kalman_filter.hypotheses import COLDEST_C, HOTTEST_C
+from bms_estimator.kernels.kalman_filter.temperature import COLDEST_C, HOTTEST_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.kernels.step import GAP_RATIO
+from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.arrays import Records
 from bms_estimator.numba_cache import njit
 

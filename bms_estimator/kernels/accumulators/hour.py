@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.kernels.step import GAP_RATIO
+from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 

@@ -11,6 +11,9 @@ import numpy as np
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
+PARAMETERS = 16
+"""a1..a15 at their own index; index 0 is unused."""
+
 State = tuple[float, float, float]
 """SOC (0..1), v_ts [V], v_tl [V]."""
 

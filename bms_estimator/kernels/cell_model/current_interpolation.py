@@ -2,6 +2,12 @@
 
 from bms_estimator.numba_cache import njit
 
+SLOW_S = 2.0
+"""Between samples further apart the current is more than their straight line [s]."""
+
+GAP_RATIO = 3.0
+"""A step this many times as long as the one before may be a gap: slow sampling is none."""
+
 UNMEASURED_S = 60.0
 """Over a longer step nobody measured the current [s], unless the source has slower samples: then over ``PERIODS`` of them."""
 PERIODS = 2.5

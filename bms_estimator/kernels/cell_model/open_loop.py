@@ -9,9 +9,8 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts, rc_step
-from bms_estimator.kernels.cell_model.current_interpolation import UNMEASURED_S, along_line, held_current
+from bms_estimator.kernels.cell_model.current_interpolation import SLOW_S, UNMEASURED_S, along_line, held_current
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS, TREND
-from bms_estimator.kernels.kalman_filter.gap_charge import SLOW_S
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 

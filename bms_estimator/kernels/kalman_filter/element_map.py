@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.kernels.observer.records import PARAMETERS
+from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS
 from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 

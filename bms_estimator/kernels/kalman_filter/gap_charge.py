@@ -5,6 +5,7 @@
 
 import math
 
+from bms_estimator.kernels.cell_model.current_interpolation import SLOW_S
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
@@ -12,8 +13,6 @@ LOAD_S = 600.0
 """The present load is judged over so long; it goes on for about as long [s]."""
 USUAL_S = 6.0 * 3600.0
 """What a load is when it has changed is judged over so long [s]."""
-SLOW_S = 2.0
-"""Between samples further apart the current is more than their straight line [s]."""
 BETWEEN = 0.2
 """Variance of the mean current about that line, over the square of the change: 1/12 where the load stays for much longer than
 from one sample to the next, 0.10 and 0.18 with levels of 20 s each 10 s and each 60 s, 1/4 where it is another each time."""

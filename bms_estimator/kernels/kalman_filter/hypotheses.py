@@ -10,26 +10,15 @@ goes out is mean and standard deviation of the mixture.
 
 import math
 
-from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, along_line, held_current
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
-    HYSTERESIS_J,
     REFERENCE_C,
-    STRONG_J,
-    TAUS,
-    WEAK_J,
-    arrhenius,
     on_grid,
 )
-from bms_estimator.kernels.kalman_filter.current_offset import learn_from_zero, watch_smallest
-from bms_estimator.kernels.kalman_filter.ekf import HIGHEST, LOWEST, OWN_R_STD, decay, inflate, predict, update
+from bms_estimator.kernels.kalman_filter.current_offset import learn_from_zero
+from bms_estimator.kernels.kalman_filter.ekf import HIGHEST, LOWEST, OWN_R_STD, inflate, predict, update
 from bms_estimator.kernels.kalman_filter.gap_charge import (
-    SLOW_S,
-    between_samples,
     first_load,
-    goes_on,
-    rounded_charge,
-    unseen_charge,
     watch_load,
 )
 from bms_estimator.kernels.kalman_filter.mixture import combine, copy, forget, merge, vacate
@@ -56,14 +45,14 @@ from bms_estimator.kernels.kalman_filter.records import (
     X,
 )
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
-from bms_estimator.kernels.kalman_filter.temperature import warm
+from bms_estimator.kernels.kalman_filter.temperature import (
+    follow_temperature,
+    is_temperature,
+)
+from bms_estimator.kernels.kalman_filter.window import clear, pass_time
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-WINDOW_S = 0.99
-"""Samples of about a second make one update [s]."""
-SAME_STEP = 0.005
-"""A step as long as that before within this, relative, has its decays."""
 ONE_STD = 0.06
 """An SOC known better than this needs one filter only."""
 REACH_STDS = 2.25
@@ -72,14 +61,6 @@ OVERLAP = 0.62
 """Std of a hypothesis over the distance to the next."""
 BEYOND_STD = 0.03
 """How far outside 0..1 a told SOC may mean, std."""
-TEMPERATURE_S = 10.0
-"""A temperature sensor's noise is averaged over so long [s]."""
-FASTEST_K_S = 0.1
-"""No cell warms or cools faster [K/s], ..."""
-SETTLED_S = 60.0
-"""... once a minute has shown that the first sample was right: some sensors begin with 85 C."""
-COLDEST_C, HOTTEST_C = -60.0, 120.0
-"""Where a cell's temperature may be [C]."""
 LEAST_STD = 0.005
 """What full and empty are of a cell is known no better, std of SOC."""
 UNKNOWN_FULL = 0.03
@@ -104,7 +85,7 @@ LN_RIGHT = 3.0
 
 
 @njit(cache=True)
-def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: float) -> None:
+def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temperature_c: float) -> None:
     """First sample: nothing is known but the told ``soc``, to ``p.soc_std``."""
     s.started, s.best = 1, 0
     s.current_a = current_a
@@ -125,19 +106,6 @@ def start(s: Record, p: Record, soc: float, current_a: float, temperature_c: flo
     forget_curve(x, cov)
     seed(s, p, soc, p.soc_std)
     clear(s)
-
-
-@njit(cache=True)
-def is_temperature(temperature_c: float) -> bool:
-    """Whether a cell can have it: sensors say -127 or -300 C where a wire is off. NaN is none."""
-    return COLDEST_C <= temperature_c <= HOTTEST_C
-
-
-@njit(cache=True)
-def follow_temperature(s: Record) -> None:
-    """The Arrhenius factors at the cell's temperature."""
-    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
-    s.hysteresis = arrhenius(HYSTERESIS_J, s.temperature_c)
 
 
 @njit(cache=True)
@@ -184,75 +152,6 @@ def tell(s: Record, p: Record, soc: float) -> None:
     s.covariance[s.best, SOC, SOC] = TOLD_STD**2
     s.ln_weight[s.best] += LN_RIGHT
     combine(s)
-
-
-@njit(cache=True)
-def clear(s: Record) -> None:
-    """Begin a new window."""
-    w = s.window
-    w.samples = w.gap = 0
-    w.time_s = w.charge_as = w.throughput_as = w.unknown_as = w.between_as2 = w.rounded_as2 = 0.0
-    w.sum_v = w.sum_a = w.sum_as = 0.0
-    w.sum_x_a[:] = 0.0
-
-
-@njit(cache=True)
-def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, temperature_c: float) -> None:
-    """Charge and branches from the sample before to this one; ``gap``: samples are missing between them."""
-    if is_temperature(temperature_c):
-        share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
-        most_k = FASTEST_K_S * dt_s if s.sensed and s.seeded_s > SETTLED_S else math.inf
-        s.temperature_c += min(max(share * (temperature_c - s.temperature_c), -most_k), most_k)
-        s.sensed = 1
-    w = s.window
-    held_a, change_a = held_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
-    unseen = gap or dt_s > p.unmeasured_s
-    charge_as = held_a * min(dt_s, LONGEST_FLOW_S)
-    if gap and dt_s > p.unmeasured_s:
-        charge_as += goes_on(s, held_a, dt_s)
-        held_a = charge_as / dt_s
-    if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
-        s.decay_s = dt_s
-        for k in range(BRANCHES):
-            s.decay[k] = math.exp(-dt_s / TAUS[k])
-    for k in range(BRANCHES):
-        s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
-        if dt_s > SLOW_S and not unseen:
-            s.x_a[k] += along_line(change_a, dt_s / TAUS[k], s.decay[k])
-    w.time_s += dt_s
-    w.charge_as += charge_as
-    w.throughput_as += abs(charge_as)
-    if gap:
-        w.gap = 1
-    if unseen:
-        w.unknown_as += unseen_charge(s, p, held_a, dt_s)
-    else:
-        w.between_as2 += between_samples(change_a, dt_s)
-    if p.current_step_a > 0.0 or p.dead_band_a > 0.0:
-        w.rounded_as2 += rounded_charge(s, p, dt_s, current_a)
-    s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
-    watch_smallest(s, current_a)
-    s.current_a = current_a
-
-
-@njit(cache=True)
-def gather(s: Record, current_a: float, voltage_v: float) -> None:
-    """Add a sample to the window."""
-    w = s.window
-    w.samples += 1
-    w.sum_v += voltage_v
-    w.sum_a += current_a
-    w.sum_as += w.charge_as
-    for k in range(BRANCHES):
-        w.sum_x_a[k] += s.x_a[k]
-
-
-@njit(cache=True)
-def pass_time(s: Record, p: Record) -> None:
-    """What the time of the window does to the temperature, where nobody measures it, and to F."""
-    if not s.sensed:
-        warm(s, p)
-    decay(s, p)
 
 
 @njit(cache=True)

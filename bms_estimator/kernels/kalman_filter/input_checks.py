@@ -19,9 +19,10 @@ from bms_estimator.kernels.kalman_filter.frozen_sensor import (
     take_back,
 )
 from bms_estimator.kernels.kalman_filter.gap_charge import first_load
-from bms_estimator.kernels.kalman_filter.hypotheses import clear, seed, start
+from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, seed
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
+from bms_estimator.kernels.kalman_filter.window import clear
 from bms_estimator.model.arrays import Record
 from bms_estimator.model.input_faults import Suspect
 from bms_estimator.numba_cache import njit
@@ -266,7 +267,7 @@ def wait(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None
         return
     if c.suspects & SIGN_OF_CURRENT:
         soc_std = max(f.soc_std, p.soc_std)
-        start(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
+        initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
         seed(f, p, f.soc, soc_std)
     else:
         seed(f, p, f.soc, max(f.soc_std, LOST_STD))

@@ -5,10 +5,34 @@
 
 import math
 
-from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, REFERENCE_C, resistances
-from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0, X
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    BRANCHES,
+    HYSTERESIS_J,
+    REFERENCE_C,
+    STRONG_J,
+    WEAK_J,
+    arrhenius,
+    resistances,
+)
+from bms_estimator.kernels.kalman_filter.records import (
+    LN_R,
+    LN_R0,
+    X,
+)
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
+
+TEMPERATURE_S = 10.0
+"""A temperature sensor's noise is averaged over so long [s]."""
+
+FASTEST_K_S = 0.1
+"""No cell warms or cools faster [K/s], ..."""
+
+SETTLED_S = 60.0
+"""... once a minute has shown that the first sample was right: some sensors begin with 85 C."""
+
+COLDEST_C, HOTTEST_C = -60.0, 120.0
+"""Where a cell's temperature may be [C]."""
 
 HEAT_J = 22.0
 """Heat that warms 1 Ah of a cell by a kelvin [J/(K Ah)] ..."""
@@ -30,3 +54,16 @@ def warm(s: Record, p: Record) -> None:
     in_the_end_c = REFERENCE_C + loss_w / p.series * COOLS_S / (HEAT_J * p.capacity_as / 3600.0)
     s.temperature_c = in_the_end_c + (s.temperature_c - in_the_end_c) * math.exp(-w.time_s / COOLS_S)
     s.temperature_c = min(s.temperature_c, WARMEST_C)
+
+
+@njit(cache=True)
+def is_temperature(temperature_c: float) -> bool:
+    """Whether a cell can have it: sensors say -127 or -300 C where a wire is off. NaN is none."""
+    return COLDEST_C <= temperature_c <= HOTTEST_C
+
+
+@njit(cache=True)
+def follow_temperature(s: Record) -> None:
+    """The Arrhenius factors at the cell's temperature."""
+    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
+    s.hysteresis = arrhenius(HYSTERESIS_J, s.temperature_c)

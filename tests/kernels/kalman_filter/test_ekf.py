@@ -11,7 +11,7 @@ from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
-from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses
+from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, temperature, window
 from bms_estimator.kernels.kalman_filter import noise as ekf_noise
 from bms_estimator.kernels.kalman_filter.mixture import combine, merge, unite
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
@@ -35,7 +35,7 @@ def somewhere(p, seed=1, time_s=1.0):
     """A state in the middle of a drive: any mean, any covariance, a window of five samples."""
     rng = np.random.default_rng(seed)
     s = np.zeros(1, EKF_STATE)[0]
-    hypotheses.start(s, p, 0.55, 1.5, 12.0)
+    hypotheses.initialize_filter(s, p, 0.55, 1.5, 12.0)
     s["count"], s["best"] = 1, 0
     s["mean"][0] = 0.3 * rng.standard_normal(STATES) * np.sqrt(np.diag(s["covariance"][3]))
     s["mean"][0, SOC] = 0.55
@@ -44,8 +44,8 @@ def somewhere(p, seed=1, time_s=1.0):
     s["covariance"][0] = (mixed @ mixed.T / STATES) * std[:, None] * std
     s["x_a"] = rng.normal(1.0, 0.5, BRANCHES)
     for current_a, voltage_v in zip(rng.normal(1.5, 0.5, 5), rng.normal(3.6, 0.01, 5), strict=True):
-        hypotheses.count_on(s, p, time_s / 5, False, current_a, 12.0)
-        hypotheses.gather(s, current_a, voltage_v)
+        window.count_on(s, p, time_s / 5, False, current_a, 12.0)
+        window.gather(s, current_a, voltage_v)
     return s
 
 
@@ -145,14 +145,14 @@ def test_an_update_over_the_bend_near_empty_is_that_of_bayes(
     cell, noise_v = load_cell(name, None if name == "chen_mora" else 3.0), 0.03
     p = filter_settings(cell, ocv_grid(cell), IdentifierSettings(), 1e-3, None)[0]
     s = np.zeros(1, EKF_STATE)[0]
-    hypotheses.start(s, p, before, 0.0, 25.0)
+    hypotheses.initialize_filter(s, p, before, 0.0, 25.0)
     s["count"], s["best"] = 1, 0
     s["mean"][0], s["covariance"][0] = 0.0, 0.0
     s["mean"][0, SOC], s["covariance"][0, SOC, SOC] = before, std**2
     grid = np.linspace(-0.05, 0.6, 4000)
     ocv_v = np.interp(grid, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
     voltage_v = np.interp(true_soc, grid, ocv_v)
-    hypotheses.gather(s, 0.0, voltage_v)
+    window.gather(s, 0.0, voltage_v)
     ekf.update(s, p, 0, noise_v**2)
     weight = np.exp(-0.5 * ((grid - before) / std) ** 2 - 0.5 * ((ocv_v - voltage_v) / noise_v) ** 2)
     mean = np.average(grid, weights=weight)
@@ -202,7 +202,7 @@ def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float)
     p = settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
-    hypotheses.start(s, p, 0.55, first_c * one_c, 12.0)
+    hypotheses.initialize_filter(s, p, 0.55, first_c * one_c, 12.0)
     assert np.sqrt(s["rms_a2"]) == pytest.approx(rms_c * one_c, rel=1e-3)
     assert abs(s["mean_a"]) <= np.sqrt(s["rms_a2"]) * (1.0 + 1e-9)
 
@@ -213,7 +213,7 @@ def test_the_load_in_a_gap_after_a_peak_may_have_gone_on_or_ended(first_c: float
     p = settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
-    hypotheses.start(s, p, 0.55, first_c * one_c, 12.0)
+    hypotheses.initialize_filter(s, p, 0.55, first_c * one_c, 12.0)
     unknown_c = gap_charge.unseen_charge(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
     assert first_c - 1.29 < unknown_c < first_c
 
@@ -233,7 +233,7 @@ def test_above_the_temperatures_of_the_cell_file_nothing_is_surer() -> None:
     s = somewhere(p)
     sizes = []
     for s["temperature_c"] in (30.0, 45.0, 60.0):
-        hypotheses.follow_temperature(s)
+        temperature.follow_temperature(s)
         sizes.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0)))
     assert sizes[1] == pytest.approx(1.5**2 * np.array(sizes[0]), rel=0.01)
     assert sizes[2] == pytest.approx(2.0**2 * np.array(sizes[0]), rel=0.01)
@@ -367,9 +367,9 @@ def test_a_hypothesis_that_holds_its_model_for_wrong_loses_against_one_that_does
     s["ln_weight"][:2] = 0.0
     assert abs(s["mean"][1 - true, B_SLOW]) > 0.2
     for _ in range(60):
-        hypotheses.count_on(s, p, 1.0, False, s["current_a"], 25.0)
+        window.count_on(s, p, 1.0, False, s["current_a"], 25.0)
         s["window"]["samples"] = 0
-        hypotheses.gather(s, s["current_a"], voltage_v)
+        window.gather(s, s["current_a"], voltage_v)
         hypotheses.update_all(s, p)
     likely = s["mean"][: s["count"], SOC][s["ln_weight"][: s["count"]] > -3.0]
     assert likely == pytest.approx([apart[true]], abs=0.05)

@@ -1,0 +1,103 @@
+"""The window of samples that make one update of the filter.
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
+"""
+
+import math
+
+from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, SLOW_S, along_line, held_current
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    BRANCHES,
+    TAUS,
+)
+from bms_estimator.kernels.kalman_filter.current_offset import watch_smallest
+from bms_estimator.kernels.kalman_filter.ekf import decay
+from bms_estimator.kernels.kalman_filter.gap_charge import (
+    between_samples,
+    goes_on,
+    rounded_charge,
+    unseen_charge,
+)
+from bms_estimator.kernels.kalman_filter.temperature import (
+    FASTEST_K_S,
+    SETTLED_S,
+    TEMPERATURE_S,
+    is_temperature,
+    warm,
+)
+from bms_estimator.model.arrays import Record
+from bms_estimator.numba_cache import njit
+
+WINDOW_S = 0.99
+"""Samples of about a second make one update [s]."""
+SAME_STEP = 0.005
+"""A step as long as that before within this, relative, has its decays."""
+
+
+@njit(cache=True)
+def clear(s: Record) -> None:
+    """Begin a new window."""
+    w = s.window
+    w.samples = w.gap = 0
+    w.time_s = w.charge_as = w.throughput_as = w.unknown_as = w.between_as2 = w.rounded_as2 = 0.0
+    w.sum_v = w.sum_a = w.sum_as = 0.0
+    w.sum_x_a[:] = 0.0
+
+
+@njit(cache=True)
+def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, temperature_c: float) -> None:
+    """Charge and branches from the sample before to this one; ``gap``: samples are missing between them."""
+    if is_temperature(temperature_c):
+        share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
+        most_k = FASTEST_K_S * dt_s if s.sensed and s.seeded_s > SETTLED_S else math.inf
+        s.temperature_c += min(max(share * (temperature_c - s.temperature_c), -most_k), most_k)
+        s.sensed = 1
+    w = s.window
+    held_a, change_a = held_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
+    unseen = gap or dt_s > p.unmeasured_s
+    charge_as = held_a * min(dt_s, LONGEST_FLOW_S)
+    if gap and dt_s > p.unmeasured_s:
+        charge_as += goes_on(s, held_a, dt_s)
+        held_a = charge_as / dt_s
+    if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
+        s.decay_s = dt_s
+        for k in range(BRANCHES):
+            s.decay[k] = math.exp(-dt_s / TAUS[k])
+    for k in range(BRANCHES):
+        s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
+        if dt_s > SLOW_S and not unseen:
+            s.x_a[k] += along_line(change_a, dt_s / TAUS[k], s.decay[k])
+    w.time_s += dt_s
+    w.charge_as += charge_as
+    w.throughput_as += abs(charge_as)
+    if gap:
+        w.gap = 1
+    if unseen:
+        w.unknown_as += unseen_charge(s, p, held_a, dt_s)
+    else:
+        w.between_as2 += between_samples(change_a, dt_s)
+    if p.current_step_a > 0.0 or p.dead_band_a > 0.0:
+        w.rounded_as2 += rounded_charge(s, p, dt_s, current_a)
+    s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
+    watch_smallest(s, current_a)
+    s.current_a = current_a
+
+
+@njit(cache=True)
+def gather(s: Record, current_a: float, voltage_v: float) -> None:
+    """Add a sample to the window."""
+    w = s.window
+    w.samples += 1
+    w.sum_v += voltage_v
+    w.sum_a += current_a
+    w.sum_as += w.charge_as
+    for k in range(BRANCHES):
+        w.sum_x_a[k] += s.x_a[k]
+
+
+@njit(cache=True)
+def pass_time(s: Record, p: Record) -> None:
+    """What the time of the window does to the temperature, where nobody measures it, and to F."""
+    if not s.sensed:
+        warm(s, p)
+    decay(s, p)

@@ -1,0 +1,38 @@
+"""The trace: one row of values for each accepted sample."""
+
+import numpy as np
+
+TRACE = np.dtype(
+    [
+        ("time_s", "f8"),
+        ("voltage_v", "f8"),
+        ("current_a", "f8"),  # positive on discharge
+        ("temperature_c", "f8"),
+        ("soc", "f8"),
+        ("voltage_estimate_v", "f8"),
+        ("innovation_v", "f8"),  # measured less predicted: the identifier's, else the observer's e
+        ("tracking_error_v", "f8"),  # the observer's e (3.15)
+        ("nussbaum_gain", "f8"),  # N(k) (3.12) of a printed law, else NaN
+        ("adaptation_gain_hz", "f8"),  # gamma k of the learning law, else NaN [1/s]
+        ("k", "f8"),
+        ("delta_1", "f8"),
+        ("delta_2", "f8"),
+        ("stability_margin", "f8"),  # soc - max(delta_1, delta_2)
+        ("lock", "i8"),
+        ("converged", "i8"),  # |e| < eps2
+        ("soc_coulomb", "f8"),  # by coulomb counting alone
+        ("soc_ocv", "f8"),  # by the inverted OCV (7.1); from here on the identifier's, NaN without it
+        ("soc_std", "f8"),
+        ("r_s_ohm", "f8"),
+        ("r_s_std_ohm", "f8"),
+        ("r_ts_ohm", "f8"),
+        ("r_ts_std_ohm", "f8"),
+        ("tau_ts_s", "f8"),
+        ("tau_ts_std_s", "f8"),
+        ("r_tl_ohm", "f8"),
+        ("r_tl_std_ohm", "f8"),
+        ("tau_tl_s", "f8"),
+        ("tau_tl_std_s", "f8"),
+    ],
+    align=True,
+)
