@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import GAP_CHARGE, GAP_STEPS
+from bms_estimator.calibration.cleaning.rests import resting_samples, runs, without_glitches
 from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, coldness
-from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests, resting_samples, runs, without_glitches
+from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests
 from bms_estimator.estimator.filter_settings import CURVE_SOC, filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
@@ -28,7 +29,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings
+from bms_estimator.settings.observer import IdentifierSettings
 
 LARGEST_STD = 0.1
 """An anchor whose SOC is less certain is none."""

@@ -6,9 +6,9 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import contradictions, soc_outside
 from bms_estimator.calibration.cleaning.clean_capture import whole_load
+from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C
 from bms_estimator.calibration.elements.identify import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ocv.overpotential import overpotential
-from bms_estimator.calibration.ocv.relaxation_test import REST_CURRENT_C
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.model.arrays import Floats

@@ -4,14 +4,13 @@ One file for each meaning that a state can have (``pack_identity``), its fields 
 edited, and versions that know other fields may come, without what was learned being lost.
 """
 
-import hashlib
 import io
 import json
 import math
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -21,8 +20,8 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from bms_estimator.model.cell import ChenMoraOcv
-from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
+from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import Totals
 from bms_estimator.process.boot_clock import Moment, moment
 from bms_estimator.process.disk_thread import DiskThread
@@ -48,44 +47,6 @@ MOST = 1e15
 """No counter comes so far, nor do seconds: 30,000 years of 1,000 samples a second."""
 
 log = structlog.get_logger(__name__)
-
-
-def pack_identity(settings: Settings, cell: PackModel) -> str:
-    """Hash of what gives the state its meaning: cells in series, capacity, open-circuit voltage, sign of the current.
-
-    Of a fuel cell: all its parameters and the sign.
-
-    Plain numbers and not the sections of the settings: a description, a tuning value or a setting that a later version
-    adds leave the meaning as it is.
-    """
-    if isinstance(cell, FuelCellModel):  # theta is over the file's values
-        return hashlib.sha256(repr((*cell.a, settings.sensor.current_sign)).encode()).hexdigest()
-    ocv = cell.ocv
-    curve = ocv.a if isinstance(ocv, ChenMoraOcv) else (*ocv.soc, *ocv.ocv_v)
-    meaning = (cell.cell.series_count, cell.cell.capacity_ah, settings.sensor.current_sign, *curve)
-    return hashlib.sha256(repr(meaning).encode()).hexdigest()
-
-
-def observer_identity(settings: Settings, cell: PackModel) -> str:
-    """Hash of what the observer's parameters and gain rest on; under other settings it begins anew, within seconds."""
-    parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
-    return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-
-def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
-    """Each field of a structured array, as a view, under its name; those of its parts as ``part.field``."""
-    for name in record.dtype.names or ():
-        if record[name].dtype.names:
-            yield from fields(record[name], f"{part}{name}.")
-        else:
-            yield f"{part}{name}", record[name]
-
-
-def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Of a state's fields by their names those that hold under other settings of the observer: all but its own."""
-    kept = "observer.soc", "observer.soc_coulomb", "observer.started"
-    dropped = "observer.", "learning.", "series_resistance."
-    return {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}
 
 
 @dataclass(frozen=True)

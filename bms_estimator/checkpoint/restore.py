@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.checkpoint_file import fields
+from bms_estimator.checkpoint.identity import fields
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS, keep
 from bms_estimator.kernels.kalman_filter.mixture import forget

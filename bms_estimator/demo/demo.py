@@ -13,15 +13,11 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.service.pack_service import serve
-from bms_estimator.settings.pack import (
-    MqttSettings,
-    ObserverSettings,
-    PackSettings,
-    PublishSettings,
-    SensorSettings,
-    Settings,
-)
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.observer import ObserverSettings
+from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings, parse_listen
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from bms_estimator.sinks.terminal.sink import ConsoleSink
 

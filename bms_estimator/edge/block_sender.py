@@ -32,7 +32,7 @@ from bms_estimator.mqtt.queue_sender import Sending
 from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.edge import EdgeSettings
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.store.database import RETRY_S, Database
 
 MIB = 1 << 20

@@ -9,7 +9,7 @@ from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
 from bms_estimator.kernels.observer.learning_model import Model
 from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
 from bms_estimator.model.cell import CellModel
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 
 MEMORY_S = 3600.0
 """Under load data are forgotten with this time constant [s]."""

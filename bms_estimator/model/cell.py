@@ -15,11 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from bms_estimator.model.config_file import Strict, read_toml
+from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml
 from bms_estimator.model.errors import UserError
-
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 
 ELEMENTS = {
     "r_ts": (1, "amplitude_ohm", "offset_ohm"),  # (2.5)

@@ -3,6 +3,9 @@
 import math
 import re
 
+PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
+"""What printed lines are made of."""
+
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 """A decimal number. Python's ``float`` also takes ``3_9`` for 39, other scripts' digits, ``nan`` and ``inf``."""
 NOT_MEASURED = frozenset({"nan", "inf", "infinity", "ovf"})

@@ -15,15 +15,13 @@ from pydantic import Field
 
 from bms_estimator.model.cell import (
     CellModel,
-    NotNegative,
-    Positive,
     Rated,
     existing,
     is_fuel_cell,
     load_cell,
     shipped_fuel_cells,
 )
-from bms_estimator.model.config_file import Strict, read_toml
+from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml
 from bms_estimator.model.errors import UserError
 
 Parameter = Literal[

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.credential import credential
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 

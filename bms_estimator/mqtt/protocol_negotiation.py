@@ -12,7 +12,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import Broker, password, tls_context
 from bms_estimator.mqtt.client import PATIENCE, Client, Patience, connected, may_know_3_1_1, refusal
 from bms_estimator.mqtt.connection import Hello, LinkError
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 
 
 class Dial:

@@ -16,7 +16,7 @@ from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.mqtt.topic_cache import Device, Heard, Published
 from bms_estimator.process.backoff import FIRST_DELAY_S
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 
 MOST_WAITING = 2000
 """Messages that wait to be read: a broker sends all that is retained at once, some twenty of each device."""

@@ -9,7 +9,7 @@ from bms_estimator.mqtt.topic_cache import Heard
 from bms_estimator.page.history_query import Past
 from bms_estimator.page.pack_topics import Hub
 from bms_estimator.page.page_server import PageServer
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.page import PageSettings
 
 

@@ -2,6 +2,11 @@
 
 import random
 
+FIRST_RETRY_S = 0.5
+"""Before a missing or lost port is tried again; doubles with each attempt [s]."""
+
+LONGEST_RETRY_S = 10.0
+
 FIRST_DELAY_S = 2.0
 """The first pause; doubles with each [s]."""
 LONGEST_DELAY_S = 30.0

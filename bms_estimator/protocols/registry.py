@@ -10,7 +10,7 @@ from bms_estimator.protocols.devices.junctek import JunctekDialect
 from bms_estimator.protocols.devices.pylontech import PylontechDialect
 from bms_estimator.protocols.devices.text import TextDialect
 from bms_estimator.protocols.devices.vedirect import VeDirectDialect
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 
 
 def _board(sensor: SensorSettings) -> Dialect:

@@ -14,14 +14,10 @@ from functools import cached_property
 
 import numpy as np
 
+from bms_estimator.calibration.cleaning.rests import rest_current_a, without_glitches
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv.points import pooled
-from bms_estimator.calibration.ocv.relaxation_test import (
-    RelaxationTest,
-    relaxation_test,
-    rest_current_a,
-    without_glitches,
-)
+from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, relaxation_test
 from bms_estimator.calibration.ocv.table_fit import TableFit, fit_table
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
 from bms_estimator.calibration.thesis.prediction import Prediction, predict, static_elements
@@ -39,7 +35,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 
 LOWEST_SOC = 0.05
 """Validation ends here: below, the elements and the open-circuit voltage run off (E14)."""

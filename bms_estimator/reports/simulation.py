@@ -25,7 +25,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Bounds, CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.reports import printed_values
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 
 STEP_S = 0.01
 """The thesis's 100 Hz."""

@@ -5,11 +5,8 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from bms_estimator.model.config_file import Strict
+from bms_estimator.model.config_file import Fraction, NotNegative, Positive, Strict
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
 AlarmName = Literal[
     "pack_over_voltage",
     "pack_under_voltage",

@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bms_estimator.settings.polled_source import Name, Positive, ReportSource
+from bms_estimator.model.config_file import Positive
+from bms_estimator.settings.polled_source import Name, ReportSource
 
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
 """One step of the voltage by chip, at its own pins: INA219 data sheet, ADS1015 at 4.096 V full scale [V]."""

@@ -6,10 +6,10 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from bms_estimator.model.config_file import Strict
+from bms_estimator.model.config_file import Positive, Strict
 from bms_estimator.settings.broker_url import of_brokers
 from bms_estimator.settings.mqtt_profiles import PROFILES, ProfileName
-from bms_estimator.settings.polled_source import Name, Positive, ReportSource
+from bms_estimator.settings.polled_source import Name, ReportSource
 
 Unit = Literal["V", "mV", "A", "mA", "C", "F", "K", "s", "ms", "iso"]
 UNITS: Mapping[str, tuple[Unit, ...]] = {

@@ -7,7 +7,6 @@ from pydantic import Field
 
 from bms_estimator.model.config_file import Strict
 
-Positive = Annotated[float, Field(gt=0)]
 Name = Annotated[str, Field(min_length=1)]
 
 

@@ -12,7 +12,7 @@ from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.mqtt.reconnect_loop import Link
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.simulation.virtual_adc import Reading
 
 INTERVAL_S = 2.0

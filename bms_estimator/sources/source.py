@@ -5,6 +5,9 @@ from typing import NamedTuple, Protocol, Self
 
 from bms_estimator.model.sample import CellBlock, SampleBlock
 
+Read = tuple[float, bytes]
+"""Arrival [s since 1970], bytes."""
+
 
 class Pulse(NamedTuple):
     """Whether what brings samples lives."""

@@ -32,7 +32,7 @@ from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings
+from bms_estimator.settings.observer import IdentifierSettings
 from tests.benchmarks.baselines import FIVE_TAU_S, five_branches, fixed_ekf, ladder_ekf
 from tests.benchmarks.pulses import pulse_table
 from tests.benchmarks.recipes import GROUPS, Group, charge_ah, chosen, runs

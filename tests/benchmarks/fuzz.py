@@ -49,7 +49,8 @@ from bms_estimator.protocols.devices.vedirect import VeDirectDialect
 from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
 from bms_estimator.protocols.firmware.protocol import BoardDialect
 from bms_estimator.protocols.registry import make_dialect
-from bms_estimator.settings.pack import SensorSettings, Settings, load_settings
+from bms_estimator.settings.pack import Settings, load_settings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.mqtt.requests import Requests, number
 from bms_estimator.sinks.terminal import text_line
 from bms_estimator.sinks.terminal.panels import View

@@ -17,7 +17,7 @@ from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 
 BLOCK = 65_536
 ROUNDS = 10

@@ -31,7 +31,7 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.numba_cache import njit
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 from tests.conftest import SHARED_DATA
 from tests.estimator.random_steps import (
     FIRST_SOC,

@@ -4,7 +4,7 @@ import numpy as np
 import pybamm
 import pybop
 
-from bms_estimator.calibration.ocv.relaxation_test import soc_by_counting
+from bms_estimator.calibration.cleaning.rests import soc_by_counting
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock

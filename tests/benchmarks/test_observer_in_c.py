@@ -10,7 +10,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 
 sys.path.insert(0, str(Path(__file__).parent))
 from load import CELL, pulses

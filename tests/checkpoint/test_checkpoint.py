@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, KEPT, CheckpointFile, Ledger, fields, pack_identity
+from bms_estimator.checkpoint.checkpoint_file import FORMAT, KEPT, CheckpointFile, Ledger
+from bms_estimator.checkpoint.identity import fields, pack_identity
 from bms_estimator.checkpoint.restore import resume
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.records import NODE, OFFSET

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, fields
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.identity import fields
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.model.cell import load_cell
 from bms_estimator.protocols.firmware.messages import ResetCause

@@ -9,7 +9,7 @@ from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 
 TRUTH = load_cell("chen_mora").model_copy(update={"adaptation": {}})
 """Bounds a quarter to four times the file's: those of Table 5 are not around a file that is wrong."""

@@ -11,7 +11,7 @@ from bms_estimator.estimator.identified_parameters import present_elements
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, RESISTANCES, STRONG_J, WEAK_J, arrhenius
 from bms_estimator.model.cell import Ladder, TableOcv, load_cell
-from bms_estimator.settings.pack import IdentifierSettings
+from bms_estimator.settings.observer import IdentifierSettings
 
 CELL = load_cell("ncr18650")
 

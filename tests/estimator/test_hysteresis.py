@@ -11,7 +11,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.kernels.kalman_filter.records import HYST
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings
+from bms_estimator.settings.observer import IdentifierSettings
 
 SOC = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.65, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0)
 OCV_V = (2.6, 2.95, 3.1, 3.19, 3.215, 3.235, 3.262, 3.274, 3.278, 3.282, 3.29, 3.308, 3.312, 3.315, 3.32, 3.335, 3.4)

@@ -11,7 +11,7 @@ from bms_estimator.kernels.kalman_filter.element_map import CAPACITANCES, ELEMEN
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 
 ON = IdentifierSettings()

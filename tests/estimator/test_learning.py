@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.telemetry.charge_energy import Flow
 from bms_estimator.telemetry.parameters import parameter_report
 from bms_estimator.telemetry.publish_window import Window

@@ -11,12 +11,12 @@ from bms_estimator.calibration.thesis.series_resistance import (
     series_resistance,
     summed,
 )
-from bms_estimator.checkpoint.checkpoint_file import fields, without_observer
+from bms_estimator.checkpoint.identity import fields, without_observer
 from bms_estimator.checkpoint.restore import resume
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.observer.series_resistance import BINS, MOST_SAMPLES
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.telemetry.parameters import parameter_report
 from tests.calibration.simulated_load import TRUTH, capture, steps
 

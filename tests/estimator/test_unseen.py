@@ -6,7 +6,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.input_faults import Suspect
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings
+from bms_estimator.settings.observer import IdentifierSettings
 from tests.estimator.simulated_cell import TRUTH, measured, pulses
 
 FULL_LOAD_A = 1.5 * TRUTH.cell.capacity_ah

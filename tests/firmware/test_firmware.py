@@ -32,7 +32,7 @@ from bms_estimator.protocols.firmware.messages import (
     set_serial_command,
     zero_current_command,
 )
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import aux_readings_of, window_of
 from bms_estimator.sources.serial.serial_source import SerialBoard
 from tests.firmware.host import Host

@@ -7,14 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.protocols.firmware.messages import (
-    AckResult,
-    MessageType,
-    Relay,
-    command,
-    relay_word,
-    set_relay_command,
-)
+from bms_estimator.protocols.base.device_protocol import Relay
+from bms_estimator.protocols.firmware.messages import AckResult, MessageType, command, relay_word, set_relay_command
 from tests.firmware.host import Host
 from tests.simavr_board import SimavrBoard, write_readings
 

@@ -12,7 +12,8 @@ from bms_estimator.estimator.stability_conditions import failed
 from bms_estimator.kernels.step import Verdict
 from bms_estimator.model.cell import TableOcv, generic_cells, load_cell, shipped_cells
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
+from bms_estimator.settings.pack import PackSettings, Settings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.replay import load_capture
 
 OHM_AH_10_S = {"lfp": 0.045, "nmc": 0.13, "nca": 0.13, "lco": 0.13, "lmo": 0.08, "lto": 0.016}

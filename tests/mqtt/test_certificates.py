@@ -13,7 +13,7 @@ import structlog
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import check, tls_context
 from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.requests import Requests
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox

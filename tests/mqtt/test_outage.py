@@ -10,7 +10,7 @@ import structlog
 
 from bms_estimator.mqtt.client import Patience
 from bms_estimator.mqtt.protocol_negotiation import Dial
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy, read_packet
 from tests.patience import LONG_S

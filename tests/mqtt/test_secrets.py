@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import check
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from tests.command_line import run
 
 SECRET = "s3cret"

@@ -11,7 +11,7 @@ import structlog
 
 from bms_estimator.mqtt.subscriber import MOST_BYTES, Subscriber
 from bms_estimator.mqtt.topic_cache import Heard
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S

@@ -20,7 +20,7 @@ from playwright.async_api import Browser
 from bms_estimator.model.payloads import Alarm
 from bms_estimator.mqtt.topic_cache import MAX_DEVICES
 from bms_estimator.page.broker_page import dashboard
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.page import PageSettings
 from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener

@@ -15,7 +15,8 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads import Health, Snapshot
 from bms_estimator.protocols.firmware.messages import MODULUS, Hello, SampleMessage
 from bms_estimator.service.live_loop import run_live
-from bms_estimator.settings.pack import PackSettings, PublishSettings, SensorSettings, Settings
+from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.serial_source import SerialBoard
 from tests.collector import Collector
 from tests.patience import LONG_S

@@ -20,7 +20,9 @@ from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.process.systemd import Notifier
 from bms_estimator.service.live_loop import LAG_STEP_S, new_estimator, run_live
-from bms_estimator.settings.pack import IdentifierSettings, PackSettings, PublishSettings, SensorSettings, Settings
+from bms_estimator.settings.observer import IdentifierSettings
+from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.mqtt.requests import Requests
 from bms_estimator.telemetry.rest_detector import WATCHED_S
 from tests.collector import Collector

@@ -13,7 +13,8 @@ from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.multi_pack_service import serve_several
 from bms_estimator.service.pack_service import serve
 from bms_estimator.service.settings_reload import Reload
-from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
+from bms_estimator.settings.pack import PackSettings, Settings
+from bms_estimator.settings.sensor import SensorSettings
 from tests.patience import LONG_S
 
 

@@ -12,7 +12,7 @@ from bms_estimator.service import publisher
 from bms_estimator.service.latency import Latency
 from bms_estimator.service.live_loop import run_live
 from bms_estimator.service.pack_service import recording_health
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import header_of
 from bms_estimator.sources.captures.recorder import Recording
 from bms_estimator.sources.serial.serial_port import Line

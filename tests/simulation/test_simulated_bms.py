@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SPREAD_V, BmsFault, SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.protocols.base.device_protocol import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameCounters, FrameDecoder
 from bms_estimator.protocols.firmware.messages import (
     AckResult,
     Channels,
     MessageType,
-    Relay,
     ResetCause,
     command,
     hello_command,
@@ -31,7 +31,7 @@ from bms_estimator.protocols.firmware.messages import (
     zero_current_command,
 )
 from bms_estimator.protocols.registry import make_dialect
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading, window_of
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
 from tests.patience import LONG_S

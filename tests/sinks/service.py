@@ -9,7 +9,7 @@ from typing import Any, Self
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.queue_sender import WINDOW
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.requests import NAMES, Requests
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox

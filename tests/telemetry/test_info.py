@@ -3,7 +3,8 @@
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.settings.pack import ObserverSettings, Settings
+from bms_estimator.settings.observer import ObserverSettings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.state import info_report
 
 

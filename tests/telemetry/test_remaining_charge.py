@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from bms_estimator.checkpoint.checkpoint_file import fields
+from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.restore import resume
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.settings.pack import IdentifierSettings
+from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.telemetry.health import identifier_counters, suspicions
 from bms_estimator.telemetry.parameters import parameter_report
 from bms_estimator.telemetry.remaining_charge import remaining_charge

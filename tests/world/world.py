@@ -19,15 +19,10 @@ import structlog
 from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointFile, Restored
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.service import pack_service as service
-from bms_estimator.settings.pack import (
-    IdentifierSettings,
-    MqttSettings,
-    PackSettings,
-    PublishSettings,
-    SensorSettings,
-    Settings,
-    StateSettings,
-)
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.observer import IdentifierSettings
+from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings, StateSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts
 from bms_estimator.sources.serial.board_check import HELD_READS, Doorkeeper
 from bms_estimator.sources.serial.known_board_file import BoardMemory

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bms_estimator.calibration.cleaning.clean_capture import Load
-from bms_estimator.calibration.ocv.relaxation_test import REST_CURRENT_C, SOC_SLACK, runs
+from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C, SOC_SLACK, runs
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel

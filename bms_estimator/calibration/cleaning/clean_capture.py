@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.ocv.relaxation_test import REST_CURRENT_C, without_glitches
+from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C, without_glitches
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, without_glitches
+from bms_estimator.calibration.cleaning.rests import without_glitches
+from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.model.cell import Capacitance, Resistance
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock

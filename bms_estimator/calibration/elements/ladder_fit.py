@@ -21,8 +21,8 @@ from scipy.interpolate import BSpline
 from scipy.optimize import lsq_linear
 
 from bms_estimator.calibration.cleaning.clean_capture import Load
+from bms_estimator.calibration.cleaning.rests import runs
 from bms_estimator.calibration.ocv.overpotential import arrhenius, hats
-from bms_estimator.calibration.ocv.relaxation_test import runs
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, WEAK_J
 from bms_estimator.model.arrays import Floats

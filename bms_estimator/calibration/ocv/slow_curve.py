@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
 
+from bms_estimator.calibration.cleaning.rests import SOC_SLACK, mean_temperature_c, resting_samples, runs
 from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
-from bms_estimator.calibration.ocv.relaxation_test import SOC_SLACK, mean_temperature_c, resting_samples, runs
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock

@@ -5,14 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bms_estimator.calibration.cleaning.rests import without_glitches
 from bms_estimator.calibration.ocv.overpotential import steady_drop
 from bms_estimator.calibration.ocv.points import Points, joined, points_of
-from bms_estimator.calibration.ocv.relaxation_test import (
-    RelaxationTest,
-    initial_rest_v,
-    relaxation_test,
-    without_glitches,
-)
+from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v, relaxation_test
 from bms_estimator.calibration.ocv.slow_curve import (
     GRID,
     Branch,

@@ -7,9 +7,9 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import contradictions
 from bms_estimator.calibration.cleaning.clean_capture import Load, whole_load
+from bms_estimator.calibration.cleaning.rests import without_glitches
 from bms_estimator.calibration.elements.identify import NO_WORSE, initial_soc
 from bms_estimator.calibration.elements.replay_score import interval_score
-from bms_estimator.calibration.ocv.relaxation_test import without_glitches
 from bms_estimator.calibration.thesis.adapt_steps import AdaptedElements, Start, steps_2_and_3
 from bms_estimator.calibration.thesis.prediction import predict
 from bms_estimator.calibration.thesis.printed_bounds import printed_bounds

@@ -20,7 +20,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 
 VOLTAGE_STEP_V = 1e-3
 """Resolution of the voltage when the capture's is not known [V]."""

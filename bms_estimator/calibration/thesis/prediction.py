@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.ocv.relaxation_test import soc_by_counting, without_glitches
+from bms_estimator.calibration.cleaning.rests import soc_by_counting, without_glitches
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.kernels.cell_model.margins import delta

@@ -15,11 +15,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.calibration.cleaning.rests import without_glitches
 from bms_estimator.calibration.elements.generic_prior import curve, ladder_of, most_alike
 from bms_estimator.calibration.elements.initial_elements import rest_elements
 from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv.points import Points, max_v, rms_v
-from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, without_glitches
+from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.calibration.ocv.sources import (
     GivenCurve,
     Recording,

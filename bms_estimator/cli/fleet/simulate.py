@@ -18,7 +18,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.text_file import write_text
 from bms_estimator.mqtt.broker_config import check
 from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.settings.pack import DeviceName, MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.pack import DeviceName
 
 MOST_PACKS = 999_999
 """Their names have six digits."""

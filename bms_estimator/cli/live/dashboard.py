@@ -13,7 +13,8 @@ from bms_estimator.page.broker_page import dashboard as serving
 from bms_estimator.process.log_setup import configure_logs, drained
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.settings.pack import MqttSettings, Settings, load_settings
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
 
 

@@ -15,7 +15,8 @@ from bms_estimator.mqtt.subscriber import Subscriber
 from bms_estimator.mqtt.topic_cache import Heard
 from bms_estimator.process.log_setup import configure_logs, drained
 from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.settings.pack import MqttSettings, Settings, load_settings
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks.terminal.live_view import LiveView
 from bms_estimator.sinks.terminal.panels import LOG_LINES
 from bms_estimator.sinks.terminal.scene import Lost

@@ -8,7 +8,9 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
 from bms_estimator.model.secret import without_secrets
-from bms_estimator.settings.pack import MqttSettings, PackSettings, SensorSettings, Settings, load_settings
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.pack import PackSettings, Settings, load_settings
+from bms_estimator.settings.sensor import SensorSettings
 
 TABLE_RESOLUTION_V = 1e-3
 """What a capture resolves when no pack file says otherwise: laboratory equipment's millivolt [V]."""

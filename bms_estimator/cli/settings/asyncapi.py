@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.asyncapi import document
 
 

@@ -25,8 +25,10 @@ from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.settings.alarm_limits import out_of_range, watched
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings
-from bms_estimator.settings.pack import MqttSettings, SensorSettings, Settings
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.page import PageSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.exports.influx import target
 from bms_estimator.sources.factory import make_bringer
 from bms_estimator.sources.serial.device_detection import Found

@@ -16,8 +16,10 @@ from nats.aio.client import Client
 from nats.aio.transport import TcpTransport
 
 from bms_estimator.fleet.nats.reasons import reason
-from bms_estimator.fleet.server.nats_config import LET_IN_S
 from bms_estimator.model.errors import UserError
+
+LET_IN_S = 10
+"""So long each step of letting somebody in may take, on a far line or while many come back at once. The server's own is 2 [s]."""
 
 RETRY_S = 1
 """Between two attempts to connect [s]."""

@@ -15,18 +15,11 @@ from bms_estimator.model.cell import (
     shipped_fuel_cells,
     with_capacity,
 )
-from bms_estimator.model.config_file import Strict, parse_toml
+from bms_estimator.model.config_file import Fraction, NotNegative, Positive, Strict, parse_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
-from bms_estimator.settings.pack import (
-    DeviceName,
-    Fraction,
-    NotNegative,
-    PackSettings,
-    Positive,
-    SensorSettings,
-    Settings,
-)
+from bms_estimator.settings.pack import DeviceName, PackSettings, Settings
+from bms_estimator.settings.sensor import SensorSettings
 
 Protocol = Literal["text", "jbd", "daly", "jk", "vedirect", "junctek", "pylontech"]
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"

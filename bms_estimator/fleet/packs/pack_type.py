@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.checkpoint_file import pack_identity
+from bms_estimator.checkpoint.identity import pack_identity
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.model.cell import CellModel

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.connection import LET_IN_S
 
 NATS_PORT, MQTT_PORT, MONITOR_PORT, CLUSTER_PORT = 4222, 1883, 8222, 6222
 """As NATS has them; the monitor, which asks nobody for a name, stays on the loopback."""
@@ -17,8 +18,6 @@ LONGEST_BLOCK_BYTES = 1 << 20
 """Of a message: a block of 60 samples takes 700 bytes, one of a whole day at 1 Hz less than this."""
 MOST_CONNECTIONS = 200_000
 """Of a node: where two of three are away, one has all edges. The server's own limit is 65,536."""
-LET_IN_S = 10
-"""So long each step of letting somebody in may take, on a far line or while many come back at once. The server's own is 2 [s]."""
 
 
 @dataclass(frozen=True)

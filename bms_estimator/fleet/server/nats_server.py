@@ -22,11 +22,11 @@ import structlog
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
-from bms_estimator.fleet.nats.connection import part
+from bms_estimator.fleet.nats.connection import LET_IN_S, part
 from bms_estimator.fleet.nats.streams import NoAnswerError, make_streams
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
-from bms_estimator.fleet.server.nats_config import LET_IN_S, Accounts, Cluster, Node, Tls, configuration
+from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us
 from bms_estimator.process.credential import credential

@@ -20,7 +20,7 @@ from bms_estimator.edge.subjects import Awaits, awaits, raw
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.mqtt.broker_config import brokers, password, tls_context
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 
 ROUND_S = 0.1
 """From one look at what is due to the next [s]."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.checkpoint_file import fields, without_observer
+from bms_estimator.checkpoint.identity import fields, without_observer
 from bms_estimator.checkpoint.restore import resume
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator

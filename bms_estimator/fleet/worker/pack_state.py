@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.checkpoint_file import fields
+from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.restore import fill
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS

@@ -8,9 +8,6 @@ from typing import NamedTuple
 
 from bms_estimator.model.decimal_text import NUMBER, measured, number
 
-PRINTABLE = b"\t\r\n" + bytes(range(0x20, 0x7F))
-"""What printed lines are made of."""
-
 
 class Reading(NamedTuple):
     """What one line says."""

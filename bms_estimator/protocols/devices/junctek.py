@@ -9,8 +9,9 @@ same line: its answers are as good.
 import math
 from collections.abc import Iterator
 
+from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.reading import PRINTABLE, Reading
+from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import MeterDialect
 
 ADDRESS = 1

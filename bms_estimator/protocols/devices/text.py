@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import (
     LEAST_C,
     LEAST_CELL_V,
@@ -17,7 +18,7 @@ from bms_estimator.model.sample import (
 )
 from bms_estimator.protocols.base.device_clock import ToldClock
 from bms_estimator.protocols.base.device_protocol import Dialect, cell_block
-from bms_estimator.protocols.base.reading import PRINTABLE, Reading, read_line
+from bms_estimator.protocols.base.reading import Reading, read_line
 
 LINE_BYTES = 4096
 """A longer line is noise: 400 cells of seven characters fit."""

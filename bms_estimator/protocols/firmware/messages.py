@@ -8,9 +8,11 @@ import math
 import struct
 from dataclasses import dataclass, fields
 from enum import IntEnum, IntFlag
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, Self
 
 from cobs import cobs
+
+from bms_estimator.protocols.base.device_protocol import Relay
 
 PROTOCOL_VERSION = 1
 BAUD = 500_000
@@ -152,16 +154,6 @@ def set_current_slope_command(volts_per_ampere: float) -> bytes:
 def set_ratiometric_command(ratiometric: int) -> bytes:
     """Tell the board whether its current sensor's slope is proportional to the supply: 0 or 1, for good."""
     return command(MessageType.COMMAND_SET_RATIOMETRIC, struct.pack("<I", ratiometric))
-
-
-class Relay(NamedTuple):
-    """Level of the relay pin, until the next reset."""
-
-    high: bool
-    high_when_silent: bool | None
-    """Level once no command of this kind has come for ``silent_s``; None: it stays as it is."""
-    silent_s: int = 0
-    """0..3600."""
 
 
 RELAY_KEEP, RELAY_LOW, RELAY_HIGH = range(3)

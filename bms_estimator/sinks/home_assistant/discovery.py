@@ -8,7 +8,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import FRESH_PERIODS, Info
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Command
+from bms_estimator.settings.mqtt import Command
+from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ
 from bms_estimator.sinks.home_assistant.entities import BATTERY, CELL, FUEL_CELL, OF_CELLS, Entity, cell_key, entities
 
 VALUES = "home_assistant"

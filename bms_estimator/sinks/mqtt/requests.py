@@ -15,7 +15,7 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.settings.pack import Command
+from bms_estimator.settings.mqtt import Command
 
 COMMANDS = get_args(Command)
 NAMES = ("state", "parameters", "health", *COMMANDS)

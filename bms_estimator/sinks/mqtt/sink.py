@@ -25,7 +25,7 @@ from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.availability import ECHO_S, Availability
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, Messages, Sent
 from bms_estimator.sinks.mqtt.requests import MOST_SHOWN, Requests

@@ -14,7 +14,7 @@ from bleak.exc import BleakError
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.report_line import CONNECTED, report_line
 from bms_estimator.settings.ble_source import BleSource
-from bms_estimator.sources.bluetooth.source import reading_of
+from bms_estimator.sources.bluetooth.bms_sample import reading_of
 from bms_estimator.sources.line_source import Bringer, NothingComesError
 
 SCAN_S = 15.0

@@ -1,52 +1,14 @@
 """A BMS over Bluetooth: what its sample says, and whether this Python can ask it. Does no I/O."""
 
-import math
 import sys
-from collections.abc import Iterable, Mapping
-from statistics import fmean
-from typing import Any
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import Bringer
 
 NEEDED_PYTHON = 0x030C0000
 """3.12, as aiobmsble needs it."""
-
-
-def reading_of(sample: Mapping[str, Any]) -> Reading | None:
-    """What a ``BMSSample`` of aiobmsble says, charge positive as it is there; None where it tells no voltage or no current."""
-    voltage_v, current_a = _number(sample.get("voltage")), _number(sample.get("current"))
-    if math.isnan(voltage_v) or math.isnan(current_a):
-        return None
-    cells_v = tuple(_number(cell) for cell in sample.get("cell_voltages", ()))
-    return Reading(voltage_v, current_a, _temperature(sample), cells_v)
-
-
-def _temperature(sample: Mapping[str, Any]) -> float:
-    """Mean of the sensors on cells; where none is called so, the temperature of the BMS, or the mean of all sensors [degC]."""
-    sensors = sample.get("temp_values", ())
-    on_cells = [sensor for sensor in sensors if getattr(getattr(sensor, "type", None), "name", "") == "CELL"]
-    if not on_cells and "temperature" in sample:
-        return _number(sample["temperature"])
-    return _mean(_number(sensor) for sensor in on_cells or sensors)
-
-
-def _mean(values: Iterable[float]) -> float:
-    """Of those that are numbers; NaN where none is."""
-    numbers = [value for value in values if not math.isnan(value)]
-    return fmean(numbers) if numbers else math.nan
-
-
-def _number(value: Any) -> float:
-    """NaN where it is none."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        return math.nan
-    return number if math.isfinite(number) else math.nan
 
 
 def bringer(settings: Settings) -> Bringer:

@@ -35,8 +35,8 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.pack import SensorSettings
 from bms_estimator.settings.polled_source import ReportSource
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES, split_records
 
 MAGIC = b"BMSRAW1\n"

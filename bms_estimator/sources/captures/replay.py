@@ -15,7 +15,7 @@ from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, CurrentSign, SampleBlock
 from bms_estimator.protocols.registry import make_dialect
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, sensor_of
 from bms_estimator.sources.captures.tables import READERS, ByName, Sign, samples_of, table_reader

@@ -15,8 +15,9 @@ from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError,
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.mqtt_source import MqttSource
-from bms_estimator.settings.pack import MqttSettings, Settings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import Bringer, NothingComesError
 from bms_estimator.sources.mqtt.sample_assembler import Assembly
 

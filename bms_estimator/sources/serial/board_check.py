@@ -12,7 +12,7 @@ import structlog
 
 from bms_estimator.protocols.base.device_protocol import Dialect
 from bms_estimator.sources.serial.known_board_file import NO_BOARD, REMEMBERED, BoardMemory
-from bms_estimator.sources.serial.serial_port import Read
+from bms_estimator.sources.source import Read
 
 HELD_READS = 4096
 """So many reads are kept for a board that has not told its serial number yet: seconds at any rate."""

@@ -13,7 +13,7 @@ from bms_estimator.protocols.firmware.frame_decoder import FrameFault
 from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command
 from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardDialect
 from bms_estimator.protocols.registry import DIALECTS
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
 
 if TYPE_CHECKING:

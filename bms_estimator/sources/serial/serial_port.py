@@ -12,18 +12,15 @@ from typing import TYPE_CHECKING
 import structlog
 
 from bms_estimator.model.clock import since_boot
+from bms_estimator.process.backoff import FIRST_RETRY_S, LONGEST_RETRY_S
 from bms_estimator.sources.serial.port_list import HeldPortError, NoPortError
+from bms_estimator.sources.source import Read
 
 if TYPE_CHECKING:
     import serial
 
-FIRST_RETRY_S = 0.5
-"""Before a missing or lost port is tried again; doubles with each attempt [s]."""
-LONGEST_RETRY_S = 10.0
 READ_BYTES = 1 << 16
 
-Read = tuple[float, bytes]
-"""Arrival [s since 1970], bytes."""
 
 log = structlog.get_logger(__name__)
 

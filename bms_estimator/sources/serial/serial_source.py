@@ -12,17 +12,17 @@ import structlog
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
-from bms_estimator.protocols.base.device_protocol import Command, Dialect
-from bms_estimator.protocols.firmware.messages import Relay
+from bms_estimator.process.backoff import FIRST_RETRY_S
+from bms_estimator.protocols.base.device_protocol import Command, Dialect, Relay
 from bms_estimator.protocols.registry import make_dialect
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.serial.board_check import Doorkeeper, OtherBoardError
 from bms_estimator.sources.serial.known_board_file import BoardMemory
 from bms_estimator.sources.serial.port_discovery import HELD_S, LEFT_S, Whereabouts
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
-from bms_estimator.sources.serial.serial_port import FIRST_RETRY_S, Line, Read
-from bms_estimator.sources.source import Pulse, Tap
+from bms_estimator.sources.serial.serial_port import Line
+from bms_estimator.sources.source import Pulse, Read, Tap
 
 if TYPE_CHECKING:
     import serial

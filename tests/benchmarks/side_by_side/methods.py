@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from bms_estimator.calibration.ocv.relaxation_test import soc_by_counting
+from bms_estimator.calibration.cleaning.rests import soc_by_counting
 from bms_estimator.calibration.thesis.adapt_steps import Start, steps_2_and_3
 from bms_estimator.calibration.thesis.prediction import open_circuit, predict
 from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
@@ -23,7 +23,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from tests.benchmarks.baselines import fixed_ekf, joint_ekf, rls_arx, simulate_arx
 
 Reader = Callable[[Estimator, CellModel], Floats]

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
-from bms_estimator.calibration.ocv.relaxation_test import resting_samples, runs
+from bms_estimator.calibration.cleaning.rests import resting_samples, runs
 from bms_estimator.model.arrays import Floats
 from tests.benchmarks.pulses import AROUND, pulses
 from tests.benchmarks.side_by_side.trials import Block

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bms_estimator.calibration.cleaning.rests import without_glitches
 from bms_estimator.calibration.elements.two_branch_fit import sections
-from bms_estimator.calibration.ocv.relaxation_test import without_glitches
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius, weak_share
 from bms_estimator.model.arrays import Floats

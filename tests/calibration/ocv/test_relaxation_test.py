@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bms_estimator.calibration.cleaning.rests import soc_by_counting, without_glitches
 from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora
 from bms_estimator.calibration.ocv.points import pooled
-from bms_estimator.calibration.ocv.relaxation_test import relaxation_test, soc_by_counting, without_glitches
+from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.model.errors import UserError

@@ -11,7 +11,7 @@ from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.model.cell import Bounds, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.simulation import discharge, with_bounds
-from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 
 CELL = load_cell("chen_mora")
 SMALL = [1, 3, 6, 13, 15]

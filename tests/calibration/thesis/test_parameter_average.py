@@ -9,7 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.simulation import discharge
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 
 CELL = load_cell("chen_mora")
 SETTINGS = ObserverSettings.model_validate({"dead_zone_v": 0.0, "rearm_gain": None, "epsilon_v": 1e-3})

@@ -20,7 +20,8 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import load_any
 from bms_estimator.model.payloads import Estimate, ParameterReport
 from bms_estimator.service.live_loop import new_estimator
-from bms_estimator.settings.pack import IdentifierSettings, ObserverSettings, PackSettings, Settings
+from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.sources.captures.replay import Replay
 from tests.estimator.simulated_cell import pulses
 from tests.fleet.an_edge import CELL, SETTINGS, STORE, Stream, blocks_of, deliver, one_block, table

@@ -17,7 +17,7 @@ from bms_estimator.kernels.kalman_filter.mixture import combine, merge, unite
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.settings.pack import IdentifierSettings
+from bms_estimator.settings.observer import IdentifierSettings
 from tests.estimator.anywhere.cases import CASES, Case, capture
 
 CELL = load_cell("nmc", 3.0)

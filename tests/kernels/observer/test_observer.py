@@ -12,7 +12,7 @@ from bms_estimator.kernels.observer import observer
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.settings.pack import ObserverSettings
+from bms_estimator.settings.observer import ObserverSettings
 
 PRINTED_LAW = ObserverSettings(dead_zone_v=0.0, rearm_gain=None)
 

@@ -13,7 +13,7 @@ from bms_estimator.protocols.base.polled_protocol import GAP_S, PACE_S, UNANSWER
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.daly import sealed
 from bms_estimator.protocols.registry import make_dialect
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from tests.protocols import bms_frames as frames
 from tests.protocols.bms_frames import PUBLISHED, Published
 

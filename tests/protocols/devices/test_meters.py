@@ -16,7 +16,7 @@ from bms_estimator.protocols.devices.junctek import ASK, JunctekDialect
 from bms_estimator.protocols.devices.pylontech import PylontechDialect
 from bms_estimator.protocols.devices.vedirect import VeDirectDialect
 from bms_estimator.protocols.registry import make_dialect
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial.serial_source import SerialBoard

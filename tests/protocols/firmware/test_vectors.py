@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from bms_estimator.protocols.base.device_protocol import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import (
     Ack,
@@ -14,7 +15,6 @@ from bms_estimator.protocols.firmware.messages import (
     Hello,
     MessageType,
     ProtocolError,
-    Relay,
     SampleMessage,
     command,
     hello_command,

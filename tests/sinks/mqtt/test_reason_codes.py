@@ -10,7 +10,7 @@ import structlog
 
 from bms_estimator.mqtt.delivery_stats import Delivery
 from bms_estimator.mqtt.queue_sender import WINDOW
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.requests import Requests
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox

@@ -22,7 +22,7 @@ from bms_estimator.mqtt.protocol_negotiation import Dial
 from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING, Inbox
 from bms_estimator.mqtt.reconnect_loop import Link
 from bms_estimator.process.backoff import LONGEST_DELAY_S
-from bms_estimator.settings.pack import MqttSettings
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.availability import CORRECTION_S
 from bms_estimator.sinks.mqtt.requests import Requests
 from bms_estimator.sinks.mqtt.sink import MqttSink

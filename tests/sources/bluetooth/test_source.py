@@ -9,7 +9,8 @@ from pydantic import ValidationError
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.bluetooth.source import NEEDED_PYTHON, reading_of
+from bms_estimator.sources.bluetooth.bms_sample import reading_of
+from bms_estimator.sources.bluetooth.source import NEEDED_PYTHON
 from bms_estimator.sources.factory import open_reports
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter, read_capture
 from bms_estimator.sources.captures.recorder import Recording
 from bms_estimator.sources.serial.serial_source import SerialBoard

@@ -10,7 +10,7 @@ from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.framing import LONGEST_DOUBT_S
 from bms_estimator.protocols.firmware.messages import Hello, hello_command
 from bms_estimator.protocols.firmware.protocol import BoardDialect
-from bms_estimator.settings.pack import SensorSettings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.board_check import HELD_READS, Doorkeeper, OtherBoardError

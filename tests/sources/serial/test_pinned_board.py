@@ -21,7 +21,8 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.service.pack_service import serve
-from bms_estimator.settings.pack import PackSettings, SensorSettings, Settings
+from bms_estimator.settings.pack import PackSettings, Settings
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import board_check, port_list, serial_source

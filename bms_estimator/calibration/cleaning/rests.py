@@ -1,0 +1,105 @@
+"""Samples without glitches, and the samples at rest among them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+
+GLITCH_FRACTION = 0.5
+"""A voltage off the median by more than this fraction is a fault of the instrument: no Li-ion cell swings so far."""
+MOST_BACK = 0.1
+"""Part of the samples that may lie before others in time: a clock that is set back by a little."""
+LEAST_GOOD = 0.5
+"""With a smaller share of good voltages nobody knows which ones are the faults."""
+REST_CURRENT_C = 0.01
+"""Below this C-rate a cell rests [1/h]: a hundredth of 1C moves SOC by 0.25 % in a quarter of an hour."""
+NOISE_STDS, NOISE_STEP_C = 6.0, 0.1
+"""A current within so many standard deviations of its noise is none; noise is what changes by less than this C-rate from
+sample to sample [1/h]."""
+BLIP_CHARGE = 2e-5
+"""Charge, in capacities, below which a current within a rest is a glitch of the sensor, not a load."""
+SOC_SLACK = 0.03
+"""How far SOC may leave 0..1 before the capacity is called wrong: cells of one type differ by as much."""
+
+
+def without_glitches(samples: SampleBlock, name: str) -> SampleBlock:
+    """Samples that can be true: finite, time going on, voltage within half of the median of those above 0 V.
+
+    Raises:
+        UserError: Nothing is left, most voltages are glitches, or time goes back and goes on from there.
+    """
+    finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
+    good = samples[finite]
+    if good.size == 0:
+        raise UserError(f"{name}: none of {samples.size} samples has finite time, current and voltage")
+    alive_v = good["voltage_v"][good["voltage_v"] > 0.0]
+    if alive_v.size == 0:
+        raise UserError(
+            f"{name}: none of {samples.size} samples has a voltage above 0 V, the largest is {good['voltage_v'].max():g} V"
+        )
+    middle = float(np.median(alive_v))
+    off = np.abs(good["voltage_v"] - middle) > GLITCH_FRACTION * middle
+    if off.mean() > 1.0 - LEAST_GOOD:
+        first = good[int(np.argmax(off))]
+        raise UserError(
+            f"{name}: {off.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
+            f"{first['voltage_v']:.3f} V where the median is {middle:.3f} V: look at the sensor's wiring"
+        )
+    good = good[~off]
+    latest = np.maximum.accumulate(good["time_s"])
+    back = good["time_s"] < latest
+    if back.mean() > MOST_BACK:
+        first = int(np.argmax(back))
+        raise UserError(
+            f"{name}: time goes back {(np.diff(good['time_s']) < 0.0).sum()} times, first from {latest[first]:g} to "
+            f"{good['time_s'][first]:g} s, and {back.sum()} of {samples.size} samples lie before others: these are several "
+            "captures, or a clock was set; nobody knows what happened between them: give each stretch a file of its own"
+        )
+    later = np.r_[True, good["time_s"][1:] > latest[:-1]]
+    kept: SampleBlock = good[later]
+    return kept
+
+
+def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:
+    """SOC at every sample by coulomb counting, (2.1): 1 - Ah/Q from full.
+
+    A current holds until the next sample. Shape (n,), not limited to 0..1.
+    """
+    step_s = np.diff(samples["time_s"])
+    charge_ah = np.r_[0.0, np.cumsum(samples["current_a"][:-1] * step_s)] / 3600.0
+    return np.asarray(initial_soc - charge_ah / capacity_ah, dtype=np.float64)
+
+
+def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
+    """Which samples belong to a rest; blips of the current sensor do not end one."""
+    resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
+    time_s = good["time_s"]
+    for first, last in runs(~resting):
+        until_s = time_s[min(last, good.size - 1)]
+        charge_ah = abs(float(good["current_a"][first:last].mean())) * (until_s - time_s[first]) / 3600.0
+        if charge_ah < BLIP_CHARGE * capacity_ah:
+            resting[first:last] = True
+    return resting
+
+
+def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
+    """Below this a cell rests: a small C-rate, or what the sensor's noise reaches, but never half a load [A]."""
+    change_a = np.diff(current_a)
+    small_a = change_a[np.abs(change_a) < NOISE_STEP_C * capacity_ah]
+    noise_a = float(np.sqrt(np.mean(small_a**2) / 2.0)) if small_a.size else 0.0
+    half_load_a = 0.5 * float(np.quantile(np.abs(current_a), 0.95))
+    return max(REST_CURRENT_C * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
+
+
+def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Stretches where ``mask`` holds, each as first and one past its last index."""
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def mean_temperature_c(samples: SampleBlock) -> float:
+    """Mean temperature where it is told [C], else NaN."""
+    told = samples["temperature_c"][np.isfinite(samples["temperature_c"])]
+    return float(told.mean()) if told.size else float("nan")

@@ -1,0 +1,50 @@
+"""Identity of a checkpoint: the pack and the settings whose state it holds."""
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.cell import ChenMoraOcv
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.settings.pack import Settings
+
+
+def pack_identity(settings: Settings, cell: PackModel) -> str:
+    """Hash of what gives the state its meaning: cells in series, capacity, open-circuit voltage, sign of the current.
+
+    Of a fuel cell: all its parameters and the sign.
+
+    Plain numbers and not the sections of the settings: a description, a tuning value or a setting that a later version
+    adds leave the meaning as it is.
+    """
+    if isinstance(cell, FuelCellModel):  # theta is over the file's values
+        return hashlib.sha256(repr((*cell.a, settings.sensor.current_sign)).encode()).hexdigest()
+    ocv = cell.ocv
+    curve = ocv.a if isinstance(ocv, ChenMoraOcv) else (*ocv.soc, *ocv.ocv_v)
+    meaning = (cell.cell.series_count, cell.cell.capacity_ah, settings.sensor.current_sign, *curve)
+    return hashlib.sha256(repr(meaning).encode()).hexdigest()
+
+
+def observer_identity(settings: Settings, cell: PackModel) -> str:
+    """Hash of what the observer's parameters and gain rest on; under other settings it begins anew, within seconds."""
+    parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+    """Each field of a structured array, as a view, under its name; those of its parts as ``part.field``."""
+    for name in record.dtype.names or ():
+        if record[name].dtype.names:
+            yield from fields(record[name], f"{part}{name}.")
+        else:
+            yield f"{part}{name}", record[name]
+
+
+def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Of a state's fields by their names those that hold under other settings of the observer: all but its own."""
+    kept = "observer.soc", "observer.soc_coulomb", "observer.started"
+    dropped = "observer.", "learning.", "series_resistance."
+    return {name: v for name, v in state.items() if name in kept or not name.startswith(dropped)}

@@ -1,0 +1,54 @@
+"""``[mqtt]``: the broker."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+
+from bms_estimator.model.config_file import Strict
+from bms_estimator.settings.broker_url import of_brokers
+
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate"]
+"""A request that changes something."""
+
+
+class MqttSettings(Strict):
+    """The broker, and what others may have done over it."""
+
+    model_config = ConfigDict(hide_input_in_errors=True)
+
+    url: Annotated[str | tuple[str, ...], AfterValidator(of_brokers)] = Field(
+        default="mqtt://localhost:1883",
+        description="mqtt://host:port or mqtts://host:port for TLS; or a list of them, tried in turn",
+    )
+    username: str | None = None
+    password_file: Path | None = Field(
+        default=None,
+        description="file that holds the password, read at start; a name alone: systemd's credential of this name",
+    )
+    ca_file: Path | None = Field(default=None, description="certificate authority for mqtts, else the system's")
+    cert_file: Path | None = Field(
+        default=None, description="our own certificate for mqtts, PEM, where the broker asks for one; as password_file"
+    )
+    key_file: Path | None = Field(
+        default=None, description="its key, PEM, not encrypted; in cert_file when left out; as password_file"
+    )
+    base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
+        default="bms", description="first part of all topics: no +, # or spaces, no / at either end"
+    )
+    commands: tuple[Command, ...] = Field(
+        default=(), description="requests that change something and may be made by whoever may publish; none by default"
+    )
+
+    @property
+    def urls(self) -> tuple[str, ...]:
+        """The addresses of all brokers."""
+        return (self.url,) if isinstance(self.url, str) else self.url
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_publish_rate(cls, table: object) -> object:
+        """The rate stood here once."""
+        if isinstance(table, dict) and "publish_rate_hz" in table:
+            raise ValueError("publish_rate_hz is now called rate_hz and stands in the section [publish]")
+        return table
