@@ -30,9 +30,10 @@ $(READY): requirements.lock pyproject.toml
 apt: ## the Debian packages of the tests: installs what is missing when allowed, else names it
 	@.ci/apt $(APT)
 
-check: venv ## style and types, in seconds
+check: venv ## style, import order of the layers, and types, in seconds
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/lint-imports --no-logo
 	$(BIN)/mypy
 
 test: apt venv ## all there is to check: packages, style, types, firmware, pytest
