@@ -2,14 +2,16 @@
 
 import asyncio
 import sys
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Self
 
 from bms_estimator.demo.board import running_board
 from bms_estimator.demo.broker import LOOPBACK, DemoBroker, choose_port
-from bms_estimator.demo.totals import Totals
 from bms_estimator.demo.true_soc import Truth
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.service.pack_service import serve
@@ -19,6 +21,7 @@ from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings, parse_listen
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
+from bms_estimator.sinks.terminal.panels import BAND_STDS
 from bms_estimator.sinks.terminal.sink import ConsoleSink
 
 CELL = "chen_mora"
@@ -87,3 +90,43 @@ def _settings(path: str, url: str, page: str, rate_hz: int) -> Settings:
         mqtt=MqttSettings(url=url),
         page=PageSettings(listen=page),
     )
+
+
+class Totals:
+    """A sink that remembers the last estimate, and how far it was from the truth.
+
+    Args:
+        first_error: Of the SOC that the estimator was told, 0..1.
+        true_soc: The pack's SOC 0..1 at the last sample.
+    """
+
+    def __init__(self, first_error: float, true_soc: Callable[[], float]) -> None:
+        self._first_error, self._true_soc = first_error, true_soc
+        self._last: Estimate | None = None
+        self._last_true_soc = 0.0
+        self._started_s = time.monotonic()
+
+    async def __aenter__(self) -> Self:
+        """Nothing to open."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Nothing to close."""
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Take a snapshot."""
+        if snapshot.estimate is not None:
+            self._last, self._last_true_soc = snapshot.estimate, self._true_soc()
+
+    def summary(self) -> str:
+        """The run in a line."""
+        e, elapsed_s = self._last, time.monotonic() - self._started_s
+        if e is None or e.soc is None or e.soc_std is None:
+            return f"{elapsed_s:.1f} s, no sample came"
+        error, band = e.soc - self._last_true_soc, BAND_STDS * e.soc_std
+        inside = "inside" if abs(error) <= band else "outside"
+        return (
+            f"{elapsed_s:.1f} s: {e.frames_received:,} frames, {e.frames_lost} lost, {e.crc_errors} CRC errors; "
+            f"SOC at first {self._first_error:+.2%} wrong, at last {error:+.2%}: the truth {self._last_true_soc:.2%} lies "
+            f"{inside} {e.soc:.2%} ± {band:.2%} (2 std); {'lock' if e.lock else 'no lock'}"
+        )

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, delta
 from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
 from bms_estimator.kernels.observer.learning_model import Model
 from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS

@@ -5,7 +5,7 @@
 
 import math
 
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.kernels.kalman_filter.ekf import predict
 from bms_estimator.kernels.kalman_filter.element_map import CAPACITANCES, ELEMENTS, age, fit_element, fit_within, learn
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import (

@@ -1,5 +1,6 @@
 """Reading a TOML file into a pydantic model, with errors that name file, key, value and what is allowed."""
 
+import re
 import tomllib
 from difflib import get_close_matches
 from pathlib import Path
@@ -15,7 +16,6 @@ from pydantic import (
 from pydantic_core.core_schema import CoreSchema, no_info_before_validator_function
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.secret import without_secrets
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -187,3 +187,27 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models(part)]
+
+
+def without_secrets(text: str) -> str:
+    """Text of a URL, or of several, without what stands before the last @: a name and a password, however it is written."""
+    return re.sub(r".*@", "***@", text, flags=re.DOTALL)
+
+
+def write_text(path: Path, text: str, *, make_folder: bool = False) -> None:
+    """Write a file anew, in UTF-8.
+
+    Args:
+        path: Whatever is there.
+        text: All of it.
+        make_folder: Whether its folder is made where there is none.
+
+    Raises:
+        UserError: It cannot be written.
+    """
+    try:
+        if make_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8", newline="")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.credential import credential
+from bms_estimator.process.systemd import credential
 from bms_estimator.settings.mqtt import MqttSettings
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}

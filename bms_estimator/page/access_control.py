@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.credential import credential
+from bms_estimator.process.systemd import credential
 from bms_estimator.settings.page import PageSettings
 
 SHORTEST_TOKEN = 16

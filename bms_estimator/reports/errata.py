@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 from bms_estimator.estimator.stability_conditions import Condition, lemma_conditions
-from bms_estimator.kernels.cell_model.chen_mora import emf
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import delta, emf
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.reports import printed_pack, printed_values
 from bms_estimator.reports.quasi_steady import quasi_steady

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import delta, emf, r_s
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values

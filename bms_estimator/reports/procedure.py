@@ -20,7 +20,7 @@ from bms_estimator.calibration.ocv.points import pooled
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, relaxation_test
 from bms_estimator.calibration.ocv.table_fit import TableFit, fit_table
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
-from bms_estimator.calibration.thesis.prediction import Prediction, predict, static_elements
+from bms_estimator.calibration.thesis.prediction import Prediction, predict, soc_by_interpolation, static_elements
 from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
 from bms_estimator.calibration.thesis.series_resistance import (
     SeriesResistance,
@@ -29,7 +29,6 @@ from bms_estimator.calibration.thesis.series_resistance import (
     mean_of,
     series_resistance,
 )
-from bms_estimator.calibration.thesis.soc_lookup import soc_by_interpolation
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel

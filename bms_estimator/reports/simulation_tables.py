@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from bms_estimator.estimator.stability_conditions import lemma_conditions
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values

@@ -30,8 +30,7 @@ from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Pulse, Source
 from bms_estimator.telemetry.alarms import Change
 from bms_estimator.telemetry.charge_energy import Flow
-from bms_estimator.telemetry.health import dropped_text, health_report, sample_counters
-from bms_estimator.telemetry.impossible import impossible_sample
+from bms_estimator.telemetry.health import dropped_text, health_report, impossible_sample, sample_counters
 from bms_estimator.telemetry.lifetime_totals import Tally, new_totals
 from bms_estimator.telemetry.parameters import parameter_report
 from bms_estimator.telemetry.publish_window import Window, WindowSummary

@@ -7,8 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.polled_source import ReportSource
-from bms_estimator.settings.profiles import with_profile
+from bms_estimator.settings.polled_source import ReportSource, with_profile
 
 LONGEST_ID, LONGEST_EXTENDED_ID = 0x7FF, 0x1FFF_FFFF
 """Largest identifiers of eleven and of 29 bits."""

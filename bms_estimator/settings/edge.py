@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import AfterValidator, ConfigDict, Field
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.broker_url import of_brokers
+from bms_estimator.settings.mqtt import of_brokers
 
 
 class EdgeSettings(Strict):

@@ -6,8 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.polled_source import ReportSource
-from bms_estimator.settings.profiles import with_profile
+from bms_estimator.settings.polled_source import ReportSource, with_profile
 
 MOST_WORDS = 125
 """Registers that one request may ask for, of the Modbus application protocol V1.1b3, section 6.3."""

@@ -1,15 +1,32 @@
 """``[mqtt]``: the broker."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.broker_url import of_brokers
 
 Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate"]
 """A request that changes something."""
+
+
+def of_brokers(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
+    """Addresses as they must be.
+
+    Raises:
+        ValueError: One is none, or holds a name or a password.
+    """
+    urls = (value,) if isinstance(value, str) else value
+    if not urls:
+        raise ValueError("must name a broker")
+    for url in urls:
+        if "@" in url:
+            raise ValueError("a name goes to mqtt.username, a password to a file that mqtt.password_file names")
+        if not re.fullmatch(r"mqtts?://[^/\s]+", url):
+            raise ValueError("must be mqtt://host:port")
+    return value
 
 
 class MqttSettings(Strict):

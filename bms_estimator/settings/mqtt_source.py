@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from bms_estimator.model.config_file import Positive, Strict
-from bms_estimator.settings.broker_url import of_brokers
+from bms_estimator.settings.mqtt import of_brokers
 from bms_estimator.settings.mqtt_profiles import PROFILES, ProfileName
 from bms_estimator.settings.polled_source import Name, ReportSource
 

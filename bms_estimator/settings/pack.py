@@ -3,19 +3,27 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from bms_estimator.model.config_file import Fraction, Positive, Strict, read_toml
 from bms_estimator.settings.alarms import AlarmSettings
+from bms_estimator.settings.ble_source import BleSource
+from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.device_resolution import Sampling
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings, PrometheusSettings
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
+from bms_estimator.settings.linux_source import LinuxSource
+from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.settings.sensor import NO_DEVICE, SensorSettings
-from bms_estimator.settings.source_settings import SOURCE, SourceSettings
+
+SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]
+
+SOURCE: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)
 
 LEAST_RATE_HZ, MOST_RATE_HZ = 0.1, 10.0
 """Of publications."""

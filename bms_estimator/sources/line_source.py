@@ -13,7 +13,7 @@ import structlog
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S, LONGEST_RETRY_S
-from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog

@@ -1,7 +1,7 @@
 """A person hears which kernel is being compiled."""
 
 from bms_estimator.cli.options.compile_progress import compiling_shown
-from bms_estimator.kernels.cell_model import margins
+from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.compile_events import compiling_told
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware import scaling
@@ -9,7 +9,7 @@ from bms_estimator.protocols.firmware import scaling
 
 def fresh():
     """A kernel that is in no cache."""
-    return njit(margins.crossing.py_func)
+    return njit(chen_mora.crossing.py_func)
 
 
 def test_each_kernel_is_told_once_with_its_number_and_what_is_compiled_already_is_not() -> None:
@@ -46,7 +46,7 @@ def test_where_stderr_is_no_terminal_lines_come_now_and_then() -> None:
     lines: list[str] = []
     with compiling_shown(lines.append):
         fresh()(0.5, 1.0, 2.0)
-        njit(margins.delta.py_func)(0.5, 1.0, 2.0)
+        njit(chen_mora.delta.py_func)(0.5, 1.0, 2.0)
     [line] = lines
     assert line.startswith("compiling kernels, once: 1/")
     assert line.endswith(" margins: crossing")

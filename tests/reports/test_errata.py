@@ -8,8 +8,17 @@ from scipy.integrate import solve_ivp
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.stability_conditions import lemma_conditions
-from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, cell_step, emf, r_s, r_tl, r_ts, terminal_voltage
-from bms_estimator.kernels.cell_model.margins import crossing
+from bms_estimator.kernels.cell_model.chen_mora import (
+    c_tl,
+    c_ts,
+    cell_step,
+    crossing,
+    emf,
+    r_s,
+    r_tl,
+    r_ts,
+    terminal_voltage,
+)
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_pack, printed_values

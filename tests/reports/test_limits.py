@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values
 

@@ -9,7 +9,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.protocols.base.report_line import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, report_line
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import header_of

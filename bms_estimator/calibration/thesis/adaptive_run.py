@@ -11,7 +11,7 @@ import numpy as np
 
 from bms_estimator.calibration.thesis.parameter_average import Settled, averaged, settled
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell_model.margins import crossing, delta
+from bms_estimator.kernels.cell_model.chen_mora import crossing, delta
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock

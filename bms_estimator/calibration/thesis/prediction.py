@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.rests import soc_by_counting, without_glitches
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_tl, r_ts, simulate_cell
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
+
+GRID = np.linspace(0.0, 1.0, 4001)
 
 EMPTY = 0.0
 """SOC where a prediction ends: below it the curves of the model mean nothing."""
@@ -136,3 +137,18 @@ def _unstable_below(a: Floats) -> float:
     """SOC below which a capacitance is negative, (2.11), (2.12); 0 when none is."""
     worst = max(delta(a[i + 1], a[i + 2], a[i]) for i in (7, 10))
     return 1.05 * worst + 1e-4 if worst > 0.0 else 0.0
+
+
+def soc_by_interpolation(cell: CellModel, run: Prediction) -> tuple[Floats, Floats]:
+    """SOC from the measured voltage and the model's overpotentials.
+
+    E_o = y + x2 + x3 + i R_s (2.4), looked up in the inverse of E_o(SOC). R_s and the overpotentials depend on SOC but
+    weakly, they are taken at the counted one.
+
+    Returns:
+        SOC (0..1) and E_o [V], each of the run's shape. Outside the curve the nearest end of it.
+    """
+    a = cell.a
+    ohmic_v = run.current_a * np.array([r_s(x, a) for x in run.soc])
+    e_o = run.voltage_v + run.overpotential_v + ohmic_v  # (2.4) solved for E_o
+    return np.interp(e_o, open_circuit(cell, GRID), GRID), e_o

@@ -42,8 +42,7 @@ from bms_estimator.sinks.trace_file import TableSink, table_sink
 from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
 from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.store.outbox import Outbox
-from bms_estimator.telemetry.health import dropped_text
-from bms_estimator.telemetry.impossible import impossible_sample
+from bms_estimator.telemetry.health import dropped_text, impossible_sample
 
 MANY = 0.01
 """Part of the samples that is more than a glitch now and then."""

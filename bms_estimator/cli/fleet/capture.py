@@ -72,7 +72,7 @@ async def fetched(pack: str, since_s: float, until_s: float, where: tuple[str, P
     Raises:
         UserError: It cannot be asked.
     """
-    from bms_estimator.fleet.identification.capture import fetch  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.identification.block_capture import fetch  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
 
     async with connected(*where) as nc:

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.browser import open_browser
 from bms_estimator.cli.options.compile_progress import compiling_shown
 from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.page_options import open_browser
 from bms_estimator.fleet.simulation.demo import Demo, free_port, run_demo
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.process.signals import stop_on_signal

@@ -25,8 +25,8 @@ from bms_estimator.cli.options.number_options import whole
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.pack_registry import KnownPacks
 from bms_estimator.fleet.packs.pack_row import PackKind, stored
+from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.text_file import write_text
 
 if TYPE_CHECKING:
     from bms_estimator.fleet.identification.reidentify import Reidentified

@@ -14,8 +14,8 @@ from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.csv_table import CELL_FILE, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.packs.pack_registry import KnownPacks
 from bms_estimator.fleet.packs.pack_row import PackKind, model_key, settings_of
+from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.text_file import write_text
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Which cells each pack has.")
 

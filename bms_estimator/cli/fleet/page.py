@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
-from bms_estimator.cli.options.browser import open_browser
-from bms_estimator.cli.options.page_options import page_settings
+from bms_estimator.cli.options.page_options import open_browser, page_settings
 from bms_estimator.fleet.page import nats_feed
 from bms_estimator.fleet.page.fleet_page import fleet_page
 from bms_estimator.process.log_setup import configure_logs, drained

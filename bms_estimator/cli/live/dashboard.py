@@ -6,9 +6,8 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.browser import open_browser
 from bms_estimator.cli.options.pack_options import with_broker
-from bms_estimator.cli.options.page_options import page_settings
+from bms_estimator.cli.options.page_options import open_browser, page_settings
 from bms_estimator.page.broker_page import dashboard as serving
 from bms_estimator.process.log_setup import configure_logs, drained
 from bms_estimator.process.signals import stop_on_signal

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.browser import open_browser
 from bms_estimator.cli.options.compile_progress import compiling_shown
 from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.page_options import open_browser
 from bms_estimator.demo.board import find_build
 from bms_estimator.demo.demo import run_demo
 from bms_estimator.process.log_setup import configure_logs, drained

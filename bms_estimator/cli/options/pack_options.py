@@ -5,9 +5,9 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
-from bms_estimator.model.secret import without_secrets
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import PackSettings, Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings

@@ -1,11 +1,17 @@
 """Options of commands that serve a page."""
 
+import os
+import sys
+import threading
+import webbrowser
 from typing import Any
 
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.page import PageSettings
+
+DESKTOP = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
 def page_settings(settings: PageSettings, **given: Any) -> PageSettings:
@@ -20,3 +26,10 @@ def page_settings(settings: PageSettings, **given: Any) -> PageSettings:
     except ValidationError as error:
         reason = error.errors()[0]["msg"].removeprefix("Value error, ")
         raise UserError(f"--listen {told.get('listen', settings.listen)}: {reason}") from None
+
+
+def open_browser(url: str) -> None:
+    """Open ``url`` in a desktop's browser, in a thread: some browsers return only when they end."""
+    if not sys.stdout.isatty() or not any(os.environ.get(name) for name in DESKTOP):
+        return
+    threading.Thread(target=webbrowser.open, args=[url], name="browser", daemon=True).start()

@@ -14,13 +14,13 @@ from bms_estimator.edge.block_sender import check_edge
 from bms_estimator.estimator.settings_plausibility import implausible
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.estimator.stability_conditions import Condition, failed
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.access_control import guard_of
-from bms_estimator.process.credential import is_for_the_service
+from bms_estimator.process.systemd import is_for_the_service
 from bms_estimator.service.alarm_hooks import unusable
 from bms_estimator.settings.alarm_limits import out_of_range, watched
 from bms_estimator.settings.edge import EdgeSettings

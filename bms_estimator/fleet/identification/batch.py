@@ -14,8 +14,7 @@ import numpy as np
 from dask.base import compute
 from dask.delayed import delayed
 
-from bms_estimator.fleet.identification.block_capture import Captured
-from bms_estimator.fleet.identification.capture import fetch
+from bms_estimator.fleet.identification.block_capture import Captured, fetch
 from bms_estimator.fleet.identification.reidentify import Reidentified, reidentify
 from bms_estimator.fleet.nats.one_shot_connection import connected
 from bms_estimator.fleet.packs.pack_row import PackKind

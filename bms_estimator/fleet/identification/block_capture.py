@@ -1,12 +1,19 @@
 """A pack's blocks, as the stream has them, put together: in the order of their numbers, each once."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from nats.aio.client import Client
 
 from bms_estimator.edge.block import Block, BlockError, decode
+from bms_estimator.edge.subjects import RAW_STREAM
+from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.model.sample import SampleBlock
+
+AHEAD_S = 3600.0
+"""The edges' clocks are ahead of the server's by no more: a block is kept at most so long before its samples' time [s]."""
 
 ROWS = 65_536
 """Samples of blocks are handed over at least so many at a time, but the last."""
@@ -110,3 +117,23 @@ class Captured:
 
 def _wall_s(block: Block, sample: int) -> float:
     return block.store * 1e-9 + float(block.samples["time_s"][sample])
+
+
+async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: float = math.inf) -> Captured:
+    """The blocks of a pack that the stream still has.
+
+    Args:
+        nc: Connected as the tenant.
+        pack: Its name.
+        since_s: Samples from then on, by the edge's clock [s since 1970].
+        until_s: Samples before it.
+
+    Raises:
+        StreamError: The server does not answer, or has no such stream.
+    """
+    found = Captured(since_s, until_s)
+    first_s = None if since_s <= AHEAD_S else since_s - AHEAD_S
+    async for batch in read_stream(nc, RAW_STREAM, f"p.*.raw.{pack}", since_s=first_s):
+        for message in batch:
+            found.add(message.data)
+    return found

@@ -8,8 +8,7 @@ import nats
 import nats.errors
 from nats.aio.client import Client
 
-from bms_estimator.fleet.nats.connection import FLUSH_S, addresses, context, readable
-from bms_estimator.fleet.nats.reasons import reason
+from bms_estimator.fleet.nats.connection import FLUSH_S, addresses, context, readable, reason
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
 

@@ -10,7 +10,7 @@ import nats.js.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.nats.reasons import reason
+from bms_estimator.fleet.nats.connection import reason
 from bms_estimator.fleet.nats.stream_reader import ANSWER_S, Stored, StreamError, read_stream
 from bms_estimator.fleet.packs.pack_registry import KnownPacks
 

@@ -29,8 +29,8 @@ from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us
-from bms_estimator.process.credential import credential
 from bms_estimator.process.private_file import write_private
+from bms_estimator.process.systemd import credential
 from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSettings, reachable
 
 log = structlog.get_logger(__name__)

@@ -21,7 +21,7 @@ from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import glance
-from bms_estimator.fleet.nats.reasons import reason
+from bms_estimator.fleet.nats.connection import reason
 from bms_estimator.fleet.nats.stored_messages import stored
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.worker.checkpoint_store import Claim, FencedError, Keeping, Kept

@@ -15,7 +15,6 @@ from nats.aio.msg import Msg
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import ANSWER_S, GROUP, PIN_S, consumer
-from bms_estimator.fleet.worker.sequences import sequences
 
 RENEW_S = PIN_S / 4.0
 """Between two requests [s]: the loop may be three times as late without losing a pin."""
@@ -136,3 +135,14 @@ class PinnedConsumer:
         self._last = consumer_sequence
         pack = message.subject.rpartition(".")[2]
         self.waiting.append(Given(pack, message.data, stream_sequence, self._pins, follows))
+
+
+def sequences(reply: str) -> tuple[int, int]:
+    """A message's number in its stream, and that of the consumer, which has no holes.
+
+    Args:
+        reply: Where it would be acknowledged (ADR-15): 9 tokens, or 11 and more with the server's domain.
+    """
+    tokens = reply.split(".")
+    first = 5 if len(tokens) == 9 else 7
+    return int(tokens[first]), int(tokens[first + 1])

@@ -15,8 +15,7 @@ from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
-from bms_estimator.fleet.nats.connection import connect, part
-from bms_estimator.fleet.nats.reasons import reason
+from bms_estimator.fleet.nats.connection import connect, part, reason
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.checkpoint_store import Keeping

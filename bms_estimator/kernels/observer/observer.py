@@ -7,9 +7,8 @@ solved exactly, so the step is stable for every N >= 0 and every step length. ``
 
 import math
 
-from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_tl, r_ts, soc_from_ocv
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, soc_from_ocv
 from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, held_current
-from bms_estimator.kernels.cell_model.margins import delta
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit

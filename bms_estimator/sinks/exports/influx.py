@@ -21,8 +21,8 @@ import structlog
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.process.backoff import FIRST_DELAY_S, Pauses
-from bms_estimator.process.credential import credential
 from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.systemd import credential
 from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.line_protocol import lines
 

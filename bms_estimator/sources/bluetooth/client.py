@@ -12,7 +12,7 @@ from bleak import AdvertisementData, BleakScanner, BLEDevice
 from bleak.exc import BleakError
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.report_line import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, report_line
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.sources.bluetooth.bms_sample import reading_of
 from bms_estimator.sources.line_source import Bringer, NothingComesError

@@ -11,7 +11,7 @@ from typing import Any
 import can
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.report_line import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, report_line
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.fieldbus.can_signals import CanMap

@@ -10,7 +10,7 @@ from pymodbus import FramerType
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
-from bms_estimator.protocols.base.report_line import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, report_line
 from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.fieldbus.modbus_registers import Request, Table, plan, reading_of, split, values_of

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from bms_estimator.process.disk_thread import DiskThread
-from bms_estimator.protocols.base.report_line import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, report_line
 from bms_estimator.settings.linux_source import LinuxSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import SILENT_PERIODS, Bringer, NothingComesError

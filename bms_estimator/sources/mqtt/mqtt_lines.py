@@ -14,7 +14,7 @@ from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError, Received
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import Dial
-from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from bms_estimator.protocols.base.report_line import report_line
+from bms_estimator.protocols.base.reading import report_line
 from bms_estimator.settings.mqtt_source import MqttSource, Place
 from bms_estimator.sources.mqtt.payload_value import MOST_CELLS, NoNumberError, cell_pattern, many, one
 from bms_estimator.sources.mqtt.publisher_conflict import MIN_JUMPS, PublisherConflict

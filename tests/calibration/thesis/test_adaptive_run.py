@@ -6,8 +6,7 @@ import pytest
 from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.chen_mora import ocv, r_s
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import delta, ocv, r_s
 from bms_estimator.model.cell import Bounds, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.simulation import discharge, with_bounds

@@ -5,11 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.thesis.prediction import open_circuit, predict, static_elements
-from bms_estimator.calibration.thesis.soc_lookup import soc_by_interpolation
+from bms_estimator.calibration.thesis.prediction import open_circuit, predict, soc_by_interpolation, static_elements
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_s, r_tl, r_ts
-from bms_estimator.kernels.cell_model.margins import delta
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.simulation import discharge

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.sources.line_source import Bringer, NothingComesError
 from tests.patience import LONG_S

@@ -11,7 +11,7 @@ import can
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.factory import open_reports

@@ -10,7 +10,7 @@ import pytest
 from pymodbus import FramerType
 from pymodbus.constants import ExcCodes
 
-from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.factory import open_reports

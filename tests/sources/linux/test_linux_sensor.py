@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.protocols.base.reading import Reading, read_line
-from bms_estimator.protocols.base.report_line import CONNECTED
+from bms_estimator.protocols.base.reading import CONNECTED, Reading, read_line
 from bms_estimator.settings.linux_source import LinuxSource
 from bms_estimator.sources.line_source import NothingComesError
 from bms_estimator.sources.linux.linux_sensor import LinuxSensor
