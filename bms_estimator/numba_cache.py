@@ -36,6 +36,7 @@ COMPILED_IN = (
             "model/arrays.py",
             "model/sample.py",
             "model/input_faults.py",
+            "protocols/base/relay.py",
             "protocols/firmware/clock_drift.py",
             "protocols/firmware/framing.py",
             "protocols/firmware/messages.py",

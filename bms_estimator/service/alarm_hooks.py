@@ -13,7 +13,7 @@ import structlog
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, HookHealth
 from bms_estimator.process.backoff import Pauses
-from bms_estimator.protocols.base.device_protocol import Relay
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service.hook_process import StartError, environment, run
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings

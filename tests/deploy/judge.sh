@@ -30,7 +30,7 @@ show
 systemctl show bms-estimator -p WatchdogUSec
 grep -E "^(Uid|NoNewPrivs|Seccomp|CapEff):" "/proc/$(main_pid)/status"
 tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep BMS_BOOT_ID
-find $cache -name "sample_step.run-*.nbi" -printf "cached %f\n"
+find $cache -name "step.run-*.nbi" -printf "cached %f\n"
 nsenter -t "$(main_pid)" -m sh -c 'ls -A /home /root; touch /root/x /etc/x' 2>&1
 
 part secret

@@ -11,7 +11,7 @@ from bms_estimator.numba_cache import COMPILED_IN
 from bms_estimator.service.kernel_warm_up import load_kernels
 
 PACKAGE = Path(bms_estimator.__file__).parent
-LEFT_OUT = "sample_step.run-"
+LEFT_OUT = "step.run-"
 """Begin of the names of the kernel's files that the service has to compile itself."""
 
 

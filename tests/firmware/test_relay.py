@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.protocols.base.device_protocol import Relay
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.messages import AckResult, MessageType, command, relay_word, set_relay_command
 from tests.firmware.host import Host
 from tests.simavr_board import SimavrBoard, write_readings

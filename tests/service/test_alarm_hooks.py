@@ -15,7 +15,7 @@ from structlog.testing import capture_logs
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, HookHealth
-from bms_estimator.protocols.base.device_protocol import Relay
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import alarm_hooks
 from bms_estimator.service.alarm_hooks import Hooks, unusable
 from bms_estimator.service.pack_service import serve

@@ -132,7 +132,7 @@ async def test_starts_after_a_run_that_left_no_word_are_counted_as_crashes(tmp_p
 async def test_checkpoints_of_all_formats_since_0_1_0_are_taken_up(tmp_path: Path, version: int) -> None:
     checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
     name = "pack.npz" if version == 4 else checkpoint.path.name
-    shutil.copy(Path(__file__).with_name(f"checkpoint_format_{version}.npz"), tmp_path / name)
+    shutil.copy(Path(__file__).parents[1] / f"checkpoint/checkpoint_format_{version}.npz", tmp_path / name)
     run = await ran(tmp_path, samples=1)
     assert run.health.checkpoint == f"restored: SOC {OLD_FILES[version]}"
     assert (run.health.restarts, run.health.total.crashes) == (4, 0)

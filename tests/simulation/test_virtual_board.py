@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
-from bms_estimator.protocols.base.device_protocol import Relay
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameCounters, FrameDecoder
 from bms_estimator.protocols.firmware.messages import (
     AckResult,

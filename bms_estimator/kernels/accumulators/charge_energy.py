@@ -28,7 +28,7 @@ def add_flow(sums: Records, trace: Records, gap_s: float) -> None:
     Args:
         sums: Shape (1,), dtype FLOW_SUMS; updated in place.
         trace: Shape (n,), dtype TRACE.
-        gap_s: A longer step is a gap, unless the one before was about as long [s]; as ``sample_step.is_gap``.
+        gap_s: A longer step is a gap, unless the one before was about as long [s]; as ``kernels.step.is_gap``.
     """
     s = sums[0]
     for j in range(trace.shape[0]):

@@ -4,23 +4,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
-
-
-class Relay(NamedTuple):
-    """Level of the relay pin, until the next reset."""
-
-    high: bool
-    high_when_silent: bool | None
-    """Level once no command of this kind has come for ``silent_s``; None: it stays as it is."""
-    silent_s: int = 0
-    """0..3600."""
+from bms_estimator.protocols.base.relay import Relay
 
 
 @dataclass

@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 
 from cobs import cobs
 
-from bms_estimator.protocols.base.device_protocol import Relay
+from bms_estimator.protocols.base.relay import Relay
 
 PROTOCOL_VERSION = 1
 BAUD = 500_000

@@ -13,7 +13,8 @@ from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S
-from bms_estimator.protocols.base.device_protocol import Command, Dialect, Relay
+from bms_estimator.protocols.base.device_protocol import Command, Dialect
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.device_protocol import Relay
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.messages import (
     Ack,
     AckResult,

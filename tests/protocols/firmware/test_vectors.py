@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.protocols.base.device_protocol import Relay
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import (
     Ack,
