@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import GAP_CHARGE, GAP_STEPS
-from bms_estimator.calibration.cleaning.rests import resting_samples, runs, without_glitches
+from bms_estimator.calibration.cleaning.rests import remove_glitches, resting_samples, true_runs
 from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, coldness
 from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests
 from bms_estimator.estimator.filter_settings import CURVE_SOC, filter_settings
@@ -117,7 +117,7 @@ def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std
     rejected: list[str] = []
     parts = 0
     for capture in captures:
-        good = without_glitches(capture.rows, capture.name)
+        good = remove_glitches(capture.rows, capture.name)
         for first, last in continuous(good, cell.cell.capacity_ah):
             of_part(capture.name, parts, good[first:last], p, anchors, rejected)
             parts += 1
@@ -177,7 +177,7 @@ def of_part(name: str, part: int, good: SampleBlock, p: np.void, anchors: list[A
     rests, why_not = find_rests(good, soc, resting, series)
     rejected += [f"{name}: {line}" for line in why_not]
     up, down = (hysteresis(good["time_s"], soc, float(p["hysteresis_soc"]), before) for before in (1.0, -1.0))
-    ends = {float(good["time_s"][first]): last - 1 for first, last in runs(resting)}
+    ends = {float(good["time_s"][first]): last - 1 for first, last in true_runs(resting)}
     for rest in rests:
         end = ends[rest.start_s]
         hyst = 0.5 * (up[end] + down[end]), math.hypot(HYST_UNSURE, 0.5 * HYST_STD * (up[end] - down[end]))

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.capture_checks import contradictions, soc_outside
-from bms_estimator.calibration.cleaning.clean_capture import whole_load
+from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, soc_outside
+from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C
 from bms_estimator.calibration.elements.identify import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ocv.overpotential import overpotential
@@ -90,9 +90,9 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     Raises:
         UserError: Most samples lie outside the cell's limits, or SOC runs outside 0..1.
     """
-    load = whole_load(capture.name, capture.rows, cell)
+    load = clean_capture(capture.name, capture.rows, cell)
     start = soc_of_first_rest(load, cell) if initial_soc is None else initial_soc
-    warnings = contradictions(load, cell, start)
+    warnings = capture_contradictions(load, cell, start)
     outside = soc_outside(load, cell.cell.capacity_ah, start)
     if outside:
         raise UserError("\n".join(dict.fromkeys([*warnings, f"{capture.name}: {outside}"])))

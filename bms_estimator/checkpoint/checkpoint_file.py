@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import Totals
-from bms_estimator.process.boot_clock import Moment, moment
+from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
 from bms_estimator.process.disk_thread import DiskThread
-from bms_estimator.process.private_file import NotOursError, read_private, write_private
+from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import new_totals
 
 FORMAT = 7
@@ -50,7 +50,7 @@ log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True)
-class Ledger:
+class RunCounters:
     """What a checkpoint tells of the runs that wrote it.
 
     Attributes:
@@ -67,14 +67,14 @@ class Ledger:
 
 
 @dataclass(frozen=True)
-class Restored:
+class CheckpointContent:
     """What a checkpoint file held."""
 
     state: Mapping[str, NDArray[Any]]
     """Fields of ESTIMATOR_STATE by their names, as ``fields`` gives them; empty when it was refused."""
     unseen_s: float
     """Since it was saved [s]; infinite when nobody knows."""
-    ledger: Ledger
+    ledger: RunCounters
     """With this start counted; of nothing when it was not of this pack, or could not be read."""
     reason: str
     """Why it is not taken up; empty when it may be."""
@@ -90,7 +90,9 @@ class CheckpointFile:
         now: The present moment.
     """
 
-    def __init__(self, folder: Path, settings: Settings, cell: PackModel, now: Callable[[], Moment] = moment) -> None:
+    def __init__(
+        self, folder: Path, settings: Settings, cell: PackModel, now: Callable[[], BootTimestamp] = boot_timestamp
+    ) -> None:
         self._name, self._now = settings.pack.name, now
         self._identity, self._observer = pack_identity(settings, cell), observer_identity(settings, cell)
         self._range_v = cell.cell.voltage_min_v, cell.cell.voltage_max_v
@@ -105,7 +107,7 @@ class CheckpointFile:
         self.saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 
-    def save(self, state: NDArray[np.void], ledger: Ledger) -> None:
+    def save(self, state: NDArray[np.void], ledger: RunCounters) -> None:
         """Write atomically: after a power cut there is the old file or the new one. A folder that is gone is made anew.
 
         Args:
@@ -118,7 +120,7 @@ class CheckpointFile:
         content = {"identity": self._identity, "observer": self._observer, "state": state, **asdict(self._now())}
         self._write(content, ledger)
 
-    def mark(self, ledger: Ledger) -> None:
+    def mark(self, ledger: RunCounters) -> None:
         """Change what the file tells of the runs, and nothing else: its state is as old as before. Without a file: nothing.
 
         Raises:
@@ -127,7 +129,7 @@ class CheckpointFile:
         if self._content:
             self._write(self._content, ledger)
 
-    def _write(self, content: dict[str, Any], ledger: Ledger) -> None:
+    def _write(self, content: dict[str, Any], ledger: RunCounters) -> None:
         packed = io.BytesIO()
         total = ledger.total.model_dump_json()
         told: dict[str, Any] = {
@@ -144,27 +146,27 @@ class CheckpointFile:
         self._content = content
         self._remove_oldest()
 
-    def load(self) -> Restored:
+    def load(self) -> CheckpointContent:
         """Read; what is wrong is a reason, not an exception.
 
         The file of a format before names is taken over by its name: it is of the settings that were used last. What it
         hashed, whole sections of the settings, cannot be made again by a version that knows others.
         """
         before = self.path.with_name(f"{self._name}.npz")
-        new = Ledger(0, new_totals(self._now().wall_s))
+        new = RunCounters(0, new_totals(self._now().wall_s))
         try:
             if not self.path.exists() and before.exists():
                 before.replace(self.path)
             with np.load(io.BytesIO(read_private(self.path, LONGEST_FILE)), allow_pickle=False) as file:
                 return self._checked(file)
         except FileNotFoundError:
-            return Restored({}, 0.0, new, "none found")
+            return CheckpointContent({}, 0.0, new, "none found")
         except _RefusedError as error:
-            return Restored({}, 0.0, error.ledger or new, f"{REFUSED}{error}")
-        except NotOursError as error:
-            return Restored({}, 0.0, new, f"{REFUSED}{error}")
+            return CheckpointContent({}, 0.0, error.ledger or new, f"{REFUSED}{error}")
+        except UnsafeFileError as error:
+            return CheckpointContent({}, 0.0, new, f"{REFUSED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return Restored({}, 0.0, new, f"{REFUSED}damaged, perhaps by a power cut ({type(error).__name__})")
+            return CheckpointContent({}, 0.0, new, f"{REFUSED}damaged, perhaps by a power cut ({type(error).__name__})")
 
     def set_aside(self) -> str:
         """Keep a file that was refused out of the way of the next save. Returns what was done, for people.
@@ -187,7 +189,7 @@ class CheckpointFile:
         )
         return f"set aside as {aside.name}{later}"
 
-    def _checked(self, found: Mapping[str, NDArray[Any]]) -> Restored:
+    def _checked(self, found: Mapping[str, NDArray[Any]]) -> CheckpointContent:
         now_s, version = self._now().wall_s, int(found["format"])
         self._later = version > FORMAT
         if self._later:
@@ -201,7 +203,9 @@ class CheckpointFile:
                 raise _RefusedError("its voltage is none of this pack")
         elif str(file["identity"]) != self._identity:
             raise _RefusedError("it belongs to another pack or cell")
-        saved = Moment(float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"]))
+        saved = BootTimestamp(
+            float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"])
+        )
         unseen_s, ledger = self._now().since(saved), _ledger(file, now_s)
         if self._longest_days is not None and self._longest_days * DAY_S < unseen_s < math.inf:
             days = f"{unseen_s / DAY_S:.1f} days old"
@@ -210,7 +214,7 @@ class CheckpointFile:
         self._content |= {"identity": self._identity}
         if str(file["observer"]) != self._observer:
             state = without_observer(state)
-        return Restored(state, unseen_s, ledger, "")
+        return CheckpointContent(state, unseen_s, ledger, "")
 
     def _remove_oldest(self) -> None:
         """Of the pack's files leave those saved last: whoever tries settings leaves one for each."""
@@ -224,21 +228,21 @@ class CheckpointFile:
 class _RefusedError(Exception):
     """Why a checkpoint is not taken up, and what is counted on nevertheless."""
 
-    def __init__(self, reason: str, ledger: Ledger | None = None) -> None:
+    def __init__(self, reason: str, ledger: RunCounters | None = None) -> None:
         super().__init__(reason)
         self.ledger = ledger
 
 
-def _ledger(file: Mapping[str, NDArray[Any]], now_s: float) -> Ledger:
+def _ledger(file: Mapping[str, NDArray[Any]], now_s: float) -> RunCounters:
     """What a file tells of its runs, with this start. What cannot be is not believed: counting begins anew at ``now_s``."""
     try:
         return _believable(file)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
         log.warning("the checkpoint's counters cannot be: counting begins anew", reason=str(error))
-        return Ledger(1, new_totals(now_s))
+        return RunCounters(1, new_totals(now_s))
 
 
-def _believable(file: Mapping[str, NDArray[Any]]) -> Ledger:
+def _believable(file: Mapping[str, NDArray[Any]]) -> RunCounters:
     """The same, of any format that tells it, with what this version knows of; what flowed before it was counted is 0.
 
     Raises:
@@ -249,11 +253,11 @@ def _believable(file: Mapping[str, NDArray[Any]]) -> Ledger:
     datetime.fromisoformat(total.since)
     restarts, crashes = int(file["restarts"]) + 1, total.crashes + (not file["clean"])
     counted = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
-    counted |= Flow.of(total)._asdict()
+    counted |= ChargeEnergy.of(total)._asdict()
     wrong = [f"{name} = {value}" for name, value in counted.items() if not 0 <= value <= MOST]
     if wrong:
         raise ValueError(", ".join(wrong))
-    return Ledger(restarts, total.model_copy(update={"crashes": crashes}), alarms=str(file.get("alarms", "")))
+    return RunCounters(restarts, total.model_copy(update={"crashes": crashes}), alarms=str(file.get("alarms", "")))
 
 
 File = dict[str, Any]

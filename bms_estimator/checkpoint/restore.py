@@ -9,23 +9,23 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS, keep
-from bms_estimator.kernels.kalman_filter.mixture import forget
+from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS, store_last_good_state
+from bms_estimator.kernels.kalman_filter.mixture import decorrelate_state
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
-from bms_estimator.kernels.kalman_filter.ocv_correction import forget_curve
+from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
 
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
 OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
-GROWING = {"filter.mean": 1, "filter.covariance": 2}
+EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
 """Fields whose last axes, so many, are along the states of the filter; states that a version adds come last."""
 SAME_SOC = 0.03
 """Largest difference between the SOC of filter and observer; beyond it the filter was switched off."""
 
 
-def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
+def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
     """Go on from a checkpoint's state, saved ``unseen_s`` ago, on the board's new clock. The counters count from this start.
 
     A field that the checkpoint does not have, or has in another shape, is what a first sample makes it, and so are states
@@ -43,7 +43,7 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     estimator.step(0.0, 0.0, estimator.cell.cell.nominal_voltage_v)
     begun = estimator.record.copy()
     was_on = bool(saved.get("filter.started", np.zeros(1))[0])
-    fill(
+    copy_known_fields(
         estimator.record,
         {
             name: v
@@ -51,7 +51,7 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
             if was_on or name.startswith(("observer.", "learning.", "series_resistance."))
         },
     )
-    wrong = _insane(estimator, begun)
+    wrong = _invalid_state_reason(estimator, begun)
     if wrong:
         estimator.record[...] = new
         return wrong
@@ -71,7 +71,7 @@ def resume(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: fl
     return ""
 
 
-def fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
+def copy_known_fields(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
     """Take from ``saved``, fields by their names, what ``record`` has in the same shape, or in one that has grown."""
     for name, field in fields(record):
         known = saved.get(name)
@@ -79,7 +79,7 @@ def fill(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
             continue
         if known.shape == field.shape:
             field[...] = known
-        elif name in GROWING and _is_shorter(known.shape, field.shape, GROWING[name]):
+        elif name in EXTENDABLE_FIELDS and _is_shorter(known.shape, field.shape, EXTENDABLE_FIELDS[name]):
             field[tuple(map(slice, known.shape))] = known
 
 
@@ -93,8 +93,8 @@ def _open_curve(estimator: Estimator) -> None:
     f, c = estimator.record[0]["filter"], estimator.record[0]["checks"]
     count = int(f["count"])
     for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
-        forget_curve(mean, covariance)
-    keep(c, f)
+        reset_ocv_correction(mean, covariance)
+    store_last_good_state(c, f)
 
 
 def _open_new_states(estimator: Estimator) -> None:
@@ -103,11 +103,11 @@ def _open_new_states(estimator: Estimator) -> None:
     best = f["best"]
     for j, variance in ((OFFSET, offset_variance(p)), (LN_Q, p["capacity_std"] ** 2)):
         if (f["covariance"][best, j, j] > 0.0) != (variance > 0.0):
-            forget(f["mean"][best], f["covariance"][best], j)
+            decorrelate_state(f["mean"][best], f["covariance"][best], j)
             f["covariance"][best, j, j] = variance
 
 
-def _insane(estimator: Estimator, begun: NDArray[np.void]) -> str:
+def _invalid_state_reason(estimator: Estimator, begun: NDArray[np.void]) -> str:
     """Why a state cannot be used; empty when it can. What a first sample leaves without a value, ``begun``, needs none."""
     record, cell = estimator.record, estimator.cell.cell
     for (name, field), (_, first) in zip(fields(record), fields(begun), strict=True):

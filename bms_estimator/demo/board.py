@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import bms_estimator
-from bms_estimator.demo.true_soc import Truth
+from bms_estimator.demo.true_soc import TrueSoc
 from bms_estimator.model.errors import UserError
 from bms_estimator.simulation.firmware_board import FirmwareBoard
 from bms_estimator.simulation.virtual_board import VirtualBoard
@@ -38,7 +38,7 @@ def find_build(given: Path | None) -> Path | None:
 
 
 @asynccontextmanager
-async def running_board(build: Path | None, truth: Truth, *, rate_hz: int, speed: float) -> AsyncIterator[Board]:
+async def running_board(build: Path | None, truth: TrueSoc, *, rate_hz: int, speed: float) -> AsyncIterator[Board]:
     """The firmware in its simulator where ``build`` holds it, else the board in Python.
 
     Args:

@@ -9,12 +9,12 @@ from typing import Self
 
 from bms_estimator.demo.board import running_board
 from bms_estimator.demo.broker import LOOPBACK, DemoBroker, choose_port
-from bms_estimator.demo.true_soc import Truth
+from bms_estimator.demo.true_soc import TrueSoc
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.service.pack_service import serve
+from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.observer import ObserverSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
@@ -22,7 +22,7 @@ from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings, parse_list
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from bms_estimator.sinks.terminal.panels import BAND_STDS
-from bms_estimator.sinks.terminal.sink import ConsoleSink
+from bms_estimator.sinks.terminal.sink import TerminalSink
 
 CELL = "chen_mora"
 LOAD_A = 0.5
@@ -64,7 +64,7 @@ async def run_demo(
     """
     stop = stop_on_signal()
     cell = load_cell(CELL)
-    truth = Truth(SimulatedPack(cell, random_steps(LOAD_A), soc=TRUE_SOC))
+    truth = TrueSoc(SimulatedPack(cell, random_steps(LOAD_A), soc=TRUE_SOC))
     totals = Totals(TOLD_SOC - TRUE_SOC, truth.soc)
     async with DemoBroker(port) as broker, running_board(build, truth, rate_hz=rate_hz, speed=speed) as board:
         page = f"{LOOPBACK}:{choose_port(page_port, parse_listen(DEFAULT_LISTEN).port)}"
@@ -74,10 +74,10 @@ async def run_demo(
         if seconds is not None:
             asyncio.get_running_loop().call_later(seconds, stop.set)
         settings = _settings(board.path, broker.url, page, rate_hz)
-        view = ConsoleSink(log=log, hint=hint, true_soc=truth.soc)
+        view = TerminalSink(log=log, hint=hint, true_soc=truth.soc)
         pages = Pages(opened)
         # no folder of state: it begins anew each time
-        await serve(settings, cell, sinks=[view, totals], tap=truth, stop=stop, pages=pages)
+        await run_pack_service(settings, cell, sinks=[view, totals], tap=truth, stop=stop, pages=pages)
     return totals.summary()
 
 

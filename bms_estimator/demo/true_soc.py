@@ -17,7 +17,7 @@ TAIL_BYTES = 256
 """The end of what came holds a whole sample's frame, whatever else is there."""
 
 
-class Truth:
+class TrueSoc:
     """A pack's signal for a board, and a tap on the board's line: the board's clock in a frame says when it was taken.
 
     Args:

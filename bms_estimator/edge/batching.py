@@ -10,7 +10,7 @@ MOST_SAMPLES = 7_000
 """Maximum number of samples in a block: even samples that do not compress stay below ``streams.MAX_BLOCK_BYTES``."""
 
 
-class Gathered(NamedTuple):
+class ReadyBlock(NamedTuple):
     """Samples of a block, and when the last of them came."""
 
     arrival_s: float
@@ -18,7 +18,7 @@ class Gathered(NamedTuple):
     samples: SampleBlock
 
 
-class Gathering:
+class Batcher:
     """Cuts what comes into blocks of a length.
 
     Args:
@@ -35,7 +35,7 @@ class Gathering:
         """Samples of the block that is open."""
         return self._count
 
-    def add(self, samples: SampleBlock, arrival_s: float) -> list[Gathered]:
+    def add(self, samples: SampleBlock, arrival_s: float) -> list[ReadyBlock]:
         """Take samples, in order of their times. Returns the blocks that they have ended."""
         ended = []
         while samples.size:
@@ -50,10 +50,10 @@ class Gathering:
                 ended += self.cut()
         return ended
 
-    def cut(self) -> list[Gathered]:
+    def cut(self) -> list[ReadyBlock]:
         """End the block that is open; none where it has no samples."""
         if not self._count:
             return []
-        block = Gathered(self._arrival_s, np.concatenate(self._parts))
+        block = ReadyBlock(self._arrival_s, np.concatenate(self._parts))
         self._parts, self._count = [], 0
         return [block]

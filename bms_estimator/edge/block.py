@@ -98,7 +98,7 @@ def decode(data: bytes) -> Block:
     return Block(store, number, oldest, arrival_s, _samples(data[_HEADER.size :], count))
 
 
-def glance(data: bytes) -> tuple[int, float]:
+def peek_header(data: bytes) -> tuple[int, float]:
     """How many samples a block says it holds, and when it arrived [s since 1970]; none, and for ever, of what is no block."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         return 0, math.inf

@@ -1,6 +1,6 @@
 """The edge: a pack's raw samples on their way to a fleet's server, by MQTT, in blocks.
 
-``take`` gathers; ``EdgeStore`` keeps blocks until a worker has said that they are safe; here they are sent, and what
+``take`` gathers; ``BlockStore`` keeps blocks until a worker has said that they are safe; here they are sent, and what
 workers say is heard. How a broker is reached is the same as for estimates.
 """
 
@@ -15,21 +15,21 @@ import structlog
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
-from bms_estimator.edge.batching import MOST_SAMPLES, Gathering
-from bms_estimator.edge.block_store import EdgeStore
+from bms_estimator.edge.batching import MOST_SAMPLES, Batcher
+from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES
-from bms_estimator.edge.sample_clock import EdgeClock
+from bms_estimator.edge.sample_clock import SampleClock
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import EdgeHealth
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import Connect, Connection, Hello
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.mqtt.denied_topics import Refusals
-from bms_estimator.mqtt.protocol_negotiation import Dial
-from bms_estimator.mqtt.queue_sender import Sending
-from bms_estimator.mqtt.reconnect_loop import Link
+from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.denied_topics import DeniedTopics
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.queue_sender import QueueSender
+from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.mqtt import MqttSettings
@@ -46,7 +46,7 @@ PARTING_S = 1.0
 log = structlog.get_logger(__name__)
 
 
-class Edge:
+class BlockSender:
     """Sends samples of one pack.
 
     Args:
@@ -84,20 +84,22 @@ class Edge:
         handover_s: float = HANDOVER_S,
     ) -> None:
         self._clock, self._steady, self._handover_s = clock or Clock(), steady, handover_s
-        self._block_s, self._gathering = settings.block_s, Gathering(settings.block_s, most_samples)
+        self._block_s, self._gathering = settings.block_s, Batcher(settings.block_s, most_samples)
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
         self._hear_topic = _topic(subjects.awaits(pack))
         most_bytes = int(settings.store_mib * MIB)
-        self.store = EdgeStore(self._database, _topic(subjects.raw(pack)), most_bytes, wall=self._clock.wall)
-        self.delivery, self.unread = Delivery(), 0
-        self._refusals = Refusals(self.delivery, lambda: None, first_delay_s)
-        self._sending = Sending(self.store, self.delivery, self._refusals, first_delay_s)
+        self.store = BlockStore(self._database, _topic(subjects.raw(pack)), most_bytes, wall=self._clock.wall)
+        self.delivery, self.unread = DeliveryStats(), 0
+        self._refusals = DeniedTopics(self.delivery, lambda: None, first_delay_s)
+        self._sending = QueueSender(self.store, self.delivery, self._refusals, first_delay_s)
         for warning in check_edge(settings):
             log.warning("a secret that is none", reason=warning)
         mqtt = _mqtt(settings)
-        hello = Hello(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._lose)
-        self._link = Link(brokers(mqtt), hello, connect or Dial(mqtt), self._serve, self.delivery, first_delay_s)
-        self._times: EdgeClock | None = None
+        hello = ConnectOptions(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._lose)
+        self._link = ReconnectLoop(
+            brokers(mqtt), hello, connect or BrokerConnector(mqtt), self._serve, self.delivery, first_delay_s
+        )
+        self._times: SampleClock | None = None
         self._overdue: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
         self._stack = contextlib.AsyncExitStack()
@@ -134,7 +136,7 @@ class Edge:
         """Start reaching for the server."""
         await self._stack.enter_async_context(self._database)
         await self._stack.enter_async_context(self.store)
-        self._times = EdgeClock(self.store.last_s)
+        self._times = SampleClock(self.store.last_s)
         self._task = asyncio.create_task(self._link.run(), name="edge")
         return self
 
@@ -188,7 +190,7 @@ class Edge:
         while True:
             message = await connection.receive()
             try:
-                awaits = subjects.Awaits.model_validate_json(message.payload)
+                awaits = subjects.BlockRequest.model_validate_json(message.payload)
             except ValidationError:
                 self._lose("unreadable", message.topic)
             else:

@@ -15,11 +15,11 @@ from typing import Self
 
 import structlog
 
-from bms_estimator.edge.batching import Gathered
+from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import with_oldest
-from bms_estimator.edge.block_table import LATEST_S, NS, Read, Settle, Settled
-from bms_estimator.edge.subjects import Awaits
-from bms_estimator.mqtt.message import Message, Waiting
+from bms_estimator.edge.block_table import LATEST_S, NS, Read, StoreResult, StoreTransaction
+from bms_estimator.edge.subjects import BlockRequest
+from bms_estimator.mqtt.message import Message, QueuedMessage
 from bms_estimator.store.database import Database, StoreError
 
 MOST_WAITING = 500_000
@@ -32,8 +32,8 @@ RESEND_S = 30.0
 log = structlog.get_logger(__name__)
 
 
-class EdgeStore:
-    """Keeps blocks in order until a worker has them, as ``mqtt.queue_sender.Numbered``.
+class BlockStore:
+    """Keeps blocks in order until a worker has them, as ``mqtt.queue_sender.MessageQueue``.
 
     Args:
         database: With ``EDGE_TABLES``, synced at each transaction; opened and closed by who made it.
@@ -59,8 +59,8 @@ class EdgeStore:
         self._database, self._topic, self._most_bytes = database, topic, most_bytes
         self._wall, self._resend_s = wall, resend_s
         self._run = secrets.token_hex(8)
-        self._put, self._waiting = 0, deque[tuple[int, Gathered]]()  # the latter without a number, not on disk
-        self._settled: Settled | None = None  # None before the disk has answered
+        self._put, self._waiting = 0, deque[tuple[int, ReadyBlock]]()  # the latter without a number, not on disk
+        self._settled: StoreResult | None = None  # None before the disk has answered
         self._known = 0  # which opening of the database that is of
         self._safe, self._after_s = 1, 0
         self._cursor, self._handed = 1, set[int]()
@@ -108,7 +108,7 @@ class EdgeStore:
         self._wanted.set()
         await self._task
 
-    def put(self, gathered: Gathered) -> None:
+    def put(self, gathered: ReadyBlock) -> None:
         """Take the newest block, its times in seconds since 1970; returns at once."""
         if self._task is not None and self._task.done():
             self._task.result()  # only a fault of ours ends it: let it be seen
@@ -119,7 +119,7 @@ class EdgeStore:
             self._drop(1, "the disk takes no blocks, and memory is full")
         self._wanted.set()
 
-    def heard(self, awaits: Awaits) -> None:
+    def heard(self, awaits: BlockRequest) -> None:
         """A worker says which block it awaits next."""
         if self._settled is None or awaits.store < (made := self._settled.kept.made_s * NS):
             return
@@ -132,7 +132,7 @@ class EdgeStore:
         if awaits.resend:
             self._send_again(awaits.number)
 
-    async def take(self, most: int) -> list[Waiting]:
+    async def take(self, most: int) -> list[QueuedMessage]:
         """Wait until there is a block, and hand out up to ``most`` that follow each other."""
         while True:
             while self._settled is None or self._cursor >= self._settled.kept.next:
@@ -151,7 +151,7 @@ class EdgeStore:
             if page.blocks:
                 self._cursor = page.blocks[-1][0] + 1
                 self._handed |= {number for number, _ in page.blocks}
-                return [Waiting(number, self._message(number, data)) for number, data in page.blocks]
+                return [QueuedMessage(number, self._message(number, data)) for number, data in page.blocks]
 
     def sent(self, number: int) -> None:
         """The broker has acknowledged a block: it may still be lost, so it stays."""
@@ -212,7 +212,9 @@ class EdgeStore:
         put = list(self._waiting)
         count = self._settled is None or self._known != self._database.opened
         known_s = self._settled.kept.made_s if self._settled else 0
-        settle = Settle(self._run, put, self._safe, known_s, self._after_s, self._most_bytes, self._wall(), count)
+        settle = StoreTransaction(
+            self._run, put, self._safe, known_s, self._after_s, self._most_bytes, self._wall(), count
+        )
         try:
             settled = await self._database.call(settle)
         except StoreError:
@@ -223,7 +225,7 @@ class EdgeStore:
         self._know(settled)
         return True
 
-    def _know(self, settled: Settled) -> None:
+    def _know(self, settled: StoreResult) -> None:
         """What is on disk now."""
         before, self._settled = self._settled, settled
         if before is None or before.kept.made_s != settled.kept.made_s:
@@ -237,7 +239,7 @@ class EdgeStore:
             self._handed = {number for number in self._handed if number >= self._cursor}
         self._filled.set()
 
-    def _change_to(self, settled: Settled, before: Settled | None) -> None:
+    def _change_to(self, settled: StoreResult, before: StoreResult | None) -> None:
         """Another store than before."""
         if before is not None:
             self._drop(before.kept.next - max(before.oldest, self._safe), "a new store is begun")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bms_estimator.edge.batching import Gathered
+from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import MOST_NUMBER, Block, BlockError, decode, encode
 
 NS = 1_000_000_000
@@ -31,7 +31,7 @@ EDGE_TABLES = (
 """As ``store.migrations.MIGRATIONS``."""
 
 
-class Kept(NamedTuple):
+class StoreState(NamedTuple):
     """A store and what is in it."""
 
     made_s: int
@@ -48,10 +48,10 @@ class Kept(NamedTuple):
     """... and how many it had put."""
 
 
-class Settled(NamedTuple):
+class StoreResult(NamedTuple):
     """After a transaction."""
 
-    kept: Kept
+    kept: StoreState
     oldest: int
     """Number of the oldest block; ``kept.next`` where there is none."""
     dropped: int
@@ -59,7 +59,7 @@ class Settled(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Settle:
+class StoreTransaction:
     """Put blocks, forget what is safe, make room; may be done twice.
 
     Raises:
@@ -68,7 +68,7 @@ class Settle:
 
     run: str
     """Of this process: what it has put before is not put again."""
-    put: Sequence[tuple[int, Gathered]]
+    put: Sequence[tuple[int, ReadyBlock]]
     """Blocks and their running numbers in this process, from 1; their times are seconds since 1970."""
     safe: int
     """Blocks below this number are forgotten."""
@@ -82,7 +82,7 @@ class Settle:
     count: bool
     """Whether to count the bytes anew."""
 
-    def __call__(self, connection: sqlite3.Connection) -> Settled:
+    def __call__(self, connection: sqlite3.Connection) -> StoreResult:
         """Do it."""
         kept = _kept(connection)
         if kept is None or kept.made_s < self.known_s or kept.made_s <= self.after_s:
@@ -99,13 +99,13 @@ class Settle:
         connection.execute("DELETE FROM store")
         connection.execute("INSERT INTO store VALUES (?, ?, ?, ?, ?, ?)", kept)
         (oldest,) = connection.execute("SELECT min(number) FROM block").fetchone()
-        return Settled(kept, kept.next if oldest is None else oldest, dropped)
+        return StoreResult(kept, kept.next if oldest is None else oldest, dropped)
 
-    def _begin(self, connection: sqlite3.Connection) -> Kept:
+    def _begin(self, connection: sqlite3.Connection) -> StoreState:
         """A new store, made when the first sample that waits for it was taken."""
         connection.execute("DELETE FROM block")
         first_s = float(self.put[0][1].samples["time_s"][0]) if self.put else self.now_s
-        return Kept(max(int(first_s), self.known_s + 1, self.after_s + 1), 1, 0.0, 0, "", 0)
+        return StoreState(max(int(first_s), self.known_s + 1, self.after_s + 1), 1, 0.0, 0, "", 0)
 
 
 class Page(NamedTuple):
@@ -148,16 +148,16 @@ class Read:
         return Page(blocks[0][0] if blocks else first, blocks)
 
 
-def _kept(connection: sqlite3.Connection) -> Kept | None:
+def _kept(connection: sqlite3.Connection) -> StoreState | None:
     """The store that is there; None of one that cannot be."""
     row = connection.execute("SELECT made_s, next, last_s, bytes, run, taken FROM store").fetchone()
     if row is None or [*map(type, row)] != [int, int, float, int, str, int]:
         return None
-    kept = Kept(*row)
+    kept = StoreState(*row)
     return kept if 0 < kept.made_s <= LATEST_S and 0 < kept.next < MOST_NUMBER else None
 
 
-def _put(connection: sqlite3.Connection, kept: Kept, gathered: Gathered) -> Kept:
+def _put(connection: sqlite3.Connection, kept: StoreState, gathered: ReadyBlock) -> StoreState:
     samples = gathered.samples.copy()
     samples["time_s"] = np.maximum(samples["time_s"] - kept.made_s, kept.last_s)
     data = encode(Block(kept.made_s * NS, kept.next, kept.next, gathered.arrival_s, samples))
@@ -166,7 +166,7 @@ def _put(connection: sqlite3.Connection, kept: Kept, gathered: Gathered) -> Kept
     return kept._replace(next=kept.next + 1, last_s=last_s, bytes=kept.bytes + len(data))
 
 
-def _make_room(connection: sqlite3.Connection, kept: Kept, most_bytes: int) -> tuple[Kept, int]:
+def _make_room(connection: sqlite3.Connection, kept: StoreState, most_bytes: int) -> tuple[StoreState, int]:
     """Drop the oldest, but never the newest."""
     dropped = 0
     oldest = "SELECT number, length(data) FROM block WHERE number < ? ORDER BY number LIMIT ?"

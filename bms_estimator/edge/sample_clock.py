@@ -19,7 +19,7 @@ GRID = 2.0**20
 """Offsets are whole parts of a second, 1/GRID: what is added so leaves an even pace even, which packs best."""
 
 
-class EdgeClock:
+class SampleClock:
     """Seconds since 1970 that never decrease, whatever becomes of the wall clock.
 
     Between samples counts the source's clock. Where it begins, and whether it is still right, the host says: by the

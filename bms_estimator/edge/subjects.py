@@ -3,7 +3,7 @@
 ===========================  ================================================================================
 ``raw.<pack>``               an edge's blocks, ``block``; the stream ``RAW`` takes them and stores them as ...
 ``p.<partition>.raw.<pack>`` ... this; published to it, a message reaches no stream
-``edge.<pack>.awaits``       to the edge: which block a worker awaits next, ``Awaits``
+``edge.<pack>.awaits``       to the edge: which block a worker awaits next, ``BlockRequest``
 ``bms.<pack>.<topic>``       estimates, as ``run`` publishes them
 ``hours.<pack>``             what a worker sums up each hour, kept by the stream ``HOURS``
 ``fleet.worker.<id>``        each second, from each worker: that it lives, what it holds, how far it lags
@@ -70,7 +70,7 @@ def partition_of(pack: str, partitions: int) -> int:
     return digest % partitions
 
 
-class Awaits(BaseModel):
+class BlockRequest(BaseModel):
     """To an edge: all blocks of ``store`` before ``number`` are safe and may be forgotten."""
 
     model_config = ConfigDict(frozen=True)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
-from bms_estimator.kernels.kalman_filter.hypotheses import tell
-from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, keep
+from bms_estimator.kernels.kalman_filter.hypotheses import set_soc
+from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.records import ESTIMATOR_STATE
-from bms_estimator.kernels.step import Verdict
+from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
@@ -23,8 +23,8 @@ from bms_estimator.settings.pack import Settings
 
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
-VERDICTS = tuple(Verdict)
-"""By value: ``Verdict(value)`` takes nearly as long as the kernel."""
+SAMPLE_OUTCOMES = tuple(SampleOutcome)
+"""By value: ``SampleOutcome(value)`` takes nearly as long as the kernel."""
 IDENTIFIER = IdentifierSettings()
 """How an estimator identifies unless told otherwise."""
 
@@ -86,7 +86,7 @@ class Estimator:
 
     def step(
         self, time_s: float, current_a: float, voltage_v: float, status: int = 0, temperature_c: float = math.nan
-    ) -> Verdict:
+    ) -> SampleOutcome:
         """Take one sample.
 
         Args:
@@ -99,7 +99,7 @@ class Estimator:
         Returns:
             Whether it was accepted, else why not; the state counts each kind.
         """
-        return VERDICTS[
+        return SAMPLE_OUTCOMES[
             kernel.step(self.record, self.settings_record, time_s, current_a, voltage_v, status, temperature_c)
         ]
 
@@ -132,11 +132,11 @@ class Estimator:
         self.state["soc"] = self.state["soc_coulomb"] = soc
         if self.identifying:
             f, c = self.record[0]["filter"], self.record[0]["checks"]
-            tell(f, self.settings_record[0]["filter"], soc)
+            set_soc(f, self.settings_record[0]["filter"], soc)
             c["outliers"] = 0.0
             if not c["suspects"] & UNUSABLE:
                 c["last_v"] = 0.0  # what is found frozen later is not taken back to before
-            keep(c, f)
+            store_last_good_state(c, f)
 
     def resume(self, unseen_s: float) -> None:
         """Prepare for samples of another clock, after a time in which nobody measured.

@@ -13,7 +13,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import on_grid
 from bms_estimator.kernels.identifier import LEAST_BINS
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
-from bms_estimator.kernels.kalman_filter.ocv_correction import per_node_v, place
+from bms_estimator.kernels.kalman_filter.ocv_correction import node_error_scale, node_position
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
 from bms_estimator.model.cell import CellModel, TableOcv
 
@@ -25,7 +25,7 @@ LEAST_RISE_V = 1e-6
 """An OCV increases, from one SOC of its table to the next by so much at least [V]."""
 
 
-class Learned(NamedTuple):
+class IdentifiedValue(NamedTuple):
     """A value with its standard deviation, both in the unit of its name, and for how long no data told of it."""
 
     value: float
@@ -38,7 +38,7 @@ class Learned(NamedTuple):
         return self.std / abs(self.value) if math.isfinite(self.std) and self.value else math.inf
 
 
-def present_elements(record: np.void) -> dict[str, Learned]:
+def present_elements(record: np.void) -> dict[str, IdentifiedValue]:
     """The elements at the present SOC by name: ``ELEMENT_NAMES``, in ohm and farad.
 
     Args:
@@ -48,7 +48,9 @@ def present_elements(record: np.void) -> dict[str, Learned]:
     order = R_TS, R_TL, C_TS, C_TL, R_S
     values = elements["value"][list(order)]
     stds = values * np.sqrt(elements["ln_variance"][list(order)])
-    return {name: Learned(*map(float, one)) for name, *one in zip(ELEMENT_NAMES, values, stds, ages, strict=True)}
+    return {
+        name: IdentifiedValue(*map(float, one)) for name, *one in zip(ELEMENT_NAMES, values, stds, ages, strict=True)
+    }
 
 
 def present_resistance(record: np.void) -> float:
@@ -57,7 +59,7 @@ def present_resistance(record: np.void) -> float:
     return float(ohm[R_S] + ohm[R_TS] + ohm[R_TL])
 
 
-def fitted_parameter(record: np.void, index: int) -> Learned | None:
+def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
     """a_index, 1..15, of the fit over SOC; None where its element was seen in fewer than ``LEAST_BINS`` bins.
 
     Args:
@@ -68,16 +70,16 @@ def fitted_parameter(record: np.void, index: int) -> Learned | None:
     fit = record["fit"]
     if fit["bins"][element] < LEAST_BINS:
         return None
-    return Learned(float(fit["a"][index]), float(fit["std"][index]), float(record["unlearned_s"][element]))
+    return IdentifiedValue(float(fit["a"][index]), float(fit["std"][index]), float(record["unlearned_s"][element]))
 
 
-def relative_capacity(record: np.void) -> Learned:
+def relative_capacity(record: np.void) -> IdentifiedValue:
     """True over declared capacity."""
     ln_q, std = _bias(record, LN_Q)
-    return Learned(math.exp(ln_q), math.exp(ln_q) * std, 0.0)
+    return IdentifiedValue(math.exp(ln_q), math.exp(ln_q) * std, 0.0)
 
 
-def relative_series_resistance(record: np.void, settings: np.void) -> Learned:
+def relative_series_resistance(record: np.void, settings: np.void) -> IdentifiedValue:
     """R_s over that of the cell file at the same SOC and temperature.
 
     Args:
@@ -86,12 +88,14 @@ def relative_series_resistance(record: np.void, settings: np.void) -> Learned:
     """
     ratio, variance = ln_r_s_ratio(record["filter"], settings["filter"])
     value = math.exp(ratio)
-    return Learned(value, value * math.sqrt(variance), float(record["unlearned_s"][ELEMENT_NAMES.index("r_s_ohm")]))
+    return IdentifiedValue(
+        value, value * math.sqrt(variance), float(record["unlearned_s"][ELEMENT_NAMES.index("r_s_ohm")])
+    )
 
 
-def current_offset(record: np.void) -> Learned:
+def current_offset(record: np.void) -> IdentifiedValue:
     """Measured less true current [A]."""
-    return Learned(*_bias(record, OFFSET), 0.0)
+    return IdentifiedValue(*_bias(record, OFFSET), 0.0)
 
 
 def _bias(record: np.void, j: int) -> tuple[float, float]:
@@ -107,7 +111,7 @@ def _bias(record: np.void, j: int) -> tuple[float, float]:
     return mean, math.sqrt(weight @ (variances + (values - mean) ** 2))
 
 
-def learned_ocv(
+def ocv_correction_with_std(
     record: np.void, settings: np.void, soc: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What the true OCV is above that of the cell file, of the likeliest hypothesis, and how sure that is.
@@ -138,14 +142,14 @@ def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArra
     p, soc = np.frombuffer(bytearray(settings), EKF_SETTINGS)[0], np.frombuffer(socs)
     rows, own_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
     for n, x in enumerate(soc):
-        i, t = place(x)
-        volts = per_node_v(p, x, t)
+        i, t = node_position(x)
+        volts = node_error_scale(p, x, t)
         rows[n, i], rows[n, i + 1] = volts * (1.0 - t), volts * t
         own_v[n] = on_grid(x, p["curve_error_v"])
     return rows, own_v
 
 
-def learned_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
+def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
     """A cell file's values with what the filter has learned: OCV, capacity, resistances, each with its error.
 
     Args:
@@ -179,7 +183,7 @@ def _corrected(record: np.void, settings: np.void, cell: CellModel, series: int)
     """The OCV of a cell as a table, corrected, other columns as they are."""
     table = cell.ocv.model_dump() if isinstance(cell.ocv, TableOcv) else {"form": "table", "soc": EVEN}
     soc = np.array(table["soc"])
-    correction_v, std_v = learned_ocv(record, settings, soc)
+    correction_v, std_v = ocv_correction_with_std(record, settings, soc)
     ocv_v = np.array(table["ocv_v"]) if "ocv_v" in table else np.array([emf(x, cell.a) for x in soc])
     rising_v = np.maximum.accumulate(ocv_v + correction_v / series) + LEAST_RISE_V * np.arange(soc.size)
     return table | {"ocv_v": rising_v.tolist(), "error_v": (std_v / series).tolist()}

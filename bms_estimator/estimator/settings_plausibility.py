@@ -21,7 +21,7 @@ CONVERTER_STEPS = 1024
 """Of the firmware's voltage converter: its range in steps."""
 
 
-def implausible(settings: Settings, cell: PackModel) -> list[str]:
+def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
     """One line for each setting that cannot be, with what it may have been meant to be; empty where all may be.
 
     Args:

@@ -19,7 +19,7 @@ def lemma_conditions(cell: CellModel) -> list[Condition]:
     """Check what Lemma 4.1.1 asks of the bounds, weights and initial values of (a7, a9) and (a10, a12).
 
     A capacitance that is positive over the whole of SOC 0..1 at both ends of the adaptation needs no condition;
-    ``failed`` leaves it out.
+    ``failed_conditions`` leaves it out.
     """
     conditions = []
     for number, (amplitude, offset) in enumerate(((7, 9), (10, 12)), start=1):
@@ -33,7 +33,7 @@ def lemma_conditions(cell: CellModel) -> list[Condition]:
     return conditions
 
 
-def failed(cell: CellModel) -> list[Condition]:
+def failed_conditions(cell: CellModel) -> list[Condition]:
     """The conditions that fail where they are needed."""
     needed = []
     for (amplitude, offset), number in zip(((7, 9), (10, 12)), "12", strict=True):

@@ -4,13 +4,13 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from bms_estimator.model.payloads import Report
+from bms_estimator.model.payloads import Payload
 
 HOUR_S = 3600
 Correlation = Annotated[float, Field(ge=-1.001, le=1.001)]
 
 
-class Hour(Report):
+class Hour(Payload):
     """One row. Charge and energy out are of discharge; std are of one standard deviation; what is not known is null."""
 
     model_config = ConfigDict(extra="ignore")  # who collects may be older than who sums up
@@ -70,4 +70,4 @@ class Hour(Report):
     tau_tl_std_s: float | None
     delta_1: float | None = Field(description="SOC below which C_ts is negative (2.11)")
     delta_2: float | None = Field(description="SOC below which C_tl is negative (2.12)")
-    suspects: int = Field(description="bits of model.input_faults.Suspect")
+    suspects: int = Field(description="bits of model.input_faults.InputFault")

@@ -10,12 +10,12 @@ from numba.core.dispatcher import Dispatcher
 
 PACKAGE = __name__.partition(".")[0]
 
-Tell = Callable[[str, int, int], None]
+CompileCallback = Callable[[str, int, int], None]
 """Gets a kernel's name, how many kernels have begun with it, and how many there are at most."""
 
 
 @contextmanager
-def compiling_told(tell: Tell) -> Iterator[None]:
+def report_compilation(tell: CompileCallback) -> Iterator[None]:
     """Have ``tell`` hear of each kernel whose compilation begins meanwhile, among the kernels imported so far."""
     with event.install_listener("numba:compile", _Listener(_kernels(), tell)):
         yield
@@ -34,7 +34,7 @@ def _name(kernel: FunctionType) -> str:
 class _Listener(event.Listener):
     """numba tells which function it begins to compile; one that comes from the cache is not told."""
 
-    def __init__(self, kernels: set[FunctionType], tell: Tell) -> None:
+    def __init__(self, kernels: set[FunctionType], tell: CompileCallback) -> None:
         self._waiting, self._all, self._tell = kernels, len(kernels), tell
 
     def on_start(self, event: event.Event) -> None:

@@ -24,7 +24,7 @@ _WORDS = "f8", "i8", "u8"
 
 
 @lru_cache(maxsize=64)
-def mirror_of(dtype: np.dtype[Any]) -> Mirror:
+def symmetry_map(dtype: np.dtype[Any]) -> Mirror:
     """Which words of a record are likely the same: those below the diagonal of a square matrix, as those above.
 
     Raises:

@@ -9,19 +9,19 @@ from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     equivalent,
 )
-from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, seed, update_all
-from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, keep
+from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, spawn_hypotheses, update_hypotheses
+from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
-from bms_estimator.kernels.kalman_filter.temperature import follow_temperature, is_temperature
-from bms_estimator.kernels.kalman_filter.window import clear, gather
-from bms_estimator.kernels.observer.learning_law import begin_learning, take_as_rest
+from bms_estimator.kernels.kalman_filter.temperature import is_temperature, update_arrhenius_factors
+from bms_estimator.kernels.kalman_filter.window import add_to_window, reset_window
+from bms_estimator.kernels.observer.learning_law import initialize_learning, initialize_states_at_rest
 from bms_estimator.kernels.observer.series_resistance import (
     begin_series_resistance,
 )
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-UNSEEN_MOST = 0.3
+MAX_SOC_STD_AFTER_GAP = 0.3
 """How far the SOC may have gone while nobody measured, at most, std."""
 
 
@@ -30,7 +30,7 @@ def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, tempe
     """Begin at the SOC of the observer's first sample."""
     initialize_filter(s.filter, p.filter, s.observer.soc, current_a, temperature_c)
     s.unlearned_s[:] = math.inf
-    take_first(s, p, current_a, voltage_v)
+    first_update(s, p, current_a, voltage_v)
 
 
 @njit(cache=True)
@@ -38,56 +38,56 @@ def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, volta
     """Go on after a time in which nobody measured: SOC as ``s.filter`` has it, to ``soc_std``; the load before is not known."""
     f = s.filter
     f.current_a, f.step.phase = current_a, UNHELD
-    follow_temperature(f)
-    seed(f, p.filter, f.soc, min(soc_std, UNSEEN_MOST))
-    clear(f)
+    update_arrhenius_factors(f)
+    spawn_hypotheses(f, p.filter, f.soc, min(soc_std, MAX_SOC_STD_AFTER_GAP))
+    reset_window(f)
     s.checks.slow_v = 0.0
     s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
     if not s.checks.suspects & UNUSABLE:
         s.checks.last_v = 0.0
-        take_first(s, p, current_a, voltage_v)
+        first_update(s, p, current_a, voltage_v)
 
 
 @njit(cache=True)
-def take_first(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
+def first_update(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
     """The first sample is an update by itself."""
     f = s.filter
-    keep(s.checks, f)
-    gather(f, current_a, voltage_v)
+    store_last_good_state(s.checks, f)
+    add_to_window(f, current_a, voltage_v)
     s.checks.mean_a = current_a
-    update_all(f, p.filter)
+    update_hypotheses(f, p.filter)
     equivalent(f, p.filter, s.elements)
     s.observer.soc = f.soc
 
 
 @njit(cache=True)
-def begin(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
+def initialize_state(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """The first sample of all, of filter and learning law. Records as in ``step``."""
     s.learning.temperature_c = math.nan
-    sense(s.learning, temperature_c)
+    store_temperature(s.learning, temperature_c)
     if p.identify:
         start_filter(s, p, current_a, voltage_v, temperature_c)
     if p.learning.enabled:
-        begin_learning(s, p, voltage_v)
+        initialize_learning(s, p, voltage_v)
     if p.series_resistance:
         begin_series_resistance(s, p)
 
 
 @njit(cache=True)
-def sense(m: Record, temperature_c: float) -> None:
+def store_temperature(m: Record, temperature_c: float) -> None:
     """Keep the last temperature that a cell can have; ``m`` is a record of LEARNING_STATE."""
     if is_temperature(temperature_c):
         m.temperature_c = temperature_c
 
 
 @njit(cache=True)
-def after_restart(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
+def restart_after_unknown_gap(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """The first sample of a new clock: nobody knows how long nobody measured. Records as in ``step``."""
     if p.identify:
         if is_temperature(temperature_c):
             s.filter.temperature_c, s.filter.sensed = temperature_c, 1
         elif not s.filter.sensed:
             s.filter.temperature_c = REFERENCE_C
-        restart_filter(s, p, UNSEEN_MOST, current_a, voltage_v)
+        restart_filter(s, p, MAX_SOC_STD_AFTER_GAP, current_a, voltage_v)
     if p.learning.enabled:
-        take_as_rest(s, p, voltage_v)
+        initialize_states_at_rest(s, p, voltage_v)

@@ -5,22 +5,22 @@ from enum import IntEnum
 
 from bms_estimator.kernels.cell_model.chen_mora import soc_from_ocv
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
-from bms_estimator.kernels.identifier import identify
+from bms_estimator.kernels.identifier import identifier_step
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
-from bms_estimator.kernels.kalman_filter.hypotheses import pack_std
+from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
 from bms_estimator.kernels.observer.learning_law import learning_step
-from bms_estimator.kernels.observer.observer import count_charge, observer_step, start
+from bms_estimator.kernels.observer.observer import count_charge, initialize, observer_step
 from bms_estimator.kernels.observer.series_resistance import (
     series_resistance,
     series_resistance_step,
 )
-from bms_estimator.kernels.start import after_restart, begin, sense
+from bms_estimator.kernels.start import initialize_state, restart_after_unknown_gap, store_temperature
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
 
-class Verdict(IntEnum):
+class SampleOutcome(IntEnum):
     """Outcome of a sample: accepted, or why it was dropped."""
 
     ACCEPTED = 0
@@ -30,16 +30,16 @@ class Verdict(IntEnum):
     SATURATED = 4
 
 
-_ACCEPTED = int(Verdict.ACCEPTED)
-_NOT_FINITE = int(Verdict.NOT_FINITE)
-_OUT_OF_RANGE = int(Verdict.OUT_OF_RANGE)
-_REPEATED = int(Verdict.REPEATED)
-_SATURATED = int(Verdict.SATURATED)
+_ACCEPTED = int(SampleOutcome.ACCEPTED)
+_NOT_FINITE = int(SampleOutcome.NOT_FINITE)
+_OUT_OF_RANGE = int(SampleOutcome.OUT_OF_RANGE)
+_REPEATED = int(SampleOutcome.REPEATED)
+_SATURATED = int(SampleOutcome.SATURATED)
 _SATURATED_BITS = 3  # SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED
 
 
 @njit(cache=True)
-def judge(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
+def validate_sample(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float, status: int) -> int:
     """Verdict on a sample; dropped samples are counted by kind.
 
     ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
@@ -81,18 +81,18 @@ def step(
         temperature_c: Of the cell [C]; NaN without a sensor.
 
     Returns:
-        A ``Verdict``.
+        A ``SampleOutcome``.
     """
     s, p = state[0].observer, settings[0].observer
-    verdict = judge(s, p, time_s, current_a, voltage_v, status)
+    verdict = validate_sample(s, p, time_s, current_a, voltage_v, status)
     if verdict != _ACCEPTED:
         return verdict
     s.samples += 1
     if not s.started:
-        start(s, p, time_s, current_a, voltage_v)
-        begin(state[0], settings[0], current_a, voltage_v, temperature_c)
+        initialize(s, p, time_s, current_a, voltage_v)
+        initialize_state(state[0], settings[0], current_a, voltage_v, temperature_c)
         return verdict
-    sense(state[0].learning, temperature_c)
+    store_temperature(state[0].learning, temperature_c)
     dt_s = time_s - s.time_s
     s.time_s = time_s
     new_clock = dt_s == -math.inf
@@ -104,7 +104,7 @@ def step(
         s.current_a = state[0].filter.current_a = current_a
         state[0].filter.step.phase = UNHELD
         if new_clock:
-            after_restart(state[0], settings[0], current_a, voltage_v, temperature_c)
+            restart_after_unknown_gap(state[0], settings[0], current_a, voltage_v, temperature_c)
         else:
             s.time_steps_back += 1
         return verdict
@@ -112,7 +112,7 @@ def step(
     before_a, before_soc = s.current_a, s.soc
     count_charge(s, p, dt_s, current_a)
     if settings[0].identify:
-        identify(state[0], settings[0], dt_s, gap, current_a, voltage_v, temperature_c)
+        identifier_step(state[0], settings[0], dt_s, gap, current_a, voltage_v, temperature_c)
     else:
         s.soc = s.soc_coulomb
     if settings[0].learning.enabled:
@@ -126,7 +126,7 @@ def step(
 
 @njit(cache=True)
 def is_gap(s: Record, p: Record, dt_s: float) -> bool:
-    """True when samples are missing in a step of ``dt_s``; such gaps are counted. Records as in ``judge``."""
+    """True when samples are missing in a step of ``dt_s``; such gaps are counted. Records as in ``validate_sample``."""
     gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
     s.step_s = dt_s
     if gap:
@@ -151,14 +151,14 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
     for j in range(samples.shape[0]):
         x = samples[j]
         if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
-            write_observer(trace[rows], state[0].observer, settings[0], x)
-            write_filter(trace[rows], state[0], settings[0])
+            write_observer_trace(trace[rows], state[0].observer, settings[0], x)
+            write_filter_trace(trace[rows], state[0], settings[0])
             rows += 1
     return rows
 
 
 @njit(cache=True)
-def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
+def write_observer_trace(row: Record, s: Record, p: Record, x: Record) -> None:
     """Columns of the observer for an accepted sample ``x``; records of OBSERVER_STATE and ESTIMATOR_SETTINGS."""
     row.time_s = x.time_s
     row.voltage_v = x.voltage_v
@@ -179,7 +179,7 @@ def write_observer(row: Record, s: Record, p: Record, x: Record) -> None:
 
 
 @njit(cache=True)
-def write_filter(row: Record, s: Record, p: Record) -> None:
+def write_filter_trace(row: Record, s: Record, p: Record) -> None:
     """Columns of the filter; records as in ``step``. Without it: the observer's e, R_s by (4.2) where that is on, and NaN.
 
     The observer's v_ts and v_tl make up for any error of the SOC: (7.1) would only give its own SOC back.
@@ -195,7 +195,7 @@ def write_filter(row: Record, s: Record, p: Record) -> None:
     row.innovation_v = f.innovation_v
     e_o = open_circuit(f, p.filter, e, row.current_a, row.voltage_v)
     row.soc_ocv = soc_from_ocv(e_o, p.filter.ocv_v, p.filter.ocv_slope_v)
-    row.soc_std = pack_std(f, p.filter)
+    row.soc_std = weakest_cell_soc_std(f, p.filter)
     row.r_s_ohm, row.r_s_std_ohm = value_and_std(e, R_S)
     row.r_ts_ohm, row.r_ts_std_ohm = value_and_std(e, R_TS)
     row.tau_ts_s, row.tau_ts_std_s = value_and_std(e, TAU_TS)

@@ -5,8 +5,8 @@ from typing import Literal, NamedTuple
 
 from pydantic import Field
 
-from bms_estimator.model.input_faults import Suspect
-from bms_estimator.model.payloads import Health, Report, Snapshot
+from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.payloads import Health, Payload, Snapshot
 
 LEAST_UNSEEN_S = 1.0
 """Shorter gaps are counted in ``health`` alone [s]."""
@@ -29,7 +29,7 @@ Name = Literal[
 ]
 
 
-class Event(Report):
+class Event(Payload):
     """Topic ``event``, not retained: something that happened."""
 
     time: str = Field(description="when it was seen, ISO 8601, UTC")
@@ -118,7 +118,7 @@ def _suspicions(was: list[str], now: list[str]) -> Iterator[_Found]:
 
 def _kind(sentence: str) -> str:
     """The part of a suspicion that does not change."""
-    return next((suspect.text for suspect in Suspect if sentence.endswith(suspect.text)), sentence)
+    return next((suspect.text for suspect in InputFault if sentence.endswith(suspect.text)), sentence)
 
 
 def _checkpoint(was: str, health: Health) -> Iterator[_Found]:

@@ -3,7 +3,7 @@
 from enum import IntFlag
 
 
-class Suspect(IntFlag):
+class InputFault(IntFlag):
     """Bits of ``suspects`` of ``kernels.kalman_filter.input_checks.CHECKS``; several may be set."""
 
     SIGN_OF_CURRENT = 1
@@ -18,24 +18,24 @@ class Suspect(IntFlag):
     @property
     def text(self) -> str:
         """What was seen and what to do, of every bit set; empty when none is."""
-        return "; ".join(_TEXT[suspect] for suspect in Suspect if suspect in self)
+        return "; ".join(_TEXT[suspect] for suspect in InputFault if suspect in self)
 
 
 _TEXT = {
-    Suspect.SIGN_OF_CURRENT: "innovation grows with current, the voltage rises when discharge is said to rise: "
+    InputFault.SIGN_OF_CURRENT: "innovation grows with current, the voltage rises when discharge is said to rise: "
     "check the sign of the current (sensor.current_sign; --current-sign of a recording)",
-    Suspect.OFFSET: "counted charge and voltage drift apart with time: "
+    InputFault.OFFSET: "counted charge and voltage drift apart with time: "
     "check the zero of the current sensor with the load disconnected",
-    Suspect.CAPACITY: "counted charge and voltage drift apart with charge moved: check the declared capacity, "
+    InputFault.CAPACITY: "counted charge and voltage drift apart with charge moved: check the declared capacity, "
     "the cell may have aged",
-    Suspect.OCV: "voltage and SOC agree with no nearby OCV: check that the OCV curve belongs to this cell's chemistry "
+    InputFault.OCV: "voltage and SOC agree with no nearby OCV: check that the OCV curve belongs to this cell's chemistry "
     "and the number of cells in series",
-    Suspect.OUTLIERS: "single samples far from those around them: check wiring and supply of the sensors, "
+    InputFault.OUTLIERS: "single samples far from those around them: check wiring and supply of the sensors, "
     "and that voltage and current are taken at the same time",
-    Suspect.TEMPERATURE: "errors are larger there: check the temperature sensor, or make the cell file with captures "
+    InputFault.TEMPERATURE: "errors are larger there: check the temperature sensor, or make the cell file with captures "
     "at this temperature",
-    Suspect.VOLTAGE: "the voltage stays the same to the last digit though current or charge move it: check its wire, "
+    InputFault.VOLTAGE: "the voltage stays the same to the last digit though current or charge move it: check its wire, "
     "and that the source does not repeat an old value",
-    Suspect.CURRENT: "the current stays the same to the last digit though the voltage changes: check the current sensor, "
+    InputFault.CURRENT: "the current stays the same to the last digit though the voltage changes: check the current sensor, "
     "and that all loads flow through it",
 }

@@ -15,7 +15,7 @@ PAYLOAD_VERSION = 1
 """Of all that is published; ``sinks/mqtt/topics.py`` says when it goes up."""
 
 
-class Report(BaseModel):
+class Payload(BaseModel):
     """Base of all published values."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -24,7 +24,7 @@ class Report(BaseModel):
 _COUNTED = "at the terminals over all runs, up to the last checkpoint where there is one; it never decreases"
 
 
-class Estimate(Report):
+class Estimate(Payload):
     """Topic ``state``: one publish window. V, I, P and temperature are means over the window, the rest is its last sample."""
 
     time: str = Field(description="arrival of the window's last sample, ISO 8601, UTC")
@@ -80,7 +80,7 @@ class Estimate(Report):
     sample_rate_hz: float | None = Field(description="samples per second of the stream's clock in the window [Hz]")
 
 
-class Parameter(Report):
+class Parameter(Payload):
     """One parameter with what is known of it."""
 
     value: float | None = Field(description="in the unit of its name; a1..a21 in SI as in the thesis")
@@ -91,7 +91,7 @@ class Parameter(Report):
     reason: str | None = Field(default=None, description="why not valid, with the numbers")
 
 
-class OcvCurve(Report):
+class OcvCurve(Payload):
     """The open-circuit voltage at 25 C over SOC, as it is used now."""
 
     soc: list[float] = Field(description="0, 0.05 ... 1")
@@ -99,7 +99,7 @@ class OcvCurve(Report):
     std_v: list[float] = Field(description="standard deviation of ocv_v [V]")
 
 
-class ParameterReport(Report):
+class ParameterReport(Payload):
     """Topic ``parameters``: a1..a21 and the elements at the present SOC."""
 
     publish_time: str = Field(description="when this message was made, ISO 8601, UTC")
@@ -115,7 +115,7 @@ class ParameterReport(Report):
     )
 
 
-class LoopHealth(Report):
+class LoopHealth(Payload):
     """How long what comes in waits, and for what."""
 
     latency_p50_s: float | None = Field(
@@ -131,7 +131,7 @@ class LoopHealth(Report):
     )
 
 
-class RecordingHealth(Report):
+class RecordingHealth(Payload):
     """The recording of the board's raw bytes."""
 
     on: bool = Field(description="false: it has ended, the log says why")
@@ -139,7 +139,7 @@ class RecordingHealth(Report):
     missed_reads: int = Field(description="reads that are not in the file")
 
 
-class EdgeHealth(Report):
+class EdgeHealth(Payload):
     """Blocks of raw samples on their way to a fleet's server."""
 
     blocks_kept: int = Field(description="on disk or in memory, for no worker has said yet that they are safe")
@@ -148,7 +148,7 @@ class EdgeHealth(Report):
     trouble: str | None = Field(description="why the server was lost or could not be reached last; null: never")
 
 
-class HookHealth(Report):
+class HookHealth(Payload):
     """Alarm hooks, since start."""
 
     done: int = Field(description="programs that ended with exit code 0, messages that were published")
@@ -159,7 +159,7 @@ class HookHealth(Report):
     failing: list[str] = Field(description="hooks whose last attempt failed, each with its reason")
 
 
-class Totals(Report):
+class Totals(Payload):
     """What is counted over restarts; what came after the last checkpoint before a kill is missing."""
 
     since: str = Field(description="when counting began, ISO 8601, UTC")
@@ -172,7 +172,7 @@ class Totals(Report):
     energy_in_kwh: float = Field(default=0.0, description="charged [kWh]")
 
 
-class Health(Report):
+class Health(Payload):
     """Topic ``health``, retained: how the service and the line are."""
 
     publish_time: str = Field(description="when this message was made, ISO 8601, UTC")
@@ -218,7 +218,7 @@ class Health(Report):
     total: Totals = Field(description="what is counted since the checkpoint began, over restarts")
 
 
-class Info(Report):
+class Info(Payload):
     """Topic ``info``, retained: what this is."""
 
     device: str
@@ -239,7 +239,7 @@ class Info(Report):
     board: dict[str, str] = Field(description="what the board said of itself; empty until it did")
 
 
-class Alarm(Report):
+class Alarm(Payload):
     """Topic ``alarm/<name>``, retained: one alarm of a pack, raised or not."""
 
     name: str = Field(description="as in the topic and in [alarms]")

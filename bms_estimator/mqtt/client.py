@@ -18,10 +18,10 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from bms_estimator.mqtt.connection import Hello, LinkError, Received, Refusal
+from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, PublishRejection, ReceivedMessage
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.reason_codes import UNSUPPORTED_VERSION, is_final, words
-from bms_estimator.mqtt.receive_queue import Inbox
+from bms_estimator.mqtt.receive_queue import ReceiveQueue
 
 PARTING_S = 1.0
 """A connection that broke cannot be ended in good order [s]."""
@@ -52,7 +52,7 @@ _logger.propagate = False
 _logger.addHandler(_ToLog())
 
 
-class Patience(NamedTuple):
+class Timeouts(NamedTuple):
     """How long silence is borne."""
 
     connected_s: float = 10.0
@@ -64,7 +64,7 @@ class Patience(NamedTuple):
     """A broker that lives but takes longer for a message is lost; NATS takes 10 s to find a new leader [s]."""
 
 
-PATIENCE = Patience()
+PATIENCE = Timeouts()
 
 
 class ClosedError(aiomqtt.MqttError):
@@ -81,7 +81,9 @@ class Client(aiomqtt.Client):
         patience: When it is taken as lost.
     """
 
-    def __init__(self, arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello, patience: Patience) -> None:
+    def __init__(
+        self, arguments: dict[str, Any], protocol: ProtocolVersion, hello: ConnectOptions, patience: Timeouts
+    ) -> None:
         limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
         limit.MaximumPacketSize = hello.most_bytes
         self._is_5 = protocol is ProtocolVersion.V5
@@ -93,34 +95,36 @@ class Client(aiomqtt.Client):
             will=aiomqtt.Will(*hello.will) if hello.will else None,
             keepalive=patience.keepalive_s,
             max_queued_incoming_messages=hello.most_waiting,
-            queue_type=partial(Inbox, hello.lose, hello.most_bytes),  # type: ignore[arg-type]  # it is only called
+            queue_type=partial(ReceiveQueue, hello.lose, hello.most_bytes),  # type: ignore[arg-type]  # it is only called
             socket_options=[NO_DELAY],
             logger=_logger,
         )
         self._acknowledged_s = patience.acknowledged_s
         self._client.on_log = self._on_log
         self.protocol = "MQTT 5" if self._is_5 else "MQTT 3.1.1"
-        self._answers: dict[int, asyncio.Future[Refusal | None]] = {}
+        self._answers: dict[int, asyncio.Future[PublishRejection | None]] = {}
         self._in_flight = asyncio.Semaphore(self._client.max_inflight_messages)
         self._most_bytes: int | None = None
         self._abandoned = False
         self._why = "the connection broke"
 
-    async def publish(self, message: Message) -> Refusal | None:  # type: ignore[override]
+    async def publish(self, message: Message) -> PublishRejection | None:  # type: ignore[override]
         """As ``Connection`` has it."""
         if self._most_bytes is not None and HEAD_BYTES + len(message.topic) + len(message.payload) > self._most_bytes:
             # it would end the connection
-            return Refusal(f"longer than the {self._most_bytes} bytes that the broker takes", for_now=False)
+            return PublishRejection(f"longer than the {self._most_bytes} bytes that the broker takes", for_now=False)
         async with self._in_flight:
             info = self._client.publish(*message)
             if info.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
-                raise LinkError(f"a message cannot be sent: {error_string(info.rc)}")
-            answer: asyncio.Future[Refusal | None] = asyncio.get_running_loop().create_future()
+                raise BrokerConnectionError(f"a message cannot be sent: {error_string(info.rc)}")
+            answer: asyncio.Future[PublishRejection | None] = asyncio.get_running_loop().create_future()
             self._answers[info.mid] = answer
             try:
                 await asyncio.wait([answer], timeout=self._acknowledged_s)
                 if not answer.done():  # it may be, though the time is up: both came while the process stood still
-                    raise LinkError(f"the broker has not acknowledged a message for {self._acknowledged_s:g} s")
+                    raise BrokerConnectionError(
+                        f"the broker has not acknowledged a message for {self._acknowledged_s:g} s"
+                    )
                 return answer.result()
             finally:
                 self._answers.pop(info.mid, None)
@@ -135,20 +139,20 @@ class Client(aiomqtt.Client):
         try:
             answers = await super().subscribe(wanted)
         except aiomqtt.MqttError as error:
-            raise LinkError(f"no subscription: {error}") from None
+            raise BrokerConnectionError(f"no subscription: {error}") from None
         return {
             topic: words(answer)
             for topic, answer in zip(topics, answers, strict=False)
             if isinstance(answer, ReasonCode) and answer.is_failure
         }
 
-    async def receive(self) -> Received:
+    async def receive(self) -> ReceivedMessage:
         """As ``Connection`` has it."""
         try:
             message = await anext(self.messages)
         except aiomqtt.MqttError:
-            raise LinkError(self._why) from None
-        return Received(message.topic.value, bytes(message.payload), bool(message.retain))
+            raise BrokerConnectionError(self._why) from None
+        return ReceivedMessage(message.topic.value, bytes(message.payload), bool(message.retain))
 
     def abandon(self) -> None:
         """Give up an attempt to connect, though the broker may still answer."""
@@ -227,13 +231,13 @@ class Client(aiomqtt.Client):
         answer = self._answers.get(mid)
         if answer is not None and not answer.done():
             answer.set_result(
-                Refusal(words(reason_code), not is_final(reason_code)) if reason_code.is_failure else None
+                PublishRejection(words(reason_code), not is_final(reason_code)) if reason_code.is_failure else None
             )
 
 
 @contextlib.asynccontextmanager
 async def connected(
-    arguments: dict[str, Any], protocol: ProtocolVersion, hello: Hello, patience: Patience
+    arguments: dict[str, Any], protocol: ProtocolVersion, hello: ConnectOptions, patience: Timeouts
 ) -> AsyncIterator[Client]:
     """A connection while the context lasts; whoever leaves it by an exception has the broker publish the will.
 
@@ -262,7 +266,7 @@ def refusal(error: aiomqtt.MqttError) -> str:
     return str(error)
 
 
-def may_know_3_1_1(error: aiomqtt.MqttError) -> bool:
+def should_retry_with_v311(error: aiomqtt.MqttError) -> bool:
     """Whether what refused MQTT 5 so may be a broker of the older one."""
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
         return error.rc.value == UNSUPPORTED_VERSION

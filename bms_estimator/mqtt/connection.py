@@ -9,11 +9,11 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING
 
 
-class LinkError(Exception):
+class BrokerConnectionError(Exception):
     """The broker cannot be reached, refuses the connection, or the connection is lost; the message says why."""
 
 
-class Received(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """A message that came."""
 
     topic: str
@@ -21,7 +21,7 @@ class Received(NamedTuple):
     retain: bool
 
 
-class Refusal(NamedTuple):
+class PublishRejection(NamedTuple):
     """The broker's no to a message."""
 
     why: str
@@ -29,7 +29,7 @@ class Refusal(NamedTuple):
     """It may take the same message later."""
 
 
-class Hello(NamedTuple):
+class ConnectOptions(NamedTuple):
     """How each connection of a client begins."""
 
     identifier: str
@@ -61,7 +61,7 @@ class Connection(Protocol):
             The topics that the broker refuses, and why.
         """
 
-    async def publish(self, message: Message) -> Refusal | None:
+    async def publish(self, message: Message) -> PublishRejection | None:
         """Hand over a message and wait until the broker has acknowledged it.
 
         What is published by several tasks goes out in the order in which they called.
@@ -70,9 +70,9 @@ class Connection(Protocol):
             The broker's refusal, where it does and says so.
         """
 
-    async def receive(self) -> Received:
+    async def receive(self) -> ReceivedMessage:
         """Wait for the next message."""
 
 
-Connect = Callable[[Broker, Hello], AbstractAsyncContextManager[Connection]]
+Connect = Callable[[Broker, ConnectOptions], AbstractAsyncContextManager[Connection]]
 """Connects to a broker; entering raises LinkError, and within a bounded time."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class Delivery:
+class DeliveryStats:
     """What became of what one pack sends and of what is asked of it, since start; topic ``health`` shows it."""
 
     drops: int = 0

@@ -5,15 +5,15 @@ from collections.abc import Callable
 
 import structlog
 
-from bms_estimator.mqtt.connection import Refusal
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.connection import PublishRejection
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.message import Message
-from bms_estimator.process.backoff import Pauses
+from bms_estimator.process.backoff import Backoff
 
 log = structlog.get_logger(__name__)
 
 
-class Refusals:
+class DeniedTopics:
     """Names what is denied in log and health, and has what is retained said again when it was refused for now.
 
     Args:
@@ -22,8 +22,8 @@ class Refusals:
         first_delay_s: From a refusal for now to that; doubles with each time [s].
     """
 
-    def __init__(self, delivery: Delivery, say_again: Callable[[], object], first_delay_s: float) -> None:
-        self._delivery, self._say_again, self._pauses = delivery, say_again, Pauses(first_delay_s)
+    def __init__(self, delivery: DeliveryStats, say_again: Callable[[], object], first_delay_s: float) -> None:
+        self._delivery, self._say_again, self._pauses = delivery, say_again, Backoff(first_delay_s)
         self._said: set[str] = set()  # one line of the log for each topic and connection
         self._denied: dict[str, None] = {}  # in the order in which it was found out
         self._for_now: dict[str, None] = {}
@@ -53,7 +53,7 @@ class Refusals:
         self._denied.pop(topic, None)
         self._show()
 
-    def answered(self, message: Message, refusal: Refusal | None) -> None:
+    def answered(self, message: Message, refusal: PublishRejection | None) -> None:
         """The broker has taken a message, or refused it."""
         if refusal is not None and refusal.for_now:
             self._for_now[message.topic] = None

@@ -12,7 +12,7 @@ class Message(NamedTuple):
     retain: bool
 
 
-class Waiting(NamedTuple):
+class QueuedMessage(NamedTuple):
     """A message on its way to the broker."""
 
     number: int

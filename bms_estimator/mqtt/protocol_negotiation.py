@@ -10,12 +10,12 @@ from aiomqtt import ProtocolVersion
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import Broker, password, tls_context
-from bms_estimator.mqtt.client import PATIENCE, Client, Patience, connected, may_know_3_1_1, refusal
-from bms_estimator.mqtt.connection import Hello, LinkError
+from bms_estimator.mqtt.client import PATIENCE, Client, Timeouts, connected, refusal, should_retry_with_v311
+from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
 from bms_estimator.settings.mqtt import MqttSettings
 
 
-class Dial:
+class BrokerConnector:
     """Connects by MQTT 5; by 3.1.1 where the broker refuses that or does not know what to say.
 
     Args:
@@ -23,12 +23,12 @@ class Dial:
         patience: How long silence is borne.
     """
 
-    def __init__(self, settings: MqttSettings, patience: Patience = PATIENCE) -> None:
+    def __init__(self, settings: MqttSettings, patience: Timeouts = PATIENCE) -> None:
         self._settings, self._patience = settings, patience
         self._silent: set[str] = set()  # gave no answer at all to MQTT 5, as a stopped broker does, and a very old one
 
     @contextlib.asynccontextmanager
-    async def __call__(self, broker: Broker, hello: Hello) -> AsyncIterator[Client]:
+    async def __call__(self, broker: Broker, hello: ConnectOptions) -> AsyncIterator[Client]:
         """As ``Connect`` has it.
 
         Raises:
@@ -38,13 +38,13 @@ class Dial:
             try:
                 client = await self._connect(stack, await asyncio.to_thread(self._arguments, broker), broker.url, hello)
             except UserError as error:
-                raise LinkError(str(error)) from None
+                raise BrokerConnectionError(str(error)) from None
             except aiomqtt.MqttError as error:
-                raise LinkError(refusal(error)) from None
+                raise BrokerConnectionError(refusal(error)) from None
             yield client
 
     async def _connect(
-        self, stack: contextlib.AsyncExitStack, arguments: dict[str, Any], url: str, hello: Hello
+        self, stack: contextlib.AsyncExitStack, arguments: dict[str, Any], url: str, hello: ConnectOptions
     ) -> Client:
         protocol = ProtocolVersion.V311 if url in self._silent else ProtocolVersion.V5
         try:
@@ -52,14 +52,14 @@ class Dial:
                 try:
                     return await stack.enter_async_context(connected(arguments, protocol, hello, self._patience))
                 except aiomqtt.MqttError as error:
-                    if protocol is ProtocolVersion.V311 or not may_know_3_1_1(error):
+                    if protocol is ProtocolVersion.V311 or not should_retry_with_v311(error):
                         raise
                 return await stack.enter_async_context(
                     connected(arguments, ProtocolVersion.V311, hello, self._patience)
                 )
         except TimeoutError:
             self._silent ^= {url}  # the other version next time
-            raise LinkError(f"no answer within {self._patience.connected_s:g} s") from None
+            raise BrokerConnectionError(f"no answer within {self._patience.connected_s:g} s") from None
 
     def _arguments(self, broker: Broker) -> dict[str, Any]:
         """For aiomqtt; reads files.

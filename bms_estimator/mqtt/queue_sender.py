@@ -5,17 +5,17 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from bms_estimator.mqtt.connection import Connection
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.mqtt.denied_topics import Refusals
-from bms_estimator.mqtt.message import Waiting
-from bms_estimator.process.backoff import Pauses
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.denied_topics import DeniedTopics
+from bms_estimator.mqtt.message import QueuedMessage
+from bms_estimator.process.backoff import Backoff
 
 WINDOW = 16
 """Messages on their way to a broker that has not acknowledged them: below the 20 that brokers allow, so that the live
 topics find room beside them."""
 
 
-class Numbered(Protocol):
+class MessageQueue(Protocol):
     """Messages in order, each with a number, as ``Outbox`` keeps them.
 
     Attributes:
@@ -32,7 +32,7 @@ class Numbered(Protocol):
     def dropped(self) -> int:
         """Messages that found no room, since start."""
 
-    async def take(self, most: int) -> Sequence[Waiting]:
+    async def take(self, most: int) -> Sequence[QueuedMessage]:
         """Wait until there is a message, and hand out up to ``most`` of the oldest that were not since ``rewind``."""
 
     def sent(self, number: int) -> None:
@@ -42,7 +42,7 @@ class Numbered(Protocol):
         """A connection is lost: hand out again, in order, what was not acknowledged."""
 
 
-class Sending:
+class QueueSender:
     """Empties what keeps messages in order.
 
     Args:
@@ -52,9 +52,11 @@ class Sending:
         first_delay_s: Before what is refused for now is tried again; doubles with each time [s].
     """
 
-    def __init__(self, outbox: Numbered, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
+    def __init__(
+        self, outbox: MessageQueue, delivery: DeliveryStats, refusals: DeniedTopics, first_delay_s: float
+    ) -> None:
         self._outbox, self._delivery, self._refusals = outbox, delivery, refusals
-        self._pauses = Pauses(first_delay_s)
+        self._pauses = Backoff(first_delay_s)
         self._refused = 0
         self._moved = asyncio.Event()
 
@@ -84,7 +86,7 @@ class Sending:
         """Send until the broker refuses one for now; then none is on its way any more, nor handed out."""
         room = asyncio.Semaphore(WINDOW)
 
-        async def carry(waiting: Waiting) -> None:
+        async def carry(waiting: QueuedMessage) -> None:
             if not await self._carry(connection, waiting):
                 feeding.cancel()
             room.release()
@@ -109,7 +111,7 @@ class Sending:
                     return
             self._outbox.rewind()
 
-    async def _carry(self, connection: Connection, waiting: Waiting) -> bool:
+    async def _carry(self, connection: Connection, waiting: QueuedMessage) -> bool:
         """Send one message; False: to be tried again.
 
         What is refused for good is counted and given up: else it would hold up all the rest.

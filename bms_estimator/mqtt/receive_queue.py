@@ -11,7 +11,7 @@ MOST_BYTES = 16_384
 """Nothing that a service hears is longer: an MQTT 5 broker keeps it back, what an older one hands on is thrown away."""
 
 
-class Inbox(asyncio.Queue[aiomqtt.Message]):
+class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):
     """What waits to be read; bounded in bytes, too, and without a log line for each message that is lost.
 
     Args:

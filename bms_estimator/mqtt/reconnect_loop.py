@@ -7,11 +7,11 @@ from collections.abc import Awaitable, Callable, Sequence
 import structlog
 
 from bms_estimator.mqtt.broker_config import Broker
-from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.process.backoff import FIRST_DELAY_S, Pauses
+from bms_estimator.mqtt.connection import BrokerConnectionError, Connect, Connection, ConnectOptions
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.process.backoff import FIRST_DELAY_S, Backoff
 
-LASTING_S = 10.0
+MIN_CONNECTION_S = 10.0
 """A connection that ends sooner is taken as an attempt that failed [s]."""
 LOG_S = 600.0
 """The same reason is logged no more often than this [s]."""
@@ -19,7 +19,7 @@ LOG_S = 600.0
 log = structlog.get_logger(__name__)
 
 
-class Link:
+class ReconnectLoop:
     """Connects, serves, and connects again until it is closed.
 
     The next broker is tried at once. When all were tried there is a pause.
@@ -36,15 +36,15 @@ class Link:
     def __init__(
         self,
         brokers: Sequence[Broker],
-        hello: Hello,
+        hello: ConnectOptions,
         connect: Connect,
         serve: Callable[[Connection], Awaitable[None]],
-        delivery: Delivery,
+        delivery: DeliveryStats,
         first_delay_s: float = FIRST_DELAY_S,
     ) -> None:
         self._brokers, self._hello, self._connect, self._serve = brokers, hello, connect, serve
         self._delivery = delivery
-        self._pauses = Pauses(first_delay_s)
+        self._pauses = Backoff(first_delay_s)
         self._said: dict[str, tuple[str, float]] = {}  # by URL: the last reason and when it was logged
         self.closing = asyncio.Event()
 
@@ -71,10 +71,10 @@ class Link:
                 log.info("broker connected", url=broker.url, protocol=connection.protocol)
                 self._said.clear()
                 await self._serve(connection)
-        except* LinkError as errors:
+        except* BrokerConnectionError as errors:
             self._delivery.losses += since_s is not None
             self._say(broker, "broker not reachable" if since_s is None else "broker lost", errors)
-        return since_s is not None and loop.time() - since_s >= LASTING_S
+        return since_s is not None and loop.time() - since_s >= MIN_CONNECTION_S
 
     def _say(self, broker: Broker, event: str, errors: BaseException) -> None:
         """Log why; a broker that is away for days says the same each half minute."""

@@ -10,11 +10,11 @@ import structlog
 
 from bms_estimator.model.clock import Clock
 from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.mqtt.protocol_negotiation import Dial
-from bms_estimator.mqtt.reconnect_loop import Link
-from bms_estimator.mqtt.topic_cache import Device, Heard, Published
+from bms_estimator.mqtt.connection import BrokerConnectionError, Connect, Connection, ConnectOptions
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
+from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics, TopicCache
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
 
@@ -51,7 +51,7 @@ class Subscriber:
     def __init__(
         self,
         settings: MqttSettings,
-        heard: Callable[[Heard], None] = lambda _: None,
+        heard: Callable[[DeviceMessage], None] = lambda _: None,
         linked: Callable[[], None] = lambda: None,
         *,
         connect: Connect | None = None,
@@ -62,19 +62,19 @@ class Subscriber:
         check(settings)
         self._heard, self._linked, self._clock = heard, linked, clock or Clock()
         self._topic = f"{settings.base_topic}/#"
-        self._published = Published(settings.base_topic, left_out)
-        self._delivery = Delivery()
+        self._published = TopicCache(settings.base_topic, left_out)
+        self._delivery = DeliveryStats()
         self._lost_since: float | None = self._clock.wall()
-        hello = Hello(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
-        connect = connect or Dial(settings)
-        self._link = Link(brokers(settings), hello, connect, self._serve, self._delivery, first_delay_s)
+        hello = ConnectOptions(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
+        connect = connect or BrokerConnector(settings)
+        self._link = ReconnectLoop(brokers(settings), hello, connect, self._serve, self._delivery, first_delay_s)
         self._task: asyncio.Task[None] | None = None
         self._loss_logged_s: float | None = None
         self.lost_messages = 0
         """That were too long, or came faster than they were read."""
 
     @property
-    def devices(self) -> Mapping[str, Device]:
+    def devices(self) -> Mapping[str, DeviceTopics]:
         """What each published last, by name, in the order in which they were heard first."""
         return self._published.devices
 
@@ -122,7 +122,7 @@ class Subscriber:
     async def _serve(self, connection: Connection) -> None:
         """Hear until the connection is lost or the subscriber closes."""
         for topic, why in (await connection.subscribe(self._topic, [])).items():
-            raise LinkError(f"not allowed to read {topic}: {why}")
+            raise BrokerConnectionError(f"not allowed to read {topic}: {why}")
         self._say_link(None)
         try:
             async with asyncio.TaskGroup() as tasks:

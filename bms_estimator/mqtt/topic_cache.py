@@ -28,7 +28,7 @@ ALARM = "alarm/"
 """Prefix of alarm topics."""
 
 
-class Heard(NamedTuple):
+class DeviceMessage(NamedTuple):
     """A message of a device."""
 
     device: str
@@ -39,7 +39,7 @@ class Heard(NamedTuple):
 
 
 @dataclass
-class Device:
+class DeviceTopics:
     """What one device published last."""
 
     topics: dict[str, Any] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Device:
         return bool(self.alarms), self.last_s
 
 
-class Published:
+class TopicCache:
     """What each device below a base topic published last.
 
     Args:
@@ -69,7 +69,7 @@ class Published:
 
     def __init__(self, base_topic: str, left_out: Callable[[str], object] = str) -> None:
         self._root, self._left_out = f"{base_topic}/", left_out
-        self.devices: dict[str, Device] = {}
+        self.devices: dict[str, DeviceTopics] = {}
         """By name, in the order in which they were heard first."""
         self._hidden: set[str] = set()
 
@@ -78,7 +78,7 @@ class Published:
         """Number of devices that publish but have no room, ``MAX_HIDDEN`` at most."""
         return len(self._hidden)
 
-    def take(self, topic: str, payload: bytes, now_s: float) -> Heard | None:
+    def take(self, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
         """Keep a message.
 
         Args:
@@ -98,10 +98,10 @@ class Published:
             return self._forget(name, rest)
         return self._keep(name, rest, payload, now_s)
 
-    def _keep(self, name: str, topic: str, payload: bytes, now_s: float) -> Heard | None:
+    def _keep(self, name: str, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
         value = parsed(payload)
         raised = topic.startswith(ALARM) and isinstance(value, dict) and value.get("active") is True
-        device = self.devices.get(name) or Device()
+        device = self.devices.get(name) or DeviceTopics()
         if topic not in device.topics and len(device.topics) >= MAX_TOPICS:
             return None
         if sum(device.sizes.values()) + len(payload) - device.sizes.get(topic, 0) > MAX_DEVICE_BYTES:
@@ -114,7 +114,7 @@ class Published:
         (device.alarms.add if raised else device.alarms.discard)(topic)
         self.devices[name] = device
         self._hidden.discard(name)
-        return Heard(name, topic, value)
+        return DeviceMessage(name, topic, value)
 
     def _make_room(self, now_s: float, *, urgent: bool) -> bool:
         """Return whether one more device may be stored, dropping the least important one if necessary."""
@@ -133,7 +133,7 @@ class Published:
             self._hidden.add(name)
         self._left_out(name)
 
-    def _forget(self, name: str, topic: str) -> Heard | None:
+    def _forget(self, name: str, topic: str) -> DeviceMessage | None:
         self._hidden.discard(name)
         device = self.devices.get(name)
         if device is None or topic not in device.topics:
@@ -142,7 +142,7 @@ class Published:
         device.alarms.discard(topic)
         if not device.topics:
             del self.devices[name]
-        return Heard(name, topic, None)
+        return DeviceMessage(name, topic, None)
 
 
 def parsed(payload: bytes) -> Any:

@@ -28,7 +28,7 @@ HEADERS = {
 """Of every answer: nothing from elsewhere is loaded, nobody frames it, and no address with a token in it leaks."""
 
 
-class Guard:
+class AccessControl:
     """Decides on requests.
 
     Args:
@@ -63,13 +63,13 @@ class Guard:
         return self._token is None or hmac.compare_digest(_bytes(cookie), self.cookie.encode())
 
 
-def guard_of(settings: PageSettings) -> Guard:
+def guard_of(settings: PageSettings) -> AccessControl:
     """The guard that settings ask for.
 
     Raises:
         UserError: The token cannot be read, or is too short.
     """
-    return Guard((settings.address.host, *settings.hosts), _token(settings))
+    return AccessControl((settings.address.host, *settings.hosts), _token(settings))
 
 
 def _token(settings: PageSettings) -> str | None:

@@ -5,9 +5,9 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 from bms_estimator.mqtt.subscriber import Subscriber
-from bms_estimator.mqtt.topic_cache import Heard
-from bms_estimator.page.history_query import Past
-from bms_estimator.page.pack_topics import Hub
+from bms_estimator.mqtt.topic_cache import DeviceMessage
+from bms_estimator.page.history_query import HistoryQuery
+from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.page import PageSettings
@@ -28,10 +28,10 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
     Raises:
         UserError: A setting cannot be used, or the address is taken.
     """
-    hub, past = Hub(), Past()
+    hub, past = PackTopics(), HistoryQuery()
     hub.say_link(f"{', '.join(broker.urls)}: not reached yet")
 
-    def heard(message: Heard) -> None:
+    def heard(message: DeviceMessage) -> None:
         if message.device not in hub.packs:
             past.add(message.device, folder / f"{message.device}.sqlite")
         hub.put(*message)

@@ -14,7 +14,7 @@ LINK = "link"
 """Whether what fills it is connected."""
 
 
-class Newest:
+class LatestValues:
     """What is known: JSON as text in one line, by key."""
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class Reader:
         newest: Source of the keys and texts.
     """
 
-    def __init__(self, newest: Newest) -> None:
+    def __init__(self, newest: LatestValues) -> None:
         self._newest = newest
         self._waiting = dict.fromkeys(newest.keys())
         self._due = asyncio.Event()

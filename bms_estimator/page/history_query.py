@@ -39,7 +39,7 @@ SPANS = {"hour": Span(3600, MINUTE_S), "day": Span(86_400, 5 * MINUTE_S), "month
 """60, 288 and 360 points."""
 
 
-class Past:
+class HistoryQuery:
     """Reads histories, one at a time; what several ask for within a minute is read once.
 
     Args:

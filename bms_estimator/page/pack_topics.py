@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from bms_estimator.page.event_stream import Newest
+from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.store.minute import epoch_s
 
@@ -30,7 +30,7 @@ _Row = tuple[float, tuple[float | None, ...]]
 """Seconds since 1970, and what ``RECENT_FIELDS`` were."""
 
 
-class Hub(Newest):
+class PackTopics(LatestValues):
     """What is known of all packs.
 
     Keys are ``<pack>/<topic>``, values JSON as text in one line.

@@ -7,8 +7,8 @@ from pathlib import Path
 from aiohttp import web
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.page.history_query import SPANS, Past
-from bms_estimator.page.pack_topics import Hub
+from bms_estimator.page.history_query import SPANS, HistoryQuery
+from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.settings.page import PageSettings
 
@@ -46,8 +46,8 @@ class PageServer(WebServer):
     def __init__(
         self,
         settings: PageSettings,
-        hub: Hub,
-        past: Past,
+        hub: PackTopics,
+        past: HistoryQuery,
         *,
         opened: Callable[[str], object] = str,
         patient: bool = True,

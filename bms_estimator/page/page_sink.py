@@ -10,11 +10,11 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.topic_cache import parsed
-from bms_estimator.page.history_query import Past
-from bms_estimator.page.pack_topics import Hub
+from bms_estimator.page.history_query import HistoryQuery
+from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 
 
 class PageSink:
@@ -29,10 +29,10 @@ class PageSink:
 
     def __init__(self, pages: "Pages", settings: PageSettings, pack: str, history: Path | None = None) -> None:
         self._pages, self._settings, self._pack, self._history = pages, settings, pack, history
-        self._messages = Messages("", pack)
+        self._messages = MessageBuilder("", pack)
         self._before: Snapshot | None = None
-        self._sent = Sent()
-        self._hub = Hub()
+        self._sent = PublishedState()
+        self._hub = PackTopics()
         self._stack = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> Self:
@@ -74,7 +74,7 @@ class Pages:
         self._open: dict[str, _Page] = {}
 
     @contextlib.asynccontextmanager
-    async def serving(self, settings: PageSettings, pack: str, history: Path | None) -> AsyncIterator[Hub]:
+    async def serving(self, settings: PageSettings, pack: str, history: Path | None) -> AsyncIterator[PackTopics]:
         """Have a pack shown; the first one starts the server of its address, the last one ends it.
 
         Raises:
@@ -103,7 +103,7 @@ class _Page:
 
     def __init__(self, settings: PageSettings, opened: Callable[[str], object]) -> None:
         self.settings, self.packs = settings, 0
-        self.hub, self.past = Hub(), Past()
+        self.hub, self.past = PackTopics(), HistoryQuery()
         self._server = PageServer(settings, self.hub, self.past, opened=opened)
         self._started: asyncio.Task[PageServer] | None = None
 

@@ -12,8 +12,8 @@ import structlog
 from aiohttp import web
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.page.access_control import HEADERS, Guard, guard_of
-from bms_estimator.page.event_stream import Newest, Reader
+from bms_estimator.page.access_control import HEADERS, AccessControl, guard_of
+from bms_estimator.page.event_stream import LatestValues, Reader
 from bms_estimator.process.listener import CONNECTIONS, Listener
 from bms_estimator.settings.page import Listen, PageSettings
 
@@ -75,14 +75,14 @@ class WebServer:
         self,
         settings: PageSettings,
         files: Mapping[str, File],
-        newest: Newest,
+        newest: LatestValues,
         handlers: Mapping[str, Handler],
         *,
         opened: Callable[[str], object] = str,
         patient: bool = True,
     ) -> None:
         self._newest, self._opened, self._patient = newest, opened, patient
-        self._guard: Guard = guard_of(settings)
+        self._guard: AccessControl = guard_of(settings)
         self._wanted, self._listening = settings.address, settings.address
         self._files = {path: _read(file) for path, file in files.items()}
         self._handlers = {**dict.fromkeys(files, self._file), "/events": self._events, **handlers}

@@ -13,7 +13,7 @@ LONGEST_DELAY_S = 30.0
 """A broker in the house is back before long [s]."""
 
 
-class Pauses:
+class Backoff:
     """Pauses that grow, each shortened by chance so that not all clients of a broker come back together.
 
     Args:

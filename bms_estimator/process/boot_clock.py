@@ -19,7 +19,7 @@ TIMEX_BYTES = 512
 
 
 @dataclass(frozen=True)
-class Moment:
+class BootTimestamp:
     """When something was left that outlives the process, and maybe the machine's being on.
 
     Attributes:
@@ -34,7 +34,7 @@ class Moment:
     boot_s: float
     boot: str
 
-    def since(self, before: "Moment") -> float:
+    def since(self, before: "BootTimestamp") -> float:
         """How long after ``before`` this is [s]; infinite when nobody knows."""
         if self.boot and self.boot == before.boot:
             return self.boot_s - before.boot_s
@@ -49,10 +49,10 @@ def synchronised() -> bool:
     return TIMESYNCD.exists() if state < 0 else state < TIME_ERROR
 
 
-def moment() -> Moment:
+def boot_timestamp() -> BootTimestamp:
     """Now. The unit hides /proc/sys and says in ``BMS_BOOT_ID`` which start of the machine this is."""
     boot = os.environ.get("BMS_BOOT_ID") or (BOOT_ID.read_text(encoding="ascii") if BOOT_ID.exists() else "")
-    return Moment(
+    return BootTimestamp(
         wall_s=time.time(),
         synchronised=synchronised(),
         boot_s=since_boot(),

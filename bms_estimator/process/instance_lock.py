@@ -24,7 +24,7 @@ log = structlog.get_logger(__name__)
 
 
 @contextlib.contextmanager
-def alone(folder: Path, pack: str) -> Iterator[None]:
+def instance_lock(folder: Path, pack: str) -> Iterator[None]:
     """Serve a pack alone: two services would overwrite each other's checkpoint and availability.
 
     Held is an abstract socket named after folder and pack. It is gone with the process however that ends, is no file that

@@ -42,7 +42,7 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
 
 
 @contextlib.contextmanager
-def drained() -> Iterator[None]:
+def flush_logs() -> Iterator[None]:
     """In the end the log is written before what the command line says of an error."""
     try:
         yield

@@ -5,7 +5,7 @@ import stat
 from pathlib import Path
 
 
-class NotOursError(Exception):
+class UnsafeFileError(Exception):
     """What has the name of a private file is none of ours."""
 
 
@@ -24,7 +24,7 @@ def read_private(path: Path, longest: int) -> bytes:
     with open(descriptor, "rb") as file:  # noqa: PTH123 - a descriptor has no Path
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode) or found.st_size > longest:
-            raise NotOursError("no file, or too long")
+            raise UnsafeFileError("no file, or too long")
         return file.read()
 
 

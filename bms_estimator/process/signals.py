@@ -28,7 +28,7 @@ def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
 
 
 @contextlib.contextmanager
-def starting(reload: Callable[[], None] | None) -> Iterator[None]:
+def startup_signals(reload: Callable[[], None] | None) -> Iterator[None]:
     """What signals do until an event loop takes them: SIGTERM ends the process with exit code 0, there is nothing to save.
 
     Args:

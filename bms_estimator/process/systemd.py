@@ -10,7 +10,7 @@ CREDENTIALS = Path("/run/credentials")
 """Where systemd keeps the credentials of all units."""
 
 
-class Notifier:
+class SystemdNotifier:
     """Sends states to the socket of ``NOTIFY_SOCKET``; silent where there is none.
 
     One process may serve several packs. Systemd knows one service: a state is sent when all of them have it, since it was

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 
-from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices.daly import DalyDialect
 from bms_estimator.protocols.devices.jbd import JbdDialect
 from bms_estimator.protocols.devices.jk import JkDialect
@@ -13,14 +13,14 @@ from bms_estimator.protocols.devices.vedirect import VeDirectDialect
 from bms_estimator.settings.sensor import SensorSettings
 
 
-def _board(sensor: SensorSettings) -> Dialect:
+def _board(sensor: SensorSettings) -> DeviceProtocol:
     """Of the firmware, whose frames a kernel decodes: who has another device need not load any."""
     from bms_estimator.protocols.firmware.protocol import BoardDialect  # noqa: PLC0415 - as said above
 
     return BoardDialect(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz)
 
 
-DIALECTS: Mapping[str, Callable[[SensorSettings], Dialect]] = {
+DIALECTS: Mapping[str, Callable[[SensorSettings], DeviceProtocol]] = {
     "binary": _board,
     "text": lambda sensor: TextDialect(current_sign=sensor.current_sign),
     "vedirect": lambda sensor: VeDirectDialect(current_sign=sensor.current_sign),
@@ -33,6 +33,6 @@ DIALECTS: Mapping[str, Callable[[SensorSettings], Dialect]] = {
 """By the protocol's name in the settings and in the header of a capture."""
 
 
-def make_dialect(sensor: SensorSettings) -> Dialect:
+def make_dialect(sensor: SensorSettings) -> DeviceProtocol:
     """What ``[sensor]`` asks for; it turns the sign of the current."""
     return DIALECTS[sensor.protocol](sensor)

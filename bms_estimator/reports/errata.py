@@ -7,7 +7,7 @@ from bms_estimator.kernels.cell_model.chen_mora import delta, emf
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.reports import printed_pack, printed_values
 from bms_estimator.reports.quasi_steady import quasi_steady
-from bms_estimator.reports.report_items import Table, Verdict, number
+from bms_estimator.reports.report_items import Reproduction, Table, number
 from bms_estimator.reports.simulated_experiment import pack
 from bms_estimator.reports.simulation import ALPHA, CURRENT_A, Simulation, mean_error_percent
 from bms_estimator.reports.theorem_4_1_2 import C_RATES, PRODUCTS, measure
@@ -51,7 +51,7 @@ def table(s: Simulation) -> Table:
         "what is printed and what holds",
         ("mark", "where", "says", "holds"),
         rows,
-        Verdict.ADDED,
+        Reproduction.ADDED,
         "The project carries the corrected form of each; its numbers are computed with this report.",
     )
 

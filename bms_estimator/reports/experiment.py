@@ -6,8 +6,8 @@ from functools import cached_property
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.reports.procedure import Capture, Protocol, kind_of
-from bms_estimator.reports.report_items import Verdict
+from bms_estimator.reports.procedure import Capture, Procedure, kind_of
+from bms_estimator.reports.report_items import Reproduction
 from bms_estimator.reports.simulated_experiment import SensorChain, captures, experiments, pack
 from bms_estimator.reports.thesis_claims import claim
 
@@ -45,34 +45,34 @@ class Experiment:
         return experiments()
 
     @cached_property
-    def protocol(self) -> Protocol:
+    def protocol(self) -> Procedure:
         """On the real captures, or on the simulated pack through 16 bits."""
         if self.recorded is None:
-            return Protocol(pack(), captures(self._true, FINE), FINE.voltage_step_v)
+            return Procedure(pack(), captures(self._true, FINE), FINE.voltage_step_v)
         cell = self.recorded.cell
         found = [Capture(name, kind_of(name, s, cell.cell.capacity_ah), s) for name, s in self.recorded.samples]
-        return Protocol(cell, found, self.recorded.voltage_step_v)
+        return Procedure(cell, found, self.recorded.voltage_step_v)
 
     @cached_property
-    def coarse(self) -> Protocol | None:
+    def coarse(self) -> Procedure | None:
         """On the simulated pack through 10 bits; None for real captures."""
         if self.recorded is not None:
             return None
-        return Protocol(pack(), captures(self._true, COARSE), COARSE.voltage_step_v)
+        return Procedure(pack(), captures(self._true, COARSE), COARSE.voltage_step_v)
 
-    def tested(self, *keys: str) -> tuple[Verdict, str]:
+    def tested(self, *keys: str) -> tuple[Reproduction, str]:
         """Verdict on one or more of ``claims.CLAIMS``, all of which must hold on the captures, and why, in words.
 
         Nothing is tested on the simulated pack: it has the model's own form.
         """
         if self.recorded is None:
-            return Verdict.NO_DATA, ""
+            return Reproduction.NO_DATA, ""
         found = [claim(key, [self.protocol]) for key in keys]
         words = "".join(f"{one.words} " for one in found)
-        verdicts = {one.verdict for one in found} - {Verdict.NO_DATA}
+        verdicts = {one.verdict for one in found} - {Reproduction.NO_DATA}
         if not verdicts:
-            return Verdict.NO_DATA, words
-        return (Verdict.CLAIM_FAILS if Verdict.CLAIM_FAILS in verdicts else Verdict.CLAIM_HOLDS), words
+            return Reproduction.NO_DATA, words
+        return (Reproduction.CLAIM_FAILS if Reproduction.CLAIM_FAILS in verdicts else Reproduction.CLAIM_HOLDS), words
 
     @property
     def truth(self) -> Floats | None:

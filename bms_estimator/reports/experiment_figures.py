@@ -8,8 +8,8 @@ import numpy as np
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
 from bms_estimator.reports import printed_values
 from bms_estimator.reports.experiment import Experiment
-from bms_estimator.reports.procedure import Kind, Protocol
-from bms_estimator.reports.report_items import Figure, Verdict
+from bms_estimator.reports.procedure import Kind, Procedure
+from bms_estimator.reports.report_items import Figure, Reproduction
 from bms_estimator.reports.simulation import SOC_GRID
 from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot, products_plot
 from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
@@ -21,7 +21,7 @@ PER_FIGURE = 4
 def _figure(
     key: str, title: str, svg: str, experiment: Experiment, reason: str, *, claims: tuple[str, ...] = ()
 ) -> Figure:
-    verdict, tested = experiment.tested(*claims) if claims else (Verdict.NO_DATA, "")
+    verdict, tested = experiment.tested(*claims) if claims else (Reproduction.NO_DATA, "")
     return Figure(key, title, svg, verdict, f"{experiment.unpublished} {tested}{reason}")
 
 
@@ -148,15 +148,15 @@ def figure_31(experiment: Experiment) -> Figure:
     )
 
 
-def _constant(p: Protocol) -> list[str]:
+def _constant(p: Procedure) -> list[str]:
     return [c.name for c in p.of(Kind.CONSTANT)][:PER_FIGURE]
 
 
-def _steps(p: Protocol) -> list[str]:
+def _steps(p: Procedure) -> list[str]:
     return [name for name in p.dynamic if name not in _constant(p)][:2]
 
 
-def _largest(p: Protocol, names: list[str]) -> str:
+def _largest(p: Procedure, names: list[str]) -> str:
     if not names:
         return "None of the captures is such a load."
     return f"Largest error {max(p.dynamic[name].max_percent for name in names):.2f} %."
@@ -179,7 +179,7 @@ def _grid(names: list[str], one: Callable[[Any, str], None], key: str) -> str:
     return plot(draw, rows=rows, columns=columns, salt=f"figure-{key}")
 
 
-def _voltages(p: Protocol) -> Callable[[Any, str], None]:
+def _voltages(p: Procedure) -> Callable[[Any, str], None]:
     def one(ax: Any, name: str) -> None:
         run = p.dynamic[name]
         t, y, yhat = thin(run.time_s / 3600.0, run.voltage_v, run.predicted_v)
@@ -191,7 +191,7 @@ def _voltages(p: Protocol) -> Callable[[Any, str], None]:
     return one
 
 
-def _errors(p: Protocol) -> Callable[[Any, str], None]:
+def _errors(p: Procedure) -> Callable[[Any, str], None]:
     def one(ax: Any, name: str) -> None:
         run = p.dynamic[name]
         t, e = thin(run.time_s / 3600.0, run.error_percent)

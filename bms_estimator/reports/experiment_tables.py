@@ -9,7 +9,7 @@ from bms_estimator.calibration.ocv.points import max_v, pooled, rms_v
 from bms_estimator.reports import printed_values
 from bms_estimator.reports.experiment import Experiment
 from bms_estimator.reports.procedure import KNEE_SOC, STATIC_SOC
-from bms_estimator.reports.report_items import Table, Verdict, number
+from bms_estimator.reports.report_items import Reproduction, Table, number
 
 
 def table_8(experiment: Experiment) -> Table:
@@ -38,7 +38,7 @@ def table_8(experiment: Experiment) -> Table:
         "Step 1: a16 to a21 from voltage relaxation tests",
         tuple(columns),
         tuple(rows),
-        Verdict.NO_DATA,
+        Reproduction.NO_DATA,
         f"{experiment.unpublished} {points.soc.size} points; residual RMS (largest): joint fit "
         f"{1e3 * rms_v(joint.residual_v):.2f} ({1e3 * max_v(joint.residual_v):.2f}) mV, mean of the parameters "
         f"{1e3 * rms_v(of_mean):.2f} ({1e3 * max_v(of_mean):.2f}) mV, monotone table {1e3 * rms_v(table.residual_v):.2f} "
@@ -62,7 +62,7 @@ def table_9(experiment: Experiment) -> Table:
         "Step 3: a13 to a15",
         columns,
         tuple(rows),
-        Verdict.NO_DATA,
+        Reproduction.NO_DATA,
         f"{experiment.unpublished} R_s by (4.2), with the sign of (2.4) and each value weighted by its current squared (E19), "
         f"over {len(protocol.r_s_curves)} constant loads and relaxation tests; residual of the fit {1e3 * fit.rms_ohm:.2f} mΩ RMS. It takes up what R_ts + R_tl, which come from the bounds, have "
         "wrong; a13 at 0 says that no rise towards empty is left for it.",
@@ -112,7 +112,7 @@ def table_10(experiment: Experiment) -> Table:
         "Step 2: a1 to a12 by Algorithm 1",
         columns,
         tuple(rows),
-        Verdict.FITTED if printed_bounds else Verdict.NO_DATA,
+        Reproduction.FITTED if printed_bounds else Reproduction.NO_DATA,
         f"{corrected}Run on {protocol.smallest.name}: {run.outcome}; t_int = {w.t_int_s:.1f} s ({w.start_reason}), "
         f"t_unst = {w.t_unst_s:.0f} s ({w.end_reason}). The estimates are the limits of the bounds, on any data (E3).",
         free=printed_values.FREE_PARAMETERS["10"] if printed_bounds else 0,

@@ -3,19 +3,19 @@
 from html import escape
 from pathlib import Path
 
-from bms_estimator.reports.report_items import Figure, Item, Table, Verdict, label, name
+from bms_estimator.reports.report_items import Figure, Item, Reproduction, Table, label, name
 from bms_estimator.reports.thesis_report import Report
 from bms_estimator.version import __version__
 
 BADGE = {
-    Verdict.FITTED: "fitted",
-    Verdict.RECOMPUTED: "recomputed",
-    Verdict.CLAIM_HOLDS: "holds",
-    Verdict.CLAIM_FAILS: "fails",
-    Verdict.NO_DATA: "no-data",
-    Verdict.CONTRADICTED: "contradicted",
-    Verdict.GIVEN: "given",
-    Verdict.ADDED: "added",
+    Reproduction.FITTED: "fitted",
+    Reproduction.RECOMPUTED: "recomputed",
+    Reproduction.CLAIM_HOLDS: "holds",
+    Reproduction.CLAIM_FAILS: "fails",
+    Reproduction.NO_DATA: "no-data",
+    Reproduction.CONTRADICTED: "contradicted",
+    Reproduction.GIVEN: "given",
+    Reproduction.ADDED: "added",
 }
 
 STYLE = """
@@ -118,7 +118,7 @@ def _navigation(report: Report) -> str:
 
 
 def _short(item: Item) -> str:
-    if item.verdict is Verdict.ADDED:
+    if item.verdict is Reproduction.ADDED:
         return item.key
     return f"{'T' if isinstance(item, Table) else 'F'} {item.key}"
 
@@ -128,7 +128,7 @@ def _counts(report: Report) -> str:
     for verdict, css in BADGE.items():
         count = sum(item.verdict is verdict for item in report.items)
         if count:
-            words = "diagram, photograph or input" if verdict is Verdict.GIVEN else verdict.value
+            words = "diagram, photograph or input" if verdict is Reproduction.GIVEN else verdict.value
             parts.append(f'<li class="{css}"><strong>{count}</strong>{escape(words)}</li>')
     return f'<ul class="counts">{"".join(parts)}</ul>'
 
@@ -140,7 +140,7 @@ def _badge(item: Item) -> str:
 def _article(item: Item) -> str:
     head = f'<h3><span class="no">{escape(name(item))}</span> {escape(item.title)} {_badge(item)}</h3>'
     body = item.svg if isinstance(item, Figure) else _table(item)
-    brief = ' class="brief"' if isinstance(item, Figure) and not item.svg and item.verdict is Verdict.GIVEN else ""
+    brief = ' class="brief"' if isinstance(item, Figure) and not item.svg and item.verdict is Reproduction.GIVEN else ""
     return f'<article id="{_anchor(item)}"{brief}>{head}{body}<p class="reason">{escape(item.reason)}</p></article>'
 
 

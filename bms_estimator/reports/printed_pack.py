@@ -9,7 +9,7 @@ from bms_estimator.kernels.cell_model.chen_mora import delta, emf, r_s
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values
-from bms_estimator.reports.report_items import Figure, Verdict
+from bms_estimator.reports.report_items import Figure, Reproduction
 from bms_estimator.reports.simulation import element, mean_error_percent
 from bms_estimator.reports.simulation_figures import NO_VALUES, condition_plot, elements_plot, products_plot
 from bms_estimator.reports.svg_plot import plot
@@ -94,7 +94,7 @@ def figure_28() -> Figure:
         "28",
         "a8 and a11 meet their stability conditions",
         plot(draw, columns=2, salt="figure-28"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} From Table 10 alone: delta1 = {at[0]:.6f}, delta2 = {at[1]:.6f}.",
     )
 
@@ -106,7 +106,7 @@ def figure_29() -> Figure:
         "29",
         "R_ts·C_ts and R_tl·C_tl as estimated",
         plot(lambda axes: products_plot(axes, true, A), columns=2, salt="figure-29"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} From Table 10 alone, beside Chen and Mora's as in print: {errors[0]:.1f} and {errors[1]:.1f} % off on "
         "average over SOC 0.05 to 1 (a5 = 150, E5). They are the products of the bounds' limits (E3), and the truth they are "
         "held against is that of another battery (E22).",
@@ -119,7 +119,7 @@ def figure_30() -> Figure:
         "30",
         "R_tl, R_ts, C_tl, C_ts with the stability conditions",
         plot(lambda axes: elements_plot(axes, None, A, deltas()), rows=2, columns=2, salt="figure-30"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} From Table 10 alone (a5 = 150, E5). Dashed and dotted: delta1 and delta2.",
     )
 

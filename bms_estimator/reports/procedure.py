@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import rest_current_a, without_glitches
+from bms_estimator.calibration.cleaning.rests import remove_glitches, rest_current_a
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv.points import pooled
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, relaxation_test
@@ -76,7 +76,7 @@ class Capture:
 
 def kind_of(name: str, samples: SampleBlock, capacity_ah: float) -> Kind:
     """What a capture is good for, by its current."""
-    good = without_glitches(samples, name)
+    good = remove_glitches(samples, name)
     current_a = good["current_a"]
     rest_a = rest_current_a(current_a, capacity_ah)
     resting = np.abs(current_a) < rest_a
@@ -89,7 +89,7 @@ def kind_of(name: str, samples: SampleBlock, capacity_ah: float) -> Kind:
     return Kind.STEPS
 
 
-class Protocol:
+class Procedure:
     """Chapter 5 on one pack.
 
     Args:
@@ -165,7 +165,7 @@ class Protocol:
 
     def initial_soc(self, capture: Capture) -> float:
         """1 when the capture begins as full as the relaxation tests do, else from its first voltage at rest."""
-        first = without_glitches(capture.samples, capture.name)[0]
+        first = remove_glitches(capture.samples, capture.name)[0]
         full_v = float(self.table.ocv_v[-1])
         if capture.kind is Kind.RELAXATION or abs(first["current_a"]) > 0.01 * self.cell.cell.capacity_ah:
             return 1.0
@@ -195,7 +195,7 @@ class Protocol:
             voltage_resolution_v=self.voltage_step_v,
             initial_soc=self.initial_soc(self.smallest),
         )
-        return adaptive_run(estimator, without_glitches(self.smallest.samples, self.smallest.name))
+        return adaptive_run(estimator, remove_glitches(self.smallest.samples, self.smallest.name))
 
     # Step 3 -----------------------------------------------------------------------------------------------------
 

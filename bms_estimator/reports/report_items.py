@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 
-class Verdict(Enum):
+class Reproduction(Enum):
     """What became of a table or figure."""
 
     FITTED = "fitted"
@@ -42,7 +42,7 @@ class Table:
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    verdict: Verdict
+    verdict: Reproduction
     reason: str
     free: int = 0
 
@@ -64,7 +64,7 @@ class Figure:
     key: str
     title: str
     svg: str
-    verdict: Verdict
+    verdict: Reproduction
     reason: str
 
     kind: str = field(default="Figure", init=False)
@@ -75,12 +75,12 @@ Item = Table | Figure
 
 def name(item: Item) -> str:
     """Table 5, Figure 19; what is not in the thesis by its key alone."""
-    return item.key if item.verdict is Verdict.ADDED else f"{item.kind} {item.key}"
+    return item.key if item.verdict is Reproduction.ADDED else f"{item.kind} {item.key}"
 
 
 def label(item: Item) -> str:
     """Verdict in words; of a fit with the number of its free parameters."""
-    if item.verdict is Verdict.FITTED and isinstance(item, Table):
+    if item.verdict is Reproduction.FITTED and isinstance(item, Table):
         return f"{item.verdict.value}, {item.free} free parameters"
     return item.verdict.value
 

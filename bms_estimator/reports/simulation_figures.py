@@ -10,7 +10,7 @@ from bms_estimator.calibration.thesis.prediction import Prediction
 from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
 from bms_estimator.model.arrays import Floats
-from bms_estimator.reports.report_items import Figure, Verdict
+from bms_estimator.reports.report_items import Figure, Reproduction
 from bms_estimator.reports.simulation import (
     FINAL_SOC,
     SOC_GRID,
@@ -38,7 +38,7 @@ def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, 
             axes.set_ylim(*limits)
 
     reason = f"From Chen and Mora's parameters. {NO_VALUES}"
-    return Figure(key, title, plot(draw, salt=f"figure-{key}"), Verdict.RECOMPUTED, reason)
+    return Figure(key, title, plot(draw, salt=f"figure-{key}"), Reproduction.RECOMPUTED, reason)
 
 
 def figure_3(s: Simulation) -> Figure:
@@ -77,7 +77,7 @@ def figure_9(_: Simulation) -> Figure:
         "9",
         "Mittag-Leffler function as a Nussbaum function: block diagram",
         "",
-        Verdict.GIVEN,
+        Reproduction.GIVEN,
         "A block diagram. Its function is kernels/observer/mittag_leffler.py, exact to 1e-10 of its envelope.",
     )
 
@@ -100,7 +100,7 @@ def figure_10(_: Simulation) -> Figure:
         "10",
         "Mittag-Leffler function as a Nussbaum function: output",
         plot(draw, salt="figure-10"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} E1: printed with a plus sign, E_a(+λk^a) has positive terms only and is no Nussbaum function. With a minus sign "
         "it swings with growing amplitude, as a Nussbaum function must. "
         "λ = 1; logarithmic beyond ±1.",
@@ -146,7 +146,7 @@ def figure_13(s: Simulation) -> Figure:
         "13",
         "Scheme 1: y(t) and ŷ(t) at run time",
         plot(tracking(run, "ŷ, scheme 1"), salt="figure-13"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} The observer's output follows the cell's, as the thesis says. Sign of N as E1; start and λ of E25.",
     )
 
@@ -159,7 +159,7 @@ def figure_14(s: Simulation) -> Figure:
         "14",
         "Scheme 1: error e(t) at run time",
         plot(lambda axes: error_plot(axes, run), salt="figure-14"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} After the first minute |e| stays below {largest:.2f} mV until the voltage collapses. Both axes are "
         "logarithmic, the error's within ±0.1 mV linear. Start and λ of E25.",
     )
@@ -172,7 +172,7 @@ def figure_15(s: Simulation) -> Figure:
         "15",
         "Scheme 1: the model with its averaged parameters",
         plot(lambda axes: frozen_plot(axes, frozen, "ŷ, parameters of Table 2"), salt="figure-15"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} The same shape and wrong values, as the thesis says: {frozen.mean_percent:.1f} % mean error. Start and "
         "λ of E25.",
     )
@@ -185,7 +185,7 @@ def _frozen_and_error(key: str, title: str, frozen: Prediction, run: AdaptiveRun
         error_plot(axes[1], run)
         axes[1].set_title("error at run time")
 
-    return Figure(key, title, plot(draw, columns=2, salt=f"figure-{key}"), Verdict.RECOMPUTED, reason)
+    return Figure(key, title, plot(draw, columns=2, salt=f"figure-{key}"), Reproduction.RECOMPUTED, reason)
 
 
 def figure_16(s: Simulation) -> Figure:
@@ -233,7 +233,7 @@ def figure_19(s: Simulation) -> Figure:
         "19",
         "a8 and a11 meet their stability conditions",
         plot(lambda axes: crossing_plot(axes, s.improved), columns=2, salt="figure-19"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} a8 meets its condition at SOC {c8.soc:.5f}, a11 at {c11.soc:.5f}: delta1 and delta2 of the estimates. The "
         "observer stops adapting 0.005 above the larger one (E14). a7 and a8 with the weights of E24 and E4.",
     )
@@ -246,7 +246,7 @@ def figure_20(s: Simulation) -> Figure:
         "20",
         "R_ts·C_ts and R_tl·C_tl: estimated and true",
         plot(lambda axes: products_plot(axes, s.cell.a, s.improved.average), columns=2, salt="figure-20"),
-        Verdict.CONTRADICTED,
+        Reproduction.CONTRADICTED,
         "The printed products lie on each other. Recomputed they do not: from the printed estimates they are "
         f"{printed_errors[0]:.1f} and {printed_errors[1]:.1f} % off, and the recomputed ones go with the bounds (E3, E9, "
         "Theorem 4.1.2 measured).",
@@ -286,7 +286,7 @@ def figure_21(s: Simulation) -> Figure:
         "21",
         "R_tl, R_ts, C_tl, C_ts with the stability conditions",
         plot(draw, rows=2, columns=2, salt="f21"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} Estimated elements are those of the Lemma 4.1.3 limits (weights: E4, E24). Dashed and dotted: delta1 "
         "and delta2.",
     )
@@ -307,7 +307,7 @@ def figure_22(s: Simulation) -> Figure:
         "22",
         "R_s by (4.2) for different currents",
         plot(draw, salt="figure-22"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} (4.2) with the sign of (2.4) (E19); currents are ours, the thesis prints none. R_s is low by what R_ts + "
         "R_tl are high.",
     )
@@ -336,7 +336,7 @@ def figure_23(s: Simulation) -> Figure:
         "23",
         "The estimated model against the cell, constant discharge",
         plot(draw, columns=2, salt="figure-23"),
-        Verdict.RECOMPUTED,
+        Reproduction.RECOMPUTED,
         f"{NO_VALUES} With the printed Tables 5 and 6 the model is {as_printed.mean_percent:.3f} % off on average, "
         f"{as_printed.max_percent:.1f} % at most, down to SOC {FINAL_SOC:g}; with a13 to a15 fitted anew to the recomputed a1 to "
         f"a12 {refitted.mean_percent:.4f} and {refitted.max_percent:.2f} %, although the elements are those of the bounds: on a "
@@ -351,7 +351,7 @@ def figure_39(s: Simulation) -> Figure:
         "39",
         "Dynamic and static model, simulation",
         plot(lambda axes: dynamic_static_plot(axes, dynamic, static), columns=2, salt="figure-39"),
-        Verdict.NO_DATA,
+        Reproduction.NO_DATA,
         f"Load and freezing point are not printed: here pulses of 0.275 A, frozen at SOC {STATIC_SOC:g}, parameters of Tables 5 "
         "and 6. As printed, the two differ where SOC is low.",
     )
@@ -392,7 +392,7 @@ def figure_43(s: Simulation) -> Figure:
         "43",
         "E_o of a healthy bank and of one with two weak batteries",
         plot(draw, salt="figure-43"),
-        Verdict.NO_DATA,
+        Reproduction.NO_DATA,
         "The bank's batteries and their SOC are not printed; here three of Chen and Mora in series, two of them begin at SOC "
         f"{WEAK_SOC[0]:g} and {WEAK_SOC[1]:g}. As printed, each shows as a dip when it runs empty.",
     )

@@ -7,7 +7,7 @@ from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values
-from bms_estimator.reports.report_items import Table, Verdict, number, percent
+from bms_estimator.reports.report_items import Reproduction, Table, number, percent
 from bms_estimator.reports.simulation import (
     CURRENT_A,
     FINAL_SOC,
@@ -29,7 +29,7 @@ def table_1(_: Simulation) -> Table:
         "a16 to a21 for the simulations",
         ("parameter", "printed", "used"),
         tuple((f"a{16 + j}", number(a), number(a)) for j, a in enumerate(printed_values.TABLE_1)),
-        Verdict.GIVEN,
+        Reproduction.GIVEN,
         "Input of the simulations, taken as printed.",
     )
 
@@ -105,7 +105,7 @@ def _scheme_table(
             "recomputed error %, of the desired",
         ),
         tuple(rows),
-        Verdict.FITTED,
+        Reproduction.FITTED,
         f"{reason} How far they move hangs on the error at the start and on λ, neither of which the thesis prints (nor k0, a, "
         f"x2(0), x3(0)). From x2(0) = x3(0) = 0 with λ = 1 it is {number(moved, 3)}. e(0) = {fitted.start_error_v:.3f} V with "
         f"λ = {fitted.lambda_:.2f} fits Tables 2 and 3 exactly, and so do other starts (E25): two free parameters fitted to the two "
@@ -151,7 +151,7 @@ def table_4(simulation: Simulation) -> Table:
             "recomputed error %",
         ),
         tuple(rows),
-        Verdict.CONTRADICTED,
+        Reproduction.CONTRADICTED,
         "The recomputed estimates are the Lemma 4.1.3 limits of the printed bounds and weights, to four digits. The printed "
         "ones are not: four lie 1 to 2 % below, a15 30 %, and no one pair of weights gives all five. The printed desired "
         "value of a15 is that of a3; Table 6 has 0.07446. The desired a1, a3, a13 and a15 lie above their own upper bounds, "
@@ -215,7 +215,7 @@ def table_5(simulation: Simulation) -> Table:
             "recomputed error %",
         ),
         tuple(rows),
-        Verdict.FITTED,
+        Reproduction.FITTED,
         f"The run gives the Lemma 4.1.3 limits, weighted means of the bounds whatever the data say (E3): a6 = {a6[0]}, printed "
         f"{a6[1]}. A closed form gives every printed digit: the way from the initial value to the limit, averaged from the very "
         f"first sample on, over {printed_values.START_MEAN_S['5']:g} s ({a6[2]}), with other weights of a7, a8, a10, a11, a12 than are "
@@ -259,7 +259,7 @@ def table_6(simulation: Simulation) -> Table:
             "recomputed error %",
         ),
         tuple(rows),
-        Verdict.CONTRADICTED,
+        Reproduction.CONTRADICTED,
         f"The currents are not printed; here {currents} A. (4.2) is printed with the opposite sign (E19): (2.4) solved for R_s is "
         "(E_o - x2 - x3 - y)/i. And x2, x3 must be those of the frozen model: with the observer's own, which settle so "
         "that (4.1) meets y, R_s is zero. So computed, R_s takes up what R_ts + R_tl have wrong, and its fit is no "
@@ -285,7 +285,7 @@ def table_7(simulation: Simulation) -> Table:
         "Absolute mean error of the elements over SOC 0.05 to 1 [%]",
         ("element", "printed", "from Table 5's printed estimates", "recomputed"),
         rows,
-        Verdict.CONTRADICTED,
+        Reproduction.CONTRADICTED,
         "E9: Table 5's own printed estimates give other errors than Table 7 prints. The products R·C are not right to 2 % "
         "and 0.04 % but to 14 % and 3.4 %, and change with the bounds: see Theorem 4.1.2 measured, below.",
     )
@@ -325,7 +325,7 @@ def table_12(simulation: Simulation) -> Table:
             "a13 to a15 refitted, max",
         ),
         rows,
-        Verdict.CONTRADICTED,
+        Reproduction.CONTRADICTED,
         f"Neither the load nor the SOC at which the static model is frozen is printed; here {CURRENT_A:g} A for 10 minutes in 20 "
         f"down to SOC {FINAL_SOC:g}, frozen at SOC {STATIC_SOC:g}. From the printed Tables 5 and 6 the order reverses: dynamic "
         f"{dynamic}, static {static} % (down to SOC {LOWEST_SOC:g} {higher[0]} and {higher[1]} %: as good as the same). Plainly "
@@ -360,7 +360,7 @@ def theorem_4_1_2(_: Simulation) -> Table:
             "R_tl·C_tl error % of the limits",
         ),
         rows,
-        Verdict.ADDED,
+        Reproduction.ADDED,
         "The tracking claim holds as far as it goes: e is small, and the smaller the smaller the current, but it does not go to "
         "zero while current flows (E16). The identification claim does "
         "not: at every current the products land on the values of the Lemma 4.1.3 limits, so their error is set by the "

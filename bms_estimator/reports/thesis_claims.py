@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.elements.initial_elements import rest_elements
+from bms_estimator.calibration.elements.initial_elements import initial_elements
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports import printed_values
-from bms_estimator.reports.procedure import Kind, Protocol
-from bms_estimator.reports.report_items import Verdict
+from bms_estimator.reports.procedure import Kind, Procedure
+from bms_estimator.reports.report_items import Reproduction
 from bms_estimator.reports.simulation import element
 
 PRODUCTS_PERCENT = 20.0
@@ -66,11 +66,11 @@ class Claim:
         return sum(result.met for result in self.results)
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Reproduction:
         """Holds, fails, or is not tested by any capture: then there is only what the thesis prints of it, no data."""
         if not self.results:
-            return Verdict.NO_DATA
-        return Verdict.CLAIM_HOLDS if 2 * self.met > len(self.results) else Verdict.CLAIM_FAILS
+            return Reproduction.NO_DATA
+        return Reproduction.CLAIM_HOLDS if 2 * self.met > len(self.results) else Reproduction.CLAIM_FAILS
 
     @property
     def span(self) -> str:
@@ -89,27 +89,27 @@ class Claim:
         return f"{criterion}: met on {self.met} of {len(self.results)} captures (found {self.span}); it had to be more than half."
 
 
-def _constant(which: Callable[[Protocol, str], float], limit: float) -> Callable[[Protocol], list[Result]]:
+def _constant(which: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
     return lambda p: [Result(c.name, which(p, c.name), limit) for c in p.validating if c.kind is Kind.CONSTANT]
 
 
-def _steps(which: Callable[[Protocol, str], float], limit: float) -> Callable[[Protocol], list[Result]]:
+def _steps(which: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
     return lambda p: [Result(c.name, which(p, c.name), limit) for c in p.validating if c.kind is Kind.STEPS]
 
 
-def _mean(p: Protocol, name: str) -> float:
+def _mean(p: Procedure, name: str) -> float:
     return p.dynamic[name].mean_percent
 
 
-def _max(p: Protocol, name: str) -> float:
+def _max(p: Procedure, name: str) -> float:
     return p.dynamic[name].max_percent
 
 
-def _dynamic(p: Protocol, limit: float) -> list[Result]:
+def _dynamic(p: Procedure, limit: float) -> list[Result]:
     return [Result(c.name, p.dynamic[c.name].mean_percent / p.static[c.name].mean_percent, limit) for c in p.validating]
 
 
-def _soc(p: Protocol) -> list[Result]:
+def _soc(p: Procedure) -> list[Result]:
     return [
         Result(
             c.name,
@@ -120,11 +120,11 @@ def _soc(p: Protocol) -> list[Result]:
     ]
 
 
-def products(p: Protocol) -> Iterator[tuple[str, float, float]]:
+def products(p: Procedure) -> Iterator[tuple[str, float, float]]:
     """Each relaxation test's name and product, as estimated and as its rests show it [s]."""
     for test, capture in zip(p.tests, p.of(Kind.RELAXATION), strict=True):
         try:
-            seen = rest_elements(capture.samples, test, p.cell.cell.capacity_ah)
+            seen = initial_elements(capture.samples, test, p.cell.cell.capacity_ah)
         except UserError:  # no rest that follows a discharge: nothing to compare with
             continue
         for name, seen_s in (("R_ts C_ts", seen.tau_ts_s), ("R_tl C_tl", seen.tau_tl_s)):
@@ -132,7 +132,7 @@ def products(p: Protocol) -> Iterator[tuple[str, float, float]]:
             yield f"{capture.name}, {name}", estimated_s, seen_s
 
 
-def _products(p: Protocol) -> list[Result]:
+def _products(p: Procedure) -> list[Result]:
     return [
         Result(name, 100.0 * abs(found_s / seen_s - 1.0), PRODUCTS_PERCENT) for name, found_s, seen_s in products(p)
     ]
@@ -142,7 +142,7 @@ PRINTED_RATIO = printed_values.TABLE_13["dynamic"] / printed_values.TABLE_13["st
 LARGEST_CONSTANT = max(printed_values.TABLE_11[load] for load in printed_values.CURRENTS_A)
 LARGEST_STEPS = max(printed_values.TABLE_11[load] for load in ("constant steps", "variable steps"))
 
-CLAIMS: dict[str, tuple[str, str, Callable[[Protocol], list[Result]]]] = {
+CLAIMS: dict[str, tuple[str, str, Callable[[Procedure], list[Result]]]] = {
     "constant loads, mean": (
         "Table 11",
         f"mean error at most {LARGEST_CONSTANT:g} %, the largest printed for a constant load",
@@ -187,7 +187,7 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Protocol], list[Result]]]] = {
 """Key -> where it is claimed, criterion, and how it is tested on one cell."""
 
 
-def claim(key: str, protocols: Sequence[Protocol]) -> Claim:
+def claim(key: str, protocols: Sequence[Procedure]) -> Claim:
     """One claim on the captures of one or more cells. A relaxation test that serves two cells counts for each."""
     where, criterion, test = CLAIMS[key]
     return Claim(key, where, criterion, tuple(result for p in protocols for result in test(p)))

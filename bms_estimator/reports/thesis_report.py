@@ -13,7 +13,7 @@ from bms_estimator.reports import (
     simulation_tables,
 )
 from bms_estimator.reports.experiment import Experiment, Recorded
-from bms_estimator.reports.report_items import Figure, Item, Verdict
+from bms_estimator.reports.report_items import Figure, Item, Reproduction
 from bms_estimator.reports.simulation import Simulation
 
 DIAGRAMS = {
@@ -111,7 +111,7 @@ def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Calla
 
 
 def _diagram(key: str) -> Callable[[], Item]:
-    verdict = Verdict.NO_DATA if key in FUEL_CELL else Verdict.GIVEN
+    verdict = Reproduction.NO_DATA if key in FUEL_CELL else Reproduction.GIVEN
     reason = FUEL_CELL.get(key, "A diagram or photograph: there is nothing to compute.")
     return lambda: Figure(key, DIAGRAMS[key], "", verdict, reason)
 

@@ -12,7 +12,7 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, HookHealth
-from bms_estimator.process.backoff import Pauses
+from bms_estimator.process.backoff import Backoff
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service.hook_process import StartError, environment, run
 from bms_estimator.settings.alarms import AlarmHook
@@ -28,9 +28,9 @@ CLOSE_S = 2.0
 FIRST_RETRY_S = 0.5
 """First pause before a program that could not be started is tried again [s]; doubles each time, up to half a minute."""
 
-Say = Callable[[str, bytes], None]
+PublishRaw = Callable[[str, bytes], None]
 """Publishes a message on a topic."""
-Switch = Callable[[Relay], Awaitable[None]]
+SetRelay = Callable[[Relay], Awaitable[None]]
 """Tells the board its relay's level. Raises UserError when it does not take it."""
 
 log = structlog.get_logger(__name__)
@@ -43,7 +43,7 @@ class Job(NamedTuple):
     state: Literal["raised", "cleared"]
 
 
-class Hooks:
+class AlarmHooks:
     """All hooks of a pack; a context manager.
 
     Args:
@@ -56,7 +56,9 @@ class Hooks:
         UserError: A hook needs what is not there.
     """
 
-    def __init__(self, hooks: Sequence[AlarmHook], device: str, say: Say | None, switch: Switch | None) -> None:
+    def __init__(
+        self, hooks: Sequence[AlarmHook], device: str, say: PublishRaw | None, switch: SetRelay | None
+    ) -> None:
         self._hooks = [_made(i, hook, device, say, switch) for i, hook in enumerate(hooks)]
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -209,7 +211,7 @@ def _counts_as_raised(alarm: Alarm) -> bool:
     return alarm.active or (alarm.severity == "critical" and not alarm.watched)
 
 
-class _Program(_Hook):
+class _CommandHook(_Hook):
     """Runs a program: the alarm as JSON on its standard input, its fields in the environment."""
 
     @property
@@ -219,7 +221,7 @@ class _Program(_Hook):
 
     async def _do(self, job: Job) -> None:
         """Run the program; one that cannot be started is tried again until it starts or the alarm's state changes."""
-        pauses = Pauses(FIRST_RETRY_S)
+        pauses = Backoff(FIRST_RETRY_S)
         while not await self._run(job):
             await self._pause(job, pauses.next_s())
             if not self._is_due(job):
@@ -256,10 +258,10 @@ class _Program(_Hook):
         return True
 
 
-class _Publication(_Hook):
+class _PublishHook(_Hook):
     """Publishes a message."""
 
-    def __init__(self, hook: AlarmHook, device: str, topic: str, say: Say) -> None:
+    def __init__(self, hook: AlarmHook, device: str, topic: str, say: PublishRaw) -> None:
         super().__init__(hook, device)
         self._topic, self._say = topic, say
 
@@ -273,10 +275,10 @@ class _Publication(_Hook):
         self._succeed()
 
 
-class _Switched(_Hook):
+class _RelayHook(_Hook):
     """Keeps the board's relay at its level: told again and again, since a reset releases it."""
 
-    def __init__(self, hook: AlarmHook, device: str, switch: Switch) -> None:
+    def __init__(self, hook: AlarmHook, device: str, switch: SetRelay) -> None:
         super().__init__(hook, device)
         self._switch = switch
 
@@ -324,7 +326,9 @@ def unusable(settings: Settings) -> list[str]:
         UserError: A hook needs a broker or a relay that is not there.
     """
     hooks = settings.alarms.hook
-    Hooks(hooks, settings.pack.name, (lambda *_: None) if settings.mqtt else None, relay_of(settings, _switch_nothing))
+    AlarmHooks(
+        hooks, settings.pack.name, (lambda *_: None) if settings.mqtt else None, relay_of(settings, _switch_nothing)
+    )
     return [
         f"alarms.hook.{i}.run = {hook.run[0]}: no such program here, or it may not be run"
         for i, hook in enumerate(hooks)
@@ -337,7 +341,7 @@ def unusable(settings: Settings) -> list[str]:
     ]
 
 
-def relay_of(settings: Settings, switch: Switch | None) -> Switch | None:
+def relay_of(settings: Settings, switch: SetRelay | None) -> SetRelay | None:
     """``switch`` where the source has a relay: no device but the firmware's board has a pin for one."""
     return switch if settings.sensor.protocol == "binary" else None
 
@@ -346,18 +350,18 @@ async def _switch_nothing(_: Relay) -> None:
     """Of no board."""
 
 
-def _made(i: int, hook: AlarmHook, device: str, say: Say | None, switch: Switch | None) -> _Hook:
+def _made(i: int, hook: AlarmHook, device: str, say: PublishRaw | None, switch: SetRelay | None) -> _Hook:
     if hook.topic:
         if say is None:
             raise UserError(f"alarms.hook.{i}.topic = {hook.topic}: there is no broker; add the section [mqtt]")
-        return _Publication(hook, device, hook.topic, say)
+        return _PublishHook(hook, device, hook.topic, say)
     if hook.relay:
         if switch is None:
             raise UserError(
                 f"alarms.hook.{i}.relay: only the board of [sensor] with protocol = 'binary' has a relay pin"
             )
-        return _Switched(hook, device, switch)
-    return _Program(hook, device)
+        return _RelayHook(hook, device, switch)
+    return _CommandHook(hook, device)
 
 
 def _values(job: Job, device: str) -> dict[str, str]:

@@ -9,7 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import HookHealth
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.alarm_limits import charging_a, silent_limit_s, watched
@@ -17,7 +17,7 @@ from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import Source
 from bms_estimator.telemetry.alarm_inputs import Inputs
-from bms_estimator.telemetry.alarms import Alarms, Change, Counts
+from bms_estimator.telemetry.alarms import AlarmEvaluator, Change, SampleCounts
 from bms_estimator.telemetry.health import sample_counters, suspicions
 
 UNUSABLE = "not_finite", "range", "saturated"
@@ -28,7 +28,7 @@ JUDGE_S, JUDGE_ROWS = 0.1, 1024
 log = structlog.get_logger(__name__)
 
 
-class AlarmWatch:
+class AlarmMonitor:
     """The alarms of one pack as the service has them.
 
     Args:
@@ -61,7 +61,7 @@ class AlarmWatch:
         self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
-        self.alarms = Alarms(watched(settings, cell), charging_a(cell), gap_s, inputs, silent_limit_s(settings))
+        self.alarms = AlarmEvaluator(watched(settings, cell), charging_a(cell), gap_s, inputs, silent_limit_s(settings))
         self._heard_s, self._arrival_s = clock.monotonic(), clock.wall()  # of the last sample, accepted or not
         self._judged_s = -math.inf
 
@@ -76,7 +76,7 @@ class AlarmWatch:
         """Look at what has come since the last time, and at that nothing came, at ``now_s`` of the monotonic clock [s]."""
         passed_s, self._judged_s = now_s - self._judged_s, now_s
         record = self._estimator.record[0]
-        suspects = Suspect(int(record["checks"]["suspects"]))
+        suspects = InputFault(int(record["checks"]["suspects"]))
         said = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.judge(self._arrival_s, self._counts(), suspects, said)
         self.alarms.silent(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
@@ -90,11 +90,11 @@ class AlarmWatch:
         self._tell()
         return known
 
-    def _counts(self) -> Counts:
+    def _counts(self) -> SampleCounts:
         """A damaged frame is missing in the sequence, too, where there is one."""
         line, samples = self._source.counters, sample_counters(self._estimator.state[0])
         lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
-        return Counts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))
+        return SampleCounts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))
 
     def _tell(self) -> None:
         for change in self.alarms.changes():

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, Ledger
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.estimator import Estimator
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.telemetry.charge_energy import Flow
-from bms_estimator.telemetry.lifetime_totals import Tally
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 
 SAVED_SOC = 0.002
 """How far the SOC may go from that of the checkpoint: a kill costs no more, beside what moves until the next start."""
@@ -25,7 +25,7 @@ LAST_S = 5.0
 log = structlog.get_logger(__name__)
 
 
-class Saving:
+class CheckpointWriter:
     """Saves what samples have taught; the disk is waited for in a thread, and nothing else waits for it.
 
     Args:
@@ -45,7 +45,7 @@ class Saving:
         checkpoint: CheckpointFile,
         estimator: Estimator,
         publisher: Publisher,
-        tally: Tally,
+        tally: LifetimeTotals,
         *,
         restarts: int,
         every_s: float,
@@ -99,17 +99,17 @@ class Saving:
         if not await self._write_with(ledger, lambda: self._checkpoint.save(state, ledger)):
             self._publisher.kept = None
             return False
-        self._publisher.checkpoint, self._saved, self._publisher.kept = "saved", taught, Flow.of(ledger.total)
+        self._publisher.checkpoint, self._saved, self._publisher.kept = "saved", taught, ChargeEnergy.of(ledger.total)
         return True
 
     def _mark(self, *, clean: bool) -> Callable[[], None]:
         ledger = self._ledger(clean=clean)
         return lambda: self._checkpoint.mark(ledger)
 
-    def _ledger(self, *, clean: bool) -> Ledger:
-        return Ledger(self._restarts, self._tally.total, clean, self._publisher.watch.alarms.kept)
+    def _ledger(self, *, clean: bool) -> RunCounters:
+        return RunCounters(self._restarts, self._tally.total, clean, self._publisher.watch.alarms.kept)
 
-    async def _write_with(self, ledger: Ledger, write: Callable[[], None]) -> bool:
+    async def _write_with(self, ledger: RunCounters, write: Callable[[], None]) -> bool:
         """As ``_write``; then the disk has the alarms, too."""
         written = await self._write(write)
         if written:

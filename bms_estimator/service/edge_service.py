@@ -5,17 +5,17 @@ from pathlib import Path
 
 import structlog
 
-from bms_estimator.edge.block_sender import Edge
+from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.instance_lock import alone
+from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.process.log_setup import set_level
 from bms_estimator.process.signals import stop_on_signal, until_first_ends
-from bms_estimator.process.systemd import Notifier
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.factory import open_reports
-from bms_estimator.sources.line_source import Reports
-from bms_estimator.sources.serial.known_board_file import BoardMemory
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.line_source import LineSource
+from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import Source
 
 UNTENDED_S = 30.0
@@ -29,7 +29,7 @@ log = structlog.get_logger(__name__)
 
 
 async def serve_edge(
-    settings: Settings, folder: Path, *, stop: asyncio.Event | None = None, notifier: Notifier | None = None
+    settings: Settings, folder: Path, *, stop: asyncio.Event | None = None, notifier: SystemdNotifier | None = None
 ) -> None:
     """Send samples until SIGINT or SIGTERM.
 
@@ -45,11 +45,11 @@ async def serve_edge(
     if settings.edge is None:
         raise UserError('edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"')
     stop, name = stop_on_signal(stop), settings.pack.name
-    notifier = notifier or Notifier([name], doing="sending samples of")
+    notifier = notifier or SystemdNotifier([name], doing="sending samples of")
     set_level(name, settings.log.level)
-    source = open_reports(settings) or SerialBoard(settings.sensor, memory=BoardMemory(folder, name))
-    with alone(folder, name):
-        async with Edge(settings.edge, name, folder) as edge, source:
+    source = open_line_source(settings) or SerialSource(settings.sensor, memory=KnownBoardFile(folder, name))
+    with instance_lock(folder, name):
+        async with BlockSender(settings.edge, name, folder) as edge, source:
             notifier.ready(name)
             try:
                 await until_first_ends(
@@ -59,13 +59,15 @@ async def serve_edge(
                 notifier.stopping(name)
 
 
-async def _take(source: Source, edge: Edge) -> None:
+async def _take(source: Source, edge: BlockSender) -> None:
     async for samples in source:
         edge.take(samples)
         await asyncio.sleep(0)  # a source that always has samples must not starve who sends them
 
 
-async def _keep_alive(source: SerialBoard | Reports, edge: Edge, notifier: Notifier, name: str) -> None:
+async def _keep_alive(
+    source: SerialSource | LineSource, edge: BlockSender, notifier: SystemdNotifier, name: str
+) -> None:
     """Pat the watchdog while somebody looks after the line, and say how it is."""
     said = ""
     while True:
@@ -78,7 +80,7 @@ async def _keep_alive(source: SerialBoard | Reports, edge: Edge, notifier: Notif
         await asyncio.sleep(min(PAT_S, notifier.watchdog_s / 3.0 or PAT_S))
 
 
-async def _report(edge: Edge) -> None:
+async def _report(edge: BlockSender) -> None:
     """Say in the log, at times, what has become of the blocks."""
     while True:
         await asyncio.sleep(REPORT_S)

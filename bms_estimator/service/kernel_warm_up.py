@@ -9,8 +9,8 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import Flow, Meter
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 
@@ -26,11 +26,11 @@ def load_kernels() -> None:
     sample = np.zeros(1, dtype=SAMPLE)
     sample["voltage_v"] = cell.cell.nominal_voltage_v
     trace = estimator.run(sample)
-    Meter(Flow(), 1.0).add(trace)
+    ChargeEnergyMeter(ChargeEnergy(), 1.0).add(trace)
     Window().add(trace, 0.0)
     estimator.set_soc(0.5)
     estimator.resume(0.0)
-    parameter_report(estimator, 0.0)
+    make_parameters_payload(estimator, 0.0)
     remaining_charge(estimator, 0.0)
     gc.collect()
     gc.freeze()  # numba's objects stay: to look through them again and again stops the loop for 100 ms each time

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointFile, Ledger
-from bms_estimator.checkpoint.restore import resume
-from bms_estimator.edge.block_sender import Edge
+from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.restore import restore_state
+from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.model.clock import Clock, since_boot
@@ -21,19 +21,19 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.process.signals import until_first_ends
 from bms_estimator.process.stderr_writer import stderr
-from bms_estimator.process.systemd import Notifier
-from bms_estimator.service.alarm_hooks import Hooks
-from bms_estimator.service.checkpoint_writer import Saving
+from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.service.alarm_hooks import AlarmHooks
+from bms_estimator.service.checkpoint_writer import CheckpointWriter
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.service.settings_reload import Reload
+from bms_estimator.service.settings_reload import SettingsReload
 from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
-from bms_estimator.sinks.mqtt.requests import Requests, number
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
 from bms_estimator.sinks.sink import Sink
-from bms_estimator.sources.source import Pulse, Source
-from bms_estimator.telemetry.lifetime_totals import Tally, new_totals
+from bms_estimator.sources.source import Source, SourceHealth
+from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
 
 LAG_STEP_S = 0.1
 """How often the loop's lag is measured [s]: what blocks it for longer is always seen."""
@@ -43,7 +43,7 @@ STATUS_S = 60.0
 log = structlog.get_logger(__name__)
 
 
-async def run_live(
+async def run_estimation_loop(
     settings: Settings,
     cell: PackModel,
     *,
@@ -51,16 +51,16 @@ async def run_live(
     sinks: Sequence[Sink],
     stop: asyncio.Event,
     checkpoint: CheckpointFile | None = None,
-    requests: Requests | None = None,
-    delivery: Delivery | None = None,
+    requests: RequestDispatcher | None = None,
+    delivery: DeliveryStats | None = None,
     current_zero: Callable[[], Awaitable[None]] | None = None,
-    notifier: Notifier | None = None,
+    notifier: SystemdNotifier | None = None,
     clock: Clock | None = None,
-    reload: Reload | None = None,
-    pulse: Callable[[], Pulse] | None = None,
+    reload: SettingsReload | None = None,
+    pulse: Callable[[], SourceHealth] | None = None,
     recording: Callable[[], RecordingHealth | None] = lambda: None,
-    hooks: Hooks | None = None,
-    edge: Edge | None = None,
+    hooks: AlarmHooks | None = None,
+    edge: BlockSender | None = None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
 
@@ -86,12 +86,12 @@ async def run_live(
         The estimator as the last sample left it.
     """
     name, clock = settings.pack.name, clock or Clock()
-    hooks = hooks or Hooks((), name, None, None)
-    notifier = notifier or Notifier([name])
+    hooks = hooks or AlarmHooks((), name, None, None)
+    notifier = notifier or SystemdNotifier([name])
     estimator = new_estimator(settings, cell)
     ledger, restored = _restore(estimator, checkpoint, clock)
     restored_s = since_boot()
-    tally = Tally(estimator, ledger.total)
+    tally = LifetimeTotals(estimator, ledger.total)
     publisher = Publisher(
         settings,
         cell,
@@ -115,7 +115,7 @@ async def run_live(
         _offer(requests, estimator, publisher, current_zero)
     every_s = settings.state.checkpoint_s
     saving = (
-        Saving(checkpoint, estimator, publisher, tally, restarts=ledger.restarts, every_s=every_s)
+        CheckpointWriter(checkpoint, estimator, publisher, tally, restarts=ledger.restarts, every_s=every_s)
         if checkpoint
         else None
     )
@@ -156,9 +156,9 @@ def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
 
 async def _estimate(
     source: Source,
-    tally: Tally,
+    tally: LifetimeTotals,
     publisher: Publisher,
-    edge: Edge | None,
+    edge: BlockSender | None,
     waited_s: Callable[[], float],
 ) -> None:
     """Take what the source gives; ``waited_s`` is how long it has given nothing since the state was restored [s]."""
@@ -173,7 +173,7 @@ async def _estimate(
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
 
-async def _keep_alive(publisher: Publisher, notifier: Notifier, name: str, clock: Clock) -> None:
+async def _keep_alive(publisher: Publisher, notifier: SystemdNotifier, name: str, clock: Clock) -> None:
     """Publish that nothing comes, and pat the watchdog while samples come or somebody still tries to have them."""
     longest_s = notifier.watchdog_s / 3.0 or publisher.period_s
     said, online, said_s = "", False, -math.inf
@@ -190,7 +190,7 @@ async def _keep_alive(publisher: Publisher, notifier: Notifier, name: str, clock
             publisher.publish()
 
 
-async def _reload(reload: Reload, notifier: Notifier, name: str) -> None:
+async def _reload(reload: SettingsReload, notifier: SystemdNotifier, name: str) -> None:
     """Read the settings anew whenever somebody asks."""
     while True:
         await reload.asked.wait()
@@ -200,7 +200,7 @@ async def _reload(reload: Reload, notifier: Notifier, name: str) -> None:
         notifier.ready(name)
 
 
-def _offer_changes(reload: Reload, publisher: Publisher, saving: Saving | None) -> None:
+def _offer_changes(reload: SettingsReload, publisher: Publisher, saving: CheckpointWriter | None) -> None:
     reload.offer("publish.rate_hz", publisher.set_rate)
     if saving:
         reload.offer("state.checkpoint_s", partial(setattr, saving, "every_s"))
@@ -215,14 +215,14 @@ async def _measure_lag(publisher: Publisher) -> None:
         publisher.add_lag(loop.time() - due_s)
 
 
-def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clock) -> tuple[Ledger, str]:
+def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clock) -> tuple[RunCounters, str]:
     """Go on from the checkpoint where there is a good one. Returns what the runs before have counted, and what was done."""
     if checkpoint is None:
-        return Ledger(0, new_totals(clock.wall())), "off"
+        return RunCounters(0, new_totals(clock.wall())), "off"
     found = checkpoint.load()
     outcome = found.reason
     if not outcome:
-        wrong = resume(estimator, found.state, found.unseen_s)
+        wrong = restore_state(estimator, found.state, found.unseen_s)
         outcome = f"{REFUSED}{wrong}" if wrong else f"restored{_soc_text(estimator)}"
     if refused := outcome.startswith(REFUSED):
         outcome = f"{outcome}; {checkpoint.set_aside()}"
@@ -263,7 +263,7 @@ def _set_soc(estimator: Estimator, soc: float) -> float:
 
 
 def _offer(
-    requests: Requests,
+    requests: RequestDispatcher,
     estimator: Estimator,
     publisher: Publisher,
     board_zero: Callable[[], Awaitable[None]] | None,

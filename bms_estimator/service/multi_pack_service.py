@@ -10,13 +10,13 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.process.systemd import Notifier
-from bms_estimator.service.pack_service import serve
-from bms_estimator.service.settings_reload import Reload
+from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.service.settings_reload import SettingsReload
 from bms_estimator.settings.pack import Settings
 
 
-async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[Reload]) -> None:
+async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[SettingsReload]) -> None:
     """Serve packs until SIGINT or SIGTERM. When one ends, all end in good order: who starts us starts all again.
 
     Args:
@@ -32,13 +32,15 @@ async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Se
     _differ("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
     _differ("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
     _differ("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
-    stop, notifier, pages = stop_on_signal(), Notifier(names), Pages()
+    stop, notifier, pages = stop_on_signal(), SystemdNotifier(names), Pages()
 
-    async def serve_one(settings: Settings, cell: PackModel, reload: Reload) -> None:
+    async def serve_one(settings: Settings, cell: PackModel, reload: SettingsReload) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
             folder = state_folder(settings)
-            await serve(settings, cell, stop=stop, folder=folder, notifier=notifier, reload=reload, pages=pages)
+            await run_pack_service(
+                settings, cell, stop=stop, folder=folder, notifier=notifier, reload=reload, pages=pages
+            )
         except UserError as error:
             raise UserError(f"{settings.pack.name}: {error}") from error
         finally:

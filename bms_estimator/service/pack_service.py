@@ -9,31 +9,31 @@ from pathlib import Path
 import structlog
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.edge.block_sender import Edge
+from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.settings_plausibility import implausible
+from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.page.page_sink import Pages, PageSink
-from bms_estimator.process.instance_lock import alone
+from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.process.log_setup import set_level
 from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.process.systemd import Notifier
-from bms_estimator.service.alarm_hooks import Hooks, Say, relay_of
-from bms_estimator.service.live_loop import run_live
-from bms_estimator.service.settings_reload import Reload
+from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.service.alarm_hooks import AlarmHooks, PublishRaw, relay_of
+from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.settings_reload import SettingsReload
 from bms_estimator.settings.alarm_limits import out_of_range, watched
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.exports.influx import InfluxSink
-from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.sinks.sink import Sink
-from bms_estimator.sources.captures.recorder import Recording
-from bms_estimator.sources.factory import open_reports
-from bms_estimator.sources.serial.known_board_file import BoardMemory
-from bms_estimator.sources.serial.serial_source import SerialBoard
-from bms_estimator.sources.source import Tap
+from bms_estimator.sources.captures.recorder import CaptureRecorder
+from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.serial_source import SerialSource
+from bms_estimator.sources.source import ReadTap
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
 from bms_estimator.store.outbox import Outbox
@@ -41,16 +41,16 @@ from bms_estimator.store.outbox import Outbox
 log = structlog.get_logger(__name__)
 
 
-async def serve(
+async def run_pack_service(
     settings: Settings,
     cell: PackModel,
     *,
     sinks: Sequence[Sink] = (),
-    tap: Tap | None = None,
+    tap: ReadTap | None = None,
     stop: asyncio.Event | None = None,
     folder: Path | None = None,
-    notifier: Notifier | None = None,
-    reload: Reload | None = None,
+    notifier: SystemdNotifier | None = None,
+    reload: SettingsReload | None = None,
     pages: Pages | None = None,
 ) -> Estimator:
     """Run until SIGINT or SIGTERM.
@@ -74,22 +74,22 @@ async def serve(
     """
     stop = stop_on_signal(stop)
     set_level(settings.pack.name, settings.log.level)
-    for line in [*implausible(settings, cell), *out_of_range(settings, cell)]:
+    for line in [*implausible_settings(settings, cell), *out_of_range(settings, cell)]:
         log.warning("a setting that cannot be", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
-    delivery = Delivery(store_trouble=lambda: database.reason) if database else Delivery()
+    delivery = DeliveryStats(store_trouble=lambda: database.reason) if database else DeliveryStats()
     all_sinks = [*sinks, *export_sinks(settings)]
-    requests = Requests(delivery, settings.mqtt.commands if settings.mqtt else ())
-    memory = BoardMemory(folder, settings.pack.name) if folder else None
-    source = open_reports(settings, tap=tap) or SerialBoard(settings.sensor, tap=tap, memory=memory)
+    requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
+    memory = KnownBoardFile(folder, settings.pack.name) if folder else None
+    source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, memory=memory)
     if database and settings.store.history_days:
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
-    edge = Edge(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
+    edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     if reload:
         reload.offer("log.level", partial(set_level, settings.pack.name))
         reload.offer("mqtt.commands", requests.allow)
-    say: Say | None = None
+    say: PublishRaw | None = None
     if settings.mqtt is not None:
         mqtt = MqttSink(
             settings.mqtt,
@@ -103,20 +103,20 @@ async def serve(
         )
         all_sinks.append(mqtt)
         say = mqtt.say
-    hooks = Hooks(settings.alarms.hook, settings.pack.name, say, relay_of(settings, source.relay))
+    hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, say, relay_of(settings, source.relay))
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None
         all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
-            stack.enter_context(alone(folder, settings.pack.name))
+            stack.enter_context(instance_lock(folder, settings.pack.name))
         if database:
             await stack.enter_async_context(database)
         await stack.enter_async_context(outbox)
         if edge:
             await stack.enter_async_context(edge)
-        return await run_live(
+        return await run_estimation_loop(
             settings,
             cell,
             source=source,
@@ -150,8 +150,8 @@ def export_sinks(settings: Settings) -> list[Sink]:
     return found
 
 
-def recording_health(tap: Tap | None) -> RecordingHealth | None:
+def recording_health(tap: ReadTap | None) -> RecordingHealth | None:
     """State of a recording; None where there is none."""
-    if not isinstance(tap, Recording):
+    if not isinstance(tap, CaptureRecorder):
         return None
     return RecordingHealth(on=not tap.ended.done(), bytes=tap.bytes, missed_reads=tap.missed_reads)

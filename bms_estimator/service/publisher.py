@@ -22,21 +22,21 @@ from bms_estimator.model.payloads import (
     Snapshot,
 )
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.service.alarm_monitor import AlarmWatch
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.latency import Latency
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
-from bms_estimator.sources.source import Pulse, Source
+from bms_estimator.sources.source import Source, SourceHealth
 from bms_estimator.telemetry.alarms import Change
-from bms_estimator.telemetry.charge_energy import Flow
-from bms_estimator.telemetry.health import dropped_text, health_report, impossible_sample, sample_counters
-from bms_estimator.telemetry.lifetime_totals import Tally, new_totals
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
+from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
 from bms_estimator.telemetry.remaining_charge import remaining_charge
-from bms_estimator.telemetry.rest_detector import Rest
-from bms_estimator.telemetry.state import estimate_report, info_report
+from bms_estimator.telemetry.rest_detector import RestDetector
+from bms_estimator.telemetry.state import make_info_payload, make_state_payload
 
 log = structlog.get_logger(__name__)
 
@@ -85,11 +85,11 @@ class Publisher:
         source: Source,
         sinks: Sequence[Sink],
         clock: Clock,
-        tally: Tally | None = None,
+        tally: LifetimeTotals | None = None,
         restarts: int = 0,
         checkpoint: str = "off",
-        delivery: Delivery | None = None,
-        pulse: Callable[[], Pulse] | None = None,
+        delivery: DeliveryStats | None = None,
+        pulse: Callable[[], SourceHealth] | None = None,
         recording: Callable[[], RecordingHealth | None] = lambda: None,
         edge: Callable[[], EdgeHealth | None] = lambda: None,
         hooks: Callable[[], HookHealth | None] = lambda: None,
@@ -97,19 +97,19 @@ class Publisher:
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
         self._source, self._sinks, self._clock = source, sinks, clock
-        self._tally = tally or Tally(estimator, new_totals(clock.wall()))
-        self._restarts, self._delivery = restarts, delivery or Delivery()
-        self._rest = Rest(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
+        self._tally = tally or LifetimeTotals(estimator, new_totals(clock.wall()))
+        self._restarts, self._delivery = restarts, delivery or DeliveryStats()
+        self._rest = RestDetector(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
         self._pulse, self._recording, self._edge, self._latency = pulse, recording, edge, Latency()
         self._hooks = hooks
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
-        self.kept: Flow | None = None
-        self._flow = Flow()  # as it was told last
+        self.kept: ChargeEnergy | None = None
+        self._flow = ChargeEnergy()  # as it was told last
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
-        self.watch = AlarmWatch(settings, cell, estimator, source, clock, on_alarm, hooks)
+        self.watch = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks)
         self._suspects = 0  # bits of ``Suspect``, as logged
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
@@ -141,7 +141,7 @@ class Publisher:
             self._window.add(trace, self._clock.wall(), self._source.cells)
             self._sample_s = now_s
         if trace.size < block.size:
-            self._impossible = impossible_sample(block, self._estimator.settings[0]) or ""
+            self._impossible = out_of_range_reason(block, self._estimator.settings[0]) or ""
         elif self._impossible is not None:
             self._impossible, self._dropped_before = None, self._dropped()
         self.watch.add(block, trace, now_s)
@@ -194,7 +194,7 @@ class Publisher:
 
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_s = self._started_s
-        parameters = parameter_report(self._estimator, self._started_wall_s)
+        parameters = make_parameters_payload(self._estimator, self._started_wall_s)
         return Snapshot(
             None, parameters, self._health(now_s, self._sensor_message(now_s)), self._info(), self.watch.alarms.report()
         )
@@ -208,7 +208,7 @@ class Publisher:
         old = now_s - self._slow_s >= SLOW_S
         if old:
             self._slow_s = now_s
-            parameters, info = parameter_report(self._estimator, wall_s), self._info()
+            parameters, info = make_parameters_payload(self._estimator, wall_s), self._info()
         if old or health.sensor_online != (message is None):
             health = self._health(now_s, message)
             self._log_suspicions(health)
@@ -219,11 +219,11 @@ class Publisher:
         # only what outlives a kill, so that the next run goes on from there
         self._flow = self._flow.at_least(self.kept or self._tally.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
-        return estimate_report(window, remaining, self._source.counters, wall_s, self._flow, capacity_ah)
+        return make_state_payload(window, remaining, self._source.counters, wall_s, self._flow, capacity_ah)
 
     def _health(self, now_s: float, message: str | None) -> Health:
         lag_s, self._lag_s = self._lag_s, 0.0
-        return health_report(
+        return make_health_payload(
             self._estimator.record[0],
             self._estimator.settings_record[0],
             self._source.counters,
@@ -265,7 +265,9 @@ class Publisher:
     def _info(self) -> Info:
         self._board = self._source.board or self._board  # one that was lost is most likely to come back
         sensed = bool(self._estimator.record["filter"]["sensed"][0])
-        return info_report(self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed)
+        return make_info_payload(
+            self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed
+        )
 
     def _sensor_message(self, now_s: float) -> str | None:
         """Why values are not fresh, None when they are."""

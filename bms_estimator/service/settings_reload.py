@@ -17,7 +17,7 @@ HUNG_S = 10.0
 log = structlog.get_logger(__name__)
 
 
-class Reload:
+class SettingsReload:
     """One pack's settings as they are in effect, and who takes another value of which.
 
     Args:
@@ -73,12 +73,12 @@ def _flat(settings: Settings) -> dict[str, Any]:
     return {f"{section}.{key}": value for section, table in sections if table for key, value in table.items()}
 
 
-def ask_all(packs: Sequence[Reload]) -> None:
+def ask_all(packs: Sequence[SettingsReload]) -> None:
     """Have the settings of all packs of this process read."""
     for pack in packs:
         pack.asked.set()
 
 
-def reload_on_hangup(packs: Sequence[Reload]) -> None:
+def reload_on_hangup(packs: Sequence[SettingsReload]) -> None:
     """Have SIGHUP reload the settings of all packs of this process."""
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, ask_all, packs)

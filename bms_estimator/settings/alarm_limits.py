@@ -36,7 +36,7 @@ NEEDED: dict[AlarmName, tuple[Quantity, ...]] = {
 """Quantities without which an alarm cannot be watched. The alarms that are missing here judge the samples themselves."""
 
 
-class Watched(NamedTuple):
+class AlarmDefinition(NamedTuple):
     """One alarm that is watched."""
 
     name: AlarmName
@@ -87,7 +87,7 @@ class _Default(NamedTuple):
     above: bool = True
 
 
-def watched(settings: Settings, cell: PackModel) -> tuple[Watched, ...]:
+def watched(settings: Settings, cell: PackModel) -> tuple[AlarmDefinition, ...]:
     """What is watched of a pack, in the order of ``ALARMS``.
 
     Args:
@@ -124,7 +124,7 @@ def out_of_range(settings: Settings, cell: PackModel) -> list[str]:
     return list(_out_of_range(watched(settings, cell), cell))
 
 
-def _out_of_range(alarms: tuple[Watched, ...], cell: PackModel) -> Iterator[str]:
+def _out_of_range(alarms: tuple[AlarmDefinition, ...], cell: PackModel) -> Iterator[str]:
     c = cell.cell
     n, middle_v = c.series_count, c.nominal_voltage_v
     ranges = {
@@ -145,7 +145,7 @@ def _out_of_range(alarms: tuple[Watched, ...], cell: PackModel) -> Iterator[str]
             )
 
 
-def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> Watched | None:
+def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDefinition | None:
     """None: it is switched off, or has no limit."""
     told = rule.model_dump(exclude_none=True)
     key = next((key for key in type(rule).model_fields if key.startswith("limit")), "limit")
@@ -163,7 +163,7 @@ def _watched(name: AlarmName, rule: AlarmRule, default: _Default) -> Watched | N
     delay_s = rule.delay_s
     if name == "link_lost":  # silence is its own delay
         limit, clear, delay_s = limit + delay_s, clear + delay_s, 0.0
-    return Watched(
+    return AlarmDefinition(
         name, rule.severity, default.unit, default.above, limit, clear, delay_s, rule.clear_delay_s, rule.latch
     )
 

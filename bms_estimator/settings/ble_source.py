@@ -5,13 +5,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bms_estimator.settings.polled_source import ReportSource
+from bms_estimator.settings.polled_source import PolledSource
 
 STEP_V, STEP_A = 0.01, 0.01
 """As JBD has them [V, A]; JK is finer, the current of Daly has steps of 0.1 A."""
 
 
-class BleSource(ReportSource):
+class BleSource(PolledSource):
     """A BMS over Bluetooth Low Energy; needs Python 3.12."""
 
     kind: Literal["ble"]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.polled_source import ReportSource, with_profile
+from bms_estimator.settings.polled_source import PolledSource, with_profile
 
 LONGEST_ID, LONGEST_EXTENDED_ID = 0x7FF, 0x1FFF_FFFF
 """Largest identifiers of eleven and of 29 bits."""
@@ -88,7 +88,7 @@ class CellSignals(Signal):
         return tuple(one.model_copy(update={"start_bit": start}) for start in starts)
 
 
-class CanSource(ReportSource):
+class CanSource(PolledSource):
     """A bus that is listened to; nothing is ever sent."""
 
     kind: Literal["can"]

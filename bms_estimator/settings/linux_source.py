@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from bms_estimator.model.config_file import Positive
-from bms_estimator.settings.polled_source import Name, ReportSource
+from bms_estimator.settings.polled_source import Name, PolledSource
 
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
 """One step of the voltage by chip, at its own pins: INA219 data sheet, ADS1015 at 4.096 V full scale [V]."""
@@ -14,7 +14,7 @@ FINE_V = 1.25e-3
 """Of the INA226; what is finer shows through hwmon in millivolts only [V]."""
 
 
-class LinuxSource(ReportSource):
+class LinuxSource(PolledSource):
     """A current sensor whose driver is in the kernel: INA2xx by hwmon, ADS1x15 by iio."""
 
     kind: Literal["linux"]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.polled_source import ReportSource, with_profile
+from bms_estimator.settings.polled_source import PolledSource, with_profile
 
 MOST_WORDS = 125
 """Registers that one request may ask for, of the Modbus application protocol V1.1b3, section 6.3."""
@@ -84,7 +84,7 @@ class CellRegisters(Register):
         return self
 
 
-class ModbusSource(ReportSource):
+class ModbusSource(PolledSource):
     """A device that is asked for its registers, over the network or over a serial line."""
 
     kind: Literal["modbus"]

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 from bms_estimator.model.config_file import Positive, Strict
 from bms_estimator.settings.mqtt import of_brokers
 from bms_estimator.settings.mqtt_profiles import PROFILES, ProfileName
-from bms_estimator.settings.polled_source import Name, ReportSource
+from bms_estimator.settings.polled_source import Name, PolledSource
 
 Unit = Literal["V", "mV", "A", "mA", "C", "F", "K", "s", "ms", "iso"]
 UNITS: Mapping[str, tuple[Unit, ...]] = {
@@ -30,7 +30,7 @@ LINEAR: Mapping[Unit, tuple[float, float]] = {
 """Of a unit: factor and offset that make V, A, degC, s of it."""
 
 
-class Place(Strict):
+class ValueLocation(Strict):
     """Where a quantity is found, and what makes SI of it. A text alone is the path."""
 
     topic: Name | tuple[Name, ...] | None = Field(
@@ -61,7 +61,7 @@ class Place(Strict):
         return factor * (self.scale * number + self.offset) + offset
 
 
-class MqttSource(ReportSource):
+class MqttSource(PolledSource):
     """What somebody else publishes of a battery by MQTT: see docs/sources-mqtt.md."""
 
     kind: Literal["mqtt"]
@@ -69,11 +69,19 @@ class MqttSource(ReportSource):
     prefix: Name | None = Field(default=None, description="name of the publisher in its topics, {prefix} in those here")
     instance: str = Field(default="", description="which of its batteries, {instance} in topics and paths")
     topic: Name | None = Field(default=None, description="of all quantities that have none of their own")
-    voltage: Place | None = Field(default=None, description='of the pack: a path, or {topic = "...", path = "..."}')
-    current: Place | None = Field(default=None, description="as voltage; sensor.current_sign says what is positive")
-    temperature: Place | None = Field(default=None, description="as voltage")
-    cells: Place | None = Field(default=None, description="as voltage, {cell} for the number of a cell, or a list")
-    time: Place | None = Field(default=None, description="as voltage: when it was measured, by the publisher's clock")
+    voltage: ValueLocation | None = Field(
+        default=None, description='of the pack: a path, or {topic = "...", path = "..."}'
+    )
+    current: ValueLocation | None = Field(
+        default=None, description="as voltage; sensor.current_sign says what is positive"
+    )
+    temperature: ValueLocation | None = Field(default=None, description="as voltage")
+    cells: ValueLocation | None = Field(
+        default=None, description="as voltage, {cell} for the number of a cell, or a list"
+    )
+    time: ValueLocation | None = Field(
+        default=None, description="as voltage: when it was measured, by the publisher's clock"
+    )
     settle_s: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.5, description="of voltage and current the one that does not come again in so long is as it was"
     )
@@ -130,7 +138,7 @@ class MqttSource(ReportSource):
             )
         return self
 
-    def places(self) -> Iterator[tuple[str, Place]]:
+    def places(self) -> Iterator[tuple[str, ValueLocation]]:
         """The quantities that are to be found, by name."""
         for name in self.quantities:
             place = getattr(self, name)
@@ -141,7 +149,7 @@ class MqttSource(ReportSource):
         """A topic or a path with prefix and instance in it."""
         return text.replace("{prefix}", self.prefix or "").replace("{instance}", self.instance)
 
-    def topics(self, place: Place) -> list[str]:
+    def topics(self, place: ValueLocation) -> list[str]:
         """Topics of a quantity; ``{cell}`` may be in them."""
         return [self.filled(topic) for topic in place.topics or (self.topic or "",)]
 

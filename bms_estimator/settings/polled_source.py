@@ -10,7 +10,7 @@ from bms_estimator.model.config_file import Strict
 Name = Annotated[str, Field(min_length=1)]
 
 
-class ReportSource(Strict):
+class PolledSource(Strict):
     """What all kinds have in common."""
 
     @property

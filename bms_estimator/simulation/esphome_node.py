@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Self
 
 from bms_estimator.mqtt.broker_config import brokers
-from bms_estimator.mqtt.connection import Connection, Hello
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.connection import Connection, ConnectOptions
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.protocol_negotiation import Dial
-from bms_estimator.mqtt.reconnect_loop import Link
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.simulation.virtual_adc import Reading
 
@@ -54,8 +54,8 @@ class SimulatedNode:
         self.samples = 0
         self._end_s = 0.0
         will = Message(f"{prefix}/status", b"offline", 1, retain=True)
-        hello = Hello(f"{prefix}-{secrets.token_hex(4)}", will, lambda *_: None)
-        self._link = Link(brokers(mqtt), hello, Dial(mqtt), self._serve, Delivery())
+        hello = ConnectOptions(f"{prefix}-{secrets.token_hex(4)}", will, lambda *_: None)
+        self._link = ReconnectLoop(brokers(mqtt), hello, BrokerConnector(mqtt), self._serve, DeliveryStats())
 
     def __enter__(self) -> Self:
         """Nothing to open: ``run`` connects."""

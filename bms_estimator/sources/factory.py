@@ -4,8 +4,8 @@ import importlib
 from collections.abc import Mapping
 
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.line_source import Bringer, Reports
-from bms_estimator.sources.source import Tap
+from bms_estimator.sources.line_source import LineProducer, LineSource
+from bms_estimator.sources.source import ReadTap
 
 KINDS: Mapping[str, str] = {
     "mqtt": "mqtt.mqtt_lines",
@@ -17,7 +17,7 @@ KINDS: Mapping[str, str] = {
 """By ``source.kind``: a module of this package whose ``bringer(settings)`` makes what brings the values."""
 
 
-def make_bringer(settings: Settings) -> Bringer | None:
+def make_line_producer(settings: Settings) -> LineProducer | None:
     """What ``[source]`` asks for; None where the source is a serial line.
 
     Raises:
@@ -27,17 +27,17 @@ def make_bringer(settings: Settings) -> Bringer | None:
     if settings.source is None:
         return None
     module = importlib.import_module(f"{__package__}.{KINDS[settings.source.kind]}")
-    made: Bringer = module.bringer(settings)
+    made: LineProducer = module.bringer(settings)
     return made
 
 
-def open_reports(settings: Settings, *, tap: Tap | None = None) -> Reports | None:
+def open_line_source(settings: Settings, *, tap: ReadTap | None = None) -> LineSource | None:
     """The source that ``[source]`` asks for; None where it is a serial line.
 
     Raises:
-        UserError, ModuleNotFoundError: As ``make_bringer``.
+        UserError, ModuleNotFoundError: As ``make_line_producer``.
     """
-    bringer = make_bringer(settings)
+    bringer = make_line_producer(settings)
     if bringer is None:
         return None
-    return Reports(bringer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)
+    return LineSource(bringer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)

@@ -1,4 +1,4 @@
-"""Sources that are no serial line: what brings values is a ``Bringer``; all else is the same for each of them."""
+"""Sources that are no serial line: what brings values is a ``LineProducer``; all else is the same for each of them."""
 
 import asyncio
 import contextlib
@@ -17,7 +17,7 @@ from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog
-from bms_estimator.sources.source import Pulse, Read, Tap
+from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
 
 LOOK_S = 1.0
 """Often enough for a line of the log [s]."""
@@ -27,11 +27,11 @@ SILENT_PERIODS = 3.0
 log = structlog.get_logger(__name__)
 
 
-class NothingComesError(Exception):
+class SourceUnavailableError(Exception):
     """What is measured cannot be reached, or was lost; the message says why, for people. It may come yet."""
 
 
-class Bringer(ABC):
+class LineProducer(ABC):
     """The I/O part of a source that is no serial line."""
 
     @property
@@ -65,7 +65,7 @@ class Bringer(ABC):
         return {}
 
 
-class Reports:
+class LineSource:
     """Async source of SAMPLE blocks from a bringer, which is begun anew whenever it ends.
 
     All that makes a sample passes ``dialect.feed(arrival_s, line)``: a capture of these calls replays to the same bits.
@@ -83,11 +83,11 @@ class Reports:
 
     def __init__(
         self,
-        bringer: Bringer,
+        bringer: LineProducer,
         sensor: SensorSettings,
         *,
         period_s: float = 1.0,
-        tap: Tap | None = None,
+        tap: ReadTap | None = None,
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
         first_retry_s: float = FIRST_RETRY_S,
@@ -97,7 +97,7 @@ class Reports:
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
         self._look_s, self._silent_s = look_s, SILENT_PERIODS * max(period_s, look_s)
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
-        self._lines: asyncio.Queue[Read | None] = asyncio.Queue()
+        self._lines: asyncio.Queue[Chunk | None] = asyncio.Queue()
         self._message: str | None = "not opened yet"
         self._said = ""
         self._openings, self._connected = 0, False
@@ -138,10 +138,10 @@ class Reports:
     relay: None = None
     """Nor is there a relay."""
 
-    def pulse(self) -> Pulse:
+    def pulse(self) -> SourceHealth:
         """Whether somebody still looks after what is brought."""
         now_s = self._monotonic()
-        return Pulse(now_s - self._tended_s, self._epoch_s + now_s - self._arrived_s, self._lines.qsize())
+        return SourceHealth(now_s - self._tended_s, self._epoch_s + now_s - self._arrived_s, self._lines.qsize())
 
     async def __aenter__(self) -> Self:
         """Begin to have lines brought; nothing need be there yet."""
@@ -186,7 +186,7 @@ class Reports:
                 async with contextlib.aclosing(self._bringer.bring()) as lines:
                     async for line in lines:
                         self._take(line)
-            except (NothingComesError, OSError) as error:
+            except (SourceUnavailableError, OSError) as error:
                 reason = str(error)
             self._connected = False
             self._say(f"{self._bringer.name}: {reason}; trying again")

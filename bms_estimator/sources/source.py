@@ -5,11 +5,11 @@ from typing import NamedTuple, Protocol, Self
 
 from bms_estimator.model.sample import CellBlock, SampleBlock
 
-Read = tuple[float, bytes]
+Chunk = tuple[float, bytes]
 """Arrival [s since 1970], bytes."""
 
 
-class Pulse(NamedTuple):
+class SourceHealth(NamedTuple):
     """Whether what brings samples lives."""
 
     untended_s: float
@@ -20,7 +20,7 @@ class Pulse(NamedTuple):
     """Reads of the line that nobody has taken yet."""
 
 
-class Tap(Protocol):
+class ReadTap(Protocol):
     """Takes all that the dialect is fed, as ``Recording`` does. Does not wait, and raises nothing."""
 
     @property

@@ -14,7 +14,7 @@ from typing import Self, TypeVar
 from bms_estimator.model.events import Event, events
 from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.minute import MINUTE_S, Minute, OpenMinute, epoch_s, minute_of, seen
+from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, minute_of, seen
 
 MINUTES_A_DAY = 1440
 WAITING_MINUTES = 2 * MINUTES_A_DAY
@@ -63,7 +63,7 @@ class History:
         self._before: Snapshot | None = None
         self._last: Estimate | None = None
         self._span_s = 0.0  # to it from the one before
-        self._open: OpenMinute | None = None
+        self._open: MinuteAccumulator | None = None
         self._minutes: deque[tuple[int, Minute]] = deque(maxlen=WAITING_MINUTES)  # with their numbers
         self._events: deque[tuple[int, Event]] = deque(maxlen=WAITING_EVENTS)
         self._run, self._number = secrets.token_hex(8), 0
@@ -102,7 +102,7 @@ class History:
         time_s = minute_of(epoch_s(estimate.time))
         if self._open is None or self._open.time_s != time_s:
             self._close_minute()
-            self._open = OpenMinute(time_s)
+            self._open = MinuteAccumulator(time_s)
         span_s = estimate.board_time_s - self._last.board_time_s if self._last else 0.0
         self._open.add(estimate, seen(span_s, self._span_s))
         self._last, self._span_s = estimate, span_s

@@ -62,7 +62,7 @@ class _Mean:
 
 
 @dataclass
-class OpenMinute:
+class MinuteAccumulator:
     """The minute that goes on; ``time_s`` is its begin [s since 1970]."""
 
     time_s: int

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 
 
-class Runs:
+class NumberRanges:
     """Numbers that are taken at the front and put at the back.
 
     Args:
@@ -51,17 +51,17 @@ class Runs:
         self._count -= 1
         return run.start
 
-    def take_before(self, end: int) -> "Runs":
+    def take_before(self, end: int) -> "NumberRanges":
         """Take all that are below ``end``."""
-        taken = Runs(range(run.start, min(run.stop, end)) for run in self._runs)
-        rest = Runs(range(max(run.start, end), run.stop) for run in self._runs)
+        taken = NumberRanges(range(run.start, min(run.stop, end)) for run in self._runs)
+        rest = NumberRanges(range(max(run.start, end), run.stop) for run in self._runs)
         self._runs, self._count = rest._runs, rest._count
         return taken
 
-    def moved(self, by: int) -> "Runs":
+    def moved(self, by: int) -> "NumberRanges":
         """The same, each number higher by so much."""
-        return Runs(range(run.start + by, run.stop + by) for run in self._runs)
+        return NumberRanges(range(run.start + by, run.stop + by) for run in self._runs)
 
-    def both(self, other: "Runs") -> "Runs":
+    def both(self, other: "NumberRanges") -> "NumberRanges":
         """What is in both."""
-        return Runs(range(max(a.start, b.start), min(a.stop, b.stop)) for a in self._runs for b in other)
+        return NumberRanges(range(max(a.start, b.start), min(a.stop, b.stop)) for a in self._runs for b in other)

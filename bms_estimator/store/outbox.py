@@ -9,17 +9,17 @@ import contextlib
 from collections import deque
 from typing import Self
 
-from bms_estimator.mqtt.message import Message, Waiting
+from bms_estimator.mqtt.message import Message, QueuedMessage
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox_queue import PAGE, Queue
-from bms_estimator.store.outbox_table import Outcome, Work, look
+from bms_estimator.store.outbox_table import OutboxTransaction, Outcome, read_backlog
 
 FLUSH_S = 1.0
 """How often what waits is written while the broker is away [s]."""
 BEHIND = 3
 """A connected broker that has not acknowledged a message after so many of these times is behind."""
 
-__all__ = ["Outbox", "Waiting"]
+__all__ = ["Outbox", "QueuedMessage"]
 
 
 class Outbox:
@@ -76,7 +76,7 @@ class Outbox:
         self._queue.put(message)
         self._tell()
 
-    async def take(self, most: int) -> list[Waiting]:
+    async def take(self, most: int) -> list[QueuedMessage]:
         """Wait until there is a message, and hand out up to ``most`` of the oldest that were not since ``rewind``."""
         while not (self._opened and self._queue.can_hand_out):
             self._filled.clear()
@@ -127,7 +127,7 @@ class Outbox:
         queue = self._queue
         try:
             if self._offset is None:
-                found = await self._database.call(look)
+                found = await self._database.call(read_backlog)
                 self._offset = queue.found(found.runs)
                 queue.dropped += found.damaged
                 self._known = self._database.opened
@@ -142,11 +142,11 @@ class Outbox:
         self._opened = True
         self._tell()
 
-    def _due(self, offset: int, *, write: bool) -> Work:
+    def _due(self, offset: int, *, write: bool) -> OutboxTransaction:
         queue, stored = self._queue, self._queue.stored
         gaps = queue.gaps() if queue.stale or not queue.sure else []
         queue.stale = False
-        return Work(
+        return OutboxTransaction(
             offset=offset,
             first=stored.first if stored else queue.next,
             end=stored.end if stored else queue.next,

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain
 
-from bms_estimator.mqtt.message import Message, Waiting
-from bms_estimator.store.number_ranges import Runs
+from bms_estimator.mqtt.message import Message, QueuedMessage
+from bms_estimator.store.number_ranges import NumberRanges
 
 MEMORY_MOST = 4096
 """Messages of the tail: some megabytes, and an hour of states for a disk that cannot be written."""
@@ -40,13 +40,13 @@ class Queue:
     most: int
     dropped: int = 0
     next: int = 0
-    handed: dict[int, Waiting] = field(default_factory=dict)
+    handed: dict[int, QueuedMessage] = field(default_factory=dict)
     stale: bool = False
     sure: bool = True
     passing: bool = False
-    stored: Runs = field(default_factory=Runs)
-    _ready: deque[Waiting] = field(default_factory=deque)
-    _tail: deque[Waiting] = field(default_factory=deque)
+    stored: NumberRanges = field(default_factory=NumberRanges)
+    _ready: deque[QueuedMessage] = field(default_factory=deque)
+    _tail: deque[QueuedMessage] = field(default_factory=deque)
     _written: set[int] = field(default_factory=set)  # in memory, and on disk as well
 
     @property
@@ -73,7 +73,7 @@ class Queue:
 
     def put(self, message: Message) -> None:
         """Take the newest message."""
-        self._tail.append(Waiting(self.next, message))
+        self._tail.append(QueuedMessage(self.next, message))
         self.next += 1
         if self.waiting > self.most:
             self._drop_oldest()
@@ -81,9 +81,9 @@ class Queue:
             self._forget(self._tail.popleft().number)
             self.dropped += 1
 
-    def hand_out(self, most: int) -> list[Waiting]:
+    def hand_out(self, most: int) -> list[QueuedMessage]:
         """Up to ``most`` of the oldest."""
-        taken: list[Waiting] = []
+        taken: list[QueuedMessage] = []
         while len(taken) < most and self.can_hand_out:
             taken.append((self._ready or self._tail).popleft())
         self.handed |= {waiting.number: waiting for waiting in taken}
@@ -99,11 +99,11 @@ class Queue:
         self._ready.extendleft(reversed(self.handed.values()))
         self.handed.clear()
 
-    def unwritten(self) -> list[Waiting]:
+    def unwritten(self) -> list[QueuedMessage]:
         """What is in memory alone."""
         return [waiting for waiting in self._in_memory() if not self.sure or waiting.number not in self._written]
 
-    def writing(self, rows: Iterable[Waiting]) -> None:
+    def writing(self, rows: Iterable[QueuedMessage]) -> None:
         """From now on these may be on disk."""
         self._written.update(waiting.number for waiting in rows)
 
@@ -117,7 +117,7 @@ class Queue:
                 self._written.discard(newest.number)
                 self.stored.add(newest.number)
 
-    def loaded(self, rows: Iterable[Waiting], end: int) -> None:
+    def loaded(self, rows: Iterable[QueuedMessage], end: int) -> None:
         """Of what is on disk alone these were read; all that is before ``end`` and not among them is lost."""
         wanted = self.stored.take_before(end)
         read = {waiting.number: waiting for waiting in rows if waiting.number in wanted}  # some were dropped meanwhile
@@ -125,7 +125,7 @@ class Queue:
         self._written.update(read)
         self._lose(len(wanted) - len(read))
 
-    def found(self, runs: Runs) -> int:
+    def found(self, runs: NumberRanges) -> int:
         """An earlier run left messages on disk: they go before all that was not handed out.
 
         Args:
@@ -138,14 +138,14 @@ class Queue:
         if not runs:
             return -first
         span = runs.end - runs.first
-        self._tail = deque(Waiting(waiting.number + span, waiting.message) for waiting in self._tail)
+        self._tail = deque(QueuedMessage(waiting.number + span, waiting.message) for waiting in self._tail)
         self.next += span
         self.stored = runs.moved(first - runs.first)
         for _ in range(self.waiting - self.most):
             self._drop_oldest()
         return runs.first - first
 
-    def left(self, runs: Runs) -> None:
+    def left(self, runs: NumberRanges) -> None:
         """So much of what was on disk alone is still there."""
         before = len(self.stored)
         self.stored = self.stored.both(runs)
@@ -161,7 +161,7 @@ class Queue:
             begin = run.stop
         return [*gaps, (begin, self.next)] if begin < self.next else gaps
 
-    def _in_memory(self) -> Iterator[Waiting]:
+    def _in_memory(self) -> Iterator[QueuedMessage]:
         return chain(self.handed.values(), self._ready, self._tail)
 
     def _forget(self, number: int) -> None:

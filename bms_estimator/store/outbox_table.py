@@ -5,8 +5,8 @@ import sqlite3
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from bms_estimator.mqtt.message import Message, Waiting
-from bms_estimator.store.number_ranges import Runs
+from bms_estimator.mqtt.message import Message, QueuedMessage
+from bms_estimator.store.number_ranges import NumberRanges
 
 FARTHEST = 1 << 40
 """No number is as far from 0 in ten thousand years; one that is, is of a row that is damaged."""
@@ -20,41 +20,41 @@ _NUMBERS = (
 )
 
 
-class Found(NamedTuple):
+class StoredBacklog(NamedTuple):
     """What is on disk at start."""
 
-    runs: Runs
+    runs: NumberRanges
     damaged: int
     """Rows that were removed."""
 
 
-def look(connection: sqlite3.Connection) -> Found:
+def read_backlog(connection: sqlite3.Connection) -> StoredBacklog:
     """What an earlier run left."""
     beyond = "DELETE FROM outbox WHERE +number <= ? OR +number >= ?"
     damaged = connection.execute(beyond, (-FARTHEST, FARTHEST)).rowcount
-    return Found(_runs(connection, -FARTHEST, FARTHEST), damaged)
+    return StoredBacklog(_runs(connection, -FARTHEST, FARTHEST), damaged)
 
 
-def _runs(connection: sqlite3.Connection, first: int, end: int) -> Runs:
+def _runs(connection: sqlite3.Connection, first: int, end: int) -> NumberRanges:
     runs: list[range] = []
     for low, high in connection.execute(_NUMBERS, (first - 1, end)):
         runs.append(range(max(low, runs[-1].stop) if runs else low, high + 1))  # in a damaged file one may come twice
-    return Runs(runs)
+    return NumberRanges(runs)
 
 
 class Outcome(NamedTuple):
     """Of one transaction."""
 
-    stored: Runs | None
+    stored: NumberRanges | None
     """Messages on disk alone before it, where it was asked."""
-    page: list[Waiting]
+    page: list[QueuedMessage]
     """The oldest of them, without those that are damaged."""
     page_end: int
     """One after the last number of those that were read."""
 
 
 @dataclass(frozen=True)
-class Work:
+class OutboxTransaction:
     """One transaction, which may be done twice; numbers are the queue's, ``offset`` makes those on disk of them."""
 
     offset: int
@@ -64,7 +64,7 @@ class Work:
     """One after its last."""
     gaps: list[tuple[int, int]]
     """What is to be removed: from each number to before the other."""
-    rows: list[Waiting]
+    rows: list[QueuedMessage]
     """To be written; what is there already is replaced."""
     page: int
     """So many of the oldest that are on disk alone are read."""
@@ -87,7 +87,7 @@ class Work:
             return Outcome(stored, [], self.first)
         oldest = "SELECT number, topic, payload, qos, retain FROM outbox WHERE number >= ? AND number < ? ORDER BY number LIMIT ?"
         found = connection.execute(oldest, (*alone, self.page)).fetchall()
-        page = [Waiting(row[0] - self.offset, message) for row in found if (message := _message(*row[1:]))]
+        page = [QueuedMessage(row[0] - self.offset, message) for row in found if (message := _message(*row[1:]))]
         end = found[-1][0] + 1 - self.offset if len(found) == self.page else self.end
         return Outcome(stored, page, end)
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from bms_estimator.model.arrays import Floats
-from bms_estimator.settings.alarm_limits import Watched
+from bms_estimator.settings.alarm_limits import AlarmDefinition
 
 
-class Raising(NamedTuple):
+class RaisedAlarm(NamedTuple):
     """When an alarm was raised, and at what."""
 
     since_s: float
@@ -18,12 +18,12 @@ class Raising(NamedTuple):
     value: float | None
 
 
-class Turn(NamedTuple):
+class AlarmTransition(NamedTuple):
     """That an alarm was raised, or ended."""
 
     at_s: float
     """On the samples' clock [s]."""
-    raising: Raising | None
+    raising: RaisedAlarm | None
     """None: it has ended."""
 
 
@@ -40,8 +40,8 @@ class AlarmState:
         lost_s: Shorter times without values count toward a delay [s].
     """
 
-    watched: Watched
-    raising: Raising | None = None
+    watched: AlarmDefinition
+    raising: RaisedAlarm | None = None
     gone: bool = False
     acknowledged: bool = False
     known: bool = False
@@ -51,7 +51,7 @@ class AlarmState:
     _held_s: float | None = None
     """For how long what leads to the next state has held [s]; None: it does not."""
 
-    def take(self, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float) -> list[Turn]:
+    def take(self, times_s: Floats, steps_s: Floats, values: Floats, wall_s: float) -> list[AlarmTransition]:
         """Take values as they came.
 
         Args:
@@ -79,12 +79,12 @@ class AlarmState:
                 turns += self._turn(at_s, sign * value, wall_s)
         return turns
 
-    def raise_at(self, at_s: float, raising: Raising) -> list[Turn]:
+    def raise_at(self, at_s: float, raising: RaisedAlarm) -> list[AlarmTransition]:
         """It is raised, whatever came before; unless it is already."""
         if self.raising is not None:
             return []
         self.raising, self._held_s = raising, None
-        return [Turn(at_s, raising)]
+        return [AlarmTransition(at_s, raising)]
 
     def acknowledge(self) -> bool:
         """Somebody knows. Returns whether it has ended by that."""
@@ -94,7 +94,7 @@ class AlarmState:
         self._end()
         return True
 
-    def restore(self, raising: Raising, *, gone: bool, acknowledged: bool) -> None:
+    def restore(self, raising: RaisedAlarm, *, gone: bool, acknowledged: bool) -> None:
         """Go on from a run before."""
         self.raising, self.gone, self.acknowledged = raising, gone, acknowledged
         self._held_s = None
@@ -112,10 +112,10 @@ class AlarmState:
         self._held_s = None
         return True
 
-    def _turn(self, at_s: float, value: float, wall_s: float) -> list[Turn]:
+    def _turn(self, at_s: float, value: float, wall_s: float) -> list[AlarmTransition]:
         """Go to the next state. Returns what others need to know of it."""
         if self.raising is None:
-            return self.raise_at(at_s, Raising(at_s + wall_s, value if math.isfinite(value) else None))
+            return self.raise_at(at_s, RaisedAlarm(at_s + wall_s, value if math.isfinite(value) else None))
         if self.gone:  # it is back
             self.gone = False
             return []
@@ -123,7 +123,7 @@ class AlarmState:
             self.gone = True
             return []
         self._end()
-        return [Turn(at_s, None)]
+        return [AlarmTransition(at_s, None)]
 
     def _end(self) -> None:
         self.raising, self.gone, self.acknowledged, self._held_s = None, False, False, None

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from bms_estimator.settings.alarm_limits import Watched
+from bms_estimator.settings.alarm_limits import AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
 
 LATCHED = "the cause is gone; acknowledge it to end it: "
@@ -30,7 +30,7 @@ _WHAT: dict[AlarmName, tuple[str, str]] = {
 }
 
 
-def alarm_text(watched: Watched, value: float | None, reasons: Sequence[str], *, gone: bool) -> str:
+def alarm_text(watched: AlarmDefinition, value: float | None, reasons: Sequence[str], *, gone: bool) -> str:
     """A sentence or two: what is wrong, and what to do.
 
     Args:

@@ -14,18 +14,20 @@ import numpy as np
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import Alarm
 from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
-from bms_estimator.settings.alarm_limits import NEEDED, Quantity, Watched
+from bms_estimator.settings.alarm_limits import NEEDED, AlarmDefinition, Quantity
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarm_inputs import LOST, Inputs, counted
 from bms_estimator.telemetry.alarm_samples import Steps, Waiting
-from bms_estimator.telemetry.alarm_state import AlarmState, Raising, Turn
+from bms_estimator.telemetry.alarm_state import AlarmState, AlarmTransition, RaisedAlarm
 from bms_estimator.telemetry.alarm_text import alarm_text
 
-SENSOR_SUSPECTS = Suspect.SIGN_OF_CURRENT | Suspect.OFFSET | Suspect.OUTLIERS | Suspect.VOLTAGE | Suspect.CURRENT
-MODEL_SUSPECTS = Suspect.CAPACITY | Suspect.OCV
+SENSOR_SUSPECTS = (
+    InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
+)
+MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
 ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """These are watched before anything was measured."""
 INPUTS = "inputs"
@@ -36,7 +38,7 @@ SHARE_S = 1.0
 """Lost and unusable samples are set against the good ones of so long at least [s]."""
 
 
-class Counts(NamedTuple):
+class SampleCounts(NamedTuple):
     """Samples since start."""
 
     good: int
@@ -57,14 +59,14 @@ class Change(NamedTuple):
 class Reasons(NamedTuple):
     """What else is known of an alarm's cause."""
 
-    suspects: Suspect
+    suspects: InputFault
     texts: tuple[str, ...]
 
 
-class Told(NamedTuple):
+class AlarmMessage(NamedTuple):
     """What is told of an alarm."""
 
-    raising: Raising | None
+    raising: RaisedAlarm | None
     gone: bool
     reasons: tuple[str, ...]
     unwatched: str | None
@@ -73,10 +75,10 @@ class Told(NamedTuple):
 
 _COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
 """Columns of a sample by quantity."""
-_NO_REASONS = Reasons(Suspect(0), ())
+_NO_REASONS = Reasons(InputFault(0), ())
 
 
-class Alarms:
+class AlarmEvaluator:
     """The alarms of one pack.
 
     Args:
@@ -92,7 +94,7 @@ class Alarms:
     """
 
     def __init__(
-        self, watched: Sequence[Watched], charging_a: float, gap_s: float, inputs: Inputs, silent_s: float
+        self, watched: Sequence[AlarmDefinition], charging_a: float, gap_s: float, inputs: Inputs, silent_s: float
     ) -> None:
         self._states = {each.name: AlarmState(each, lost_s=inputs.lost_s) for each in watched}
         self._charging_a = charging_a
@@ -102,13 +104,13 @@ class Alarms:
         self._unwatched: dict[AlarmName, str] = {}  # reasons
         self._sampled, self._traced, self._shared = Steps(gap_s), Steps(gap_s), Steps(math.inf)
         self._waiting = Waiting()
-        self._counts: Counts | None = None
+        self._counts: SampleCounts | None = None
         self._counted_s = -math.inf
         self._at_s = 0.0  # of the last sample
         self._mismatch_suspected = False
         self._reasons: dict[AlarmName, Reasons] = {}
         self._changes: list[Change] = []
-        self._unshown: dict[AlarmName, Told] = {}
+        self._unshown: dict[AlarmName, AlarmMessage] = {}
         self.kept = ""
 
     @property
@@ -120,7 +122,7 @@ class Alarms:
         """Take a block, what the estimator made of it, and the cells beside it; ``judge`` looks at them."""
         self._waiting.add(block, trace, cells)
 
-    def judge(self, arrival_s: float, counts: Counts, suspects: Suspect, suspicions: Sequence[str]) -> None:
+    def judge(self, arrival_s: float, counts: SampleCounts, suspects: InputFault, suspicions: Sequence[str]) -> None:
         """Judge all that waits.
 
         Args:
@@ -163,8 +165,8 @@ class Alarms:
             state.gone = False
             self._keep()
         if state.raising is None:
-            self._reasons["link_lost"] = Reasons(Suspect(0), (reason,) if reason else ())
-            self._note(state, state.raise_at(self._at_s, Raising(now_s, silent_s)))
+            self._reasons["link_lost"] = Reasons(InputFault(0), (reason,) if reason else ())
+            self._note(state, state.raise_at(self._at_s, RaisedAlarm(now_s, silent_s)))
             self._keep()
 
     def judge_hooks(self, failing: Sequence[str], passed_s: float, now_s: float) -> None:
@@ -176,7 +178,7 @@ class Alarms:
             now_s: Wall clock [s since 1970].
         """
         if failing:
-            self._reasons["hook_failed"] = Reasons(Suspect(0), tuple(failing))
+            self._reasons["hook_failed"] = Reasons(InputFault(0), tuple(failing))
         value = np.array([math.inf if failing else 0.0])  # this alarm publishes no value
         self._take("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
         self._keep()
@@ -240,7 +242,7 @@ class Alarms:
             iso_utc(since_s)
             if value is not None and not math.isfinite(value):
                 raise ValueError(f"{name}: value = {value}")
-            raising = Raising(since_s, None if value is None else float(value))
+            raising = RaisedAlarm(since_s, None if value is None else float(value))
             state.restore(raising, gone=bool(told["gone"]), acknowledged=bool(told["acknowledged"]))
         self._keep()
 
@@ -303,9 +305,9 @@ class Alarms:
         """Raise it without its own delay: the quantity has been missing for ``lost_s`` already."""
         state = self._states.get("sensor_fault")
         if state is not None:
-            self._note(state, state.raise_at(at_s, Raising(at_s + wall_s, None)))
+            self._note(state, state.raise_at(at_s, RaisedAlarm(at_s + wall_s, None)))
 
-    def _judge_share(self, at_s: float, counts: Counts, suspects: Suspect, wall_s: float) -> None:
+    def _judge_share(self, at_s: float, counts: SampleCounts, suspects: InputFault, wall_s: float) -> None:
         """Of samples that are lost or unusable among all."""
         if 0.0 <= at_s - self._counted_s < SHARE_S:
             return
@@ -317,7 +319,7 @@ class Alarms:
             share = math.inf
         self._take("sensor_fault", np.array([at_s]), seen_s, np.array([share]), wall_s)
 
-    def _judge_estimates(self, trace: TraceBlock, suspects: Suspect, wall_s: float) -> None:
+    def _judge_estimates(self, trace: TraceBlock, suspects: InputFault, wall_s: float) -> None:
         times_s = trace["time_s"]
         _, seen_s = self._traced.of(times_s)
         soc, std = trace["soc"], trace["soc_std"]
@@ -337,15 +339,17 @@ class Alarms:
         if state is not None:
             self._note(state, state.take(times_s, steps_s, values, wall_s))
 
-    def _note(self, state: AlarmState, turns: Iterable[Turn]) -> None:
+    def _note(self, state: AlarmState, turns: Iterable[AlarmTransition]) -> None:
         name = state.watched.name
         for turn in turns:
-            told = Told(turn.raising, gone=False, reasons=self._texts(name), unwatched=self._unwatched.get(name))
+            told = AlarmMessage(
+                turn.raising, gone=False, reasons=self._texts(name), unwatched=self._unwatched.get(name)
+            )
             if turn.raising is not None:
                 self._unshown[name] = told
             self._changes.append(Change(turn.at_s, _alarm(state.watched, told)))
 
-    def _suspect(self, name: AlarmName, suspects: Suspect, suspicions: Sequence[str]) -> None:
+    def _suspect(self, name: AlarmName, suspects: InputFault, suspicions: Sequence[str]) -> None:
         """Keep the sentences as they were when one came or went: numbers in them may change each second."""
         state, before = self._states.get(name), self._reasons.get(name, _NO_REASONS)
         if state is not None and suspects != before.suspects and (suspects or state.raising is None):
@@ -354,7 +358,9 @@ class Alarms:
 
     def _alarm(self, state: AlarmState) -> Alarm:
         name = state.watched.name
-        told = Told(state.raising, gone=state.gone, reasons=self._texts(name), unwatched=self._unwatched.get(name))
+        told = AlarmMessage(
+            state.raising, gone=state.gone, reasons=self._texts(name), unwatched=self._unwatched.get(name)
+        )
         return _alarm(state.watched, told)
 
     def _texts(self, name: AlarmName) -> tuple[str, ...]:
@@ -381,7 +387,7 @@ class Alarms:
         self.kept = json.dumps(kept) if kept else ""
 
 
-def _alarm(watched: Watched, told: Told) -> Alarm:
+def _alarm(watched: AlarmDefinition, told: AlarmMessage) -> Alarm:
     raising, value = told.raising, told.raising.value if told.raising else None
     return Alarm(
         name=watched.name,

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS, add_flow
+from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS, accumulate_charge_energy
 from bms_estimator.model.payloads import Totals
 
 
-class Flow(NamedTuple):
+class ChargeEnergy(NamedTuple):
     """What has gone through the terminals; none of it ever decreases."""
 
     charge_out_ah: float = 0.0
@@ -23,22 +23,22 @@ class Flow(NamedTuple):
         """The part of ``total`` that has flowed."""
         return cls(*(getattr(total, name) for name in cls._fields))
 
-    def and_net(self, charge_as: float, energy_ws: float) -> "Flow":
+    def and_net(self, charge_as: float, energy_ws: float) -> "ChargeEnergy":
         """And ``charge_as`` [A s] and ``energy_ws`` [W s], positive on discharge, each in the direction in which it went."""
         charge_ah, energy_kwh = charge_as / 3600.0, energy_ws / 3.6e6
-        return Flow(
+        return ChargeEnergy(
             self.charge_out_ah + max(charge_ah, 0.0),
             self.charge_in_ah + max(-charge_ah, 0.0),
             self.energy_out_kwh + max(energy_kwh, 0.0),
             self.energy_in_kwh + max(-energy_kwh, 0.0),
         )
 
-    def at_least(self, other: "Flow") -> "Flow":
+    def at_least(self, other: "ChargeEnergy") -> "ChargeEnergy":
         """The larger of each."""
-        return Flow(*map(max, self, other))
+        return ChargeEnergy(*map(max, self, other))
 
 
-class Meter:
+class ChargeEnergyMeter:
     """Counts what flows: straight between samples, nothing over a gap.
 
     What comes is netted from one look at ``flow`` to the next: a current that is noise about zero must not count as energy
@@ -50,21 +50,21 @@ class Meter:
         sums: Shape (1,), dtype ``FLOW_SUMS``: what it counts in, where that outlives it.
     """
 
-    def __init__(self, before: Flow, gap_s: float, sums: NDArray[np.void] | None = None) -> None:
+    def __init__(self, before: ChargeEnergy, gap_s: float, sums: NDArray[np.void] | None = None) -> None:
         self._gap_s = gap_s
         self._sums: NDArray[np.void] = np.zeros(1, dtype=FLOW_SUMS) if sums is None else sums
         self.go_on(before)
 
-    def go_on(self, flow: Flow) -> None:
+    def go_on(self, flow: ChargeEnergy) -> None:
         """Count on from ``flow`` and what the sums hold."""
         self._flow = flow
 
     def add(self, trace: TraceBlock) -> None:
         """Take accepted samples; ``trace`` has shape (n,), dtype TRACE."""
-        add_flow(self._sums, trace, self._gap_s)
+        accumulate_charge_energy(self._sums, trace, self._gap_s)
 
     @property
-    def flow(self) -> Flow:
+    def flow(self) -> ChargeEnergy:
         """All that has flowed."""
         s = self._sums[0]
         self._flow = self._flow.and_net(float(s["charge_as"]), float(s["energy_ws"]))

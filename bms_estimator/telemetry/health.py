@@ -10,10 +10,10 @@ import numpy as np
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import EdgeHealth, Health, HookHealth, LoopHealth, RecordingHealth, Totals
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / 2**20
 _SAMPLE_COUNTERS = [
@@ -55,17 +55,17 @@ def suspicions(record: np.void, settings: np.void) -> list[str]:
         record: Of dtype ESTIMATOR_STATE.
         settings: Of dtype ESTIMATOR_SETTINGS.
     """
-    suspects = Suspect(int(record["checks"]["suspects"]))
-    texts = {suspect: suspect.text for suspect in Suspect if suspect in suspects}
-    if Suspect.TEMPERATURE in texts:
+    suspects = InputFault(int(record["checks"]["suspects"]))
+    texts = {suspect: suspect.text for suspect in InputFault if suspect in suspects}
+    if InputFault.TEMPERATURE in texts:
         low_c, high_c = float(settings["filter"]["low_c"]), float(settings["filter"]["high_c"])
         known = f"{low_c:.0f} C" if low_c == high_c else f"{low_c:.0f} to {high_c:.0f} C"
         numbers = f"no data at {float(record['filter']['temperature_c']):.0f} C, the cell file knows {known}"
-        texts[Suspect.TEMPERATURE] = f"{numbers}: {Suspect.TEMPERATURE.text}"
+        texts[InputFault.TEMPERATURE] = f"{numbers}: {InputFault.TEMPERATURE.text}"
     return list(texts.values())
 
 
-def health_report(
+def make_health_payload(
     record: np.void,
     settings: np.void,
     line: Mapping[str, int],
@@ -76,7 +76,7 @@ def health_report(
     restarts: int,
     checkpoint: str,
     sensor_message: str | None,
-    delivery: Delivery,
+    delivery: DeliveryStats,
     clock_ppm: float | None,
     total: Totals,
     unseen_s: float | None,
@@ -141,7 +141,7 @@ def health_report(
     )
 
 
-def impossible_sample(block: SampleBlock, settings: np.void) -> str | None:
+def out_of_range_reason(block: SampleBlock, settings: np.void) -> str | None:
     """The last sample of a block that is out of range or has no number, for people; None where there is none.
 
     Args:

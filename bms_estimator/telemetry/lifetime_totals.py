@@ -12,7 +12,7 @@ from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads import Totals
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.telemetry.charge_energy import Flow, Meter
+from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.health import sample_counters
 
 
@@ -21,7 +21,7 @@ def new_totals(now_s: float) -> Totals:
     return Totals(since=iso_utc(now_s), crashes=0, samples={}, unseen_s=0.0)
 
 
-class Tally:
+class LifetimeTotals:
     """Takes blocks to the estimator and adds up what they tell.
 
     Args:
@@ -35,7 +35,7 @@ class Tally:
 
     def __init__(self, estimator: Estimator, before: Totals) -> None:
         self.estimator, self._before = estimator, before
-        self._meter = Meter(Flow.of(before), float(estimator.settings["gap_s"][0]))
+        self._meter = ChargeEnergyMeter(ChargeEnergy.of(before), float(estimator.settings["gap_s"][0]))
         self._unseen_s = 0.0  # of this run
         self.unseen_s: float | None = None
 
@@ -48,7 +48,7 @@ class Tally:
         return self._before.model_copy(update=changed | self.flow._asdict())
 
     @property
-    def flow(self) -> Flow:
+    def flow(self) -> ChargeEnergy:
         """Through the terminals, in all runs."""
         return self._meter.flow
 

@@ -11,7 +11,7 @@ POINTS = 101
 """Evenly spaced SOCs that the fit is made at."""
 
 
-class Formula(NamedTuple):
+class OcvFormulaFit(NamedTuple):
     """(2.10) fitted to a table.
 
     Attributes:
@@ -25,13 +25,13 @@ class Formula(NamedTuple):
     rms_v: float
 
 
-def formula(cell: CellModel) -> Formula | None:
+def formula(cell: CellModel) -> OcvFormulaFit | None:
     """That of a cell's table; None where the cell file gives (2.10) itself."""
     return _fitted(cell.ocv) if isinstance(cell.ocv, TableOcv) else None
 
 
 @cache
-def _fitted(ocv: TableOcv) -> Formula:
+def _fitted(ocv: TableOcv) -> OcvFormulaFit:
     from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - what fits is loaded only where there is a table
 
     from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora  # noqa: PLC0415
@@ -39,4 +39,4 @@ def _fitted(ocv: TableOcv) -> Formula:
 
     soc = np.linspace(0.0, 1.0, POINTS)
     fit = fit_chen_mora(Points(soc, PchipInterpolator(ocv.soc, ocv.ocv_v)(soc), np.ones(POINTS)))
-    return Formula(tuple(map(float, fit.a)), tuple(map(float, fit.std)), rms_v(fit.residual_v))
+    return OcvFormulaFit(tuple(map(float, fit.a)), tuple(map(float, fit.std)), rms_v(fit.residual_v))

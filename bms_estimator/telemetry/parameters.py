@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import (
-    Learned,
+    IdentifiedValue,
     current_offset,
     fitted_parameter,
-    learned_ocv,
+    ocv_correction_with_std,
     present_elements,
     relative_capacity,
     relative_series_resistance,
@@ -45,7 +45,7 @@ _FUNCTIONS = {
 }
 
 
-def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
+def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterReport:
     """Topic ``parameters``: a1..a15 as the observer holds them, a16..a21 of the cell file, elements at the present SOC.
 
     Where the cell file gives the OCV as a table, a16..a21 are (2.10) fitted to it.
@@ -70,7 +70,7 @@ def parameter_report(estimator: Estimator, now_s: float) -> ParameterReport:
     parameters, elements = _of_cell_file(estimator.cell, a), _elements_of(estimator, a)
     health: dict[str, Parameter] = {}
     learning, record = bool(estimator.settings_record["learning"]["enabled"][0]), estimator.record[0]
-    led = _led(estimator)
+    led = _is_data_driven(estimator)
     for i in range(1, 16):
         held = parameters[f"a{i}"] = _of_source(parameters[f"a{i}"], led[i], learning)
         if estimator.identifying and not learning:
@@ -116,7 +116,7 @@ def _ocv(estimator: Estimator) -> OcvCurve:
     """The filter's curve with its error: the cell file's, and what was learned on top."""
     record, settings = estimator.record[0], estimator.settings_record[0]
     p = settings["filter"]
-    correction_v, std_v = learned_ocv(record, settings, OCV_SOC)
+    correction_v, std_v = ocv_correction_with_std(record, settings, OCV_SOC)
     given_v = _given_v(p["ocv_v"].tobytes(), p["ocv_slope_v"].tobytes())
     return OcvCurve(soc=OCV_SOC.tolist(), ocv_v=(given_v + correction_v).tolist(), std_v=std_v.tolist())
 
@@ -155,7 +155,7 @@ def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]
     }
 
 
-def _bias(learned: Learned, limit: float, setting: str, now_s: float) -> Parameter:
+def _bias(learned: IdentifiedValue, limit: float, setting: str, now_s: float) -> Parameter:
     """Bias of the sensor or the capacity, valid below ``limit`` [its unit]."""
     value, std = finite(learned.value), finite(learned.std)
     if std == 0.0:
@@ -166,7 +166,7 @@ def _bias(learned: Learned, limit: float, setting: str, now_s: float) -> Paramet
     return Parameter(value=value, std=std, valid=valid, source="identified", updated=iso_utc(now_s), reason=reason)
 
 
-def _led(estimator: Estimator) -> np.ndarray:
+def _is_data_driven(estimator: Estimator) -> np.ndarray:
     """Which of a1..a15 data have led away from the configured: the learning law, else the fit that (3.18) follows."""
     state, settings = estimator.state[0], estimator.settings_record[0]
     if settings["learning"]["enabled"]:
@@ -181,7 +181,7 @@ def _of_source(held: Parameter, led: np.bool_, learning: bool) -> Parameter:
     return held.model_copy(update={"source": "identified"} | ({"reason": LEARNED} if learning else {}))
 
 
-def _parameter(held: Parameter, fit: Learned | None, now_s: float) -> Parameter:
+def _parameter(held: Parameter, fit: IdentifiedValue | None, now_s: float) -> Parameter:
     """a_i as the observer holds it, with the error that the fit has."""
     if fit is None or held.source == "configured":
         return held
@@ -189,7 +189,7 @@ def _parameter(held: Parameter, fit: Learned | None, now_s: float) -> Parameter:
     return known.model_copy(update={"value": held.value}) if known.valid else known
 
 
-def _identified(learned: Learned, held: Parameter, limit: float, now_s: float) -> Parameter:
+def _identified(learned: IdentifiedValue, held: Parameter, limit: float, now_s: float) -> Parameter:
     """Learned value if its error is small enough, else the observer's value and how far learning has come."""
     if math.isinf(learned.unlearned_s):
         return held

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, add_window
+from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, accumulate_window
 from bms_estimator.model.sample import NO_CELLS, CellBlock
 
 
@@ -67,7 +67,7 @@ class Window:
         if cells.size:
             self._cells = cells[-1:]
         if trace.size:
-            add_window(self._sums, trace)
+            accumulate_window(self._sums, trace)
             self._last = trace[-1].copy()
         self._arrival_s = arrival_s
 

@@ -12,7 +12,7 @@ MOST_STEPS = 2.0
 """Of the voltage's resolution: between the means of two publish windows noise makes less."""
 
 
-class Rest:
+class RestDetector:
     """Watches the publish windows.
 
     Args:

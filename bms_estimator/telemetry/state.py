@@ -13,7 +13,7 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import PAYLOAD_VERSION, Estimate, Info
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.publish_window import WindowSummary
 from bms_estimator.telemetry.remaining_charge import RemainingCharge
 from bms_estimator.version import __version__
@@ -25,12 +25,12 @@ def finite(value: float) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def estimate_report(
+def make_state_payload(
     window: WindowSummary,
     remaining: RemainingCharge,
     counters: Mapping[str, int],
     now_s: float,
-    flow: Flow,
+    flow: ChargeEnergy,
     capacity_ah: float | None,
 ) -> Estimate:
     """Topic ``state``.
@@ -102,7 +102,7 @@ def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
     }
 
 
-def info_report(
+def make_info_payload(
     settings: Settings, cell: PackModel, board: Mapping[str, str], started_s: float, *, temperature_sensor: bool
 ) -> Info:
     """Topic ``info``.

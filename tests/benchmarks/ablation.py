@@ -16,7 +16,7 @@ from rich.table import Table
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import CURVE_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, REFERENCE_C
-from bms_estimator.kernels.kalman_filter.mixture import combine, copy
+from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, mixture_moments
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, SOC
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -131,11 +131,11 @@ def judge(part: str, cell: CellModel, seen: SampleBlock, truth: Floats, start_so
 def unite_all(s: np.void, p: np.void) -> None:
     """The one in the middle stays, with the std of all."""
     if s["count"] == HYPOTHESES:
-        copy(s, HYPOTHESES // 2, 0)
+        copy_hypothesis(s, HYPOTHESES // 2, 0)
         s["count"], s["best"] = 1, 0
         s["ln_weight"][0] = 0.0
         s["covariance"][0, SOC, SOC] = p["soc_std"] ** 2
-        combine(s)
+        mixture_moments(s)
 
 
 if __name__ == "__main__":

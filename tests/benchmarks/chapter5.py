@@ -15,7 +15,7 @@ from bms_estimator.calibration.thesis.series_resistance import SeriesResistance,
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.reports import printed_values
-from bms_estimator.reports.procedure import KNEE_SOC, Capture, Kind, Protocol
+from bms_estimator.reports.procedure import KNEE_SOC, Capture, Kind, Procedure
 from bms_estimator.reports.thesis_claims import CLAIMS, claim, products
 from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks.recipes import DATA, LFP, NCR, PF, charge_ah, path_of
@@ -100,13 +100,13 @@ MIDDLE_SOC = 0.5
 """Where the fit of (2.10) is looked at."""
 
 
-def protocol(experiment: Experiment) -> Protocol:
+def protocol(experiment: Experiment) -> Procedure:
     """The protocol on one cell; a constant load is cut to its discharge."""
     found = load_cell(experiment.cell, experiment.capacity_ah)
     captures = [
         Capture(name.split("/")[1], kind, _samples(name, kind, experiment)) for name, kind in experiment.captures
     ]
-    return Protocol(found, captures, VOLTAGE_STEP_V)
+    return Procedure(found, captures, VOLTAGE_STEP_V)
 
 
 def _samples(name: str, kind: Kind, experiment: Experiment) -> SampleBlock:
@@ -122,7 +122,7 @@ def discharge(rows: SampleBlock, least_a: float) -> SampleBlock:
     return most[: int(np.flatnonzero(most["current_a"] > least_a)[-1]) + 1]
 
 
-def lines(name: str, p: Protocol) -> Iterator[tuple[str, ...]]:
+def lines(name: str, p: Procedure) -> Iterator[tuple[str, ...]]:
     """One row of the table for each load."""
     validating = [capture.name for capture in p.validating]
     for load, run in p.dynamic.items():
@@ -160,7 +160,7 @@ def main() -> None:
     console.print(steps_by_variant(protocols))
 
 
-def errors(protocols: dict[str, Protocol]) -> Table:
+def errors(protocols: dict[str, Procedure]) -> Table:
     """Tables 11 and 13."""
     printed_means = ", ".join(f"{load} {value}" for load, value in printed_values.TABLE_11.items())
     table = Table(
@@ -186,7 +186,7 @@ def errors(protocols: dict[str, Protocol]) -> Table:
     return table
 
 
-def parameters(protocols: dict[str, Protocol]) -> Table:
+def parameters(protocols: dict[str, Procedure]) -> Table:
     """What the three steps gave."""
     table = Table(title="steps 1 to 3")
     residual = f"residual in mV, nearest SOC {MIDDLE_SOC}"
@@ -209,7 +209,7 @@ def parameters(protocols: dict[str, Protocol]) -> Table:
     return table
 
 
-def verdicts(on: str, protocols: list[Protocol]) -> Table:
+def verdicts(on: str, protocols: list[Procedure]) -> Table:
     """The claims, each on the captures of several cells."""
     table = Table(title=f"claims on {on}; each must be met on more than half of them")
     for column in ("claim", "where", "criterion", "met", "found", "verdict"):
@@ -220,14 +220,14 @@ def verdicts(on: str, protocols: list[Protocol]) -> Table:
     return table
 
 
-def outcomes(protocols: list[Protocol]) -> Iterator[tuple[str, str, str, str]]:
+def outcomes(protocols: list[Procedure]) -> Iterator[tuple[str, str, str, str]]:
     """Of each claim: key, how often it was met, the range of what was found, verdict."""
     for key in CLAIMS:
         found = claim(key, protocols)
         yield key, f"{found.met} of {len(found.results)}", found.span, found.verdict.value
 
 
-class FastInStep3(Protocol):
+class FastInStep3(Procedure):
     """Constant loads of any current give R_s."""
 
     @property
@@ -244,7 +244,7 @@ class OwnInStep3(FastInStep3):
         return self.r_s_fit
 
 
-class Unweighted(Protocol):
+class Unweighted(Procedure):
     """The plain mean of (4.2) as printed, whatever the current (E19)."""
 
     @cached_property
@@ -266,7 +266,7 @@ AS_IT_IS, UNWEIGHTED, FAST = "as it is", "(4.2) not weighted by the current", "1
 VARIANTS = {UNWEIGHTED: Unweighted, FAST: FastInStep3, "each load in its own step 3 as well": OwnInStep3}
 
 
-def variants(experiment: Experiment, made: Protocol) -> dict[str, Protocol]:
+def variants(experiment: Experiment, made: Procedure) -> dict[str, Procedure]:
     """The protocol as ``made``, with step 3 done otherwise, and with other bounds."""
     model = load_cell(experiment.cell, experiment.capacity_ah)
     bounds = {f"a{i}": model.bounds(i) for i in range(1, 13)}
@@ -274,12 +274,12 @@ def variants(experiment: Experiment, made: Protocol) -> dict[str, Protocol]:
     return {
         AS_IT_IS: made,
         **{name: variant(model, made.captures, VOLTAGE_STEP_V) for name, variant in VARIANTS.items()},
-        "bounds around the cell file's elements": Protocol(own_bounds, made.captures, VOLTAGE_STEP_V),
+        "bounds around the cell file's elements": Procedure(own_bounds, made.captures, VOLTAGE_STEP_V),
     }
 
 
 STEP_3 = {
-    AS_IT_IS: Protocol,
+    AS_IT_IS: Procedure,
     UNWEIGHTED: Unweighted,
     "(4.2) as printed: its sign, not weighted": PrintedSign,
     FAST: FastInStep3,
@@ -287,7 +287,7 @@ STEP_3 = {
 """Ways of step 3 that the claim of Table 11 for steps is tested with."""
 
 
-def steps_met(protocols: dict[str, Protocol]) -> Iterator[tuple[str, str, str]]:
+def steps_met(protocols: dict[str, Procedure]) -> Iterator[tuple[str, str, str]]:
     """Each way of step 3 and how often the printed mean error under steps is met, on all captures and at room temperature."""
     for what, variant in STEP_3.items():
         made = {name: variant(p.cell, p.captures, VOLTAGE_STEP_V) for name, p in protocols.items()}
@@ -295,7 +295,7 @@ def steps_met(protocols: dict[str, Protocol]) -> Iterator[tuple[str, str, str]]:
         yield what, *(f"{one.met} of {len(one.results)}" for one in found)
 
 
-def steps_by_variant(protocols: dict[str, Protocol]) -> Table:
+def steps_by_variant(protocols: dict[str, Procedure]) -> Table:
     """What the claim of Table 11 for steps rests on."""
     table = Table(title="mean error under steps at most as printed, by step 3")
     for column in ("step 3", "all captures", "room temperature"):
@@ -305,7 +305,7 @@ def steps_by_variant(protocols: dict[str, Protocol]) -> Table:
     return table
 
 
-def ablation(name: str, otherwise: dict[str, Protocol]) -> Table:
+def ablation(name: str, otherwise: dict[str, Procedure]) -> Table:
     """What the parts of step 3 and the bounds are worth on one cell."""
     table = Table(title=f"{name}: mean / largest error in % when one thing is done otherwise")
     loads = [capture.name for capture in otherwise[AS_IT_IS].validating]
@@ -317,7 +317,7 @@ def ablation(name: str, otherwise: dict[str, Protocol]) -> Table:
     return table
 
 
-def resistances(name: str, otherwise: dict[str, Protocol]) -> Table:
+def resistances(name: str, otherwise: dict[str, Procedure]) -> Table:
     """R_s by (4.2) of each load of one cell, and by the fit to their mean, over SOC."""
     table = Table(title=f"{name}: R_s by (4.2) in mohm, by SOC; its fit (2.9)")
     for column in ("load", "its current in A", *map(str, R_S_SOC)):
@@ -333,7 +333,7 @@ def resistances(name: str, otherwise: dict[str, Protocol]) -> Table:
     return table
 
 
-def worst(name: str, p: Protocol) -> Table:
+def worst(name: str, p: Procedure) -> Table:
     """Where each load of one cell has its largest error."""
     table = Table(title=f"{name}: where the largest error is")
     for column in ("load", "at SOC", "measured in V", "less predicted in V", "current in A"):

@@ -38,9 +38,9 @@ from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_any
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.mqtt.topic_cache import Published
-from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.topic_cache import TopicCache
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.junctek import JunctekDialect
 from bms_estimator.protocols.devices.pylontech import PylontechDialect
@@ -51,14 +51,14 @@ from bms_estimator.protocols.firmware.protocol import BoardDialect
 from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.sinks.mqtt.requests import Requests, number
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
 from bms_estimator.sinks.terminal import text_line
-from bms_estimator.sinks.terminal.panels import View
-from bms_estimator.sinks.terminal.scene import Scene
+from bms_estimator.sinks.terminal.panels import Screen
+from bms_estimator.sinks.terminal.scene import ScreenState
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.raw_capture import MAGIC
 from bms_estimator.sources.captures.replay import load_capture
-from bms_estimator.sources.serial.known_board_file import BoardMemory
+from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.port_list import NoPortError, may_be_board, resolve_port
 
 CORPUS = Path(__file__).parents[1] / "data" / "fuzz"
@@ -117,7 +117,7 @@ def _text(_: Path) -> Read:
     return read
 
 
-def _meter(make: Callable[[], Dialect]) -> Callable[[Path], Read]:
+def _meter(make: Callable[[], DeviceProtocol]) -> Callable[[Path], Read]:
     """Of a dialect that only needs bytes."""
 
     def read(data: bytes) -> None:
@@ -179,8 +179,8 @@ def _file(name: str, load: Callable[[Path], object]) -> Callable[[Path], Read]:
 
 
 def _requests(_: Path) -> Read:
-    counts = Delivery()
-    requests = Requests(counts, ("set_soc",), monotonic=lambda: float(sum(counts.requests.values())) * 60.0)
+    counts = DeliveryStats()
+    requests = RequestDispatcher(counts, ("set_soc",), monotonic=lambda: float(sum(counts.requests.values())) * 60.0)
 
     async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"soc": number(arguments, "soc", 0.0, 1.0)}
@@ -205,14 +205,14 @@ def _published(_: Path) -> Read:
     console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, color_system=None)
 
     def read(data: bytes) -> None:
-        published = Published("bms")
+        published = TopicCache("bms")
         for topic in topics:
             heard = published.take(f"bms/pack/{topic}", data, 0.0)
             told = text_line.line(heard) if heard else None
             assert told is None or told.isprintable(), told
         if data:
-            scene = Scene("pack", published.devices["pack"].topics, 0.0, 0.0)
-            drawn = "".join(segment.text for segment in console.render(View(scene)))
+            scene = ScreenState("pack", published.devices["pack"].topics, 0.0, 0.0)
+            drawn = "".join(segment.text for segment in console.render(Screen(scene)))
             assert all(each.isprintable() or each == "\n" for each in drawn), drawn
 
     return read
@@ -229,7 +229,7 @@ def _checkpoint(folder: Path) -> Read:
 
 
 def _memory(folder: Path) -> Read:
-    memory = BoardMemory(folder, "pack")
+    memory = KnownBoardFile(folder, "pack")
 
     def read(data: bytes) -> None:
         memory.path.write_bytes(data)

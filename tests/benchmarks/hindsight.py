@@ -20,7 +20,7 @@ from rich.table import Table
 
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
-from bms_estimator.fleet.queries.duckdb_queries import LIMITS, Limits, ask
+from bms_estimator.fleet.queries.duckdb_queries import LIMITS, Limits, run_query
 from bms_estimator.fleet.queries.parquet_files import write
 from bms_estimator.fleet.worker.hour_summary import HOUR_SUMS, Hour, add, begin, row
 from bms_estimator.model.arrays import Floats
@@ -62,7 +62,7 @@ def _outcome(group: Group, folder: Path) -> list[str]:
     packs = [slots(f"p{n}", *run) for n, run in enumerate(runs(group, folder))]
     hours = folder / group.name.replace("/", " ")
     write(hours, [known.hour for pack in packs for known in pack])
-    found = ask(hours, "honest", limits=limits()).records
+    found = run_query(hours, "honest", limits=limits()).records
     if not found:
         return ["0"]
     there = np.array([x for pack in packs for x in judged(pack)])

@@ -147,7 +147,7 @@ def step_alone(m: Record, q: Record, share: float) -> None:
     for j in range(q.count):
         way += m.step[j] * m.step[j]
         m.theta[j] = min(max(m.theta[j] + share * m.step[j], q.lower[j]), q.upper[j])
-    learning_law.forget(m, q, share * way / (q.reach * q.reach))
+    learning_law.discount_information(m, q, share * way / (q.reach * q.reach))
 
 
 @njit

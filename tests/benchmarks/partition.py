@@ -14,10 +14,10 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
-from bms_estimator.telemetry.state import estimate_report
+from bms_estimator.telemetry.state import make_state_payload
 
 PACKS, MINUTES, SAMPLES = 100, 90, 60
 STORE = 480_000 * 3600 * 10**9
@@ -83,7 +83,7 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
         summary = window.take()
         assert summary is not None
         remaining = remaining_charge(estimator, summary.current_a)
-        return estimate_report(summary, remaining, {}, wall_s, of_type.meter.flow, 3.0).model_dump_json().encode()
+        return make_state_payload(summary, remaining, {}, wall_s, of_type.meter.flow, 3.0).model_dump_json().encode()
 
     def step() -> None:
         estimator.record[...] = before
@@ -97,7 +97,7 @@ def _parts(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> I
     yield "what has flowed", _us(lambda: (of_type.meter.add(trace), of_type.meter.flow))
     yield "topic state", _us(state)
     yield "the state packed", _us(bench.take)
-    parameters_us = _us(lambda: parameter_report(estimator, wall_s).model_dump_json())
+    parameters_us = _us(lambda: make_parameters_payload(estimator, wall_s).model_dump_json())
     row_us = _us(lambda: hour_summary.row(of_type.settings, 480_000, bench.record["hour"], estimator).model_dump_json())
     yield "topic parameters and the row of an hour, a 60th of it", (parameters_us + row_us) / 60
 

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, KEPT, CheckpointFile, Ledger
+from bms_estimator.checkpoint.checkpoint_file import FORMAT, KEPT, CheckpointFile, RunCounters
 from bms_estimator.checkpoint.identity import fields, pack_identity
-from bms_estimator.checkpoint.restore import resume
+from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.records import NODE, OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads import Health
 from bms_estimator.service import checkpoint_writer, live_loop
-from bms_estimator.service.live_loop import new_estimator, run_live
+from bms_estimator.service.live_loop import new_estimator, run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.collector import Collector
@@ -32,7 +32,7 @@ from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
 SETTINGS = Settings.model_validate({"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}})
-NEW = Ledger(0, new_totals(0.0))
+NEW = RunCounters(0, new_totals(0.0))
 OLD_FILE = Path(__file__).with_name("checkpoint_format_4.npz")
 """Of the version before: half an hour of a simulated chen_mora under random steps, SOC 0.576."""
 
@@ -68,7 +68,9 @@ async def ran(
     source.give(*((float(i), current_a, 3.8 * cell.cell.series_count) for i in range(samples)))
     source.finish()
     checkpoint = CheckpointFile(folder, settings, cell)
-    running = run_live(settings, cell, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    running = run_estimation_loop(
+        settings, cell, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint
+    )
     estimator = await asyncio.wait_for(running, LONG_S)
     return Ended(estimator, sink.snapshots[0].health)
 
@@ -105,7 +107,9 @@ async def test_samples_that_cannot_be_used_do_not_prolong_what_nobody_measured(
     source.give((5.0, 0.275, 3.8))
     source.finish()
     checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
-    running = run_live(SETTINGS, CELL, source=source, sinks=[Collector()], stop=asyncio.Event(), checkpoint=checkpoint)
+    running = run_estimation_loop(
+        SETTINGS, CELL, source=source, sinks=[Collector()], stop=asyncio.Event(), checkpoint=checkpoint
+    )
     estimator = await asyncio.wait_for(running, LONG_S)
     assert 41.0 < estimator.record["unseen_s"][0] < 41.0 + LONG_S
 
@@ -181,7 +185,7 @@ def test_a_version_with_other_fields_reads_what_it_knows() -> None:
     fresh.step(0.0, 0.0, CELL.cell.nominal_voltage_v)
     later = {name: field for name, field in fields(saved.record) if name not in ("checks.good_soc", "map.dwell_s")}
     later |= {"filter.ohm": np.zeros((1, 99)), "map.of_a_later_version": np.ones(3)}
-    assert resume(estimator, later, 0.0) == ""
+    assert restore_state(estimator, later, 0.0) == ""
     assert estimator.state["soc"][0] == saved.state["soc"][0]
     assert (estimator.record["map"]["weight"] == saved.record["map"]["weight"]).all()
     assert estimator.record["checks"]["good_soc"] == fresh.record["checks"]["good_soc"]
@@ -197,7 +201,7 @@ def test_a_version_whose_filter_has_more_states_keeps_those_it_knows() -> None:
     for name, axes in cut.items():
         saved[name] = saved[name][(..., *axes * (slice(NODE),))]
     estimator = new_estimator(SETTINGS, CELL)
-    assert resume(estimator, saved, 1.0) == ""
+    assert restore_state(estimator, saved, 1.0) == ""
     learned.resume(1.0)
     now, before = (one.record[0]["filter"] for one in (estimator, learned))
     assert np.array_equal(now["covariance"][:, :NODE, :NODE], before["covariance"][:, :NODE, :NODE])
@@ -229,7 +233,7 @@ async def test_a_checkpoint_of_the_format_before_of_another_voltage_is_refused(t
 
 
 def saved_as(
-    version: int, file: CheckpointFile, estimator: Estimator, monkeypatch: pytest.MonkeyPatch, ledger: Ledger = NEW
+    version: int, file: CheckpointFile, estimator: Estimator, monkeypatch: pytest.MonkeyPatch, ledger: RunCounters = NEW
 ) -> None:
     """A checkpoint of another format."""
     with monkeypatch.context() as patch:
@@ -312,10 +316,10 @@ def test_an_offset_that_may_be_learned_from_now_on_begins_as_configured() -> Non
     before = new_estimator(edited("identifier", current_offset_std_a=0.0), CELL)
     before.step(0.0, 0.1, 3.8)
     after = new_estimator(edited("identifier", current_offset_std_a=0.1), CELL)
-    assert resume(after, dict(fields(before.record)), 1.0) == ""
+    assert restore_state(after, dict(fields(before.record)), 1.0) == ""
     assert offset_covariance(after)[OFFSET] == pytest.approx(0.01)
     after.step(0.0, 0.1, 3.8)
-    assert resume(before, dict(fields(after.record)), 1.0) == ""
+    assert restore_state(before, dict(fields(after.record)), 1.0) == ""
     assert not offset_covariance(before).any()
 
 
@@ -323,7 +327,7 @@ def test_an_identifier_that_is_switched_on_begins_at_the_soc_that_was_counted() 
     counted = new_estimator(edited("identifier", enabled=False), CELL)
     counted.step(0.0, 0.1, 3.8)
     identifying = new_estimator(SETTINGS, CELL)
-    assert resume(identifying, dict(fields(counted.record)), 1.0) == ""
+    assert restore_state(identifying, dict(fields(counted.record)), 1.0) == ""
     for i in range(3):
         identifying.step(float(i), 0.0, 3.8)
     assert identifying.state["soc"][0] == pytest.approx(0.5, abs=0.15)
@@ -336,7 +340,7 @@ async def often(checkpoint: CheckpointFile) -> AsyncIterator[tuple[ScriptedSourc
     settings = SETTINGS.model_copy(update={"state": SETTINGS.state.model_copy(update={"checkpoint_s": 0.02})})
     source, sink = ScriptedSource(), Collector()
     task = asyncio.create_task(
-        run_live(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
     )
     yield source, sink, task
     source.finish()
@@ -347,7 +351,7 @@ async def test_the_last_save_waits_for_the_one_that_the_end_has_interrupted(tmp_
     slow, began, release, saves = threading.Lock(), threading.Event(), threading.Event(), []
 
     class SlowDisk(CheckpointFile):
-        def save(self, state: Any, ledger: Ledger) -> None:
+        def save(self, state: Any, ledger: RunCounters) -> None:
             assert slow.acquire(blocking=False), "two saves at once"
             began.set()
             assert release.wait(LONG_S)
@@ -379,11 +383,11 @@ async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monke
     loop = asyncio.get_running_loop()
 
     class Noting(CheckpointFile):
-        def save(self, state: Any, ledger: Ledger) -> None:
+        def save(self, state: Any, ledger: RunCounters) -> None:
             super().save(state, ledger)
             loop.call_soon_threadsafe(saved.put_nowait, float(state["observer"]["soc"][0]))
 
-    class Looking(checkpoint_writer.Saving):
+    class Looking(checkpoint_writer.CheckpointWriter):
         async def _save(self, *, clean: bool = False) -> bool:
             looked.set()
             return await super()._save(clean=clean)
@@ -394,7 +398,7 @@ async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monke
     settings = Settings.model_validate(SETTINGS.model_dump(by_alias=True, exclude_none=True) | tables)
     source = ScriptedSource()
     task = asyncio.create_task(
-        run_live(
+        run_estimation_loop(
             settings,
             CELL,
             source=source,
@@ -431,7 +435,7 @@ async def test_a_disk_that_is_full_is_not_tried_again_and_again(
     attempts = []
 
     class Full(CheckpointFile):
-        def save(self, state: Any, ledger: Ledger) -> None:
+        def save(self, state: Any, ledger: RunCounters) -> None:
             attempts.append((state, ledger))
             raise OSError(28, "No space left on device")
 
@@ -441,7 +445,7 @@ async def test_a_disk_that_is_full_is_not_tried_again_and_again(
     source, sink = ScriptedSource(), Collector()
     checkpoint = Full(tmp_path, settings, CELL)
     task = asyncio.create_task(
-        run_live(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
     )
     for second in range(5):
         source.give((30.0 * second, 0.275, 3.8))
@@ -458,7 +462,7 @@ async def test_a_checkpoint_is_of_the_last_sample_and_not_of_a_later_time_withou
     states = []
 
     class Counting(CheckpointFile):
-        def save(self, state: Any, ledger: Ledger) -> None:
+        def save(self, state: Any, ledger: RunCounters) -> None:
             super().save(state, ledger)
             states.append(state["observer"]["samples"][0])
 
@@ -483,7 +487,7 @@ async def test_what_was_learned_is_saved_when_a_fault_ends_the_loop(tmp_path: Pa
     source.give((0.0, 0.1, 3.8))
     source.finish()
     with pytest.raises(ZeroDivisionError):
-        await run_live(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=file)
+        await run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=file)
     found = file.load()
     assert found.state["observer.samples"] == 1
     assert found.ledger.total.crashes == 1
@@ -500,7 +504,7 @@ async def test_the_last_checkpoint_does_not_wait_for_a_broker_that_parts_slowly(
     source.give((0.0, 0.1, 3.8))
     source.finish()
     file = CheckpointFile(tmp_path, SETTINGS, CELL)
-    running = run_live(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=file)
+    running = run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=file)
     await asyncio.wait_for(running, LONG_S)
     assert saved == [True]
     assert sink.snapshots[-1].health.checkpoint == "saved"

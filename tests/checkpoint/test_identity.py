@@ -8,11 +8,11 @@ import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.identity import observer_identity, pack_identity
-from bms_estimator.fleet.packs.pack_type import made_of
+from bms_estimator.fleet.packs.pack_type import config_digest
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import PackModel, load_any
-from bms_estimator.process.boot_clock import Moment
+from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.settings.pack import Settings
 
 FILE = Path(__file__).with_name("checkpoint_format_7.npz")
@@ -36,7 +36,7 @@ def test_identity_stays_the_same(
     checked = Settings.model_validate(settings)
     assert pack_identity(checked, cell).startswith(pack)
     assert observer_identity(checked, cell).startswith(observer)
-    assert made_of(checked, cell)[0] == fleet
+    assert config_digest(checked, cell)[0] == fleet
 
 
 def test_state_has_the_fields_of_format_7() -> None:
@@ -47,7 +47,7 @@ def test_state_has_the_fields_of_format_7() -> None:
 def test_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
     settings, cell = Settings.model_validate(STEPS), load_any("chen_mora")
     with np.load(FILE) as file:
-        minute_later = Moment(float(file["wall_s"]) + 60.0, True, 0.0, "another boot")
+        minute_later = BootTimestamp(float(file["wall_s"]) + 60.0, True, 0.0, "another boot")
     checkpoint = CheckpointFile(tmp_path, settings, cell, lambda: minute_later)
     checkpoint.path.write_bytes(FILE.read_bytes())
     restored = checkpoint.load()

@@ -10,7 +10,7 @@ import pytest
 
 from bms_estimator.cli.fleet.serve import _nodes
 from bms_estimator.fleet.server.nats_config import Accounts, configuration
-from bms_estimator.fleet.server.nats_server import Place, Told, node_of
+from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec, node_of
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.settings.fleet import FleetSettings
 from tests.deploy.test_unit import HIGHEST_EXPOSURE, verify
@@ -43,11 +43,11 @@ def test_exposure_is_at_most_1_5(program: Program, unit: Path) -> None:
 def example(deploy: Path, number: int) -> str:
     """The configuration of a node of three; the claims, which are of the operator's own keys, only named."""
     settings = read_toml(deploy / "fleet" / "fleet.toml", FleetSettings)
-    place = Place(Path("/var/lib/bms-estimator-fleet"), number, _nodes(settings, number, NODES))
+    place = NodeLocation(Path("/var/lib/bms-estimator-fleet"), number, _nodes(settings, number, NODES))
     accounts = Accounts(
         "OPERATOR", "SYSTEM", {"SYSTEM": "CLAIMS", **dict.fromkeys(map(str.upper, settings.tenants), "CLAIMS")}
     )
-    text = configuration(node_of(place, Told(settings, accounts)))
+    text = configuration(node_of(place, ServerSpec(settings, accounts)))
     return re.sub(r'"[^"]*/(fleet[a-z-]*\.(crt|key))"', r'"/run/credentials/bms-estimator-fleet.service/\1"', text)
 
 

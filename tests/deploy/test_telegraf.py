@@ -13,7 +13,7 @@ import pytest
 
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.sinks.exports.line_protocol import lines
-from bms_estimator.sinks.mqtt.messages import Messages
+from bms_estimator.sinks.mqtt.messages import MessageBuilder
 from tests.sinks.snapshots import ONE, SOC_LOW
 
 CONFIGURATION = tomllib.loads((Path(__file__).parents[2] / "deploy/telegraf/bms.conf").read_text(encoding="utf-8"))
@@ -80,7 +80,7 @@ def full() -> Snapshot:
 
 def test_what_it_writes_of_a_state_and_an_alarm_is_what_our_own_sink_writes(full: Snapshot) -> None:
     state, alarm = lines(None, full)
-    [sent] = [m for m in Messages("bms", "pack").kept(full, full) if m.topic == "bms/pack/state"]
+    [sent] = [m for m in MessageBuilder("bms", "pack").kept(full, full) if m.topic == "bms/pack/state"]
     assert made(STATE, sent.topic, sent.payload) == written(state)
     payload = full.alarms[0].model_dump_json().encode()
     assert made(ALARM, "bms/pack/alarm/soc_low", payload) == written(alarm)

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.edge.batching import Gathering
+from bms_estimator.edge.batching import Batcher
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 
@@ -15,7 +15,7 @@ def samples(times_s: np.ndarray) -> SampleBlock:
 
 
 def test_a_minute_at_one_a_second_is_sixty_samples() -> None:
-    gathering = Gathering(60.0)
+    gathering = Batcher(60.0)
     blocks = [block for t in range(181) for block in gathering.add(samples(np.array([float(t)])), t + 0.5)]
     assert [block.samples.size for block in blocks] == [60, 60, 60]
     assert [block.arrival_s for block in blocks] == [59.5, 119.5, 179.5]
@@ -25,7 +25,7 @@ def test_a_minute_at_one_a_second_is_sixty_samples() -> None:
 
 @given(st.lists(st.lists(st.floats(0.0, 30.0), max_size=40), max_size=20), st.integers(1, 7))
 def test_what_comes_goes_on_in_order(reads: list[list[float]], most: int) -> None:
-    gathering, time_s, given_s, blocks = Gathering(20.0, most), 0.0, [], []
+    gathering, time_s, given_s, blocks = Batcher(20.0, most), 0.0, [], []
     for steps in reads:
         times_s = time_s + np.cumsum(steps)
         time_s = times_s[-1] if times_s.size else time_s

@@ -11,8 +11,8 @@ import pytest
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
-from bms_estimator.edge.block_sender import Edge
-from bms_estimator.edge.subjects import Awaits
+from bms_estimator.edge.block_sender import BlockSender
+from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import EdgeHealth
@@ -47,7 +47,7 @@ class Feed:
     def __init__(self, receiver: Receiver, folder: Path, url: str, **settings: float) -> None:
         self.now_s, self._count, self._reads = 0.0, 0, list[SampleBlock]()
         self.receiver, self._random = receiver, np.random.default_rng(1)
-        self.edge = Edge(
+        self.edge = BlockSender(
             EdgeSettings(url=url, **SETTINGS | settings),
             receiver.pack,
             folder,
@@ -131,7 +131,7 @@ async def test_a_store_that_must_be_later_than_the_clock_goes_on_at_the_same_pac
     feed = Feed(receiver, tmp_path, "mqtt://127.0.0.1:9")  # nobody is there
     async with feed.edge:
         feed.give(2)
-        later = Awaits(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
+        later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
         await until(lambda: feed.edge.store._settled.kept.next == 2)  # on disk
         feed.edge.store.heard(later)
         await until(lambda: feed.edge.store.last_s > WALL_S + 1e8)
@@ -218,8 +218,8 @@ async def test_garbage_from_who_is_no_worker_changes_nothing(
         garbage += [f'{{"store": {n}, "number": {n}, "resend": true}}'.encode() for n in (10**30, 10**400)]
         for payload in garbage:
             await receiver.say(payload)
-        await receiver.say(Awaits(store=1, number=1, resend=True))
-        await receiver.say(Awaits(store=store, number=1, resend=False))
+        await receiver.say(BlockRequest(store=1, number=1, resend=True))
+        await receiver.say(BlockRequest(store=store, number=1, resend=False))
         await until(lambda: feed.edge.unread == len(garbage))
         feed.give(3)
         await feed.all_came()
@@ -227,7 +227,7 @@ async def test_garbage_from_who_is_no_worker_changes_nothing(
 
 async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
     """What hears there says which blocks are safe, and from where to send again."""
-    edge = Edge(EdgeSettings(url=broker.url), "pack", tmp_path, handover_s=LONG_S)
+    edge = BlockSender(EdgeSettings(url=broker.url), "pack", tmp_path, handover_s=LONG_S)
     async with Listener(broker, "raw/#") as heard, edge:
         samples = np.zeros(600, dtype=SAMPLE)
         samples["time_s"] = np.arange(600.0)
@@ -235,7 +235,9 @@ async def test_any_broker_will_do(broker: Broker, tmp_path: Path) -> None:
         await heard.wait("raw/pack", lambda data: decode(data).number == 9)
         store = decode(heard.all("raw/pack")[0]).store
         before = len(heard.messages)
-        await heard.publish("edge/pack/awaits", Awaits(store=store, number=7, resend=True).model_dump_json(), qos=1)
+        await heard.publish(
+            "edge/pack/awaits", BlockRequest(store=store, number=7, resend=True).model_dump_json(), qos=1
+        )
         again = decode(await heard.wait("raw/pack", skip=before))
         await heard.wait("raw/pack", lambda data: decode(data).number == 9, skip=before)
         assert (again.number, again.oldest) == (7, 7)
@@ -254,7 +256,7 @@ async def test_a_source_that_is_silent_holds_no_samples_back(
 
 async def test_a_server_that_lets_nobody_in_is_named(engine: Engine, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^edge.password_file = /none: cannot be read"):
-        Edge(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
+        BlockSender(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
 
 
 async def test_the_server_keeps_what_came_from_an_edge_by_its_pack(

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.edge.batching import Gathered
+from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import Block, decode
-from bms_estimator.edge.block_store import EdgeStore
+from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES, NS
-from bms_estimator.edge.subjects import Awaits
+from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.store.database import Database
 from tests.patience import LONG_S
@@ -27,18 +27,18 @@ FAR = 1 << 30
 """More bytes than any test keeps."""
 
 
-def gathered(at_s: float, count: int = 5) -> Gathered:
+def gathered(at_s: float, count: int = 5) -> ReadyBlock:
     """Samples of which each can be told from all others."""
     samples = np.zeros(count, dtype=SAMPLE)
     samples["time_s"] = at_s + np.arange(count)
     samples["voltage_v"] = samples["time_s"] - WALL_S
-    return Gathered(at_s + count, samples)
+    return ReadyBlock(at_s + count, samples)
 
 
 @contextlib.asynccontextmanager
-async def opened(path: Path, most_bytes: int = FAR, wall_s: float = WALL_S) -> AsyncIterator[EdgeStore]:
+async def opened(path: Path, most_bytes: int = FAR, wall_s: float = WALL_S) -> AsyncIterator[BlockStore]:
     database = Database(path, tables=EDGE_TABLES, sync_s=0.0, retry_s=0.0)
-    store = EdgeStore(database, "raw/pack", most_bytes, wall=lambda: wall_s, resend_s=0.0)
+    store = BlockStore(database, "raw/pack", most_bytes, wall=lambda: wall_s, resend_s=0.0)
     async with database, store:
         yield store
 
@@ -49,13 +49,13 @@ async def until(condition) -> None:
             await asyncio.sleep(0.002)
 
 
-async def written(store: EdgeStore, *blocks: Gathered) -> None:
+async def written(store: BlockStore, *blocks: ReadyBlock) -> None:
     for block in blocks:
         store.put(block)
     await until(lambda: not store._waiting)
 
 
-async def handed_out(store: EdgeStore, count: int) -> list[Block]:
+async def handed_out(store: BlockStore, count: int) -> list[Block]:
     blocks = list[Block]()
     async with asyncio.timeout(LONG_S):
         while len(blocks) < count:
@@ -70,7 +70,7 @@ def numbers(blocks: list[Block]) -> list[int]:
     return [block.number for block in blocks]
 
 
-def minutes(count: int, first: int = 0) -> list[Gathered]:
+def minutes(count: int, first: int = 0) -> list[ReadyBlock]:
     return [gathered(WALL_S + 60.0 * i) for i in range(first, first + count)]
 
 
@@ -92,7 +92,7 @@ async def test_a_restart_goes_on_with_store_number_and_time_and_sends_what_is_no
         await written(store, *minutes(6))
         for block in await handed_out(store, 6):
             store.sent(block.number)
-        store.heard(Awaits(store=int(WALL_S) * NS, number=4, resend=False))
+        store.heard(BlockRequest(store=int(WALL_S) * NS, number=4, resend=False))
         assert (store.waiting, store.kept) == (0, 3)
     async with opened(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
         assert store.last_s == WALL_S + 304.0
@@ -136,7 +136,7 @@ async def test_a_worker_that_asks_is_sent_the_rest_again(tmp_path: Path) -> None
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(8))
         await handed_out(store, 8)
-        store.heard(Awaits(store=int(WALL_S) * NS, number=3, resend=True))
+        store.heard(BlockRequest(store=int(WALL_S) * NS, number=3, resend=True))
         blocks = await handed_out(store, 6)
         assert (numbers(blocks), {block.oldest for block in blocks}) == ([3, 4, 5, 6, 7, 8], {3})
 
@@ -146,7 +146,7 @@ async def test_what_was_asked_for_is_not_sent_again_at_once(tmp_path: Path) -> N
         store._resend_s = LONG_S
         await written(store, *minutes(8))
         await handed_out(store, 8)
-        asked = Awaits(store=int(WALL_S) * NS, number=3, resend=True)
+        asked = BlockRequest(store=int(WALL_S) * NS, number=3, resend=True)
         store.heard(asked)
         await handed_out(store, 6)
         store.heard(asked)
@@ -157,12 +157,12 @@ async def test_what_was_asked_for_is_not_sent_again_at_once(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "awaits",
     [
-        Awaits(store=(int(WALL_S) + 77) * NS + 1, number=1, resend=False),
-        Awaits(store=int(WALL_S) * NS, number=100, resend=True),
+        BlockRequest(store=(int(WALL_S) + 77) * NS + 1, number=1, resend=False),
+        BlockRequest(store=int(WALL_S) * NS, number=100, resend=True),
     ],
     ids=["a later store", "a later number"],
 )
-async def test_a_disk_that_was_set_back_begins_a_store_that_counts(tmp_path: Path, awaits: Awaits) -> None:
+async def test_a_disk_that_was_set_back_begins_a_store_that_counts(tmp_path: Path, awaits: BlockRequest) -> None:
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(3))
         await handed_out(store, 3)
@@ -180,7 +180,7 @@ async def test_a_disk_that_was_set_back_begins_a_store_that_counts(tmp_path: Pat
 async def test_a_store_that_cannot_be_is_not_believed(tmp_path: Path, store_ns: int) -> None:
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(3))
-        store.heard(Awaits(store=store_ns, number=1 << 63, resend=True))
+        store.heard(BlockRequest(store=store_ns, number=1 << 63, resend=True))
         await written(store, *minutes(1, 3))
         assert numbers(await handed_out(store, 4)) == [1, 2, 3, 4]
 
@@ -233,9 +233,9 @@ async def test_a_damaged_block_is_given_up_and_those_behind_it_come(tmp_path: Pa
         blocks = await handed_out(store, 3)
         assert numbers(blocks) == [2, 3, 6]
         assert {block.oldest for block in blocks} == {2}  # of those no worker has said that they are safe
-        store.heard(Awaits(store=blocks[0].store, number=2, resend=True))
+        store.heard(BlockRequest(store=blocks[0].store, number=2, resend=True))
         assert numbers(await handed_out(store, 3)) == [2, 3, 6]
-        store.heard(Awaits(store=blocks[0].store, number=4, resend=True))
+        store.heard(BlockRequest(store=blocks[0].store, number=4, resend=True))
         (block,) = await handed_out(store, 1)
         assert (block.number, block.oldest, store.dropped) == (6, 6, 3)
 

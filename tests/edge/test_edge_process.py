@@ -13,9 +13,9 @@ from typing import IO
 
 import pytest
 
-from bms_estimator.edge.block_sender import Edge
+from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.cell import load_cell
-from bms_estimator.service.pack_service import serve
+from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.health import sample_counters
@@ -115,13 +115,15 @@ async def test_run_sends_what_it_estimates_from(tmp_path: Path, line: Line, engi
         {"pack": {"name": "both"}, "sensor": {"port": str(line.path), "protocol": "text"}, "edge": edge}
     )
     async with Receiver(engine.url, "both") as receiver:
-        service = asyncio.create_task(serve(settings, load_cell("chen_mora"), stop=stop, folder=tmp_path))
+        service = asyncio.create_task(run_pack_service(settings, load_cell("chen_mora"), stop=stop, folder=tmp_path))
         await receiver.until(1)
         stop.set()
         estimator = await asyncio.wait_for(service, LONG_S)
         counters = sample_counters(estimator.state[0])
         samples = counters["samples"] + sum(n for name, n in counters.items() if name.startswith("dropped_"))
-        async with Edge(EdgeSettings.model_validate(edge), "both", tmp_path):  # has what a busy machine had no time for
+        async with BlockSender(
+            EdgeSettings.model_validate(edge), "both", tmp_path
+        ):  # has what a busy machine had no time for
             await receiver.until(samples)
         assert receiver.samples.size == samples
     board.cancel()

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.edge.sample_clock import BAND_S, GRID, STEP_S, EdgeClock
+from bms_estimator.edge.sample_clock import BAND_S, GRID, STEP_S, SampleClock
 
 WALL_S = 1.7e9
 """Wall clock at the start."""
 
 
-def run(clock: EdgeClock, told_s: np.ndarray, late_s: float | np.ndarray = 0.0, host_s: np.ndarray | None = None):
+def run(clock: SampleClock, told_s: np.ndarray, late_s: float | np.ndarray = 0.0, host_s: np.ndarray | None = None):
     """Samples that come one by one, at ``host_s`` (as told when left out); wall and steady clock agree."""
     host_s = (told_s if host_s is None else host_s) + late_s
     host_s = np.broadcast_to(host_s, told_s.shape)
@@ -23,7 +23,7 @@ def run(clock: EdgeClock, told_s: np.ndarray, late_s: float | np.ndarray = 0.0, 
 def test_an_even_pace_stays_even_to_the_last_bit() -> None:
     told_s = 0.37 + np.arange(3600.0)
     late_s = np.random.default_rng(1).uniform(0.0, 0.3, told_s.size)
-    placed = run(EdgeClock(), told_s, late_s)
+    placed = run(SampleClock(), told_s, late_s)
     assert set(np.diff(placed)) == {1.0}
     assert placed[0] == pytest.approx(WALL_S + told_s[0] + late_s[0], abs=2 / GRID)
 
@@ -32,7 +32,7 @@ def test_an_even_pace_stays_even_to_the_last_bit() -> None:
 def test_a_source_whose_clock_is_slow_or_fast_is_followed_without_a_gap(wrong: float) -> None:
     host_s = np.arange(0.0, 40_000.0, 10.0)
     told_s = host_s * (1.0 + wrong)
-    clock = EdgeClock()
+    clock = SampleClock()
     placed = run(clock, told_s, host_s=host_s)
     assert clock.steps == 1  # the start
     assert np.abs(placed - WALL_S - host_s).max() < BAND_S + 0.02 * 600.0
@@ -43,12 +43,12 @@ def test_a_source_whose_clock_is_slow_or_fast_is_followed_without_a_gap(wrong: f
 
 def test_a_source_that_is_hopelessly_slow_loses_no_time() -> None:
     host_s = np.arange(0.0, 20_000.0, 10.0)
-    placed = run(EdgeClock(), 0.5 * host_s, host_s=host_s)
+    placed = run(SampleClock(), 0.5 * host_s, host_s=host_s)
     assert WALL_S + host_s[-1] - placed[-1] <= 600.0
 
 
 def test_a_source_that_begins_anew_goes_on_by_the_host() -> None:
-    clock = EdgeClock()
+    clock = SampleClock()
     before = run(clock, np.arange(100.0))
     after = run(clock, np.arange(100.0), host_s=np.arange(1000.0, 1100.0))
     assert clock.steps == 2
@@ -56,7 +56,7 @@ def test_a_source_that_begins_anew_goes_on_by_the_host() -> None:
 
 
 def test_it_goes_on_from_a_later_time_at_the_source_s_pace() -> None:
-    clock = EdgeClock()
+    clock = SampleClock()
     run(clock, np.arange(10.0))
     clock.go_on_from(WALL_S)  # it is there already
     assert run(clock, np.arange(10.0, 20.0))[-1] == WALL_S + 19.0
@@ -65,7 +65,7 @@ def test_it_goes_on_from_a_later_time_at_the_source_s_pace() -> None:
 
 
 def test_a_step_back_within_one_read_is_seen() -> None:
-    clock = EdgeClock()
+    clock = SampleClock()
     clock.place(np.array([0.0]), WALL_S, 0.0)
     placed = clock.place(np.array([1.0, 2.0, 0.0, 1.0]), WALL_S + 3.0, 3.0)
     assert clock.steps == 2
@@ -73,20 +73,20 @@ def test_a_step_back_within_one_read_is_seen() -> None:
 
 
 def test_a_source_that_leaps_ahead_is_not_believed() -> None:
-    clock = EdgeClock()
+    clock = SampleClock()
     run(clock, np.arange(10.0))
     placed = clock.place(np.array([1e6]), WALL_S + 10.0, 10.0)
     assert placed[0] == pytest.approx(WALL_S + 10.0)
 
 
 def test_samples_that_were_held_up_keep_their_own_times() -> None:
-    clock = EdgeClock()
+    clock = SampleClock()
     placed = run(clock, np.arange(2000.0), host_s=np.maximum(np.arange(2000.0), 900.0 * (np.arange(2000.0) > 10.0)))
     assert set(np.diff(placed)) == {1.0}
 
 
 def test_a_wall_clock_that_is_set_ahead_is_a_gap_and_one_that_is_set_back_is_none() -> None:
-    clock = EdgeClock()
+    clock = SampleClock()
     told_s = np.arange(3.0)
     first = clock.place(told_s, WALL_S, 0.0)
     back = clock.place(told_s + 3.0, WALL_S - 5000.0, 3.0)
@@ -96,9 +96,9 @@ def test_a_wall_clock_that_is_set_ahead_is_a_gap_and_one_that_is_set_back_is_non
 
 
 def test_a_restart_is_a_gap_and_never_goes_back() -> None:
-    last_s = run(EdgeClock(), np.arange(10.0))[-1]
-    assert EdgeClock(last_s).place(np.arange(3.0), WALL_S + 500.0, 7.0)[-1] == pytest.approx(WALL_S + 500.0)
-    set_back = EdgeClock(last_s).place(np.arange(3.0), WALL_S - 9e8, 7.0)
+    last_s = run(SampleClock(), np.arange(10.0))[-1]
+    assert SampleClock(last_s).place(np.arange(3.0), WALL_S + 500.0, 7.0)[-1] == pytest.approx(WALL_S + 500.0)
+    set_back = SampleClock(last_s).place(np.arange(3.0), WALL_S - 9e8, 7.0)
     assert set_back[0] >= last_s
     assert set_back[-1] == pytest.approx(last_s + 2.0)
 
@@ -114,7 +114,7 @@ def test_a_restart_is_a_gap_and_never_goes_back() -> None:
     )
 )
 def test_time_never_steps_back(reads: list[tuple[list[float], float, float]]) -> None:
-    clock, steady_s, last_s = EdgeClock(), 0.0, -math.inf
+    clock, steady_s, last_s = SampleClock(), 0.0, -math.inf
     for told_s, wall_s, passed_s in reads:
         steady_s += passed_s
         placed = clock.place(np.array(told_s), wall_s, steady_s)

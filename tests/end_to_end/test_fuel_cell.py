@@ -9,7 +9,7 @@ import numpy as np
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.restore import resume
+from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.simulation.virtual_adc import Reading
@@ -76,7 +76,7 @@ folder = "{tmp_path / "state"}"
     for block in RawCapture(capture):
         replayed.run(block)
     assert saved.state["learning.theta"].tobytes() == replayed.record["learning"]["theta"].tobytes(), "to the last bit"
-    assert resume(resumed, saved.state, 10.0) == ""
+    assert restore_state(resumed, saved.state, 10.0) == ""
     np.testing.assert_array_equal(resumed.record["learning"]["theta"], replayed.record["learning"]["theta"])
     insane = {**saved.state, "learning.theta": np.full_like(saved.state["learning.theta"], np.nan)}
-    assert resume(new_estimator(settings, cell), insane, 10.0) == "theta of the learning is not finite"
+    assert restore_state(new_estimator(settings, cell), insane, 10.0) == "theta of the learning is not finite"

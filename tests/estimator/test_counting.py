@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.identified_parameters import Learned, current_offset, relative_capacity
+from bms_estimator.estimator.identified_parameters import IdentifiedValue, current_offset, relative_capacity
 from bms_estimator.kernels.kalman_filter.records import LN_Q
 from tests.estimator.anywhere.cases import Capture, Case, capture
 from tests.estimator.anywhere.use import DAY_S, cycles, days
@@ -27,7 +27,7 @@ def nees_limit(cells: int) -> float:
     return float(chi2.ppf(0.999, cells)) / cells
 
 
-def ratio(learned: Learned, true: float) -> float:
+def ratio(learned: IdentifiedValue, true: float) -> float:
     """Error over std."""
     return (learned.value - true) / learned.std
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import VERDICTS
-from bms_estimator.estimator.stability_conditions import failed, lemma_conditions
-from bms_estimator.kernels.step import Verdict
+from bms_estimator.estimator.estimator import SAMPLE_OUTCOMES
+from bms_estimator.estimator.stability_conditions import failed_conditions, lemma_conditions
+from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.cell import load_cell, shipped_cells
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 
@@ -49,18 +49,18 @@ def test_saved_state_goes_on_where_it_was() -> None:
 @pytest.mark.parametrize(
     ("time_s", "current_a", "voltage_v", "status", "verdict", "counter"),
     [
-        (2.0, 0.1, float("nan"), 0, Verdict.NOT_FINITE, "dropped_not_finite"),
-        (2.0, float("inf"), 3.7, 0, Verdict.NOT_FINITE, "dropped_not_finite"),
-        (float("nan"), 0.1, 3.7, 0, Verdict.NOT_FINITE, "dropped_not_finite"),
-        (2.0, 0.1, 0.0, 0, Verdict.OUT_OF_RANGE, "dropped_range"),
-        (2.0, 400.0, 3.7, 0, Verdict.OUT_OF_RANGE, "dropped_range"),
-        (1.0, 0.1, 3.7, 0, Verdict.REPEATED, "dropped_repeated"),
-        (2.0, 0.1, 3.7, SampleStatus.VOLTAGE_SATURATED, Verdict.SATURATED, "dropped_saturated"),
-        (2.0, 0.1, 3.7, SampleStatus.CURRENT_SATURATED, Verdict.SATURATED, "dropped_saturated"),
+        (2.0, 0.1, float("nan"), 0, SampleOutcome.NOT_FINITE, "dropped_not_finite"),
+        (2.0, float("inf"), 3.7, 0, SampleOutcome.NOT_FINITE, "dropped_not_finite"),
+        (float("nan"), 0.1, 3.7, 0, SampleOutcome.NOT_FINITE, "dropped_not_finite"),
+        (2.0, 0.1, 0.0, 0, SampleOutcome.OUT_OF_RANGE, "dropped_range"),
+        (2.0, 400.0, 3.7, 0, SampleOutcome.OUT_OF_RANGE, "dropped_range"),
+        (1.0, 0.1, 3.7, 0, SampleOutcome.REPEATED, "dropped_repeated"),
+        (2.0, 0.1, 3.7, SampleStatus.VOLTAGE_SATURATED, SampleOutcome.SATURATED, "dropped_saturated"),
+        (2.0, 0.1, 3.7, SampleStatus.CURRENT_SATURATED, SampleOutcome.SATURATED, "dropped_saturated"),
     ],
 )
 def test_a_bad_sample_is_dropped_counted_and_changes_nothing_else(
-    time_s: float, current_a: float, voltage_v: float, status: int, verdict: Verdict, counter: str
+    time_s: float, current_a: float, voltage_v: float, status: int, verdict: SampleOutcome, counter: str
 ) -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     estimator.step(0.0, 0.1, 3.7)
@@ -72,13 +72,13 @@ def test_a_bad_sample_is_dropped_counted_and_changes_nothing_else(
 
 
 def test_verdicts_are_found_by_their_value() -> None:
-    assert [VERDICTS[verdict] for verdict in Verdict] == list(Verdict)
+    assert [SAMPLE_OUTCOMES[verdict] for verdict in SampleOutcome] == list(SampleOutcome)
 
 
 def test_a_clock_set_back_is_counted_and_costs_one_step_only() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s in (0.0, 1.0, 2.0, -500.0, -499.0):
-        assert estimator.step(time_s, 3.0, 3.7) is Verdict.ACCEPTED
+        assert estimator.step(time_s, 3.0, 3.7) is SampleOutcome.ACCEPTED
     assert estimator.state["time_steps_back"][0] == 1
     assert estimator.state["soc"][0] == pytest.approx(0.5 - 3.0 * 3.0 / (3.0 * 3600))
 
@@ -124,16 +124,16 @@ def test_soc_starts_from_the_open_circuit_voltage_when_not_given() -> None:
 @pytest.mark.parametrize("name", shipped_cells())
 def test_shipped_cells_load_and_step(name: str) -> None:
     cell = load_cell(name)
-    assert Estimator(cell, identifier=None).step(0.0, 0.0, cell.cell.nominal_voltage_v) is Verdict.ACCEPTED
+    assert Estimator(cell, identifier=None).step(0.0, 0.0, cell.cell.nominal_voltage_v) is SampleOutcome.ACCEPTED
 
 
 def test_printed_settings_of_table_5_fail_condition_1_of_the_lemma() -> None:
     """E6: P9.l9 = 89000 is not below P7.l7 = 87500."""
     cell = load_cell("chen_mora")
-    assert [(c.name, c.left, c.right) for c in failed(cell)] == [("1: P9.l9 < P7.l7", 89000.0, 87500.0)]
+    assert [(c.name, c.left, c.right) for c in failed_conditions(cell)] == [("1: P9.l9 < P7.l7", 89000.0, 87500.0)]
     assert sum(c.holds for c in lemma_conditions(cell)) == 5
 
 
 def test_default_bounds_meet_the_lemma() -> None:
     cell = load_cell("chen_mora").model_copy(update={"adaptation": {}})
-    assert failed(cell) == []
+    assert failed_conditions(cell) == []

@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator import Estimator, load_capture, load_cell
 from bms_estimator.model.cell import CellModel, TableOcv
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SampleBlock
 from tests.estimator.simulated_cell import TRUTH, pulses
 
@@ -118,13 +118,15 @@ def test_an_hour_of_bad_input(captures: Path, name: str, fault: Fault) -> None:
 @pytest.mark.parametrize(
     ("fault", "suspect"),
     [
-        (flipped, Suspect.SIGN_OF_CURRENT),
-        (glitches, Suspect.OUTLIERS),
-        (stuck, Suspect.VOLTAGE),
-        (dead, Suspect.CURRENT),
+        (flipped, InputFault.SIGN_OF_CURRENT),
+        (glitches, InputFault.OUTLIERS),
+        (stuck, InputFault.VOLTAGE),
+        (dead, InputFault.CURRENT),
     ],
 )
-def test_a_passing_fault_is_named_and_then_forgotten(captures: Path, name: str, fault: Fault, suspect: Suspect) -> None:
+def test_a_passing_fault_is_named_and_then_forgotten(
+    captures: Path, name: str, fault: Fault, suspect: InputFault
+) -> None:
     run = Run(capture(captures, name), TRUTH, fault)
     named = run.suspects & suspect != 0
     assert named[(run.time_s > FAULT_S[0]) & (run.time_s < FAULT_S[1])].any()
@@ -151,7 +153,7 @@ def test_an_offset_that_no_sensor_may_have_is_suspected(captures: Path, name: st
         block["current_a"] += 0.15
 
     run = Run(capture(captures, name), TRUTH, off)
-    assert run.suspects[-1] & (Suspect.OFFSET | Suspect.CAPACITY)
+    assert run.suspects[-1] & (InputFault.OFFSET | InputFault.CAPACITY)
     assert np.abs(run.error[run.after(3600.0)]).max() < 0.03
 
 
@@ -159,7 +161,7 @@ def test_an_offset_that_no_sensor_may_have_is_suspected(captures: Path, name: st
 def test_a_capacity_that_is_a_fifth_too_small_is_suspected(captures: Path, name: str) -> None:
     smaller = TRUTH.cell.model_copy(update={"capacity_ah": 0.8 * TRUTH.cell.capacity_ah})
     run = Run(capture(captures, name), TRUTH.model_copy(update={"cell": smaller}))
-    assert run.suspects[-1] & Suspect.CAPACITY
+    assert run.suspects[-1] & InputFault.CAPACITY
     assert np.abs(run.error[run.after(3600.0)]).max() < 0.03
     assert run.covered() > 0.95
 
@@ -171,7 +173,7 @@ def test_the_ocv_of_another_chemistry_is_suspected(captures: Path, name: str) ->
     plateau_v = 3.275 + 0.05 * soc + 0.1 * np.tanh((soc - 0.98) * 40.0) - 0.5 * np.exp(-25.0 * soc)
     table = TableOcv(form="table", soc=tuple(soc), ocv_v=tuple(plateau_v))
     run = Run(capture(captures, name), TRUTH.model_copy(update={"ocv": table}))
-    assert run.suspects[-1] == Suspect.OCV
+    assert run.suspects[-1] == InputFault.OCV
 
 
 @pytest.mark.parametrize("wrong", [-0.2, 0.2])
@@ -252,12 +254,12 @@ def test_single_samples_far_off_are_passed_over_but_a_new_level_is_taken(load) -
 
 
 def test_every_suspect_says_what_to_do() -> None:
-    for suspect in Suspect:
+    for suspect in InputFault:
         assert "check" in suspect.text
-    both = Suspect.OFFSET | Suspect.CAPACITY
-    assert Suspect.OFFSET.text in both.text
-    assert Suspect.CAPACITY.text in both.text
-    assert not Suspect(0).text
+    both = InputFault.OFFSET | InputFault.CAPACITY
+    assert InputFault.OFFSET.text in both.text
+    assert InputFault.CAPACITY.text in both.text
+    assert not InputFault(0).text
 
 
 @pytest.mark.parametrize("wrong_c", [-127.0, -300.0, 850.0, np.inf])

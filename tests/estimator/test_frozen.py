@@ -10,14 +10,14 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.device_resolution import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
 
 HOUR = 3600
 STUCK = slice(HOUR, 3 * HOUR)
-FROZEN = Suspect.VOLTAGE | Suspect.CURRENT
+FROZEN = InputFault.VOLTAGE | InputFault.CURRENT
 
 
 def load_a(seconds: int, levels: tuple[float, ...], each_s: int = 60, seed: int = 1) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_the_truth_stays_inside(fields: tuple[str, ...], during_a: np.ndarray, e
     step_s = float(np.median(np.diff(samples["time_s"])))
     soc, std, suspects = run(Estimator(TRUTH, initial_soc=0.7, sampling=Sampling(step_s)), samples)
     before = samples["time_s"] < HOUR
-    named = suspects & Suspect.VOLTAGE != 0
+    named = suspects & InputFault.VOLTAGE != 0
     assert named.any()
     assert not (suspects[before] & FROZEN).any()
     assert suspects[-1] & FROZEN == 0
@@ -76,7 +76,7 @@ def test_what_a_dead_current_sensor_made_of_the_voltage_is_taken_back() -> None:
     samples, true_soc = measured(np.r_[DRIVE, PULSES, AFTER], 0.8, np.random.default_rng(3))
     samples["current_a"][STUCK] = 0.0
     soc, std, suspects = run(Estimator(TRUTH, initial_soc=0.7), samples)
-    named = suspects & Suspect.CURRENT != 0
+    named = suspects & InputFault.CURRENT != 0
     assert named.any()
     assert (np.abs(soc - true_soc)[named] < 2.0 * std[named]).all()
 
@@ -108,7 +108,7 @@ def test_a_knee_under_a_constant_current_is_no_fault(samples: SampleBlock, soc: 
     """The voltage ramps by itself; where the charge ends, it falls with the current."""
     assert np.ptp(samples["voltage_v"]) > 0.2
     assert not (
-        run(Estimator(load_cell("lfp", 2.3), initial_soc=soc), samples)[2] & (FROZEN | Suspect.SIGN_OF_CURRENT)
+        run(Estimator(load_cell("lfp", 2.3), initial_soc=soc), samples)[2] & (FROZEN | InputFault.SIGN_OF_CURRENT)
     ).any()
 
 

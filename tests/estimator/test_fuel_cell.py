@@ -9,11 +9,11 @@ from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.cli.captures.replay_summary import Summary
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
-from bms_estimator.kernels.step import Verdict
+from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 from tests import mann_stack
 
@@ -58,7 +58,9 @@ def test_run_and_step_leave_the_same_state_to_the_last_bit(ten_minutes: mann_sta
     for part in np.array_split(samples, 7):
         in_parts.run(part)
     assert stepped.record.tobytes() == ran.record.tobytes() == in_parts.record.tobytes()
-    assert [verdicts.count(v) for v in (Verdict.ACCEPTED, Verdict.NOT_FINITE, Verdict.OUT_OF_RANGE)] == [2998, 1, 1]
+    assert [
+        verdicts.count(v) for v in (SampleOutcome.ACCEPTED, SampleOutcome.NOT_FINITE, SampleOutcome.OUT_OF_RANGE)
+    ] == [2998, 1, 1]
     assert ran.state["samples"][0] == 2998
 
 
@@ -70,10 +72,10 @@ def test_what_a_stack_has_not_is_nan_inside_and_null_outside(ten_minutes: mann_s
     assert np.isfinite(trace["voltage_estimate_v"]).all()
     assert (trace["lock"] == 1).all()
     assert all(math.isnan(value) for value in vars(remaining_charge(estimator, 3.0)).values())
-    report = parameter_report(estimator, 0.0)
+    report = make_parameters_payload(estimator, 0.0)
     assert (report.soc, report.a, report.ocv, report.state_of_health) == (None, {}, None, {})
     assert tuple(report.elements) == KEYS
-    assert parameter_report(Estimator(PEM), 0.0).elements == {}
+    assert make_parameters_payload(Estimator(PEM), 0.0).elements == {}
     with pytest.raises(ValueError, match="has no SOC"):
         estimator.set_soc(0.5)
 

@@ -6,7 +6,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import fitted_parameter, present_elements
 from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.kernels.identifier import hand_over
+from bms_estimator.kernels.identifier import set_adaptation_targets
 from bms_estimator.kernels.kalman_filter.element_map import CAPACITANCES, ELEMENTS
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
@@ -94,7 +94,7 @@ def test_a_fit_that_is_negative_at_the_present_soc_is_not_handed_over(load) -> N
     estimator.settings_record["lower"][0, 7:13], estimator.settings_record["upper"][0, 7:13] = 0.0, np.inf
     record["fit"]["a"][7:13] = [2e5, 1.0, 1e3, 1e6, 1.0, 1e4]  # delta = 5.3 and 4.6
     for e in CAPACITANCES:
-        hand_over(record, estimator.settings_record[0], e)
+        set_adaptation_targets(record, estimator.settings_record[0], e)
     assert soc < 4.6
     assert np.array_equal(record["observer"]["target"], targets)
 

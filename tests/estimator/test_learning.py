@@ -9,11 +9,11 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from bms_estimator.telemetry.charge_energy import Flow
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
-from bms_estimator.telemetry.state import estimate_report
+from bms_estimator.telemetry.state import make_state_payload
 from tests.estimator.random_steps import (
     FIRST_SOC,
     RATED_A,
@@ -267,7 +267,7 @@ def test_beside_the_filter_the_law_has_its_soc_and_keeps_its_parameters(ten_hour
 def test_what_was_learned_is_published_with_its_source(ten_hours: SampleBlock) -> None:
     estimator = learner(file_off_by(*OFF))
     estimator.run(ten_hours)
-    report = parameter_report(estimator, 0.0)
+    report = make_parameters_payload(estimator, 0.0)
     assert report.a["a15"].source == report.elements["r_s_ohm"].source == "identified"
     assert report.a["a15"].value == estimator.state["a"][0, 15]
     assert "law" in (report.a["a15"].reason or "")
@@ -283,7 +283,7 @@ def test_gamma_k_has_its_own_name_and_delta_is_said_to_be_configured(ten_hours: 
         window.add(estimator.run(ten_hours[:600]), 0.0)
         summary = window.take()
         assert summary is not None
-        states[law] = estimate_report(summary, remaining_charge(estimator, 0.0), {}, 0.0, Flow(), 3.0)
+        states[law] = make_state_payload(summary, remaining_charge(estimator, 0.0), {}, 0.0, ChargeEnergy(), 3.0)
         k = float(estimator.state["k"][0])
         assert states[law].adaptive_gain_k == k
     learning, improved = states["learning"], states["improved"]

@@ -12,12 +12,12 @@ from bms_estimator.calibration.thesis.series_resistance import (
     summed,
 )
 from bms_estimator.checkpoint.identity import fields, without_observer
-from bms_estimator.checkpoint.restore import resume
+from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.observer.series_resistance import BINS, MOST_SAMPLES
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from tests.calibration.simulated_load import TRUTH, capture, steps
 
 FIRST_SOC = 0.98
@@ -79,15 +79,18 @@ def test_steps_and_a_run_leave_the_same_r_s_to_the_last_bit(load: SampleBlock) -
 def test_r_s_is_published_as_of_4_2_and_null_until_a_current_flows(load: SampleBlock) -> None:
     estimator = thesis()
     estimator.run(load[:10])
-    before = parameter_report(estimator, 0.0).elements["r_s_ohm"]
+    before = make_parameters_payload(estimator, 0.0).elements["r_s_ohm"]
     assert (before.value, before.valid) == (None, False)
     assert before.reason == "(4.2) needs a current: none above 0.06 A has flowed"
     estimator.run(load[10:600])
-    first = parameter_report(estimator, 0.0)
+    first = make_parameters_payload(estimator, 0.0)
     assert first.elements["r_s_ohm"].value is not None
     assert (first.elements["r_s_ohm"].std, first.a["a15"].source) == (None, "configured")
     estimator.run(load[600:])
-    report, offline = parameter_report(estimator, 0.0), steps_2_and_3(TRUTH, [Start(load, FIRST_SOC)], LOWEST_SOC)
+    report, offline = (
+        make_parameters_payload(estimator, 0.0),
+        steps_2_and_3(TRUTH, [Start(load, FIRST_SOC)], LOWEST_SOC),
+    )
     r_s, a15 = report.elements["r_s_ohm"], report.a["a15"]
     assert r_s.value == pytest.approx(float(offline.r_s(np.array(report.soc))), rel=R_S_ERROR)
     assert (r_s.source, a15.source, r_s.valid) == ("identified", "identified", False)
@@ -102,7 +105,7 @@ def test_a_checkpoint_goes_on_from_the_same_sums(load: SampleBlock) -> None:
     estimator, next_run = thesis(), thesis()
     estimator.run(load[:5000])
     saved = {name: field.copy() for name, field in fields(estimator.record)}
-    assert resume(next_run, saved, 5.0) == ""
+    assert restore_state(next_run, saved, 5.0) == ""
     sums = ("samples", "square_a2", "product_va", "v_ts", "v_tl")
     for name in sums:
         assert next_run.record["series_resistance"][name].tobytes() == saved[f"series_resistance.{name}"].tobytes()
@@ -119,7 +122,7 @@ def test_a_damaged_or_foreign_sum_is_not_taken_up(load: SampleBlock) -> None:
     saved = {name: field.copy() for name, field in fields(estimator.record)}
     assert not any(name.startswith("series_resistance.") for name in without_observer(saved))
     saved["series_resistance.product_va"][0, 5] = np.nan
-    assert resume(thesis(), saved, 5.0) == "product_va of the series_resistance is not finite"
+    assert restore_state(thesis(), saved, 5.0) == "product_va of the series_resistance is not finite"
 
 
 def test_nothing_is_summed_with_branches_that_nobody_knows(load: SampleBlock) -> None:

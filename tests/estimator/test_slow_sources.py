@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.kalman_filter.gap_charge import rounded_charge
+from bms_estimator.kernels.kalman_filter.gap_charge import rounding_charge_variance
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.device_resolution import Sampling
@@ -75,9 +75,11 @@ def test_a_current_that_stays_the_same_is_wrong_by_the_same_all_the_time(
     f, p = np.zeros(1, dtype=EKF_STATE)[0], np.zeros(1, dtype=EKF_SETTINGS)[0]
     p["current_step_a"], p["dead_band_a"] = sampling.current_resolution_a, sampling.current_dead_band_a
     f["current_a"] = current_a
-    variance_as2 = sum(rounded_charge(f, p, sampling.period_s, current_a) for _ in range(3600))
+    variance_as2 = sum(rounding_charge_variance(f, p, sampling.period_s, current_a) for _ in range(3600))
     assert variance_as2 == pytest.approx((error_a * 3600.0) ** 2)
-    assert rounded_charge(f, p, 1.0, current_a + 1.0) == pytest.approx(0.1**2 / 12.0)  # another current errs on its own
+    assert rounding_charge_variance(f, p, 1.0, current_a + 1.0) == pytest.approx(
+        0.1**2 / 12.0
+    )  # another current errs on its own
 
 
 def test_a_board_is_as_it_was() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings
 from tests.estimator.simulated_cell import TRUTH, measured, pulses
@@ -117,7 +117,7 @@ def test_while_the_sign_of_the_current_is_wrong_a_gap_narrows_nothing() -> None:
     block["current_a"] *= -1.0
     estimator = Estimator(TRUTH, initial_soc=1.0)
     estimator.run(block[:3600])
-    assert estimator.record["checks"]["suspects"][0] == Suspect.SIGN_OF_CURRENT
+    assert estimator.record["checks"]["suspects"][0] == InputFault.SIGN_OF_CURRENT
     before = estimator.record["filter"]["soc_std"][0]
     estimator.run(block[5100:5101])
     assert estimator.record["filter"]["soc_std"][0] >= before

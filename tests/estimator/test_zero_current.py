@@ -139,7 +139,7 @@ def test_a_state_that_is_observed_is_a_textbook_update() -> None:
     before, mean = mixed @ mixed.T, rng.standard_normal(STATES)
     mean[0] = 0.5
     s["covariance"][0], s["mean"][0] = before, mean
-    ekf.observe(s, 0, OFFSET, mean[OFFSET] + 0.01, 0.3)
+    ekf.update_state_directly(s, 0, OFFSET, mean[OFFSET] + 0.01, 0.3)
     gain = before[OFFSET] / (before[OFFSET, OFFSET] + 0.3)
     assert s["mean"][0] == pytest.approx(mean + 0.01 * gain)
     assert s["covariance"][0] == pytest.approx(before - np.outer(gain, before[OFFSET]))

@@ -27,7 +27,7 @@ def measured(host: Host) -> tuple[float, float]:
 def test_a_board_whose_bandgap_was_wrong_measures_right_once_its_aref_was_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_detection, "PATIENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(device_detection, "REFERENCE_S", LONG_S)
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 22.2, 25.0)])
     with SimavrBoard(readings, avcc_mv=4750) as board, Host(board.path) as host:
@@ -50,7 +50,7 @@ def test_a_board_whose_bandgap_was_wrong_measures_right_once_its_aref_was_told(
 def test_gains_that_differ_from_the_drawings_are_set_once_and_used_from_then_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_detection, "PATIENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 20.0, 25.0)])
     with SimavrBoard(readings) as board, Host(board.path) as host:
         with pytest.raises(SystemExit) as ended:

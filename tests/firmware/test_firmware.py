@@ -34,7 +34,7 @@ from bms_estimator.protocols.firmware.messages import (
 )
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import aux_readings_of, window_of
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.firmware.host import Host
 from tests.simavr_board import FIRMWARE, SimavrBoard, write_readings
 
@@ -350,7 +350,7 @@ async def test_the_services_own_source_sets_the_rate_and_reads(tmp_path: Path) -
     readings = write_readings(tmp_path / "readings.csv", STEADY)
     with SimavrBoard(readings) as simulated:
         settings = SensorSettings(port=simulated.path, sample_rate_hz=250)
-        async with SerialBoard(settings, first_retry_s=0.05) as board:
+        async with SerialSource(settings, first_retry_s=0.05) as board:
             async for block in board:
                 assert block["voltage_v"] == pytest.approx(22.2, abs=0.03)
                 assert block["current_a"] == pytest.approx(2.5, abs=0.06)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.fleet.worker.partition import Partition, Taken
+from bms_estimator.fleet.worker.partition import BlockResult, Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import PackSettings, Settings
@@ -38,15 +38,15 @@ class Stream:
         self.partition = partition
         self.messages: list[tuple[str, bytes]] = []
 
-    def send(self, pack: str, data: bytes, *, waits: bool = False) -> Taken:
+    def send(self, pack: str, data: bytes, *, waits: bool = False) -> BlockResult:
         self.messages.append((pack, data))
         if waits:
             return self.partition.defer(pack, len(self.messages))
         return self.partition.take(pack, data, len(self.messages))
 
-    def take_deferred(self, most: int = 10_000) -> list[Taken]:
+    def take_deferred(self, most: int = 10_000) -> list[BlockResult]:
         """Take what waits of known packs, one message of each at a time."""
-        made: list[Taken] = []
+        made: list[BlockResult] = []
         while len(made) < most and (found := self.partition.deferred.next(self.partition.is_known)):
             pack, span = found
             messages = enumerate(self.messages, 1)

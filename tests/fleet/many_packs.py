@@ -8,13 +8,13 @@ from nats.aio.client import Client
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
-from bms_estimator.fleet.packs.pack_row import PackKind, stored
+from bms_estimator.fleet.packs.pack_row import PackSpec, stored
 from tests.sinks.snapshots import ONE
 
 HOME, VAN, PLANT = (
-    PackKind(cell="lfp", capacity_ah=280.0, series=16),
-    PackKind(cell="ncr18650", series=14, parallel=10),
-    PackKind(cell="nmc", capacity_ah=50.0, series=96),
+    PackSpec(cell="lfp", capacity_ah=280.0, series=16),
+    PackSpec(cell="ncr18650", series=14, parallel=10),
+    PackSpec(cell="nmc", capacity_ah=50.0, series=96),
 )
 SHARES = {"home": (HOME, 0.7), "van": (VAN, 0.25), "plant": (PLANT, 0.05)}
 MEASURED = {
@@ -47,7 +47,7 @@ class Pack(NamedTuple):
     """A pack, and what is said of it."""
 
     name: str
-    kind: PackKind
+    kind: PackSpec
     state: bytes
 
 

@@ -14,7 +14,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.page.fleet_page import fleet_page
 from bms_estimator.fleet.page.nats_feed import Server
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.page import PageSettings
 from tests.fleet.engine import running
 from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
@@ -24,7 +24,12 @@ from tests.sinks.snapshots import ONE
 
 DOCS = Path(__file__).parents[2] / "docs"
 PACKS, AWAY, DAYS = 5000, 12, 90
-SUSPECTED = {7: Suspect.CAPACITY, 40: Suspect.OFFSET, 93: Suspect.SIGN_OF_CURRENT, 161: Suspect.OUTLIERS | Suspect.OCV}
+SUSPECTED = {
+    7: InputFault.CAPACITY,
+    40: InputFault.OFFSET,
+    93: InputFault.SIGN_OF_CURRENT,
+    161: InputFault.OUTLIERS | InputFault.OCV,
+}
 STEP_S = 0.2
 TOP = 420
 """Of the page: so much shows how it looks in the dark, or stale [px]."""

@@ -10,7 +10,7 @@ from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, decode
-from bms_estimator.edge.subjects import Awaits
+from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.model.sample import SampleBlock
 from tests.fleet.engine import connected
@@ -69,7 +69,7 @@ class Receiver:
                     self._task.result()
                 await asyncio.sleep(POLL_S)
 
-    async def say(self, awaits: Awaits | bytes) -> None:
+    async def say(self, awaits: BlockRequest | bytes) -> None:
         payload = awaits if isinstance(awaits, bytes) else awaits.model_dump_json().encode()
         await self.nc.publish(subjects.awaits(self.pack), payload)
         await self.nc.flush()
@@ -102,9 +102,9 @@ class Receiver:
             self.gaps += 1
             if self._asked != self._next or self.gaps % 5 == 0:
                 self._asked = self._next
-                await self.say(Awaits(store=self._store, number=self._next, resend=True))
+                await self.say(BlockRequest(store=self._store, number=self._next, resend=True))
         else:
             self._next += 1
             self.blocks.append(block)
             if self._next % 10 == 2:
-                await self.say(Awaits(store=self._store, number=self._next, resend=False))
+                await self.say(BlockRequest(store=self._store, number=self._next, resend=False))

@@ -20,9 +20,9 @@ from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
-from bms_estimator.fleet.packs.pack_registry import KnownPacks
-from bms_estimator.fleet.packs.pack_row import PackKind, stored
-from bms_estimator.fleet.worker.checkpoint_store import Keeping
+from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.packs.pack_row import PackSpec, stored
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import SAMPLE
 from tests.command_line import PROGRAM
@@ -30,7 +30,7 @@ from tests.patience import LONG_S
 
 PERIOD_S = 10.0
 """Between two samples."""
-KIND = stored(PackKind(cell="ncr18650", period_s=PERIOD_S))
+KIND = stored(PackSpec(cell="ncr18650", period_s=PERIOD_S))
 STORE = 1_790_000_000 * 10**9
 """When the edges' stores were made [ns since 1970]."""
 SAMPLES = 60
@@ -52,10 +52,10 @@ def block(pack: str, number: int, arrival_s: float = 1.79e9) -> bytes:
     return encode(Block(STORE, number, 1, arrival_s, samples(pack, number)))
 
 
-async def know(nc: Client, packs: list[str]) -> KnownPacks:
+async def know(nc: Client, packs: list[str]) -> PackRegistry:
     """Load the table, and have it here, too."""
     await write_bucket(nc, subjects.PACKS_BUCKET, dict.fromkeys(packs, KIND))
-    known = KnownPacks()
+    known = PackRegistry()
     for pack in packs:
         known.set_row(pack, KIND)
     return known
@@ -153,11 +153,11 @@ async def until(found: Callable[[], Any], or_else: Callable[[], object]) -> Any:
     raise AssertionError(str(or_else()))
 
 
-async def end_states(nc: Client, known: KnownPacks, partitions: int) -> dict[int, Partition]:
+async def end_states(nc: Client, known: PackRegistry, partitions: int) -> dict[int, Partition]:
     """What is in the last checkpoints."""
     js = nc.jetstream(timeout=LONG_S)
     checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    keeping = Keeping(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))
+    keeping = CheckpointStore(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))
     found = {}
     for number in range(partitions):
         async with aclosing(keeping.load(await keeping.claim(number))) as kept:
@@ -167,7 +167,7 @@ async def end_states(nc: Client, known: KnownPacks, partitions: int) -> dict[int
     return found
 
 
-def estimated(known: KnownPacks, pack: str, blocks: int) -> bytes:
+def estimated(known: PackRegistry, pack: str, blocks: int) -> bytes:
     """The record that the estimator leaves of a pack's blocks, all in one run."""
     settings, cell = known(pack) or (None, None)
     assert settings

@@ -15,8 +15,8 @@ import pytest
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.sinks.home_assistant.discovery import Described, discovery
-from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
+from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.telemetry.rest_detector import WATCHED_S
 from tests.home_assistant.conftest import DASHBOARD
 from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant
@@ -141,7 +141,7 @@ def test_the_dashboard_has_only_cards_and_entities_that_there_are(home: HomeAssi
 
 def play(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], home: HomeAssistant) -> None:
     """Say what a pack says in ``stream``, as fast as the broker takes it, once Home Assistant has its entities."""
-    messages, sent, said = Messages("bms", device), Sent(), list[Message]()
+    messages, sent, said = MessageBuilder("bms", device), PublishedState(), list[Message]()
     for now_s, each in stream:
         info = each.info.model_copy(update={"device": device})
         due, sent = messages.due(sent, each._replace(info=info), now_s)
@@ -173,14 +173,14 @@ def test_what_a_pack_has_no_more_is_removed(home: HomeAssistant, broker: Broker)
     info = next(noisy(1.0))[1].info.model_copy(update={"device": "changed"})
     topic, entity = "homeassistant/device/bms_changed/config", "number.bms_changed_set_soc"
 
-    async def tell(told: Described) -> None:
+    async def tell(told: DiscoveryInputs) -> None:
         payload = json.dumps(discovery(HomeAssistantSettings(), told, "bms/changed", 0.0))
         async with aiomqtt.Client("127.0.0.1", broker.port) as client:
             await client.publish(topic, payload, 1, retain=True)
 
-    asyncio.run(tell(Described(info, commands=("set_soc",))))
+    asyncio.run(tell(DiscoveryInputs(info, commands=("set_soc",))))
     home.until(lambda states: entity in states)
-    asyncio.run(tell(Described(info)))
+    asyncio.run(tell(DiscoveryInputs(info)))
     home.until(lambda states: entity not in states and "sensor.bms_changed_voltage_v" in states)
     assert entity not in {entry["entity_id"] for entry in home.command("config/entity_registry/list")}
 
@@ -192,7 +192,7 @@ def test_its_recorder_writes_at_most_20_rows_a_minute_for_a_pack(
     minutes = 10
     play(broker, device, stream(60.0 * minutes), home)
     info = next(stream(1.0))[1].info
-    described = Described(info, CELLS if stream is restless else 0)
+    described = DiscoveryInputs(info, CELLS if stream is restless else 0)
     wanted = len(rows(stream(60.0 * minutes), shown(discovery(HomeAssistantSettings(), described, "bms/pack", 0.0))))
     assert 100 < wanted <= MOST_ROWS_PER_MIN * minutes
     deadline = time.monotonic() + LONG_S

@@ -1,8 +1,8 @@
 """A person hears which kernel is being compiled."""
 
-from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.kernels.compile_events import compiling_told
+from bms_estimator.kernels.compile_events import report_compilation
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware import scaling
 
@@ -15,20 +15,20 @@ def fresh():
 def test_each_kernel_is_told_once_with_its_number_and_what_is_compiled_already_is_not() -> None:
     told = []
     kernel = fresh()
-    with compiling_told(lambda *what: told.append(what)):
+    with report_compilation(lambda *what: told.append(what)):
         kernel(0.5, 1.0, 2.0)
         kernel(1, 1, 2)  # for other types
     [(name, number, most)] = told
     assert (name, number) == ("margins: crossing", 1)
     assert most >= 2
-    with compiling_told(lambda *what: told.append(what)):
+    with report_compilation(lambda *what: told.append(what)):
         kernel(0.6, 1.0, 2.0)
     assert len(told) == 1
 
 
 def test_what_decodes_the_line_is_told_as_well() -> None:
     told = []
-    with compiling_told(lambda *what: told.append(what)):
+    with report_compilation(lambda *what: told.append(what)):
         njit(scaling.running_mean.py_func)(0.0, 0.0, 1.0, 1.0, 0.0)
     [(name, _, _)] = told
     assert name == "scaling: running mean"
@@ -36,7 +36,7 @@ def test_what_decodes_the_line_is_told_as_well() -> None:
 
 def test_nobody_is_told_after_the_end() -> None:
     told = []
-    with compiling_told(lambda *what: told.append(what)):
+    with report_compilation(lambda *what: told.append(what)):
         pass
     fresh()(0.5, 1.0, 2.0)
     assert told == []
@@ -44,7 +44,7 @@ def test_nobody_is_told_after_the_end() -> None:
 
 def test_where_stderr_is_no_terminal_lines_come_now_and_then() -> None:
     lines: list[str] = []
-    with compiling_shown(lines.append):
+    with show_compile_progress(lines.append):
         fresh()(0.5, 1.0, 2.0)
         njit(chen_mora.delta.py_func)(0.5, 1.0, 2.0)
     [line] = lines

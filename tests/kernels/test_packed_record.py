@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.packed_record import WORD_BITS, mirror_of, pack, room, unpack
+from bms_estimator.kernels.packed_record import WORD_BITS, pack, room, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.cell import load_cell
 from tests.estimator.simulated_cell import pulses
@@ -15,7 +15,7 @@ from tests.estimator.simulated_cell import pulses
 LAYOUT = np.dtype(
     [("count", "i8"), ("part", [("matrix", "f8", (2, 5, 5)), ("row", "f8", 7)]), ("end", "f8"), ("long", "u8", 40)]
 )
-MIRROR = mirror_of(LAYOUT)
+MIRROR = symmetry_map(LAYOUT)
 SIZE = MIRROR.size
 BITMAP = -(-SIZE // WORD_BITS)
 words_of = hnp.arrays(np.uint64, SIZE, elements=st.sampled_from([0, 1, 2**63, 2**64 - 1]))
@@ -80,14 +80,14 @@ def test_no_bytes_harm(noise) -> None:
 )
 def test_a_record_that_has_no_whole_words_is_refused(dtype) -> None:
     with pytest.raises(ValueError, match="word"):
-        mirror_of(dtype)
+        symmetry_map(dtype)
 
 
 def test_an_estimator_that_has_found_its_soc_needs_a_fifth_of_its_record() -> None:
     estimator = Estimator(load_cell("ncr18650"))
     estimator.run(pulses(hours=1.0)[0])
     assert estimator.record["filter"]["count"] == 1
-    words, mirror = estimator.record.view(np.uint64), mirror_of(ESTIMATOR_STATE)
+    words, mirror = estimator.record.view(np.uint64), symmetry_map(ESTIMATOR_STATE)
     kept = packed(words, mirror)
     assert kept.nbytes < ESTIMATOR_STATE.itemsize / 5
     back = np.ones_like(words)

@@ -4,12 +4,12 @@ import itertools
 from typing import Any
 
 from bms_estimator.model.events import events
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import Snapshot
 from tests.sinks.snapshots import ONE
 
-WARM = f"no data at 41 C, the cell file knows 25 C: {Suspect.TEMPERATURE.text}"
-WARMER = f"no data at 42 C, the cell file knows 25 C: {Suspect.TEMPERATURE.text}"
+WARM = f"no data at 41 C, the cell file knows 25 C: {InputFault.TEMPERATURE.text}"
+WARMER = f"no data at 42 C, the cell file knows 25 C: {InputFault.TEMPERATURE.text}"
 
 
 def with_health(**changes: Any) -> Snapshot:

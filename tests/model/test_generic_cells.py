@@ -7,9 +7,9 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.settings_plausibility import implausible
-from bms_estimator.estimator.stability_conditions import failed
-from bms_estimator.kernels.step import Verdict
+from bms_estimator.estimator.settings_plausibility import implausible_settings
+from bms_estimator.estimator.stability_conditions import failed_conditions
+from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.cell import TableOcv, generic_cells, load_cell, shipped_cells
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import PackSettings, Settings
@@ -39,9 +39,9 @@ def test_it_steps_and_nothing_of_it_is_odd(name):
     assert cell.cell.voltage_min_v < cell.ocv.ocv_v[0]
     assert cell.ocv.ocv_v[-1] < cell.cell.voltage_max_v
     settings = Settings(pack=PackSettings(cell=name, capacity_ah=100.0), sensor=SensorSettings(protocol="text"))
-    assert implausible(settings, cell) == []
-    assert failed(cell) == []
-    assert Estimator(cell, identifier=None).step(0.0, 0.0, cell.cell.nominal_voltage_v) is Verdict.ACCEPTED
+    assert implausible_settings(settings, cell) == []
+    assert failed_conditions(cell) == []
+    assert Estimator(cell, identifier=None).step(0.0, 0.0, cell.cell.nominal_voltage_v) is SampleOutcome.ACCEPTED
 
 
 @pytest.mark.parametrize("name", generic_cells())

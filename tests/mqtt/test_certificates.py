@@ -12,9 +12,9 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import check, tls_context
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
@@ -54,8 +54,8 @@ def settings(broker: Broker, folder: Path, name: str | None) -> MqttSettings:
 
 
 def sink(settings: MqttSettings) -> MqttSink:
-    delivery = Delivery()
-    return MqttSink(settings, "pack", Requests(delivery), delivery, Outbox(None, most=4), first_delay_s=0.1)
+    delivery = DeliveryStats()
+    return MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, most=4), first_delay_s=0.1)
 
 
 async def test_our_certificate_opens_the_broker(strict_broker: Broker, folder: Path) -> None:

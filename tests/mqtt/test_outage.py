@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.mqtt.client import Patience
-from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.client import Timeouts
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy, read_packet
@@ -17,12 +17,12 @@ from tests.patience import LONG_S
 from tests.sinks.service import STATE, Sink, assert_all_in_order, numbers, state, until
 from tests.sinks.snapshots import ONE
 
-SOON = Patience(connected_s=1.0, keepalive_s=1, acknowledged_s=1.0)
+SOON = Timeouts(connected_s=1.0, keepalive_s=1, acknowledged_s=1.0)
 """A busy machine may take a broker for lost that is not: then it is found again."""
 
 
-def dial(url: str | tuple[str, ...], patience: Patience = SOON) -> dict[str, Any]:
-    return {"connect": Dial(MqttSettings(url=url), patience), "most_kept": 10_000}
+def dial(url: str | tuple[str, ...], patience: Timeouts = SOON) -> dict[str, Any]:
+    return {"connect": BrokerConnector(MqttSettings(url=url), patience), "most_kept": 10_000}
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ async def test_a_line_that_falls_silent_is_given_up_for_the_next_broker(broker: 
 async def test_a_line_that_falls_silent_while_nothing_is_to_be_said_is_found_out(broker: Broker) -> None:
     async with Proxy(broker.port) as silent, Listener(broker) as live:
         with structlog.testing.capture_logs() as logs:
-            async with Sink(silent.url, **dial(silent.url, Patience(keepalive_s=1))) as sink:
+            async with Sink(silent.url, **dial(silent.url, Timeouts(keepalive_s=1))) as sink:
                 await live.wait("bms/pack/schema")
                 silent.swallows = True
                 await until(lambda: any(line["event"] == "broker lost" for line in logs))

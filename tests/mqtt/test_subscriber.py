@@ -10,7 +10,7 @@ import pytest
 import structlog
 
 from bms_estimator.mqtt.subscriber import MOST_BYTES, Subscriber
-from bms_estimator.mqtt.topic_cache import Heard
+from bms_estimator.mqtt.topic_cache import DeviceMessage
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy
@@ -23,13 +23,13 @@ class Watch:
     """A subscriber whose callbacks wake who waits."""
 
     def __init__(self, url: str, **options: Any) -> None:
-        self.heard: list[Heard] = []
+        self.heard: list[DeviceMessage] = []
         self.links: list[float | None] = []
         self._news = asyncio.Event()
         settings = MqttSettings(url=url, **options)
         self.subscriber = Subscriber(settings, self._hear, self._link, first_delay_s=0.1)
 
-    def _hear(self, heard: Heard) -> None:
+    def _hear(self, heard: DeviceMessage) -> None:
         self.heard.append(heard)
         self._news.set()
 
@@ -61,7 +61,7 @@ async def test_what_a_pack_publishes_is_kept_and_told(broker: Broker, *, knows_5
             assert ONE.estimate
             assert watch.kept("pack", "state") == ONE.estimate.model_dump(mode="json")
             assert watch.kept("pack", "availability") == "online"
-            assert Heard("pack", "availability", "online") in watch.heard
+            assert DeviceMessage("pack", "availability", "online") in watch.heard
             await sink.mqtt.__aexit__(None, None, None)
             await watch.until(lambda: watch.kept("pack", "availability") == "offline")
     assert watch.subscriber.lost_messages == 0
@@ -118,7 +118,7 @@ async def test_before_there_is_a_broker_it_is_lost_since_the_start(broker: Broke
 
 
 async def test_a_fault_of_who_is_called_is_seen(broker: Broker) -> None:
-    def fail(_: Heard) -> None:
+    def fail(_: DeviceMessage) -> None:
         raise ZeroDivisionError
 
     subscriber = Subscriber(MqttSettings(url=broker.url), fail)

@@ -6,15 +6,23 @@ import string
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.mqtt.topic_cache import MAX_DEVICE_BYTES, MAX_DEVICES, MAX_TOPICS, SILENT_S, Heard, Published, parsed
-from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from bms_estimator.mqtt.topic_cache import (
+    MAX_DEVICE_BYTES,
+    MAX_DEVICES,
+    MAX_TOPICS,
+    SILENT_S,
+    DeviceMessage,
+    TopicCache,
+    parsed,
+)
+from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.sinks.snapshots import NOW, ONE
 
 
 def test_all_that_a_pack_publishes_is_kept_by_device_and_topic():
-    published = Published("site/bms")
-    messages = Messages("site/bms", "pack")
-    for message in (*messages.greeting(), *messages.kept(None, ONE), *messages.due(Sent(), ONE, NOW)[0]):
+    published = TopicCache("site/bms")
+    messages = MessageBuilder("site/bms", "pack")
+    for message in (*messages.greeting(), *messages.kept(None, ONE), *messages.due(PublishedState(), ONE, NOW)[0]):
         published.take(message.topic, message.payload, NOW)
     [(name, device)] = published.devices.items()
     assert name == "pack"
@@ -36,10 +44,10 @@ def test_what_is_no_json_is_text_and_no_number_is_infinite():
 
 
 def test_a_topic_that_is_emptied_is_gone_and_with_its_last_the_device():
-    published = Published("bms")
+    published = TopicCache("bms")
     published.take("bms/pack/state", b"1", NOW)
     published.take("bms/pack/info", b"2", NOW)
-    assert published.take("bms/pack/info", b"", NOW) == Heard("pack", "info", None)
+    assert published.take("bms/pack/info", b"", NOW) == DeviceMessage("pack", "info", None)
     assert published.take("bms/pack/info", b"", NOW) is None
     assert published.devices["pack"].topics == {"state": 1}
     published.take("bms/pack/state", b"", NOW)
@@ -47,7 +55,7 @@ def test_a_topic_that_is_emptied_is_gone_and_with_its_last_the_device():
 
 
 def test_what_is_of_no_device_is_not_looked_at():
-    published = Published("bms")
+    published = TopicCache("bms")
     for topic in ("bms", "bms/", "bms/pack", "bms/pack/", "bms//state", "other/pack/state", "bms/a b/state"):
         assert published.take(topic, b"1", NOW) is None, topic
     for topic in ("bms/pack/request/set_soc", "bms/pack/response/state", "bms/\x1b[2J/state", f"bms/{'x' * 65}/state"):
@@ -56,7 +64,7 @@ def test_what_is_of_no_device_is_not_looked_at():
 
 
 def test_devices_topics_and_bytes_are_bounded_and_known_devices_are_updated() -> None:
-    published = Published("bms")
+    published = TopicCache("bms")
     for number in range(2 * MAX_DEVICES):
         published.take(f"bms/d{number}/state", b"1", NOW)
     assert (len(published.devices), published.hidden) == (MAX_DEVICES, MAX_DEVICES)
@@ -66,27 +74,27 @@ def test_devices_topics_and_bytes_are_bounded_and_known_devices_are_updated() ->
     quarter = json.dumps("x" * (MAX_DEVICE_BYTES // 4)).encode()
     taken = [published.take(f"bms/d1/t{number}", quarter, NOW) for number in range(10)]
     assert sum(heard is not None for heard in taken) == 3
-    assert published.take("bms/d1/state", b"2", NOW + 1.0) == Heard("d1", "state", 2)
+    assert published.take("bms/d1/state", b"2", NOW + 1.0) == DeviceMessage("d1", "state", 2)
     published.take("bms/d1/t0", b"", NOW)
     assert published.take("bms/d1/t9", quarter, NOW) is not None
 
 
 def test_a_new_device_replaces_the_one_that_has_been_silent_longest() -> None:
     left_out = list[str]()
-    published = Published("bms", left_out.append)
+    published = TopicCache("bms", left_out.append)
     for number in range(MAX_DEVICES):
         published.take(f"bms/d{number}/state", b"1", NOW + number)
     published.take("bms/d0/state", b"1", NOW + MAX_DEVICES)
     assert published.take("bms/new/state", b"1", NOW + SILENT_S) is None
     assert left_out == ["new"]
-    assert published.take("bms/new/state", b"1", NOW + SILENT_S + MAX_DEVICES) == Heard("new", "state", 1)
+    assert published.take("bms/new/state", b"1", NOW + SILENT_S + MAX_DEVICES) == DeviceMessage("new", "state", 1)
     assert left_out == ["new", "d1"]
     assert published.hidden == 1
     assert {"new", "d0"} <= published.devices.keys()
 
 
 def test_a_raised_alarm_finds_room_at_once_and_its_device_is_kept() -> None:
-    published = Published("bms")
+    published = TopicCache("bms")
     for number in range(2 * MAX_DEVICES):
         published.take(f"bms/d{number}/state", b"1", NOW)
     alarm = "bms/new/alarm/over_temperature"
@@ -101,7 +109,7 @@ def test_a_raised_alarm_finds_room_at_once_and_its_device_is_kept() -> None:
 
 
 def test_raised_alarms_of_new_devices_do_not_replace_a_device_with_a_raised_alarm() -> None:
-    published = Published("bms")
+    published = TopicCache("bms")
     for number in range(2 * MAX_DEVICES):
         published.take(f"bms/d{number}/alarm/over_temperature", b'{"active": true}', NOW)
     assert set(published.devices) == {f"d{number}" for number in range(MAX_DEVICES)}
@@ -109,6 +117,6 @@ def test_raised_alarms_of_new_devices_do_not_replace_a_device_with_a_raised_alar
 
 @given(st.text(string.printable), st.binary(max_size=200))
 def test_nothing_that_comes_raises(topic, payload):
-    published = Published("bms")
+    published = TopicCache("bms")
     for full in (topic, f"bms/{topic}", f"bms/pack/{topic}"):
         published.take(full, payload, NOW)

@@ -3,7 +3,7 @@
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.page.access_control import Guard, guard_of
+from bms_estimator.page.access_control import AccessControl, guard_of
 from bms_estimator.settings.page import PageSettings, parse_listen
 
 TOKEN = "0123456789abcdef"
@@ -77,4 +77,4 @@ def test_a_token_is_known_with_its_newline_off(tmp_path):
     ],
 )
 def test_only_names_of_ours_are_answered(host, known):
-    assert Guard(["bms.example.org"]).knows_host(host) is known
+    assert AccessControl(["bms.example.org"]).knows_host(host) is known

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from bms_estimator.page.event_stream import MESSAGE_BYTES, Reader
-from bms_estimator.page.pack_topics import RECENT_STATES, Hub
+from bms_estimator.page.pack_topics import RECENT_STATES, PackTopics
 from bms_estimator.store.minute import epoch_s
 
 TIME = "2026-11-22T16:00:{:06.3f}Z"
@@ -22,7 +22,7 @@ async def read(reader: Reader) -> dict[str, Any]:
 
 
 async def test_who_comes_finds_what_came_last_of_all_packs():
-    hub = Hub()
+    hub = PackTopics()
     hub.put("attic", "state", state(0.0))
     hub.put("attic", "state", state(1.0))
     hub.put("cellar", "availability", "online")
@@ -35,7 +35,7 @@ async def test_who_comes_finds_what_came_last_of_all_packs():
 
 
 async def test_a_slow_reader_finds_the_newest_alone_however_much_came():
-    hub = Hub()
+    hub = PackTopics()
     with hub.reading() as reader:
         for number in range(10_000):
             hub.put("attic", "state", state(number % 60, frames_received=number))
@@ -51,7 +51,7 @@ async def test_a_slow_reader_finds_the_newest_alone_however_much_came():
 
 
 async def test_of_a_pack_that_has_emptied_its_topics_nothing_is_kept():
-    hub = Hub()
+    hub = PackTopics()
     hub.put("attic", "availability", "online")
     hub.put("attic", "state", state(0.0))
     hub.put("attic", "parameters", {"soc": 0.5, "elements": {"r_s_ohm": {"value": 1.0, "std": 0.1, "valid": True}}})
@@ -67,7 +67,7 @@ async def test_of_a_pack_that_has_emptied_its_topics_nothing_is_kept():
 
 
 def test_what_is_too_deep_to_be_written_is_left_out():
-    hub, deep = Hub(), 0
+    hub, deep = PackTopics(), 0
     for _ in range(sys.getrecursionlimit() + 1):
         deep = [deep]
     hub.put("attic", "state", deep)
@@ -75,7 +75,7 @@ def test_what_is_too_deep_to_be_written_is_left_out():
 
 
 async def test_a_reader_ends_when_the_hub_closes():
-    hub = Hub()
+    hub = PackTopics()
     with hub.reading() as reader:
         hub.close()
         assert await reader.next(60.0) == ""
@@ -84,13 +84,13 @@ async def test_a_reader_ends_when_the_hub_closes():
 
 @pytest.mark.parametrize("topic", ["schema", "home_assistant", "home_assistant/problems", "response/state", "x"])
 async def test_what_is_not_shown_is_not_kept(topic):
-    hub = Hub()
+    hub = PackTopics()
     hub.put("attic", topic, {"a": 1})
     assert hub.packs == []
 
 
 async def test_a_topic_that_was_emptied_is_gone_and_readers_hear_of_it():
-    hub = Hub()
+    hub = PackTopics()
     hub.put("attic", "availability", "online")
     hub.put("attic", "alarm/soc_low", {"active": True})
     with hub.reading() as reader:
@@ -102,7 +102,7 @@ async def test_a_topic_that_was_emptied_is_gone_and_readers_hear_of_it():
 
 
 async def test_curves_have_a_point_each_second_and_a_bounded_number():
-    hub = Hub()
+    hub = PackTopics()
     for tenth in range(100):
         hub.put("attic", "state", state(tenth / 10.0))
     with hub.reading() as reader:
@@ -118,14 +118,14 @@ async def test_curves_have_a_point_each_second_and_a_bounded_number():
 )
 @pytest.mark.parametrize("topic", ["state", "parameters", "health", "alarm/x"])
 async def test_what_others_may_publish_is_borne(topic, payload):
-    hub = Hub()
+    hub = PackTopics()
     hub.put("attic", topic, payload)
     with hub.reading() as reader:
         assert (await read(reader))[f"attic/{topic}"] == payload
 
 
 async def test_elements_are_kept_by_percent_of_soc_where_they_are_valid():
-    hub = Hub()
+    hub = PackTopics()
 
     def report(soc, value, *, valid=True):
         return {"soc": soc, "elements": {"r_s_ohm": {"value": value, "std": 0.001, "valid": valid}, "e_o_v": None}}
@@ -140,7 +140,7 @@ async def test_elements_are_kept_by_percent_of_soc_where_they_are_valid():
 
 @pytest.mark.parametrize("ahead", ["9999-01-01T00:00:00.000Z", "2026-11-23T23:00:00.000Z"])
 async def test_a_state_dated_in_the_future_does_not_stop_the_curves(ahead: str) -> None:
-    hub = Hub(lambda: epoch_s(TIME.format(0.0)))
+    hub = PackTopics(lambda: epoch_s(TIME.format(0.0)))
     hub.put("attic", "state", state(0.0))
     hub.put("attic", "state", state(1.0) | {"time": ahead})
     hub.put("attic", "state", state(2.0))
@@ -149,7 +149,7 @@ async def test_a_state_dated_in_the_future_does_not_stop_the_curves(ahead: str) 
 
 
 async def test_a_message_to_a_reader_is_bounded_and_the_rest_comes_next() -> None:
-    hub = Hub()
+    hub = PackTopics()
     for number in range(100):
         hub.put("attic", f"alarm/{number}", "x" * 10_000)
     found, sizes = dict[str, object](), list[int]()
@@ -163,7 +163,7 @@ async def test_a_message_to_a_reader_is_bounded_and_the_rest_comes_next() -> Non
 
 
 async def test_a_pack_that_is_dropped_is_named_no_more() -> None:
-    hub = Hub()
+    hub = PackTopics()
     for pack in ("attic", "cellar"):
         hub.put(pack, "availability", "online")
     with hub.reading() as reader:
@@ -175,7 +175,7 @@ async def test_a_pack_that_is_dropped_is_named_no_more() -> None:
 
 
 async def test_the_link_is_said_once_for_each_change():
-    hub = Hub()
+    hub = PackTopics()
     hub.say_link("no broker")
     with hub.reading() as reader:
         assert (await read(reader))["link"] == {"up": False, "reason": "no broker"}

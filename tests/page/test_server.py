@@ -13,8 +13,8 @@ from yarl import URL
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.page import web_server as of_server
-from bms_estimator.page.history_query import Past
-from bms_estimator.page.pack_topics import Hub
+from bms_estimator.page.history_query import HistoryQuery
+from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import FILES, STATIC, PageServer
 from bms_estimator.page.page_sink import Pages, PageSink
 from bms_estimator.settings.page import PageSettings
@@ -29,17 +29,19 @@ TOKEN = "0123456789abcdef"
 
 
 @pytest.fixture
-def hub() -> Hub:
-    return Hub()
+def hub() -> PackTopics:
+    return PackTopics()
 
 
 @pytest.fixture
-def past() -> Past:
-    return Past()
+def past() -> HistoryQuery:
+    return HistoryQuery()
 
 
 @contextlib.asynccontextmanager
-async def browsing(hub: Hub, past: Past, settings: PageSettings | None = None) -> AsyncIterator[aiohttp.ClientSession]:
+async def browsing(
+    hub: PackTopics, past: HistoryQuery, settings: PageSettings | None = None
+) -> AsyncIterator[aiohttp.ClientSession]:
     """Somebody who keeps cookies, at a server's address."""
     jar = aiohttp.CookieJar(unsafe=True)  # of an address, too
     async with (
@@ -113,7 +115,7 @@ async def test_one_who_reads_nothing_holds_a_bounded_amount_and_is_parted_from(h
 
 
 async def test_a_stream_too_many_replaces_the_oldest_one_of_the_address_that_has_most(
-    hub: Hub, past: Past, monkeypatch: pytest.MonkeyPatch
+    hub: PackTopics, past: HistoryQuery, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(of_server, "MAX_STREAMS", 3)
     hub.say_link(None)
@@ -139,7 +141,7 @@ async def test_a_stream_too_many_replaces_the_oldest_one_of_the_address_that_has
             assert "attic/availability" in await anext(stream)
 
 
-async def test_readers_that_never_read_share_what_waits_for_them(hub: Hub, past: Past) -> None:
+async def test_readers_that_never_read_share_what_waits_for_them(hub: PackTopics, past: HistoryQuery) -> None:
     for number in range(256):
         hub.put("attic", f"alarm/{number}", f"{number}".zfill(65_000))
     process = psutil.Process()
@@ -197,7 +199,7 @@ async def test_a_token_is_shown_once_and_a_cookie_goes_on(hub, past, tmp_path):
 async def test_history_comes_in_a_bounded_number_of_points(tmp_path, hub):
     await keep(tmp_path / "attic.sqlite", [at(30.0 * s) for s in range(4000)])  # 33 h
     now_s = epoch_s(at(30.0 * 3999).estimate.time)
-    past = Past(lambda: now_s)
+    past = HistoryQuery(lambda: now_s)
     past.add("attic", tmp_path / "attic.sqlite")
     async with browsing(hub, past) as session:
         lengths = {}

@@ -12,7 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.instance_lock import _name, alone
+from bms_estimator.process.instance_lock import _name, instance_lock
 
 NOBODY = 65534
 SQUAT = """
@@ -30,13 +30,17 @@ sys.stdin.read()
 def test_a_pack_is_served_once_at_a_time_however_often_a_second_service_is_tried(tmp_path: Path) -> None:
     served = "^pack: this pack is served already, by "
     for _ in range(2):
-        with alone(tmp_path, "pack"):
-            with pytest.raises(UserError, match=f"{served}process {os.getpid()}$"), alone(tmp_path, "pack"):
+        with instance_lock(tmp_path, "pack"):
+            with pytest.raises(UserError, match=f"{served}process {os.getpid()}$"), instance_lock(tmp_path, "pack"):
                 pass
             for _ in range(5):  # the system tells the first ones only whose the name is
-                with pytest.raises(UserError, match=served), alone(tmp_path, "pack"):
+                with pytest.raises(UserError, match=served), instance_lock(tmp_path, "pack"):
                     pass
-    with alone(tmp_path, "pack"), alone(tmp_path, "other"), alone(tmp_path / "elsewhere", "pack"):
+    with (
+        instance_lock(tmp_path, "pack"),
+        instance_lock(tmp_path, "other"),
+        instance_lock(tmp_path / "elsewhere", "pack"),
+    ):
         pass
 
 
@@ -45,10 +49,10 @@ def test_a_service_that_does_not_listen_yet_counts_and_one_that_has_just_ended_d
 ) -> None:
     with socket.socket(socket.AF_UNIX) as starting:
         starting.bind(_name(tmp_path, "pack"))
-        with pytest.raises(UserError, match=r"served already, by another process$"), alone(tmp_path, "pack"):
+        with pytest.raises(UserError, match=r"served already, by another process$"), instance_lock(tmp_path, "pack"):
             pass
         monkeypatch.setattr(time, "sleep", lambda _: starting.close())
-        with capture_logs() as lines, alone(tmp_path, "pack"):
+        with capture_logs() as lines, instance_lock(tmp_path, "pack"):
             pass
         assert not lines
 
@@ -57,12 +61,12 @@ def test_a_folder_that_is_deleted_and_made_anew_lets_no_second_service_in(tmp_pa
     folder = tmp_path / "state"
     folder.mkdir()
     (tmp_path / "link").symlink_to(folder)
-    with alone(folder, "pack"):
+    with instance_lock(folder, "pack"):
         shutil.rmtree(folder)
-        with pytest.raises(UserError, match="served already"), alone(folder, "pack"):
+        with pytest.raises(UserError, match="served already"), instance_lock(folder, "pack"):
             pass
         folder.mkdir()
-        with pytest.raises(UserError, match="served already"), alone(tmp_path / "link", "pack"):
+        with pytest.raises(UserError, match="served already"), instance_lock(tmp_path / "link", "pack"):
             pass
         assert not list(folder.iterdir())
 
@@ -71,7 +75,7 @@ def test_a_link_that_was_planted_where_a_lock_file_would_be_leads_to_nothing(tmp
     victim, link = tmp_path / "victim", tmp_path / "pack.lock"
     victim.write_text("precious")
     link.symlink_to(victim)
-    with alone(tmp_path, "pack"):
+    with instance_lock(tmp_path, "pack"):
         assert victim.read_text() == "precious"
     assert link.is_symlink()
     assert victim.read_text() == "precious"
@@ -84,13 +88,13 @@ def test_a_stranger_who_takes_the_name_first_does_not_keep_the_service_from_star
     with subprocess.Popen(command, stdin=pipe, stdout=pipe) as stranger:
         assert stranger.stdout
         assert stranger.stdout.readline()
-        with capture_logs() as lines, alone(tmp_path, "pack"):
+        with capture_logs() as lines, instance_lock(tmp_path, "pack"):
             pass
         assert [line["user"] for line in lines] == [NOBODY]
         os.chown(tmp_path, NOBODY, NOBODY)  # one who may write the folder is a service
-        with pytest.raises(UserError, match=f"by process {stranger.pid}"), alone(tmp_path, "pack"):
+        with pytest.raises(UserError, match=f"by process {stranger.pid}"), instance_lock(tmp_path, "pack"):
             pass
-        with pytest.raises(UserError, match="served already"), alone(tmp_path, "pack"):
+        with pytest.raises(UserError, match="served already"), instance_lock(tmp_path, "pack"):
             pass  # whose it is is told to nobody any more: rather no service than two
         assert stranger.stdin
         stranger.stdin.close()

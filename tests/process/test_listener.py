@@ -12,8 +12,8 @@ import pytest
 import structlog
 
 from bms_estimator.page import listener as of_listener
-from bms_estimator.page.history_query import Past
-from bms_estimator.page.pack_topics import Hub
+from bms_estimator.page.history_query import HistoryQuery
+from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer
 from bms_estimator.process.listener import CONNECTIONS, Connections, Listener
 from bms_estimator.settings.page import PageSettings
@@ -28,7 +28,7 @@ async def test_a_thousand_idle_connections_leave_descriptors_and_an_authorized_c
     token.write_text("0123456789abcdef")
     settings = PageSettings(listen="127.0.0.1:0", token_file=token)
     with few_descriptors():
-        async with PageServer(settings, Hub(), Past(), patient=False) as server:
+        async with PageServer(settings, PackTopics(), HistoryQuery(), patient=False) as server:
             await _answered_under_attack(server, tmp_path)
 
 
@@ -45,7 +45,7 @@ async def _answered_under_attack(server: PageServer, tmp_path: Path) -> None:
 
 async def test_a_client_without_a_complete_header_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(of_listener, "HEADER_S", 0.05)
-    async with PageServer(PageSettings(listen="127.0.0.1:0"), Hub(), Past(), patient=False) as server:
+    async with PageServer(PageSettings(listen="127.0.0.1:0"), PackTopics(), HistoryQuery(), patient=False) as server:
         port = int(server.url.rsplit(":", 1)[1].strip("/"))
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(b"GET / HTTP/1.1\r\nHost: loc")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.process.systemd import Notifier
+from bms_estimator.process.systemd import SystemdNotifier
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def heard(systemd: socket.socket) -> list[str]:
 def test_several_packs_are_ready_with_the_last_and_alive_only_while_each_is(
     tmp_path: Path, systemd: socket.socket
 ) -> None:
-    notifier = Notifier(["a", "b"], {"NOTIFY_SOCKET": str(tmp_path / "notify")})
+    notifier = SystemdNotifier(["a", "b"], {"NOTIFY_SOCKET": str(tmp_path / "notify")})
     notifier.ready("a")
     assert heard(systemd) == []
     notifier.ready("b")
@@ -45,5 +45,5 @@ def test_several_packs_are_ready_with_the_last_and_alive_only_while_each_is(
 
 def test_a_watchdog_that_waits_for_another_process_is_not_ours() -> None:
     ours = {"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())}
-    assert Notifier(["a"], ours).watchdog_s == 3.0
-    assert Notifier(["a"], ours | {"WATCHDOG_PID": "1"}).watchdog_s == 0.0
+    assert SystemdNotifier(["a"], ours).watchdog_s == 3.0
+    assert SystemdNotifier(["a"], ours | {"WATCHDOG_PID": "1"}).watchdog_s == 0.0

@@ -10,8 +10,8 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.experiment import Experiment, Recorded
 from bms_estimator.reports.experiment_figures import FIGURES
-from bms_estimator.reports.procedure import Capture, Kind, Protocol, kind_of, printed_bounds
-from bms_estimator.reports.report_items import Verdict
+from bms_estimator.reports.procedure import Capture, Kind, Procedure, kind_of, printed_bounds
+from bms_estimator.reports.report_items import Reproduction
 from bms_estimator.reports.thesis_claims import CLAIMS, Claim, Result, claim
 from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks import chapter5
@@ -35,7 +35,7 @@ def samples():
 
 def on(samples):
     captures = [Capture(name, kind_of(name, block, CAPACITY_AH), block) for name, block in samples.items()]
-    return Protocol(TRUTH, captures, 1e-3)
+    return Procedure(TRUTH, captures, 1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def leaf(data):
     """A capture with rests, and a 1C discharge cut out of one that charges as well."""
     hppc, cc = (load_capture(data / "leaf" / f"{name}.csv.gz").rows for name in ("hppc_25c_from_full", "cc_1c"))
     captures = [Capture("hppc", Kind.RELAXATION, hppc), Capture("cc", Kind.CONSTANT, chapter5.discharge(cc, 0.3))]
-    return Protocol(load_cell("leaf"), captures, 1e-3)
+    return Procedure(load_cell("leaf"), captures, 1e-3)
 
 
 @pytest.mark.parametrize("noise_a", [0.0, 0.01, 0.05])
@@ -131,7 +131,7 @@ def test_bounds_are_the_printed_ones_scaled_by_cells_and_capacity():
     assert scaled["a5"] == pack.adaptation["a5"]
     own = TRUTH.model_copy(update={"adaptation": {"a3": pack.adaptation["a3"]}})
     captures = [Capture(name, kind, np.empty(0)) for name, kind in SERVES.items()]
-    assert Protocol(own, captures, 1e-3).cell.bounds(3) == pack.adaptation["a3"]  # a cell file's own come first
+    assert Procedure(own, captures, 1e-3).cell.bounds(3) == pack.adaptation["a3"]  # a cell file's own come first
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_bounds_are_the_printed_ones_scaled_by_cells_and_capacity():
 def test_what_is_missing_is_named(samples, missing, words):
     captures = [Capture(name, SERVES[name], block) for name, block in samples.items() if name not in missing]
     with pytest.raises(UserError, match=rf"needs a {words}; given: .*\)"):
-        Protocol(TRUTH, captures, 1e-3)
+        Procedure(TRUTH, captures, 1e-3)
 
 
 def test_a_lone_constant_load_validates_and_step_2_runs_on_the_relaxation_test(leaf):
@@ -172,8 +172,8 @@ def test_leaf_figures(leaf):
 
 def test_leaf_verdicts(leaf):
     found = {key: claim(key, [leaf]).verdict for key in CLAIMS}
-    fails, none = Verdict.CLAIM_FAILS, Verdict.NO_DATA
-    assert list(found.values()) == [fails, fails, none, none, fails, fails, Verdict.CLAIM_HOLDS, fails]
+    fails, none = Reproduction.CLAIM_FAILS, Reproduction.NO_DATA
+    assert list(found.values()) == [fails, fails, none, none, fails, fails, Reproduction.CLAIM_HOLDS, fails]
 
 
 def test_a_relaxation_test_that_serves_two_cells_counts_for_each(leaf):
@@ -191,7 +191,7 @@ def test_dynamic_against_static_is_their_ratio(leaf):
 
 
 @pytest.mark.parametrize(
-    ("met", "verdict"), [(0, Verdict.CLAIM_FAILS), (2, Verdict.CLAIM_FAILS), (3, Verdict.CLAIM_HOLDS)]
+    ("met", "verdict"), [(0, Reproduction.CLAIM_FAILS), (2, Reproduction.CLAIM_FAILS), (3, Reproduction.CLAIM_HOLDS)]
 )
 def test_a_claim_holds_when_it_is_met_on_more_than_half(met, verdict):
     results = tuple(Result(f"load {i}", 1.0 if i < met else 2.0, 1.5) for i in range(4))

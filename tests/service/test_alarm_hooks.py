@@ -17,8 +17,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, HookHealth
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import alarm_hooks
-from bms_estimator.service.alarm_hooks import Hooks, unusable
-from bms_estimator.service.pack_service import serve
+from bms_estimator.service.alarm_hooks import AlarmHooks, unusable
+from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.virtual_adc import Reading
@@ -44,9 +44,9 @@ CLEARED = RAISED.model_copy(update={"active": False, "since": None, "value": Non
 
 
 @asynccontextmanager
-async def hooks(*told: dict[str, Any], **edges: Any) -> AsyncIterator[Hooks]:
+async def hooks(*told: dict[str, Any], **edges: Any) -> AsyncIterator[AlarmHooks]:
     options = {"say": None, "switch": None} | edges
-    async with Hooks([AlarmHook.model_validate(each) for each in told], "pack", **options) as made:
+    async with AlarmHooks([AlarmHook.model_validate(each) for each in told], "pack", **options) as made:
         yield made
 
 
@@ -70,7 +70,7 @@ async def until(path: Path, lines: int) -> list[str]:
     return said
 
 
-async def until_health(made: Hooks, fits: Callable[[HookHealth], bool]) -> HookHealth:
+async def until_health(made: AlarmHooks, fits: Callable[[HookHealth], bool]) -> HookHealth:
     async with asyncio.timeout(LONG_S):
         while (health := made.health) is None or not fits(health):  # noqa: ASYNC110 - as above
             await asyncio.sleep(0.01)
@@ -397,7 +397,7 @@ async def test_a_dry_run_says_what_would_be_done_and_does_nothing(tmp_path: Path
 )
 def test_a_hook_that_needs_what_is_not_there_is_refused_at_the_start(told: dict[str, Any], reason: str) -> None:
     with pytest.raises(UserError, match=reason):
-        Hooks([AlarmHook.model_validate(told)], "pack", None, None)
+        AlarmHooks([AlarmHook.model_validate(told)], "pack", None, None)
 
 
 async def test_an_over_current_cuts_the_load_by_the_relay_is_published_and_acknowledged(
@@ -423,7 +423,7 @@ async def test_an_over_current_cuts_the_load_by_the_relay_is_published_and_ackno
     async def served() -> AsyncIterator[None]:
         stop = asyncio.Event()
         settings = Settings.model_validate(tables | {"sensor": {"port": board.path}})
-        task = asyncio.create_task(serve(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
+        task = asyncio.create_task(run_pack_service(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
         try:
             yield
         finally:
@@ -484,7 +484,7 @@ async def test_a_lost_temperature_sensor_takes_the_load_off_and_a_hook_that_cann
         running = asyncio.create_task(board.run())
         async with Listener(broker) as live:
             settings = Settings.model_validate(tables | {"sensor": {"port": board.path}})
-            service = asyncio.create_task(serve(settings, cell, stop=stop, folder=tmp_path))
+            service = asyncio.create_task(run_pack_service(settings, cell, stop=stop, folder=tmp_path))
             await live.wait_json("bms/pack/alarm/over_temperature", lambda alarm: alarm["watched"])
             await relay(board, high=False)
             temperature_c = math.nan

@@ -14,10 +14,10 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads import Health, Snapshot
 from bms_estimator.protocols.firmware.messages import MODULUS, Hello, SampleMessage
-from bms_estimator.service.live_loop import run_live
+from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.serial_line import Line
@@ -82,9 +82,9 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
         publish=PublishSettings(rate_hz=10.0),
     )
     clock = SkippingClock()
-    board = SerialBoard(settings.sensor, first_retry_s=0.05, silent_s=0.3, monotonic=clock)
+    board = SerialSource(settings.sensor, first_retry_s=0.05, silent_s=0.3, monotonic=clock)
     sink, stop = Collector(), asyncio.Event()
-    task = asyncio.create_task(run_live(settings, CELL, source=board, sinks=[sink], stop=stop))
+    task = asyncio.create_task(run_estimation_loop(settings, CELL, source=board, sinks=[sink], stop=stop))
     async with asyncio.timeout(LONG_S):
         while "no frame yet" not in (board.message or ""):  # noqa: ASYNC110 - the board has no event for it
             await asyncio.sleep(0.01)

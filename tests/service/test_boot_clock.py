@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, Ledger
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.model.cell import load_cell
-from bms_estimator.process.boot_clock import Moment, moment, synchronised
+from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp, synchronised
 from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.lifetime_totals import new_totals
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()
-SAVED = Moment(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, boot="one")
+SAVED = BootTimestamp(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, boot="one")
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_a_checkpoint_is_as_old_as_the_clock_that_can_be_trusted_says(
 ) -> None:
     estimator = new_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record, Ledger(0, new_totals(0.0)))
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record, RunCounters(0, new_totals(0.0)))
     later = replace(SAVED, **changes)
     assert CheckpointFile(tmp_path, SETTINGS, CELL, lambda: later).load().unseen_s == unseen_s
 
@@ -51,9 +51,9 @@ def test_a_clock_is_right_when_the_kernel_says_so_whoever_sets_it() -> None:
 
 def test_the_machine_tells_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("BMS_BOOT_ID", raising=False)
-    first, second = moment(), moment()
+    first, second = boot_timestamp(), boot_timestamp()
     assert first.boot == second.boot
     assert len(first.boot) == 32
     assert 0.0 <= second.since(first) < math.inf
     monkeypatch.setenv("BMS_BOOT_ID", "0123")
-    assert moment().boot == "0123"
+    assert boot_timestamp().boot == "0123"

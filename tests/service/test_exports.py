@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.service.pack_service import serve
+from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
 from tests.free_port import free_port
 from tests.influxdb import INFLUXD, InfluxDB
@@ -32,7 +32,7 @@ async def test_what_a_board_measures_reaches_both(line: Line, tmp_path: Path) ->
     )
     line.plug()
     stop = asyncio.Event()
-    serving = asyncio.create_task(serve(settings, load_cell("ncr18650"), stop=stop))
+    serving = asyncio.create_task(run_pack_service(settings, load_cell("ncr18650"), stop=stop))
     try:
         async with asyncio.timeout(LONG_S):
             while "bms_voltage_volts{" not in await asyncio.to_thread(scraped, listen):

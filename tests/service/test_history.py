@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, LATER, CheckpointFile, Ledger
+from bms_estimator.checkpoint.checkpoint_file import FORMAT, LATER, CheckpointFile, RunCounters
 from bms_estimator.model.payloads import Totals
-from bms_estimator.process.boot_clock import Moment
+from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.service import checkpoint_writer
-from bms_estimator.service.live_loop import new_estimator, run_live
+from bms_estimator.service.live_loop import new_estimator, run_estimation_loop
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import gap_lengths
 from tests.checkpoint.test_checkpoint import CELL, NEW, SETTINGS, a_used_pack, edited, often, ran, saved_as
 from tests.collector import Collector
@@ -29,8 +29,8 @@ OLD_FILES = {4: 0.5762, 5: 0.4149, 6: 0.4132}
 """SOC by format: 4 is that of 0.1.0."""
 
 
-def at(hours: float) -> Moment:
-    return Moment(1.7e9 + 3600.0 * hours, synchronised=True, boot_s=5000.0 + 3600.0 * hours, boot="one")
+def at(hours: float) -> BootTimestamp:
+    return BootTimestamp(1.7e9 + 3600.0 * hours, synchronised=True, boot_s=5000.0 + 3600.0 * hours, boot="one")
 
 
 async def run_at(hours: float, folder: Path, *rows: tuple[float, float, float], settings: Settings = SETTINGS) -> Any:
@@ -39,7 +39,9 @@ async def run_at(hours: float, folder: Path, *rows: tuple[float, float, float], 
     source.give(*rows)
     source.finish()
     checkpoint = CheckpointFile(folder, settings, CELL, lambda: at(hours))
-    running = run_live(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    running = run_estimation_loop(
+        settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint
+    )
     return await asyncio.wait_for(running, LONG_S), sink.snapshots[-1]
 
 
@@ -65,10 +67,12 @@ async def test_what_has_flowed_outlives_restarts(tmp_path: Path) -> None:
     async with often(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(4.0))) as (source, sink, _):
         source.give(hour[0])
         told = (await sink.until(lambda s: s.estimate is not None)).estimate
-    assert Flow.of(discharged.health.total) == pytest.approx((2.0, 0.0, 7.6e-3, 0.0))
-    assert Flow.of(charged.health.total) == pytest.approx((2.0, 1.0, 7.6e-3, 3.8e-3))
+    assert ChargeEnergy.of(discharged.health.total) == pytest.approx((2.0, 0.0, 7.6e-3, 0.0))
+    assert ChargeEnergy.of(charged.health.total) == pytest.approx((2.0, 1.0, 7.6e-3, 3.8e-3))
     assert told
-    assert Flow(*(getattr(told, name) for name in Flow._fields)) == Flow.of(charged.health.total)
+    assert ChargeEnergy(*(getattr(told, name) for name in ChargeEnergy._fields)) == ChargeEnergy.of(
+        charged.health.total
+    )
     assert told.equivalent_cycles == pytest.approx(2.0 / CELL.cell.capacity_ah)
 
 
@@ -76,7 +80,7 @@ async def test_what_has_flowed_is_told_once_it_is_on_disk_so_that_a_kill_sets_no
     release = threading.Event()
 
     class SlowDisk(CheckpointFile):
-        def save(self, state: Any, ledger: Ledger) -> None:
+        def save(self, state: Any, ledger: RunCounters) -> None:
             assert release.wait(LONG_S)
             super().save(state, ledger)
 
@@ -105,7 +109,7 @@ async def killed(folder: Path, *, with_a_sample: bool) -> None:
     """A run that leaves no word: its last save is not made."""
 
     class Killed(CheckpointFile):
-        def _write(self, content: dict[str, Any], ledger: Ledger) -> None:
+        def _write(self, content: dict[str, Any], ledger: RunCounters) -> None:
             if not ledger.clean:
                 super()._write(content, ledger)
                 written.set()
@@ -152,7 +156,9 @@ async def test_a_checkpoint_that_is_older_than_configured_is_refused_and_without
         assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: at(hours)).load().reason == reason
 
 
-COUNTED = Ledger(6, Totals(since="2023-11-14T22:13:20Z", crashes=2, samples={"samples": 70}, unseen_s=30.0), clean=True)
+COUNTED = RunCounters(
+    6, Totals(since="2023-11-14T22:13:20Z", crashes=2, samples={"samples": 70}, unseen_s=30.0), clean=True
+)
 
 
 async def test_what_is_counted_goes_on_over_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:

@@ -17,13 +17,13 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Estimate
 from bms_estimator.model.sample import SAMPLE, SampleStatus
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.process.systemd import Notifier
-from bms_estimator.service.live_loop import LAG_STEP_S, new_estimator, run_live
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.service.live_loop import LAG_STEP_S, new_estimator, run_estimation_loop
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.telemetry.rest_detector import WATCHED_S
 from tests.collector import Collector
 from tests.patience import LONG_S
@@ -37,10 +37,10 @@ SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), publish=PublishSettings(
 class Run:
     source: ScriptedSource
     sink: Collector
-    requests: Requests
+    requests: RequestDispatcher
     task: asyncio.Task[Estimator]
     stop: asyncio.Event
-    delivery: Delivery
+    delivery: DeliveryStats
 
     async def ask(self, name: str, **arguments: Any) -> Any:
         """The data of the response; UserError where there is an error."""
@@ -58,10 +58,12 @@ class Run:
 
 @asynccontextmanager
 async def running(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
-    source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), Delivery()
-    requests = Requests(delivery, ("set_soc", "current_zero"))
+    source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), DeliveryStats()
+    requests = RequestDispatcher(delivery, ("set_soc", "current_zero"))
     edges = {"requests": requests, "delivery": delivery}
-    task = asyncio.create_task(run_live(settings, cell, source=source, sinks=[sink], stop=stop, **edges, **options))
+    task = asyncio.create_task(
+        run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, **edges, **options)
+    )
     try:
         yield Run(source, sink, requests, task, stop, delivery)
     finally:
@@ -354,7 +356,7 @@ async def test_systemd_hears_ready_watchdog_and_stopping(tmp_path: Path) -> None
                 heard.append((await asyncio.get_running_loop().sock_recv(systemd, 4096)).decode())
 
         async with asyncio.timeout(LONG_S):
-            async with running(notifier=Notifier([SETTINGS.pack.name], environment)) as run:
+            async with running(notifier=SystemdNotifier([SETTINGS.pack.name], environment)) as run:
                 await hear("WATCHDOG=1", times=3)
                 await run.end()
             await hear("STOPPING=1", times=1)
@@ -371,7 +373,7 @@ async def test_a_source_that_never_waits_does_not_starve_the_sinks() -> None:
                 yield block
 
     stop, sink = asyncio.Event(), Collector()
-    running = asyncio.create_task(run_live(SETTINGS, CELL, source=Endless(), sinks=[sink], stop=stop))
+    running = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, source=Endless(), sinks=[sink], stop=stop))
     await sink.until(lambda _: len(estimates(sink)) >= 3)
     stop.set()
     await asyncio.wait_for(running, LONG_S)
@@ -384,7 +386,7 @@ async def test_a_fault_of_the_source_is_raised_not_swallowed() -> None:
             yield
 
     with pytest.raises(ZeroDivisionError):
-        await run_live(SETTINGS, CELL, source=Broken(), sinks=[], stop=asyncio.Event())
+        await run_estimation_loop(SETTINGS, CELL, source=Broken(), sinks=[], stop=asyncio.Event())
 
 
 async def test_how_long_something_blocked_the_loop_is_published() -> None:

@@ -10,13 +10,13 @@ import aiomqtt
 from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.service.pack_service import serve
+from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import header_of
-from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
-from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.factory import open_line_source
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S, end
@@ -64,9 +64,9 @@ async def publishing(broker: Broker, voltage: str, current: str) -> AsyncIterato
 
 
 @contextlib.asynccontextmanager
-async def serving(told: Settings, tap: Recording | None = None) -> AsyncIterator[None]:
+async def serving(told: Settings, tap: CaptureRecorder | None = None) -> AsyncIterator[None]:
     stop = asyncio.Event()
-    service = asyncio.create_task(serve(told, load_cell("lfp", 100.0).pack(16, 1), stop=stop, tap=tap))
+    service = asyncio.create_task(run_pack_service(told, load_cell("lfp", 100.0).pack(16, 1), stop=stop, tap=tap))
     try:
         yield
     finally:
@@ -77,7 +77,7 @@ async def serving(told: Settings, tap: Recording | None = None) -> AsyncIterator
 async def test_what_a_node_publishes_is_estimated_through_all_that_happens(broker: Broker, tmp_path: Path) -> None:
     await publish(broker, "40.00", "99.0")  # of yesterday: the broker keeps it
     told, path = settings(broker), tmp_path / "heard.raw"
-    with Recording(path, header_of(told.sensor, told.source)) as recording:
+    with CaptureRecorder(path, header_of(told.sensor, told.source)) as recording:
         async with serving(told, recording):
             async with Listener(broker, "bms/#") as listener:
                 await estimated(broker, listener)
@@ -146,7 +146,7 @@ async def test_a_publisher_that_must_be_asked_is_asked(broker: Broker) -> None:
 
 async def test_the_next_broker_is_tried_and_the_one_that_is_not_there_is_named(broker: Broker) -> None:
     dead = f"mqtt://127.0.0.1:{free_port()}"
-    source = open_reports(settings(broker, url=[dead, broker.url]))
+    source = open_line_source(settings(broker, url=[dead, broker.url]))
     assert source
     with capture_logs() as lines:
         async with asyncio.timeout(LONG_S), source, publishing(broker, "53.00", "-12.5"):

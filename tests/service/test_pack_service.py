@@ -1,4 +1,4 @@
-"""``serve``: what its log says before the first sample, and where the state goes."""
+"""``run_pack_service``: what its log says before the first sample, and where the state goes."""
 
 import asyncio
 import re
@@ -11,8 +11,8 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.multi_pack_service import serve_several
-from bms_estimator.service.pack_service import serve
-from bms_estimator.service.settings_reload import Reload
+from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.service.settings_reload import SettingsReload
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from tests.patience import LONG_S
@@ -23,7 +23,7 @@ async def test_the_log_says_what_of_the_settings_cannot_be():
     stop = asyncio.Event()
     stop.set()
     with capture_logs() as lines:
-        await serve(settings, load_cell("ncr18650").pack(14, 1), stop=stop)
+        await run_pack_service(settings, load_cell("ncr18650").pack(14, 1), stop=stop)
     said = [line["reason"] for line in lines if line["event"] == "a setting that cannot be"]
     assert len(said) == 2
     assert "14 in series of 3 Ah" in said[0]
@@ -50,7 +50,7 @@ async def test_one_of_several_packs_that_cannot_be_served_is_named(
     for name, port in zip(names, ports, strict=True):
         tables = {"pack": {"name": name}, "sensor": {"port": port}} | ({"mqtt": mqtt} if mqtt and name == "b" else {})
         packs.append((Settings.model_validate(tables), cell))
-    reloads = [Reload(settings, lambda settings=settings: settings) for settings, _ in packs]
+    reloads = [SettingsReload(settings, lambda settings=settings: settings) for settings, _ in packs]
     with pytest.raises(UserError, match=f"^{re.escape(said)}"):
         await asyncio.wait_for(serve_several(packs, reloads), LONG_S)
 
@@ -60,7 +60,7 @@ async def test_packs_without_a_serial_line_need_no_port_of_their_own(state_home:
     sources = {"a": source, "b": source | {"password_file": "/none"}}
     tables = [{"pack": {"name": name}, "source": table} for name, table in sources.items()]
     packs = [(Settings.model_validate(table), load_cell("chen_mora")) for table in tables]
-    reloads = [Reload(settings, lambda settings=settings: settings) for settings, _ in packs]
+    reloads = [SettingsReload(settings, lambda settings=settings: settings) for settings, _ in packs]
     with pytest.raises(UserError, match=r"^b: source.password_file = /none: cannot be read"):
         await asyncio.wait_for(serve_several(packs, reloads), LONG_S)
 

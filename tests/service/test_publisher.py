@@ -5,7 +5,7 @@ from structlog.testing import capture_logs
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from tests.scripted_source import ScriptedSource
@@ -18,7 +18,12 @@ def test_a_suspicion_is_logged_when_it_is_raised_and_when_it_is_cleared_whatever
     clock = Clock(monotonic=lambda: now_s)
     publisher = Publisher(Settings(), cell, estimator, source=ScriptedSource(), sinks=[], clock=clock)
     said = []
-    for temperature_c, suspects in ((41.0, Suspect.TEMPERATURE), (42.0, Suspect.TEMPERATURE), (30.0, 0), (30.0, 0)):
+    for temperature_c, suspects in (
+        (41.0, InputFault.TEMPERATURE),
+        (42.0, InputFault.TEMPERATURE),
+        (30.0, 0),
+        (30.0, 0),
+    ):
         now_s += 2.0
         estimator.record["checks"]["suspects"] = int(suspects)
         estimator.record["filter"]["temperature_c"] = temperature_c

@@ -13,13 +13,13 @@ from structlog.testing import capture_logs
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.cli.main import main
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.process.systemd import Notifier
-from bms_estimator.service.live_loop import run_live
-from bms_estimator.service.settings_reload import Reload, reload_on_hangup
+from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.settings_reload import SettingsReload, reload_on_hangup
 from bms_estimator.settings.pack import Settings, load_settings
-from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, edited
 from tests.collector import Collector
 from tests.patience import LONG_S
@@ -33,7 +33,7 @@ def logged(lines: list[Any], event: str) -> list[dict[str, Any]]:
 async def test_what_cannot_be_changed_is_said_each_time_and_what_can_is_changed_once() -> None:
     now = edited("publish", rate_hz=2.0).model_copy(update={"log": SETTINGS.log.model_copy(update={"level": "error"})})
     now = now.model_copy(update={"pack": now.pack.model_copy(update={"series": 2})})
-    reload, taken = Reload(SETTINGS, lambda: now), []
+    reload, taken = SettingsReload(SETTINGS, lambda: now), []
     reload.offer("publish.rate_hz", taken.append)
     with capture_logs() as lines:
         assert await reload.reload() == ["pack.series", "log.level"]
@@ -46,7 +46,9 @@ async def test_what_cannot_be_changed_is_said_each_time_and_what_can_is_changed_
 
 
 async def test_a_section_that_is_new_needs_a_restart() -> None:
-    reload = Reload(SETTINGS, lambda: Settings.model_validate({**SETTINGS.model_dump(by_alias=True), "mqtt": {}}))
+    reload = SettingsReload(
+        SETTINGS, lambda: Settings.model_validate({**SETTINGS.model_dump(by_alias=True), "mqtt": {}})
+    )
     assert "mqtt.url" in await reload.reload()
 
 
@@ -54,7 +56,7 @@ async def test_a_file_that_is_wrong_changes_nothing() -> None:
     def read() -> Settings:
         raise UserError("pack.toml: pack.series = 0")
 
-    reload = Reload(SETTINGS, read)
+    reload = SettingsReload(SETTINGS, read)
     with capture_logs() as lines:
         assert await reload.reload() == []
     (line,) = lines
@@ -65,7 +67,7 @@ async def test_a_file_that_hangs_ends_no_reload_after_it(tmp_path: Path, monkeyp
     monkeypatch.setattr("bms_estimator.service.settings_reload.HUNG_S", 0.1)
     file = tmp_path / "pack.toml"
     os.mkfifo(file)  # whoever opens it for reading waits for a writer
-    reload = Reload(SETTINGS, lambda: load_settings(file))
+    reload = SettingsReload(SETTINGS, lambda: load_settings(file))
     with capture_logs() as lines:
         assert await asyncio.wait_for(reload.reload(), LONG_S) == []
     assert "nothing could be read in 0.1 s" in lines[0]["reason"]
@@ -76,7 +78,7 @@ async def test_a_file_that_hangs_ends_no_reload_after_it(tmp_path: Path, monkeyp
 
 
 def test_commands_that_are_allowed_may_change() -> None:
-    requests = Requests(Delivery(), ["set_soc"])
+    requests = RequestDispatcher(DeliveryStats(), ["set_soc"])
     requests.allow([])
     assert b"not allowed" in (asyncio.run(requests.respond("set_soc", b"")) or b"")
 
@@ -86,13 +88,13 @@ async def test_a_running_service_takes_another_rate_at_a_signal_and_tells_system
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.setblocking(False)
-        notifier = Notifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(tmp_path / "notify")})
-        reload, source, sink = Reload(SETTINGS, lambda: now), ScriptedSource(), Collector()
+        notifier = SystemdNotifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(tmp_path / "notify")})
+        reload, source, sink = SettingsReload(SETTINGS, lambda: now), ScriptedSource(), Collector()
         reload_on_hangup([reload])
         stop = stop_on_signal()
         edges = {"source": source, "sinks": [sink], "stop": stop, "reload": reload, "notifier": notifier}
         file = CheckpointFile(tmp_path, SETTINGS, CELL)
-        task = asyncio.create_task(run_live(SETTINGS, CELL, checkpoint=file, **edges))
+        task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, checkpoint=file, **edges))
         await sink.until(lambda s: s.info.publish_rate_hz == 10.0)
         heard: list[str] = []
         now = edited("publish", rate_hz=5.0)
@@ -112,7 +114,7 @@ async def test_a_running_service_takes_another_rate_at_a_signal_and_tells_system
 def test_a_hangup_before_samples_are_taken_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    async def serve(*_: Any, reload: Reload, **__: Any) -> None:
+    async def serve(*_: Any, reload: SettingsReload, **__: Any) -> None:
         asked.append(reload.asked.is_set())
 
     monkeypatch.setattr("bms_estimator.cli.live.run.load_kernels", lambda: os.kill(os.getpid(), signal.SIGHUP))

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.process.systemd import Notifier
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service import publisher
 from bms_estimator.service.latency import Latency
-from bms_estimator.service.live_loop import run_live
+from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.service.pack_service import recording_health
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import header_of
-from bms_estimator.sources.captures.recorder import Recording
-from bms_estimator.sources.serial.serial_port import Line
-from bms_estimator.sources.serial.serial_source import SerialBoard
-from bms_estimator.sources.source import Pulse
+from bms_estimator.sources.captures.recorder import CaptureRecorder
+from bms_estimator.sources.serial.serial_port import SerialPort
+from bms_estimator.sources.serial.serial_source import SerialSource
+from bms_estimator.sources.source import SourceHealth
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS
 from tests.collector import Collector
 from tests.patience import LONG_S
@@ -31,7 +31,7 @@ class Systemd:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
         self._socket.setblocking(False)
-        self.notifier = Notifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "30000"})
+        self.notifier = SystemdNotifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "30000"})
 
     async def hear(self, wanted: str) -> str:
         """Wait for a state that begins so."""
@@ -61,12 +61,12 @@ def systemd(tmp_path: Path):
 
 
 async def test_a_source_that_hangs_is_not_covered_by_the_loop_that_turns(systemd: Systemd) -> None:
-    pulse = Pulse(0.0, 0.0, 0)
+    pulse = SourceHealth(0.0, 0.0, 0)
     source, sink = ScriptedSource(), Collector()
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
-    task = asyncio.create_task(run_live(SETTINGS, CELL, **edges, pulse=lambda: pulse))
+    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges, pulse=lambda: pulse))
     await systemd.hear("WATCHDOG=1")  # nothing comes, but somebody tries
-    pulse = Pulse(publisher.UNTENDED_S + 1.0, 0.0, 0)
+    pulse = SourceHealth(publisher.UNTENDED_S + 1.0, 0.0, 0)
     for _ in range(3):
         await sink.until(lambda _: True, skip=len(sink.snapshots))
     systemd.heard()
@@ -82,20 +82,20 @@ async def test_a_source_that_hangs_is_not_covered_by_the_loop_that_turns(systemd
 async def test_the_task_of_a_board_tells_whether_it_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     now_s, opened = 0.0, asyncio.Event()
 
-    async def hang(_: Line) -> str:
+    async def hang(_: SerialPort) -> str:
         opened.set()
         await asyncio.Event().wait()
         raise AssertionError
 
     sensor = SensorSettings(port=str(tmp_path / "none"))
-    async with SerialBoard(sensor, monotonic=lambda: now_s, first_retry_s=0.001) as board:
+    async with SerialSource(sensor, monotonic=lambda: now_s, first_retry_s=0.001) as board:
         for _ in range(3):
             now_s += 10.0
             async with asyncio.timeout(LONG_S):
                 while board.pulse().untended_s > 0.0:  # noqa: ASYNC110 - the board tells nobody
                     await asyncio.sleep(0.001)
-    monkeypatch.setattr(Line, "open", hang)
-    async with SerialBoard(sensor, monotonic=lambda: now_s) as board:
+    monkeypatch.setattr(SerialPort, "open", hang)
+    async with SerialSource(sensor, monotonic=lambda: now_s) as board:
         await asyncio.wait_for(opened.wait(), LONG_S)
         now_s += 100.0
         assert board.pulse().untended_s == 100.0
@@ -104,7 +104,7 @@ async def test_the_task_of_a_board_tells_whether_it_hangs(monkeypatch: pytest.Mo
 async def test_systemctl_status_shows_the_soc_and_why_samples_do_not_come(systemd: Systemd) -> None:
     source, sink = ScriptedSource(), Collector()
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
-    task = asyncio.create_task(run_live(SETTINGS, CELL, **edges))
+    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **edges))
     assert await systemd.hear("READY=1") == "READY=1\nSTATUS=estimating pack"
     source.message = "waiting for /dev/none: it does not exist"
     await systemd.hear("STATUS=estimating pack: no samples: ")
@@ -120,7 +120,7 @@ async def test_health_tells_how_long_bytes_wait_and_how_many_reads() -> None:
     source, sink = ScriptedSource(), Collector()
     late_s = [0.3]
     edges = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
-    live = run_live(SETTINGS, CELL, **edges, pulse=lambda: Pulse(0.0, late_s[0], 7))
+    live = run_estimation_loop(SETTINGS, CELL, **edges, pulse=lambda: SourceHealth(0.0, late_s[0], 7))
     task = asyncio.create_task(live)
     first = await sink.until(lambda _: True)
     assert first.health.loop.latency_p50_s is None
@@ -149,7 +149,7 @@ def test_percentiles_of_the_latency_are_right_to_a_fifth() -> None:
 
 def test_health_tells_of_a_recording(tmp_path: Path) -> None:
     assert recording_health(None) is None
-    with Recording(tmp_path / "raw", header_of(SensorSettings())) as recording:
+    with CaptureRecorder(tmp_path / "raw", header_of(SensorSettings())) as recording:
         recording.write(0.0, b"12345")
         on = recording_health(recording)
         assert on

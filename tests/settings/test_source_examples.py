@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.settings.mqtt_profiles import PROFILES
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.factory import make_bringer
+from bms_estimator.sources.factory import make_line_producer
 
 DOCS = Path(__file__).parents[2] / "docs"
 EXAMPLES = [
@@ -24,7 +24,7 @@ def test_an_example_is_accepted(document: str, text: str) -> None:
     settings = Settings.model_validate(tables)
     assert settings.model_dump(include={"source"}) or settings.sensor.model_fields_set
     if settings.source is not None and settings.source.kind in ("mqtt", "linux"):
-        assert make_bringer(Settings.model_validate({"mqtt": {}} | tables))
+        assert make_line_producer(Settings.model_validate({"mqtt": {}} | tables))
 
 
 def test_every_profile_stands_in_the_document() -> None:

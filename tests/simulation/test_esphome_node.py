@@ -8,7 +8,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.virtual_adc import Reading
-from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.factory import open_line_source
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
@@ -17,7 +17,7 @@ async def test_what_the_node_publishes_is_heard_with_signs_and_cells(broker: Bro
     told = Settings.model_validate(
         {"source": {"kind": "mqtt", "url": broker.url, "profile": "esphome-jk", "prefix": "bms7"}}
     )
-    source = open_reports(told)
+    source = open_line_source(told)
     assert source
     pack = lambda time_s: Reading(12.5 if time_s > 0 else 0.0, 53.0, 21.5)  # noqa: E731 - a signal
     node = SimulatedNode(pack, cells=16, mqtt=MqttSettings(url=broker.url), prefix="bms7", speed=20.0)

@@ -15,9 +15,9 @@ from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SPREAD_V, BmsFault, SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.captures.raw_capture import header_of
-from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import LONG_S
 
 CELLS = 16
@@ -53,7 +53,7 @@ class Taken:
     def count(self) -> int:
         return sum(block.size for block in self.blocks)
 
-    async def take(self, source: SerialBoard) -> None:
+    async def take(self, source: SerialSource) -> None:
         async for block in source:
             self.blocks.append(block.copy())
             self.cells += source.cells.tolist()
@@ -70,12 +70,12 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 @contextlib.asynccontextmanager
-async def read(bms: SimulatedBms, protocol: str, tap: Recording) -> AsyncIterator[tuple[SerialBoard, Taken]]:
+async def read(bms: SimulatedBms, protocol: str, tap: CaptureRecorder) -> AsyncIterator[tuple[SerialSource, Taken]]:
     """The reader of the line of a BMS that answers."""
     with bms:
         sensor = SensorSettings.model_validate({"port": bms.path, "protocol": protocol})
         taken = Taken()
-        async with SerialBoard(sensor, tap=tap, first_retry_s=0.05, silent_s=0.5) as board:
+        async with SerialSource(sensor, tap=tap, first_retry_s=0.05, silent_s=0.5) as board:
             tasks = [asyncio.create_task(bms.run()), asyncio.create_task(taken.take(board))]
             try:
                 yield board, taken
@@ -94,7 +94,7 @@ async def test_it_is_read_recorded_and_replayed_to_the_same_bits_whatever_happen
     protocol, path = name.removesuffix("-pb"), tmp_path / "line.bms"
     bms = SimulatedBms(name, swinging, cells=CELLS)
     header = header_of(SensorSettings.model_validate({"protocol": protocol}))
-    with Recording(path, header) as recording:
+    with CaptureRecorder(path, header) as recording:
         async with read(bms, protocol, recording) as (board, taken):
             await taken.more(2)
             assert (board.message, board.counters["crc_errors"], board.counters["noise_bytes"]) == (None, 0, 0)

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 from bms_estimator.model.payloads import Snapshot
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.queue_sender import WINDOW
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.sinks.mqtt.requests import NAMES, Requests
+from bms_estimator.sinks.mqtt.requests import NAMES, RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import Listener
@@ -24,8 +24,8 @@ class Sink:
     """A sink for the pack, and what it counts; every request is answered with its name."""
 
     def __init__(self, url: str | tuple[str, ...], most_kept: int = 4, **options: Any) -> None:
-        self.delivery = Delivery()
-        self.requests = Requests(self.delivery, ["set_soc", "current_zero"])
+        self.delivery = DeliveryStats()
+        self.requests = RequestDispatcher(self.delivery, ["set_soc", "current_zero"])
         self.asked: list[str] = []
         for name in NAMES:
             self.requests.offer(name, self._handler(name))

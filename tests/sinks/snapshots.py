@@ -7,15 +7,15 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
 from bms_estimator.model.payloads import Alarm, LoopHealth, Snapshot
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import Flow
-from bms_estimator.telemetry.health import health_report
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.health import make_health_payload
 from bms_estimator.telemetry.lifetime_totals import new_totals
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
-from bms_estimator.telemetry.state import estimate_report, info_report
+from bms_estimator.telemetry.state import make_info_payload, make_state_payload
 
 NOW = 1_700_000_000.0
 
@@ -30,7 +30,7 @@ IDLE = LoopHealth(
 )
 
 
-def snapshot(sensor_message: str | None = None, delivery: Delivery | None = None) -> Snapshot:
+def snapshot(sensor_message: str | None = None, delivery: DeliveryStats | None = None) -> Snapshot:
     cell = load_cell("chen_mora")
     return _of(cell, Estimator(cell, identifier=None, initial_soc=0.5), 3.8, sensor_message, delivery)
 
@@ -49,7 +49,7 @@ def _of(
     estimator: Estimator,
     voltage_v: float,
     sensor_message: str | None = None,
-    delivery: Delivery | None = None,
+    delivery: DeliveryStats | None = None,
 ) -> Snapshot:
     """After two samples without a load."""
     window = Window()
@@ -59,9 +59,11 @@ def _of(
     summary = window.take()
     assert summary
     return Snapshot(
-        estimate_report(summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW, Flow(), _capacity_ah(cell)),
-        parameter_report(estimator, NOW),
-        health_report(
+        make_state_payload(
+            summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW, ChargeEnergy(), _capacity_ah(cell)
+        ),
+        make_parameters_payload(estimator, NOW),
+        make_health_payload(
             estimator.record[0],
             estimator.settings_record[0],
             {"frames_received": 2},
@@ -72,20 +74,20 @@ def _of(
             checkpoint="off",
             sensor_message=sensor_message,
             clock_ppm=None,
-            delivery=delivery or Delivery(),
+            delivery=delivery or DeliveryStats(),
             total=new_totals(NOW),
             unseen_s=None,
             loop=IDLE,
             recording=None,
         ),
-        info_report(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW, temperature_sensor=False),
+        make_info_payload(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW, temperature_sensor=False),
     )
 
 
 ONE = snapshot()
 STACK = of_fuel_cell()
 NOTHING_YET = ONE._replace(
-    estimate=None, parameters=parameter_report(Estimator(load_cell("chen_mora"), identifier=None), NOW)
+    estimate=None, parameters=make_parameters_payload(Estimator(load_cell("chen_mora"), identifier=None), NOW)
 )
 """Before the first sample."""
 

@@ -9,19 +9,19 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.protocols.base.reading import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import header_of
-from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
-from bms_estimator.sources.line_source import Bringer, NothingComesError, Reports
+from bms_estimator.sources.line_source import LineProducer, LineSource, SourceUnavailableError
 from tests.patience import LONG_S
 
 TEXT = SensorSettings(protocol="text")
 
 
-class Scripted(Bringer):
+class Scripted(LineProducer):
     """Each time it is begun it plays the next script; after the last it brings nothing more."""
 
     name = "a device"
@@ -40,7 +40,7 @@ class Scripted(Bringer):
             await asyncio.Event().wait()
 
 
-async def take(source: Reports, samples: int) -> SampleBlock:
+async def take(source: LineSource, samples: int) -> SampleBlock:
     """The next so many samples."""
     blocks: list[SampleBlock] = []
     async with asyncio.timeout(LONG_S):
@@ -51,7 +51,7 @@ async def take(source: Reports, samples: int) -> SampleBlock:
     return np.concatenate(blocks)
 
 
-async def message(source: Reports, wanted: str) -> None:
+async def message(source: LineSource, wanted: str) -> None:
     """Once this is what it says."""
     async with asyncio.timeout(LONG_S):
         while source.message != wanted:  # noqa: ASYNC110 - it has no event for it
@@ -59,12 +59,12 @@ async def message(source: Reports, wanted: str) -> None:
 
 
 def lines(*volts: float) -> list[bytes]:
-    return [CONNECTED, *(report_line(v, -2.0, temperature_c=21.5, cells_v=[v / 16, None]) for v in volts)]
+    return [CONNECTED, *(sample_json_line(v, -2.0, temperature_c=21.5, cells_v=[v / 16, None]) for v in volts)]
 
 
 async def test_what_is_lost_is_brought_anew_with_a_reason_and_counted():
-    script = [NothingComesError("no answer")], [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
-    source = Reports(Scripted(*script), TEXT, first_retry_s=0.001)
+    script = [SourceUnavailableError("no answer")], [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
+    source = LineSource(Scripted(*script), TEXT, first_retry_s=0.001)
     with capture_logs() as logged:
         async with source:
             block = await take(source, 2)
@@ -82,9 +82,9 @@ async def test_what_is_lost_is_brought_anew_with_a_reason_and_counted():
 async def test_a_recording_of_what_was_brought_replays_to_the_same_bits(tmp_path: Path):
     path = tmp_path / "brought.raw"
     sensor = SensorSettings(protocol="text", current_sign="charge_positive")
-    brought = [*lines(50.0, 51.0), b"junk\n", *lines(52.0)[1:], report_line(53.0, 1.25, time_s=7.5)]
-    with Recording(path, header_of(sensor)) as recording:
-        source = Reports(Scripted(brought), sensor, tap=recording)
+    brought = [*lines(50.0, 51.0), b"junk\n", *lines(52.0)[1:], sample_json_line(53.0, 1.25, time_s=7.5)]
+    with CaptureRecorder(path, header_of(sensor)) as recording:
+        source = LineSource(Scripted(brought), sensor, tap=recording)
         async with source:
             live = await take(source, 4)
     again = RawCapture(path)
@@ -101,7 +101,7 @@ async def test_it_says_that_nothing_comes_and_what_comes_instead():
         ([CONNECTED], "a device: connected, but silent"),
         (junk, 'a device: lines come that do not tell voltage and current; the first: \'{"voltage":"unavailable"}\''),
     ):
-        source = Reports(Scripted(script), TEXT, period_s=0.001, look_s=0.001)
+        source = LineSource(Scripted(script), TEXT, period_s=0.001, look_s=0.001)
         async with source:
             taking = asyncio.create_task(take(source, 1))
             await message(source, said)
@@ -109,7 +109,7 @@ async def test_it_says_that_nothing_comes_and_what_comes_instead():
 
 
 async def test_a_fault_of_ours_is_not_hidden():
-    source = Reports(Scripted([*lines(50.0), KeyError("ours")]), TEXT)
+    source = LineSource(Scripted([*lines(50.0), KeyError("ours")]), TEXT)
     async with source:
         with pytest.raises(KeyError, match="ours"):
             await take(source, 2)
@@ -118,7 +118,7 @@ async def test_a_fault_of_ours_is_not_hidden():
 @pytest.mark.parametrize("values", [(float("nan"), 1.0), (50.0, float("inf"))])
 def test_a_line_is_a_sample(values: tuple[float, float]):
     with pytest.raises(ValueError, match="no sample"):
-        report_line(*values)
+        sample_json_line(*values)
 
 
 def test_a_source_makes_the_sensor_what_its_lines_are_unless_told():

@@ -3,19 +3,19 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.store.number_ranges import Runs
+from bms_estimator.store.number_ranges import NumberRanges
 
 NUMBERS = st.sets(st.integers(-5, 30))
 
 
-def runs(numbers: set[int]) -> Runs:
-    made = Runs()
+def runs(numbers: set[int]) -> NumberRanges:
+    made = NumberRanges()
     for number in sorted(numbers):
         made.add(number)
     return made
 
 
-def numbers(of: Runs) -> set[int]:
+def numbers(of: NumberRanges) -> set[int]:
     found = [number for run in of for number in run]
     assert found == sorted(set(found))
     assert len(of) == len(found)

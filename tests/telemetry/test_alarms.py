@@ -15,13 +15,13 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.model.fuel_cell import load_fuel_cell
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
-from bms_estimator.settings.alarm_limits import Watched, out_of_range, watched
+from bms_estimator.settings.alarm_limits import AlarmDefinition, out_of_range, watched
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarm_state import AlarmState
-from bms_estimator.telemetry.alarms import Alarms, Counts
+from bms_estimator.telemetry.alarms import AlarmEvaluator, SampleCounts
 from tests.telemetry.alarm_captures import PACK, WALL_S, Line, Told, record, replayed, settings
 
 NAN = math.nan
@@ -146,7 +146,9 @@ def _values(state: AlarmState, *values: float, step_s: float = 1.0, begin_s: flo
 
 def _state(**told: Any) -> AlarmState:
     rule = {"severity": "warning", "unit": "V", "above": True, "limit": 10.0, "clear": 8.0, "delay_s": 2.0}
-    return AlarmState(Watched(**{"name": "pack_over_voltage", "clear_delay_s": 3.0, "latch": False, **rule, **told}))
+    return AlarmState(
+        AlarmDefinition(**{"name": "pack_over_voltage", "clear_delay_s": 3.0, "latch": False, **rule, **told})
+    )
 
 
 @pytest.mark.parametrize(
@@ -229,7 +231,7 @@ async def test_what_is_raised_outlives_a_restart_and_ends_where_it_would_have_en
 
 
 async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
-    alarms = Alarms(
+    alarms = AlarmEvaluator(
         watched(settings({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}}), PACK),
         0.2,
         5.0,
@@ -240,14 +242,14 @@ async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
     block["time_s"], block["current_a"], block["voltage_v"] = [0.0, 0.1], 25.0, 7.4
     block["status"] = [0, int(SampleStatus.CURRENT_SATURATED)]
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    alarms.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     (change,) = alarms.changes()
     assert (change.alarm.name, change.at_s, change.alarm.value) == ("discharge_over_current", 0.1, None)
     assert change.alarm.since == iso_utc(WALL_S)
 
 
 def test_silence_that_is_back_is_the_cause_of_a_latched_link_lost_again() -> None:
-    alarms = Alarms(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = AlarmEvaluator(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     kept = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
     alarms.restore(json.dumps({"link_lost": kept}))
     alarms.silent(1.0, WALL_S, "")
@@ -259,7 +261,7 @@ def test_silence_that_is_back_is_the_cause_of_a_latched_link_lost_again() -> Non
 
 
 def test_an_alarm_that_was_kept_with_a_value_that_is_none_is_refused() -> None:
-    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     kept = {"since_s": WALL_S, "value": math.inf, "gone": False, "acknowledged": False}
     with pytest.raises(ValueError, match="pack_over_voltage: value = inf"):
         alarms.restore(json.dumps({"pack_over_voltage": kept}))
@@ -359,11 +361,11 @@ async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None
 
 
 def test_without_samples_alarms_are_unwatched_until_some_come() -> None:
-    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     block = np.zeros(1, dtype=SAMPLE)
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    alarms.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     seen = [(9.9, True, None), (10.0, False, "no cable"), (0.1, True, None)]
     for silent_s, is_watched, reason in seen:
         alarms.silent(silent_s, WALL_S, "no cable")
@@ -374,17 +376,17 @@ def test_without_samples_alarms_are_unwatched_until_some_come() -> None:
 
 
 def test_an_alarm_that_silence_kept_from_being_watched_is_so_over_a_restart_until_samples_come() -> None:
-    before, after = (Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0) for _ in range(2))
+    before, after = (AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0) for _ in range(2))
     block = np.zeros(1, dtype=SAMPLE)
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     before.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    before.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    before.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     before.silent(10.0, WALL_S, "no cable")
     after.restore(before.kept)
     after.silent(0.0, WALL_S, "")
     assert "pack_over_voltage" in after.unwatched, "no sample has come since the restart"
     after.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    after.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    after.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     after.silent(0.0, WALL_S, "")
     changed = {change.alarm.name: change for change in after.changes()}
     assert (changed["pack_over_voltage"].turn, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
@@ -393,7 +395,7 @@ def test_an_alarm_that_silence_kept_from_being_watched_is_so_over_a_restart_unti
 
 
 def test_saved_quantities_that_are_damaged_are_refused() -> None:
-    alarms = Alarms(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = AlarmEvaluator(watched(settings(), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     with pytest.raises(ValueError, match="temperature: measured = 77"):
         alarms.restore(json.dumps({"inputs": {"temperature": [77, True]}}))
 
@@ -402,25 +404,25 @@ def test_saved_quantities_that_are_damaged_are_refused() -> None:
 def test_a_delay_counts_the_time_between_bursts_of_samples(spacing_s: float) -> None:
     """Two samples at a time, twice a minute: over the limit from the fifth burst on."""
     rule = {"pack_over_voltage": {"delay_s": 10.0}}
-    alarms = Alarms(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = AlarmEvaluator(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     for burst in range(12):
         block = np.zeros(2, dtype=SAMPLE)
         block["time_s"], block["voltage_v"] = 30.0 * burst + np.array([0.0, spacing_s]), 8.6 if burst >= 4 else 7.4
         alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-        alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+        alarms.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
     assert turns == [150.0], "the first burst after which it has been over the limit for 10 s"
 
 
 def test_a_gap_that_does_not_come_again_soon_counts_for_no_delay() -> None:
     rule = {"pack_over_voltage": {"delay_s": 25.0}}
-    alarms = Alarms(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
+    alarms = AlarmEvaluator(watched(settings(rule), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     times_s = [*range(5), *range(25, 200), *range(220, 300)]
     block = np.zeros(len(times_s), dtype=SAMPLE)
     block["time_s"] = times_s
     block["voltage_v"] = np.where((block["time_s"] < 180.0) & (block["time_s"] > 10.0), 7.4, 8.6)
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    alarms.judge(WALL_S, Counts(0, 0), Suspect(0), ())
+    alarms.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
     assert turns == [226.0]  # 180 to 199 s, nothing for 20 s, then 6 s
 

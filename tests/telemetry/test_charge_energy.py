@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.telemetry.charge_energy import Flow, Meter
+from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
 GAP_S = 5.0
 
@@ -17,15 +17,15 @@ def trace(time_s: np.ndarray, current_a: float | np.ndarray, voltage_v: float | 
     return rows
 
 
-def after(*blocks: np.ndarray) -> Flow:
-    meter = Meter(Flow(), GAP_S)
+def after(*blocks: np.ndarray) -> ChargeEnergy:
+    meter = ChargeEnergyMeter(ChargeEnergy(), GAP_S)
     for block in blocks:
         meter.add(block)
     return meter.flow
 
 
 def test_an_hour_out_and_half_an_hour_in_count_each_on_its_own_and_upon_what_was_counted_before() -> None:
-    meter = Meter(Flow(1.0, 2.0, 3.0, 4.0), GAP_S)
+    meter = ChargeEnergyMeter(ChargeEnergy(1.0, 2.0, 3.0, 4.0), GAP_S)
     meter.add(trace(np.arange(0.0, 3601.0), 2.0))
     assert meter.flow == pytest.approx((3.0, 2.0, 3.008, 4.0))
     meter.add(trace(np.arange(3601.0, 5401.0), -2.0))
@@ -38,7 +38,7 @@ def test_it_is_the_same_in_blocks_of_any_size() -> None:
     time_s = np.cumsum(rng.uniform(0.001, 4.0, 3000))
     whole = trace(time_s, rng.normal(3.0, 1.0, time_s.size), rng.uniform(3.0, 4.2, time_s.size))
     current_a, power_w = whole["current_a"], whole["current_a"] * whole["voltage_v"]
-    wanted = Flow().and_net(np.trapezoid(current_a, time_s), np.trapezoid(power_w, time_s))
+    wanted = ChargeEnergy().and_net(np.trapezoid(current_a, time_s), np.trapezoid(power_w, time_s))
     for size in (1, 7, 1000, time_s.size):
         assert after(*(whole[i : i + size] for i in range(0, time_s.size, size))) == pytest.approx(wanted)
 
@@ -60,7 +60,7 @@ def test_slow_samples_are_no_gaps() -> None:
 
 def test_noise_about_no_current_hardly_counts() -> None:
     """20 mA of it at 100 Hz, looked at once a second: rectified it would be 8 mAh in an hour, in both directions."""
-    rng, meter = np.random.default_rng(2), Meter(Flow(), GAP_S)
+    rng, meter = np.random.default_rng(2), ChargeEnergyMeter(ChargeEnergy(), GAP_S)
     for second in range(3600):
         meter.add(trace(second + np.arange(100) / 100.0, rng.normal(0.0, 0.02, 100)))
         assert meter.flow
@@ -68,7 +68,7 @@ def test_noise_about_no_current_hardly_counts() -> None:
 
 
 def test_it_never_decreases_and_its_difference_is_the_net_charge() -> None:
-    rng, meter = np.random.default_rng(3), Meter(Flow(), GAP_S)
+    rng, meter = np.random.default_rng(3), ChargeEnergyMeter(ChargeEnergy(), GAP_S)
     time_s, current_a = 0.1 * np.arange(5000), np.cumsum(rng.normal(0.0, 0.2, 5000))
     flows = [meter.flow]
     for i in range(0, 5000, 10):

@@ -5,7 +5,7 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.observer import ObserverSettings
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.state import info_report
+from bms_estimator.telemetry.state import make_info_payload
 
 
 @pytest.mark.parametrize(
@@ -13,5 +13,5 @@ from bms_estimator.telemetry.state import info_report
 )
 def test_a_law_without_a_nussbaum_function_names_none(law: str, said: str) -> None:
     observer = ObserverSettings.model_validate({"law": law, "nussbaum": "k2-cos"})
-    info = info_report(Settings(observer=observer), load_cell("chen_mora"), {}, 0.0, temperature_sensor=False)
+    info = make_info_payload(Settings(observer=observer), load_cell("chen_mora"), {}, 0.0, temperature_sensor=False)
     assert info.observer == said

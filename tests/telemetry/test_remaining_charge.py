@@ -7,14 +7,14 @@ import pytest
 from scipy.integrate import quad
 
 from bms_estimator.checkpoint.identity import fields
-from bms_estimator.checkpoint.restore import resume
+from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.telemetry.health import identifier_counters, suspicions
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 from tests.estimator.anywhere.cases import Case, capture
 
@@ -74,7 +74,7 @@ def test_a_pack_that_charges_has_a_time_to_full_and_no_other_has() -> None:
 def test_nothing_is_known_before_the_first_sample() -> None:
     estimator = Estimator(CELL, initial_soc=0.5, identifier=None)
     assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)
-    assert parameter_report(estimator, NOW_S).elements == {}
+    assert make_parameters_payload(estimator, NOW_S).elements == {}
 
 
 def test_identified_elements_and_state_of_health_are_published_with_their_errors() -> None:
@@ -83,7 +83,7 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert before["soc_std"][-1] > 0.0
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     estimator.run(pulses(0.2, 2.5))
-    report = parameter_report(estimator, NOW_S)
+    report = make_parameters_payload(estimator, NOW_S)
     r_s = report.elements["r_s_ohm"]
     assert (r_s.source, r_s.valid, r_s.reason) == ("identified", True, None)
     assert r_s.updated is not None
@@ -118,7 +118,7 @@ def test_what_the_identifier_did_not_believe_is_counted_since_the_start() -> Non
     block["voltage_v"][3000:3003] = 2.6
     estimator.run(block)
     assert identifier_counters(estimator.record[0])["gated"] == 3
-    resume(estimator, dict(fields(estimator.record.copy())), 1.0)
+    restore_state(estimator, dict(fields(estimator.record.copy())), 1.0)
     assert set(identifier_counters(estimator.record[0]).values()) == {0}
     assert suspicions(estimator.record[0], estimator.settings_record[0]) == []
 
@@ -127,7 +127,7 @@ def test_nothing_is_identified_before_a_load_has_told_of_it() -> None:
     estimator = Estimator(CELL, initial_soc=0.5)
     block = pulses(0.0, 0.1)
     estimator.run(block)
-    report = parameter_report(estimator, NOW_S)
+    report = make_parameters_payload(estimator, NOW_S)
     assert {p.source for p in report.elements.values()} == {"configured"}
     assert {p.valid for p in report.state_of_health.values()} == {False}
 
@@ -138,10 +138,10 @@ def test_the_curve_is_published_with_what_was_learned() -> None:
     p = estimator.settings_record[0]["filter"]
     truth_v = chen_mora.ocv(0.9, p["ocv_v"], p["ocv_slope_v"]) + 0.020
     estimator.step(0.0, 0.0, truth_v)
-    first = parameter_report(estimator, NOW_S).ocv
+    first = make_parameters_payload(estimator, NOW_S).ocv
     for i in range(1, 3600):
         estimator.step(float(i), 0.0, truth_v)
-    curve = parameter_report(estimator, NOW_S).ocv
+    curve = make_parameters_payload(estimator, NOW_S).ocv
     assert first is not None
     assert curve is not None
     at, far = curve.soc.index(0.9), curve.soc.index(0.2)
@@ -156,7 +156,7 @@ def test_a_table_has_its_formula_too(name: str) -> None:
     """Packs and single cells: the same curve, as near as (2.10) can come to it."""
     for cells in (1, 6):
         estimator = Estimator(load_cell(name, 3.0).pack(cells, 1))
-        a = parameter_report(estimator, NOW_S).a
+        a = make_parameters_payload(estimator, NOW_S).a
         values = np.array([math.nan] * 16 + [a[f"a{i}"].value for i in range(16, 22)])
         curve_v = estimator.settings[0]["ocv_v"][::4]
         off_v = np.array([chen_mora.emf(soc, values) for soc in np.linspace(0.0, 1.0, curve_v.size)]) - curve_v
@@ -171,7 +171,7 @@ def test_what_is_not_to_be_learned_is_taken_as_declared() -> None:
     off = IdentifierSettings(capacity_std=0.0, current_offset_std_a=0.0)
     estimator = Estimator(CELL, identifier=off, initial_soc=1.0)
     estimator.run(pulses(0.2, 0.1))
-    health = parameter_report(estimator, NOW_S).state_of_health
+    health = make_parameters_payload(estimator, NOW_S).state_of_health
     assert (health["capacity"].value, health["current_offset_a"].value) == (1.0, 0.0)
     assert "identifier.capacity_std is 0: taken as declared" in (health["capacity"].reason or "")
 
@@ -209,7 +209,7 @@ def test_the_series_resistance_of_a_cold_cell_is_compared_with_that_of_its_file_
         seen = capture(Case("R_s", temperature_c=temperature_c, hours=0.5))
         estimator = Estimator(seen.cell, initial_soc=float(seen.soc[0]))
         estimator.run(seen.samples)
-        r_s = parameter_report(estimator, NOW_S).state_of_health["r_s"]
+        r_s = make_parameters_payload(estimator, NOW_S).state_of_health["r_s"]
         assert r_s.source == "identified"
         ratios.append(r_s.value)
     assert ratios == pytest.approx([1.0, 1.0], abs=0.15)  # the file is of another such cell, and errs by 10 %

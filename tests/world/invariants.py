@@ -8,7 +8,7 @@ from pydantic_core import from_json
 
 from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.protocols.firmware.messages import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
-from bms_estimator.telemetry.charge_energy import Flow
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from tests.world.broker import Connection, Packet
 
 MOST_STDS = 4.0
@@ -171,12 +171,12 @@ class Band:
 class Flowed:
     """Charge and energy that the service has told, over all its processes."""
 
-    kept: Flow = field(default_factory=Flow)
+    kept: ChargeEnergy = field(default_factory=ChargeEnergy)
     """What it told that was on disk."""
 
     def take(self, estimate: Estimate, *, kept: bool) -> str:
         """A state; ``kept``: the disk has taken what it tells. Returns what is wrong with that."""
-        flow = Flow(*(getattr(estimate, name) for name in Flow._fields))
+        flow = ChargeEnergy(*(getattr(estimate, name) for name in ChargeEnergy._fields))
         wrong = f"{flow} after {self.kept}" if any(a < b for a, b in zip(flow, self.kept, strict=True)) else ""
         if kept:
             self.kept = flow

@@ -10,8 +10,8 @@ import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
-from bms_estimator.sinks.mqtt.messages import Messages
-from bms_estimator.sources.serial.board_check import Doorkeeper
+from bms_estimator.sinks.mqtt.messages import MessageBuilder
+from bms_estimator.sources.serial.board_check import BoardCheck
 from bms_estimator.store.outbox_queue import Queue
 
 
@@ -43,27 +43,27 @@ def no_fsync() -> Iterator[None]:
 @contextlib.contextmanager
 def no_sensor_availability() -> Iterator[None]:
     """That the sensor has gone silent is not said."""
-    said = Messages._sensor
+    said = MessageBuilder._sensor
 
-    def sensor(self: Messages, health: Any) -> Any:
+    def sensor(self: MessageBuilder, health: Any) -> Any:
         return said(self, health.model_copy(update={"sensor_online": True}))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Messages, "_sensor", sensor)
+        patch.setattr(MessageBuilder, "_sensor", sensor)
         yield
 
 
 @contextlib.contextmanager
 def no_second_try() -> Iterator[None]:
     """A disk that did not take the board once is not asked again."""
-    asked = Doorkeeper._remember
+    asked = BoardCheck._remember
 
-    def remember(self: Doorkeeper, now_s: float) -> None:
+    def remember(self: BoardCheck, now_s: float) -> None:
         if not self._failed:
             asked(self, now_s)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Doorkeeper, "_remember", remember)
+        patch.setattr(BoardCheck, "_remember", remember)
         yield
 
 

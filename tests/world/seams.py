@@ -48,8 +48,8 @@ class Clocks:
     def monotonic(self) -> float:
         return self.since_boot() - self.asleep_s
 
-    def moment(self) -> moment.Moment:
-        return moment.Moment(self.wall(), self.synchronised, self.since_boot(), self.boot)
+    def moment(self) -> moment.BootTimestamp:
+        return moment.BootTimestamp(self.wall(), self.synchronised, self.since_boot(), self.boot)
 
 
 class _Instead:
@@ -82,7 +82,7 @@ def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], d
         id(time.monotonic): clocks.monotonic,
         id(time.perf_counter): clocks.monotonic,
         id(clock.since_boot): clocks.since_boot,
-        id(moment.moment): clocks.moment,
+        id(moment.boot_timestamp): clocks.moment,
         id(random.uniform): dice.uniform,
         id(random.random): dice.random,
         id(ThreadPoolExecutor): lambda *args, **named: threads().executor(*args, **named),

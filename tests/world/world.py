@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointFile, Restored
+from bms_estimator.checkpoint.checkpoint_file import REFUSED, CheckpointContent, CheckpointFile
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.service import pack_service as service
 from bms_estimator.settings.mqtt import MqttSettings
@@ -24,8 +24,8 @@ from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings, StateSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts
-from bms_estimator.sources.serial.board_check import HELD_READS, Doorkeeper
-from bms_estimator.sources.serial.known_board_file import BoardMemory
+from bms_estimator.sources.serial.board_check import MAX_PENDING_READS, BoardCheck
+from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from tests.world import invariants
 from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError
@@ -310,7 +310,7 @@ class World:
         self.broker.loop = loop
         self.note(f"start {self.runs}")
         process.main = loop.start(
-            service.serve(
+            service.run_pack_service(
                 self.settings,
                 CELL,
                 sinks=[Probe(lambda snapshot: self._published(process, snapshot))],
@@ -379,7 +379,7 @@ class World:
         if self.process is not None:
             board = self.process.board
             no_room = (
-                board is not None and len(board._door._held) == HELD_READS
+                board is not None and len(board._door._held) == MAX_PENDING_READS
             )  # samples that find none are not counted
             self.process.foreign |= no_room or self.cable.board is self.foreigner
             if not self.board.text and self.process.reference.feed(data):
@@ -456,7 +456,7 @@ class World:
             if taken != process.reference.samples and not held:
                 self.fail(f"{process.reference.samples} samples came, {taken} are counted: {counters}")
 
-    def _reopened(self, process: Process, door: Doorkeeper, opened: Callable[[], None]) -> None:
+    def _reopened(self, process: Process, door: BoardCheck, opened: Callable[[], None]) -> None:
         """A port that was lost before its board was known: what it said is nobody's."""
         if door.stranger is not None:
             nobodys = Reference()
@@ -527,7 +527,7 @@ class World:
         if process is None:
             self.fail("the service does not run")
         if process is not None and process.board is not None and (serial := process.board.board.get("serial")):
-            remembered = BoardMemory(self.disk.folder, NAME).load().get("serial")
+            remembered = KnownBoardFile(self.disk.folder, NAME).load().get("serial")
             if remembered != serial:
                 self.fail(f"board {serial} is not remembered, but {remembered}")
         if lost := self.said.lost(self.timeline.now_s):
@@ -574,7 +574,7 @@ class World:
         """What the service finds on the disk when it starts is whole."""
         load = CheckpointFile.load
 
-        def loaded(file: CheckpointFile) -> Restored:
+        def loaded(file: CheckpointFile) -> CheckpointContent:
             found = load(file)
             if found.reason.startswith(REFUSED):
                 self.fail(f"the checkpoint is {found.reason}")

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.clean_capture import Load
-from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C, SOC_SLACK, runs
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
+from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C, SOC_SLACK, true_runs
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
@@ -31,7 +31,7 @@ LEAST_SWEEP = 0.05
 """SOC that must have moved for the sign to show in the voltage's trend."""
 
 
-def contradictions(load: Load, cell: CellModel, start: float) -> list[str]:
+def capture_contradictions(load: CleanCapture, cell: CellModel, start: float) -> list[str]:
     """One line with what to do; empty where all is well. The first one found explains the others.
 
     Args:
@@ -44,12 +44,12 @@ def contradictions(load: Load, cell: CellModel, start: float) -> list[str]:
     return [f"{load.name}: {found}"] if found else []
 
 
-def without_excitation(load: Load, cell: CellModel) -> bool:
+def without_excitation(load: CleanCapture, cell: CellModel) -> bool:
     """Whether the current is too small to tell anything of the resistances."""
     return _no_excitation(load, cell) is not None
 
 
-def step_resistance(load: Load) -> float | None:
+def step_resistance(load: CleanCapture) -> float | None:
     """Median of -dV/dI over the steps of current [ohm], negative under a wrong sign; None with too few steps."""
     change_a = np.diff(load.current_a)
     largest_a = float(np.abs(load.current_a).max(initial=0.0))
@@ -59,7 +59,7 @@ def step_resistance(load: Load) -> float | None:
     return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
 
 
-def soc_outside(load: Load, capacity_ah: float, start: float) -> str | None:
+def soc_outside(load: CleanCapture, capacity_ah: float, start: float) -> str | None:
     """How far SOC, counted from ``start``, leaves 0..1; None where it does not."""
     soc = start - load.discharged_ah / capacity_ah
     if soc.min() >= -2.0 * SOC_SLACK and soc.max() <= 1.0 + 2.0 * SOC_SLACK:
@@ -71,13 +71,13 @@ def soc_outside(load: Load, capacity_ah: float, start: float) -> str | None:
     )
 
 
-def _short(load: Load) -> str | None:
+def _short(load: CleanCapture) -> str | None:
     if load.time_s[-1] >= SHORTEST_S:
         return None
     return f"it lasts {load.time_s[-1]:.3g} s, which tells nothing of a battery: is time_s in seconds?"
 
 
-def _no_excitation(load: Load, cell: CellModel) -> str | None:
+def _no_excitation(load: CleanCapture, cell: CellModel) -> str | None:
     largest_a = float(np.abs(load.current_a).max())
     least_a = LEAST_CURRENT_C * cell.cell.capacity_ah
     if largest_a >= least_a:
@@ -88,7 +88,7 @@ def _no_excitation(load: Load, cell: CellModel) -> str | None:
     )
 
 
-def _sign(load: Load, cell: CellModel) -> str | None:
+def _sign(load: CleanCapture, cell: CellModel) -> str | None:
     ohm = step_resistance(load)
     if ohm is not None and ohm < 0.0:
         return (
@@ -104,7 +104,7 @@ def _sign(load: Load, cell: CellModel) -> str | None:
     return None
 
 
-def _answer(load: Load, cell: CellModel) -> str | None:
+def _answer(load: CleanCapture, cell: CellModel) -> str | None:
     ohm, least_ohm = step_resistance(load), LEAST_ANSWER_V * cell.cell.series_count / cell.cell.capacity_ah
     if np.ptp(load.voltage_v) == 0.0:
         moves = "does not move"
@@ -115,7 +115,7 @@ def _answer(load: Load, cell: CellModel) -> str | None:
     return f"the voltage {moves}: it is not this current's; check the column, and that no old value was repeated"
 
 
-def _gap(load: Load, cell: CellModel) -> str | None:
+def _gap(load: CleanCapture, cell: CellModel) -> str | None:
     step_s = np.diff(load.time_s)
     charge_ah = np.abs(load.current_a[:-1]) * step_s / 3600.0
     gaps = (step_s > GAP_STEPS * np.median(step_s)) & (charge_ah > GAP_CHARGE * cell.cell.capacity_ah)
@@ -128,7 +128,7 @@ def _gap(load: Load, cell: CellModel) -> str | None:
     )
 
 
-def _capacity(load: Load, cell: CellModel, start: float) -> str | None:
+def _capacity(load: CleanCapture, cell: CellModel, start: float) -> str | None:
     capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
     outside = soc_outside(load, capacity_ah, start)
     if outside:
@@ -146,7 +146,7 @@ def _capacity(load: Load, cell: CellModel, start: float) -> str | None:
     return None
 
 
-def _ends_of_long_rests(load: Load, capacity_ah: float) -> list[int]:
+def _ends_of_long_rests(load: CleanCapture, capacity_ah: float) -> list[int]:
     """Last sample of each rest longer than ``LONG_REST_S``."""
     resting = np.abs(load.current_a) < REST_CURRENT_C * capacity_ah
-    return [end - 1 for first, end in runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]
+    return [end - 1 for first, end in true_runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]

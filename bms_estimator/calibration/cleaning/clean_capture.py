@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C, without_glitches
+from bms_estimator.calibration.cleaning.rests import REST_CURRENT_C, remove_glitches
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
@@ -23,7 +23,7 @@ EXPLAINED = 3.0
 
 
 @dataclass(frozen=True)
-class Load:
+class CleanCapture:
     """One capture.
 
     Attributes:
@@ -54,17 +54,17 @@ class Load:
         return float(np.median(self.voltage_v[: max(self.resting_samples, 1)]))
 
 
-def whole_load(name: str, samples: SampleBlock, cell: CellModel) -> Load:
+def clean_capture(name: str, samples: SampleBlock, cell: CellModel) -> CleanCapture:
     """All good samples of a capture.
 
     Raises:
         UserError: No, too few or mostly samples that cannot be this cell's.
     """
-    good = _without_spikes(_within_limits(name, without_glitches(samples, name), cell), cell)
+    good = _without_spikes(_within_limits(name, remove_glitches(samples, name), cell), cell)
     time_s = np.ascontiguousarray(good["time_s"] - good["time_s"][0])
     current_a = np.ascontiguousarray(good["current_a"])
     resting = np.abs(current_a) < REST_CURRENT_C * cell.cell.capacity_ah
-    return Load(
+    return CleanCapture(
         name=name,
         time_s=time_s,
         current_a=current_a,

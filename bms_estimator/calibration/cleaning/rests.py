@@ -24,7 +24,7 @@ SOC_SLACK = 0.03
 """How far SOC may leave 0..1 before the capacity is called wrong: cells of one type differ by as much."""
 
 
-def without_glitches(samples: SampleBlock, name: str) -> SampleBlock:
+def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
     """Samples that can be true: finite, time going on, voltage within half of the median of those above 0 V.
 
     Raises:
@@ -76,7 +76,7 @@ def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     """Which samples belong to a rest; blips of the current sensor do not end one."""
     resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
     time_s = good["time_s"]
-    for first, last in runs(~resting):
+    for first, last in true_runs(~resting):
         until_s = time_s[min(last, good.size - 1)]
         charge_ah = abs(float(good["current_a"][first:last].mean())) * (until_s - time_s[first]) / 3600.0
         if charge_ah < BLIP_CHARGE * capacity_ah:
@@ -93,7 +93,7 @@ def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
     return max(REST_CURRENT_C * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
 
 
-def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Stretches where ``mask`` holds, each as first and one past its last index."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

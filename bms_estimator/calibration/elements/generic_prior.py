@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.calibration.elements.initial_elements import RestElements
+from bms_estimator.calibration.elements.initial_elements import InitialElements
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells, load_cell
@@ -13,7 +13,7 @@ RESTS_STD = 0.35
 """Relative standard deviation of resistances that rests tell, and typical cells how they are shared."""
 
 
-def most_alike(soc: Floats, ocv_v: Floats, capacity_ah: float, series_count: int) -> CellModel:
+def nearest_generic_cell(soc: Floats, ocv_v: Floats, capacity_ah: float, series_count: int) -> CellModel:
     """The generic cell of this capacity whose curve is nearest, as a pack of as many in series.
 
     Args:
@@ -40,11 +40,13 @@ def curve(cell: CellModel, column: str) -> tuple[Floats, Floats]:
     return np.array(ocv.soc), np.array(getattr(ocv, column))
 
 
-def ladder_of(generic: CellModel, rests: RestElements | None, temperature_c: float = REFERENCE_C) -> Ladder:
+def scaled_generic_ladder(
+    generic: CellModel, rests: InitialElements | None, temperature_c: float = REFERENCE_C
+) -> Ladder:
     """Its resistances over SOC, each as large as rests say; their growth in the cold and towards empty is no rest's to tell.
 
     Args:
-        generic: Of ``most_alike``.
+        generic: Of ``nearest_generic_cell``.
         rests: None: as large as the generic cell's.
         temperature_c: Of the rests [C].
     """

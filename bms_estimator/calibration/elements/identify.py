@@ -9,8 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.capture_checks import contradictions, step_resistance, without_excitation
-from bms_estimator.calibration.cleaning.clean_capture import Load, whole_load
+from bms_estimator.calibration.cleaning.capture_checks import (
+    capture_contradictions,
+    step_resistance,
+    without_excitation,
+)
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.elements import two_branch_fit
 from bms_estimator.calibration.elements.ladder_fit import (
     EVEN,
@@ -29,7 +33,13 @@ from bms_estimator.calibration.elements.ladder_fit import (
     moments,
 )
 from bms_estimator.calibration.elements.replay_score import interval_score
-from bms_estimator.calibration.ocv.overpotential import arrhenius, beside_ocv, hats, overpotential, temperature_of
+from bms_estimator.calibration.ocv.overpotential import (
+    arrhenius,
+    linear_interpolation_matrix,
+    ocv_offset,
+    overpotential,
+    temperature_of,
+)
 from bms_estimator.calibration.ocv.slow_curve import PAIR_V
 from bms_estimator.calibration.ocv.sources import REST_SHARE_STD, has_plateau
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
@@ -125,7 +135,7 @@ class Identification:
 class Run:
     """One capture with what is known of it beside its samples."""
 
-    load: Load
+    load: CleanCapture
     soc: Floats
     temperature_c: Floats
     miscount: float = 0.0
@@ -138,7 +148,7 @@ class Run:
         return replace(self, soc=self.soc[0] + (1.0 + miscount) * moved, miscount=miscount)
 
     @property
-    def warm_load(self) -> Load:
+    def warm_load(self) -> CleanCapture:
         """``load`` at ``temperature_c``."""
         return replace(self.load, temperature_c=self.temperature_c)
 
@@ -169,10 +179,10 @@ def identify(
         UserError: No capture with excitation; one that contradicts the cell: sign of the current, capacity, OCV; a
             temperature that no cell has; or replays that get worse.
     """
-    whole = [whole_load(capture.name, capture.rows, cell) for capture in captures]
+    whole = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
     loads = [load for load in whole if not without_excitation(load, cell)]
     runs = [_run(load, cell, initial_soc, temperature_c) for load in loads or whole]
-    found = [line for run in runs for line in contradictions(run.load, cell, float(run.soc[0]))]
+    found = [line for run in runs for line in capture_contradictions(run.load, cell, float(run.soc[0]))]
     found += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
     if found:
         raise UserError("\n".join(found))
@@ -192,7 +202,7 @@ def identify(
     return outcome
 
 
-def initial_soc(load: Load, cell: CellModel) -> float:
+def initial_soc(load: CleanCapture, cell: CellModel) -> float:
     """SOC at the first sample from the voltage of the first rest; of a first sample under load, with i R_s added."""
     current_a = 0.0 if load.resting_samples else float(load.current_a[0])
     return soc_from_ocv(load.start_v + current_a * r_s(0.5, cell.a), *ocv_grid(cell))
@@ -210,7 +220,7 @@ class _Candidate:
         grid = np.linspace(0.0, 1.0, ocv_grid(cell)[0].size)
         self._moments = []
         for run in runs:
-            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + beside_ocv(cell, run.warm_load, run.soc)
+            given_v = np.interp(run.soc, grid, ocv_grid(cell)[0]) + ocv_offset(cell, run.warm_load, run.soc)
             self._moments.append(
                 moments(
                     run.load,
@@ -301,7 +311,7 @@ class _Candidate:
             error_v=1.0,
             temperature_c=(low_c, high_c),
         )
-        update: dict[str, object] = {"ladder": ladder, "adaptation": {}, **two_branch_fit.sections(ladder)}
+        update: dict[str, object] = {"ladder": ladder, "adaptation": {}, **two_branch_fit.cell_file_sections(ladder)}
         if self._refine:
             update["ocv"] = _corrected_ocv(self._cell, fit, entropy=tells)
         new = self._cell.model_copy(update=update)
@@ -324,7 +334,7 @@ class _Candidate:
         return np.asarray(np.sqrt(shapes) if known.std >= TYPICAL_STD else shapes)
 
 
-def _run(load: Load, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
+def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
     if temperature_c is not None:
         load = replace(load, temperature_c=temperature_of(load, temperature_c))
     temperature = temperature_of(load)
@@ -344,7 +354,7 @@ def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Ru
     return runs
 
 
-def _wrong_temperature(load: Load, temperature_c: float | None) -> list[str]:
+def _wrong_temperature(load: CleanCapture, temperature_c: float | None) -> list[str]:
     temperature = temperature_of(load, REFERENCE_C if temperature_c is None else temperature_c)
     if temperature.min() >= LOWEST_C and temperature.max() <= HIGHEST_C:
         return []
@@ -401,7 +411,7 @@ def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOc
     grid_v = ocv_grid(cell)[0]
     slope = LEAST_SLOPE_V * cell.cell.series_count * soc
     corrected_v = np.interp(soc, np.linspace(0.0, 1.0, grid_v.size), grid_v) + correction_at(soc) @ fit.correction
-    per_kelvin_v = hats(soc, KELVIN_NODES) @ fit.per_kelvin_v if entropy else None
+    per_kelvin_v = linear_interpolation_matrix(soc, KELVIN_NODES) @ fit.per_kelvin_v if entropy else None
     if given is not None and given.per_kelvin_v is not None:
         known_v = np.interp(soc, given.soc, given.per_kelvin_v)
         per_kelvin_v = known_v if per_kelvin_v is None else per_kelvin_v + known_v

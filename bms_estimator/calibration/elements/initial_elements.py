@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from bms_estimator.calibration.cleaning.rests import without_glitches
+from bms_estimator.calibration.cleaning.rests import remove_glitches
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.model.cell import Capacitance, Resistance
 from bms_estimator.model.errors import UserError
@@ -28,7 +28,7 @@ LEAST_OHM = 1e-5
 
 
 @dataclass(frozen=True)
-class RestElements:
+class InitialElements:
     """Elements that do not depend on SOC.
 
     Attributes:
@@ -57,7 +57,7 @@ class RestElements:
         }
 
 
-def rest_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: float) -> RestElements:
+def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: float) -> InitialElements:
     """The medians over the rests of one test.
 
     Args:
@@ -68,7 +68,7 @@ def rest_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: float
     Raises:
         UserError: No rest follows a load.
     """
-    good = without_glitches(samples, test.name)
+    good = remove_glitches(samples, test.name)
     found = []
     soc = test.start_soc
     for rest in test.rests:
@@ -81,7 +81,7 @@ def rest_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: float
             found.append(_of_rest(good[first:last], float(good["voltage_v"][first - 1]), current_a, drawn_as))
     if not found:
         raise UserError(f"{test.name}: none of its {len(test.rests)} rests follows a discharge above SOC {LOWEST_SOC}")
-    return RestElements(*(float(x) for x in np.median(np.array(found), axis=0)))
+    return InitialElements(*(float(x) for x in np.median(np.array(found), axis=0)))
 
 
 def _of_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: float) -> tuple[float, ...]:

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.optimize import lsq_linear
 
-from bms_estimator.calibration.cleaning.clean_capture import Load
-from bms_estimator.calibration.cleaning.rests import runs
-from bms_estimator.calibration.ocv.overpotential import arrhenius, hats
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
+from bms_estimator.calibration.cleaning.rests import true_runs
+from bms_estimator.calibration.ocv.overpotential import arrhenius, linear_interpolation_matrix
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, WEAK_J
 from bms_estimator.model.arrays import Floats
@@ -134,7 +134,7 @@ class LadderFit:
 
     def branches(self, soc: float, first: int, end: int) -> tuple[float, float]:
         """Sum of resistances ``first`` to before ``end`` at ``soc`` and 25 C, and its standard error [ohm]."""
-        place = hats(np.array([soc]), SOC_NODES)[0]
+        place = linear_interpolation_matrix(np.array([soc]), SOC_NODES)[0]
         row = np.zeros((2, RESISTANCES, SOC_NODES.size))
         row[:, first:end] = place
         ohm = float((row[0] * (self.weak_ohm + self.strong_ohm)).sum())
@@ -176,7 +176,7 @@ def correction_at(soc: Floats) -> Floats:
 
 
 def moments(
-    load: Load,
+    load: CleanCapture,
     soc: Floats,
     given_v: Floats,
     slope_v: Floats,
@@ -236,11 +236,11 @@ def moments(
 
 def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:
     """The model's rows, not weighted. Shape (n, FREE + 2 PART)."""
-    places = (currents[:, :, None] * hats(soc, SOC_NODES)[:, None, :]).reshape(soc.size, -1)
+    places = (currents[:, :, None] * linear_interpolation_matrix(soc, SOC_NODES)[:, None, :]).reshape(soc.size, -1)
     return np.hstack(
         [
             correction_at(soc),
-            hats(soc, KELVIN_NODES) * (temperature_c - REFERENCE_C)[:, None],
+            linear_interpolation_matrix(soc, KELVIN_NODES) * (temperature_c - REFERENCE_C)[:, None],
             -places * arrhenius(WEAK_J, temperature_c)[:, None],
             -places * arrhenius(STRONG_J, temperature_c)[:, None],
         ]
@@ -298,7 +298,7 @@ def _apart(time_s: Floats) -> NDArray[np.bool_]:
     return np.asarray(np.r_[True, np.diff(slot) > 0.0], dtype=np.bool_)
 
 
-def _weights(load: Load) -> tuple[Floats, NDArray[np.bool_]]:
+def _weights(load: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
     """Of each row, up to a factor, and which are the last of a long rest."""
     largest_a = float(np.abs(load.current_a).max())
     step_s = np.clip(np.diff(load.time_s, append=load.time_s[-1] + 1.0), 0.0, LONGEST_S)
@@ -307,14 +307,14 @@ def _weights(load: Load) -> tuple[Floats, NDArray[np.bool_]]:
     weight = step_s / np.maximum(since_s + step_s, SHORTEST_S)
     weight /= weight.sum()
     resting = np.abs(load.current_a) < REST_SHARE * largest_a
-    ends = [end - 1 for first, end in runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]
+    ends = [end - 1 for first, end in true_runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]
     weight[ends] += 1.0 / max(len(ends), 1)
     last = np.zeros(weight.size, dtype=np.bool_)
     last[ends] = True
     return weight, last
 
 
-def _clean_steps(load: Load) -> NDArray[np.bool_]:
+def _clean_steps(load: CleanCapture) -> NDArray[np.bool_]:
     """Samples right behind a step of current that is held before and behind it."""
     largest_a = float(np.abs(load.current_a).max())
     change_a = np.abs(np.diff(load.current_a, prepend=load.current_a[0]))

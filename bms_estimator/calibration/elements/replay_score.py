@@ -6,7 +6,7 @@ forty times what the truth lies outside. Neither a wider nor a narrower band tha
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.clean_capture import Load
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -26,7 +26,7 @@ OUTSIDE = 40.0
 """Weight of what lies outside a band of 95 %."""
 
 
-def interval_score(cell: CellModel, load: Load, soc: Floats) -> float:
+def interval_score(cell: CellModel, load: CleanCapture, soc: Floats) -> float:
     """Mean over the replays, in percent of SOC; NaN when none is long enough.
 
     Args:
@@ -41,7 +41,7 @@ def interval_score(cell: CellModel, load: Load, soc: Floats) -> float:
     return float(np.mean(judged)) if judged else float("nan")
 
 
-def _one(cell: CellModel, load: Load, soc: Floats, start: int, wrong: float) -> float:
+def _one(cell: CellModel, load: CleanCapture, soc: Floats, start: int, wrong: float) -> float:
     samples = np.zeros(load.time_s.size - start, dtype=SAMPLE)
     for name in ("time_s", "current_a", "voltage_v", "temperature_c"):
         samples[name] = getattr(load, name)[start:]

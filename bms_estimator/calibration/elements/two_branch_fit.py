@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import nnls
 
-from bms_estimator.calibration.ocv.overpotential import hats
+from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
 from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import LN_TAUS, SHORT
 from bms_estimator.model.arrays import Floats
@@ -20,9 +20,12 @@ SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT), "r_tl": (1 + SHORT, RESISTANC
 """Section of the cell file -> which resistances of the ladder it sums up."""
 
 
-def sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
+def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
     """The five sections of a cell file."""
-    total = hats(SOC, np.array(ladder.soc)) @ (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).T
+    total = (
+        linear_interpolation_matrix(SOC, np.array(ladder.soc))
+        @ (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).T
+    )
     made: dict[str, Resistance | Capacitance] = {}
     for name, (first, end) in SECTIONS.items():
         ohm = np.maximum(total[:, first:end].sum(axis=1), 1e-4 * total.sum(axis=1))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.clean_capture import Load
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
 from bms_estimator.kernels.cell_model.open_loop import branch_currents, hysteresis, two_branches
 from bms_estimator.kernels.cell_model.rc_ladder import GAS_J, HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
 from bms_estimator.kernels.kalman_filter.records import Noise
@@ -19,17 +19,17 @@ def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:
     )
 
 
-def hats(soc: Floats, nodes: Floats) -> Floats:
+def linear_interpolation_matrix(soc: Floats, nodes: Floats) -> Floats:
     """Linear interpolation between ``nodes`` as columns, constant beyond the ends. Shape (n, nodes)."""
     return np.column_stack([np.interp(soc, nodes, row) for row in np.eye(nodes.size)])
 
 
-def temperature_of(load: Load, otherwise_c: float = REFERENCE_C) -> Floats:
+def temperature_of(load: CleanCapture, otherwise_c: float = REFERENCE_C) -> Floats:
     """Temperature at each sample, ``otherwise_c`` where there was no sensor [C]."""
     return np.where(np.isfinite(load.temperature_c), load.temperature_c, otherwise_c)
 
 
-def overpotential(cell: CellModel, load: Load, soc: Floats) -> Floats:
+def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
     """What the voltage lies under E_o(SOC) at 25 C, dE/dT and hysteresis included [V].
 
     Args:
@@ -41,11 +41,11 @@ def overpotential(cell: CellModel, load: Load, soc: Floats) -> Floats:
     if cell.ladder is None:
         drop_v = two_branches(load.time_s, load.current_a, soc, cell.a[:16])
     else:
-        drop_v = of_ladder(cell.ladder, load, soc, temperature_c)
-    return drop_v - beside_ocv(cell, load, soc)
+        drop_v = ladder_overpotential(cell.ladder, load, soc, temperature_c)
+    return drop_v - ocv_offset(cell, load, soc)
 
 
-def beside_ocv(cell: CellModel, load: Load, soc: Floats) -> Floats:
+def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
     """What temperature and hysteresis add to E_o(SOC) at 25 C [V]; a load begins after a charge."""
     ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(load)
     if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
@@ -67,17 +67,17 @@ def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Fl
         first: 0 is the ohmic one.
     """
     weak_ohm, strong_ohm = (
-        hats(soc, np.array(ladder.soc)) @ np.array(part[first:]).sum(axis=0)
+        linear_interpolation_matrix(soc, np.array(ladder.soc)) @ np.array(part[first:]).sum(axis=0)
         for part in (ladder.weak_ohm, ladder.strong_ohm)
     )
     ohm = arrhenius(WEAK_J, temperature_c) * weak_ohm + arrhenius(STRONG_J, temperature_c) * strong_ohm
     return np.asarray(current_a * ohm)
 
 
-def of_ladder(ladder: Ladder, load: Load, soc: Floats, temperature_c: Floats) -> Floats:
+def ladder_overpotential(ladder: Ladder, load: CleanCapture, soc: Floats, temperature_c: Floats) -> Floats:
     """Overpotential of the ladder with its ohmic drop [V]."""
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
-    places = hats(soc, np.array(ladder.soc))
+    places = linear_interpolation_matrix(soc, np.array(ladder.soc))
     weak_v = ((places @ np.array(ladder.weak_ohm).T) * currents).sum(axis=1)
     strong_v = ((places @ np.array(ladder.strong_ohm).T) * currents).sum(axis=1)
     return np.asarray(arrhenius(WEAK_J, temperature_c) * weak_v + arrhenius(STRONG_J, temperature_c) * strong_v)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.cleaning.rests import (
     SOC_SLACK,
     mean_temperature_c,
+    remove_glitches,
     resting_samples,
-    runs,
     soc_by_counting,
-    without_glitches,
+    true_runs,
 )
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
@@ -143,7 +143,7 @@ def relaxation_test(
     Raises:
         UserError: No relaxation test: no rests, too short ones, more charge in than out, wrong sign or capacity.
     """
-    good = without_glitches(samples, name)
+    good = remove_glitches(samples, name)
     soc = soc_by_counting(good, capacity_ah, initial_soc)
     resting = resting_samples(good, capacity_ah)
     _check_charge(name, good, soc, resting, capacity_ah)
@@ -174,7 +174,7 @@ def find_rests(
     """
     rests: list[Rest] = []
     rejected: list[str] = []
-    for first, last in runs(resting):
+    for first, last in true_runs(resting):
         duration_s = float(good["time_s"][last - 1] - good["time_s"][first])
         if duration_s < SHORTEST_REST_S:
             rejected.append(
@@ -225,11 +225,11 @@ def initial_rest_v(samples: SampleBlock, name: str, capacity_ah: float) -> float
     """Voltage at the end of the rest that a capture starts with [V]; NaN when it starts under load.
 
     Raises:
-        UserError: As ``without_glitches``.
+        UserError: As ``remove_glitches``.
     """
-    good = without_glitches(samples, name)
+    good = remove_glitches(samples, name)
     resting = resting_samples(good, capacity_ah)
-    first, last = next(iter(runs(resting)), (1, 1))
+    first, last = next(iter(true_runs(resting)), (1, 1))
     return float(good["voltage_v"][last - 1]) if first == 0 else float("nan")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
 
-from bms_estimator.calibration.cleaning.rests import SOC_SLACK, mean_temperature_c, resting_samples, runs
+from bms_estimator.calibration.cleaning.rests import SOC_SLACK, mean_temperature_c, resting_samples, true_runs
 from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
@@ -54,7 +54,7 @@ COLD_PART = 0.25
 
 
 @dataclass(frozen=True)
-class Branch:
+class SlowBranch:
     """One slow discharge or charge.
 
     Attributes:
@@ -97,13 +97,13 @@ class SlowCurve:
         notes: What is to be known of it, one line each.
     """
 
-    branches: tuple[Branch, ...]
+    branches: tuple[SlowBranch, ...]
     points: Points
     hysteresis_v: Floats | None
     notes: tuple[str, ...]
 
 
-def slow_branches(good: SampleBlock, name: str) -> list[Branch]:
+def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
     """The slow discharges and charges of a capture without glitches; none: it is of another kind.
 
     Raises:
@@ -117,10 +117,10 @@ def slow_branches(good: SampleBlock, name: str) -> list[Branch]:
     noise_a = NOISE_OF_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
     resting = resting_samples(smooth, float(np.ptp(moved_ah)))
     found = []
-    for first, last in runs(~resting):
+    for first, last in true_runs(~resting):
         current_a = smooth["current_a"][first:last]
         middle_a = float(np.median(current_a))
-        for a, b in runs(np.abs(current_a - middle_a) <= SAME_CURRENT * abs(middle_a) + noise_a):
+        for a, b in true_runs(np.abs(current_a - middle_a) <= SAME_CURRENT * abs(middle_a) + noise_a):
             if good["time_s"][first + b - 1] - good["time_s"][first + a] >= LEAST_S:
                 found.append(_branch(good, moved_ah, resting, first + a, first + b, name))
     return found
@@ -128,7 +128,7 @@ def slow_branches(good: SampleBlock, name: str) -> list[Branch]:
 
 def _branch(
     good: SampleBlock, moved_ah: Floats, resting: NDArray[np.bool_], first: int, last: int, name: str
-) -> Branch:
+) -> SlowBranch:
     part = good[first:last]
     charge = bool(np.median(part["current_a"]) < 0.0)
     ah = np.abs(moved_ah[first:last] - moved_ah[first])
@@ -145,7 +145,7 @@ def _branch(
     elif not charge and first > 0 and resting[first - 1]:
         jump_v = float(good["voltage_v"][first - 1]) - voltage_v[0]
     late_v = float(np.interp(0.99 * ah[-1], ah, voltage_v)) - voltage_v[-1]
-    return Branch(
+    return SlowBranch(
         name=name,
         charge=charge,
         ah=ah,
@@ -159,7 +159,7 @@ def _branch(
     )
 
 
-def measured_capacity_ah(branches: Sequence[Branch]) -> float:
+def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
     """Charge of the whole slow discharge nearest to 25 C [Ah]; NaN when there is none."""
     whole = [branch for branch in branches if branch.whole and branch.before_ah < 0.01 * branch.ah[-1]]
     if not whole:
@@ -168,7 +168,7 @@ def measured_capacity_ah(branches: Sequence[Branch]) -> float:
 
 
 def slow_curves(
-    branches: Sequence[Branch], capacity_ah: float, *, initial_soc: float = 1.0, series_count: int = 1
+    branches: Sequence[SlowBranch], capacity_ah: float, *, initial_soc: float = 1.0, series_count: int = 1
 ) -> list[SlowCurve]:
     """Pairs, and what is left of the branches alone.
 
@@ -213,13 +213,13 @@ def slow_curves(
     ]
 
 
-def _are_pair(discharge: Branch, charge: Branch) -> bool:
+def _are_pair(discharge: SlowBranch, charge: SlowBranch) -> bool:
     warmer = charge.temperature_c - discharge.temperature_c
     near = np.isnan(warmer) or abs(warmer) <= PAIR_K
     return bool(near) and abs(charge.current_a / discharge.current_a - 1.0) <= PAIR_CURRENT
 
 
-def _pair(down: Branch, soc: Floats, up: Branch, up_soc: Floats, series_count: int) -> SlowCurve:
+def _pair(down: SlowBranch, soc: Floats, up: SlowBranch, up_soc: Floats, series_count: int) -> SlowCurve:
     """The mean of the two; where one is missing the other, off by half of what they differ by in the middle."""
     low, high = max(soc[-1], up_soc[0]), min(soc[0], up_soc[-1])
     high = high if high > ENDS[1] else high - TURN  # a charge that ends early rises before it ends
@@ -243,7 +243,7 @@ def _pair(down: Branch, soc: Floats, up: Branch, up_soc: Floats, series_count: i
     )
 
 
-def _lone(branch: Branch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
+def _lone(branch: SlowBranch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
     grid = GRID[(soc.min() <= GRID) & (soc.max() >= GRID)]
     sign = -1.0 if branch.charge else 1.0
     ohmic_v = float(np.nan_to_num(branch.step_v))

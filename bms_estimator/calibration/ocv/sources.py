@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import without_glitches
+from bms_estimator.calibration.cleaning.rests import remove_glitches
 from bms_estimator.calibration.ocv.overpotential import steady_drop
 from bms_estimator.calibration.ocv.points import Points, joined, points_of
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v, relaxation_test
 from bms_estimator.calibration.ocv.slow_curve import (
     GRID,
-    Branch,
+    SlowBranch,
     SlowCurve,
     measured_capacity_ah,
     slow_branches,
@@ -51,7 +51,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class GivenCurve:
+class ExternalCurve:
     """A curve that somebody else found: soc 0..1, ocv_v [V], hysteresis_v [V] or None; shape (n,) each."""
 
     name: str
@@ -80,11 +80,11 @@ class Source:
     temperature_c: float
     hysteresis_v: Floats | None
     notes: tuple[str, ...]
-    lone: Branch | None = None
+    lone: SlowBranch | None = None
 
 
 @dataclass(frozen=True)
-class Sources:
+class OcvSources:
     """All of them.
 
     Attributes:
@@ -95,7 +95,7 @@ class Sources:
         hysteresis_v: At ``NODES`` and 25 C [V], of the source nearest to it that tells, as far as rests keep it; None when
             none does.
         hysteresis_std_v: Its standard deviation [V].
-        usual_hysteresis: It is no source's: ``amid_usual_hysteresis``.
+        usual_hysteresis: It is no source's: ``center_on_typical_hysteresis``.
     """
 
     capacity_ah: float
@@ -114,12 +114,12 @@ class Sources:
 
 def find_sources(
     recordings: Sequence[Recording],
-    curves: Sequence[GivenCurve],
+    curves: Sequence[ExternalCurve],
     *,
     capacity_ah: float | None,
     initial_soc: float = 1.0,
     series_count: int = 1,
-) -> Sources:
+) -> OcvSources:
     """Find out what each capture is, and what it says.
 
     Args:
@@ -133,7 +133,7 @@ def find_sources(
     Raises:
         UserError: A capture is neither kind, or no capacity is known.
     """
-    good = [Recording(one.name, without_glitches(one.samples, one.name)) for one in recordings]
+    good = [Recording(one.name, remove_glitches(one.samples, one.name)) for one in recordings]
     branches = {one.name: slow_branches(one.samples, one.name) for one in good}
     every = [branch for found in branches.values() for branch in found]
     measured_ah = measured_capacity_ah(every) / initial_soc if initial_soc > 0.0 else float("nan")
@@ -167,7 +167,7 @@ def find_sources(
             ]
     of_rests = [_of_test(test, points) for test, points in found]
     tests = tuple(test for test, _ in found)
-    return Sources(known_ah, measured_ah, (*sources, *of_rests), tests, hysteresis_v, hysteresis_std_v)
+    return OcvSources(known_ah, measured_ah, (*sources, *of_rests), tests, hysteresis_v, hysteresis_std_v)
 
 
 def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
@@ -184,7 +184,7 @@ def _of_slow(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
     return Source(name, kind, curve.points, first.temperature_c, curve.hysteresis_v, notes, lone)
 
 
-def _of_given(curve: GivenCurve, series_count: int) -> Source:
+def _of_given(curve: ExternalCurve, series_count: int) -> Source:
     everywhere = np.full(curve.soc.size, float(series_count))
     points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, common_v=GIVEN_COMMON_V * everywhere)
     hysteresis_v = None
@@ -241,7 +241,7 @@ def has_plateau(soc: Floats, ocv_v: Floats, series_count: int) -> bool:
 def _rests(
     recordings: Sequence[Recording],
     sources: Sequence[Source],
-    branches: Sequence[Branch],
+    branches: Sequence[SlowBranch],
     capacity_ah: float,
     initial_soc: float,
     series_count: int,
@@ -280,7 +280,7 @@ def _amid_hysteresis(points: Points, kept_v: Floats, relative_std: float) -> Poi
     )
 
 
-def without_branches(found: Sources, ladder: Ladder) -> Sources:
+def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
     """Lone slow curves without what their current takes in the branches: a pair has it twice, with both signs.
 
     Args:
@@ -305,7 +305,7 @@ def _without_branches(source: Source, ladder: Ladder) -> Source:
     return replace(source, points=points, lone=None, notes=(*source.notes, note))
 
 
-def amid_usual_hysteresis(found: Sources, usual_v: Floats) -> Sources:
+def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSources:
     """Sources of which none tells of hysteresis, brought to the middle of what is usual: discharges alone lie below it.
 
     Args:

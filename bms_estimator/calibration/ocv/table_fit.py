@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import BSpline, PchipInterpolator
 from scipy.optimize import lsq_linear
 
-from bms_estimator.calibration.ocv.overpotential import hats
+from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
 from bms_estimator.calibration.ocv.points import Points, check_points, rms_v, with_ends
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.arrays import Floats
@@ -147,7 +147,7 @@ def fit_table(points: Points) -> TableFit:
         slope_v = np.clip(_spline(points.soc, 1) @ x[: model.splines], 0.0, STEEPEST_V * cells)
         steepness_v = _spline(middles, 1) @ x[: model.splines]
         noise, common = _sizes(points, model, x, common)
-    basis, entropy = _spline(NODES), hats(NODES, ENTROPY_NODES)
+    basis, entropy = _spline(NODES), linear_interpolation_matrix(NODES, ENTROPY_NODES)
     rows = np.vstack([model.points / std_v[:, None], model.prior])
     covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)[: model.splines, : model.splines]
     u = x[model.splines : model.splines + ENTROPY_NODES.size]
@@ -169,13 +169,13 @@ def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells:
     warmer = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
     columns, stds = [spline], [np.zeros(0)]
     if np.ptp(warmer) >= TEMPERATURE_SPAN_C:
-        by_soc = hats(points.soc, ENTROPY_NODES)
+        by_soc = linear_interpolation_matrix(points.soc, ENTROPY_NODES)
         columns += [warmer[:, None] * by_soc, points.cold_v[:, None] * by_soc]
         stds += [np.full(ENTROPY_NODES.size, ENTROPY_V_PER_K * cells), np.ones(ENTROPY_NODES.size)]
     warmths = sum(one.size for one in stds)
     for source in range(int(points.source.max()) + 1):
         own = (points.source == source)[:, None]
-        off_v = common * points.common_v[:, None] * hats(points.soc, DEVIATION_NODES)
+        off_v = common * points.common_v[:, None] * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
         columns += [own * off_v, own * _shifts(points.soc, slope_v)]
         stds += [np.ones(DEVIATION_NODES.size), np.array([SOC_STD, CAPACITY_STD])]
     weights = 1.0 / np.concatenate(stds)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.capture_checks import contradictions
-from bms_estimator.calibration.cleaning.clean_capture import Load, whole_load
-from bms_estimator.calibration.cleaning.rests import without_glitches
+from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
+from bms_estimator.calibration.cleaning.rests import remove_glitches
 from bms_estimator.calibration.elements.identify import NO_WORSE, initial_soc
 from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.thesis.adapt_steps import AdaptedElements, Start, steps_2_and_3
@@ -78,14 +78,15 @@ def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = N
     Raises:
         UserError: A capture contradicts the cell, a1..a15 cannot be estimated, or replays get worse.
     """
-    loads = [whole_load(capture.name, capture.rows, cell) for capture in captures]
+    loads = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
     socs = [initial_soc(load, cell) if soc is None else soc for load in loads]
-    found = [line for load, start in zip(loads, socs, strict=True) for line in contradictions(load, cell, start)]
+    found = [
+        line for load, start in zip(loads, socs, strict=True) for line in capture_contradictions(load, cell, start)
+    ]
     if found:
         raise UserError("\n".join(found))
     starts = [
-        Start(without_glitches(capture.rows, capture.name), start)
-        for capture, start in zip(captures, socs, strict=True)
+        Start(remove_glitches(capture.rows, capture.name), start) for capture, start in zip(captures, socs, strict=True)
     ]
     steps, adapted = _adapted(cell, starts)
     judged = tuple(_judged(cell, adapted, loads, starts, j) for j in range(len(starts)))
@@ -127,7 +128,9 @@ def _with_elements(cell: CellModel, steps: AdaptedElements, starts: Sequence[Sta
     return new.model_copy(update={"ladder": ladder})
 
 
-def _judged(cell: CellModel, adapted: CellModel, loads: list[Load], starts: list[Start], j: int) -> AdaptedCapture:
+def _judged(
+    cell: CellModel, adapted: CellModel, loads: list[CleanCapture], starts: list[Start], j: int
+) -> AdaptedCapture:
     """Figures of capture ``j``, by a cell that did not see it where other captures were given."""
     load, start = loads[j], starts[j]
     others = [s for k, s in enumerate(starts) if k != j]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.thesis.parameter_average import Settled, averaged, settled
+from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, settled
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import crossing, delta
 from bms_estimator.model.arrays import Floats
@@ -68,7 +68,7 @@ class AdaptiveRun:
     k: Floats
     gain: Floats
     a: Floats
-    window: Settled
+    window: AveragingWindow
     average: Floats
     crossings: tuple[Crossing, Crossing]
     epsilon_v: float
@@ -155,7 +155,7 @@ def _crossing(parameter: str, a: Floats, soc: Floats, time_s: Floats) -> Crossin
     return Crossing(parameter, at, float(time_s[below[0]]) if below.size else None)
 
 
-def _outcome(window: Settled, time_s: Floats, error_v: Floats, epsilon_v: float, lock_losses: int) -> str:
+def _outcome(window: AveragingWindow, time_s: Floats, error_v: Floats, epsilon_v: float, lock_losses: int) -> str:
     """Lines 8 to 14 of Algorithm 1, with |e| (E10)."""
     inside = (time_s >= window.t_int_s) & (time_s <= window.t_unst_s)
     if inside.sum() < 2:

@@ -18,7 +18,7 @@ KNEE_SLOPE = 5.0
 
 
 @dataclass(frozen=True)
-class Settled:
+class AveragingWindow:
     """From when to when (3.19) averages, and why there.
 
     Attributes:
@@ -44,7 +44,7 @@ def settled(
     *,
     t_int_s: float | None = None,
     t_unst_s: float | None = None,
-) -> Settled:
+) -> AveragingWindow:
     """Find t_int and t_unst of (3.19).
 
     t_unst: the margin SOC - max(delta1, delta2) reaches zero, or the voltage its knee, whichever is first.
@@ -69,7 +69,7 @@ def settled(
     end_s, end_reason = _unstable_from(time_s, voltage_v, margin) if t_unst_s is None else (t_unst_s, "given")
     if t_int_s is not None:
         _check_inside("t_int", t_int_s, time_s[0], end_s)
-        return Settled(t_int_s, end_s, "given", end_reason)
+        return AveragingWindow(t_int_s, end_s, "given", end_reason)
     inside = time_s <= end_s
     beyond = np.abs(error_v[inside]) > epsilon_v
     left = np.arange(beyond.size, 0, -1)
@@ -77,14 +77,14 @@ def settled(
     good = (share <= 1.0 - SETTLED_SHARE) & ~beyond
     if not good.any():
         reason = f"the error never settles within {1e3 * epsilon_v:.2f} mV"
-        return Settled(float(time_s[inside][-1]), end_s, reason, end_reason)
+        return AveragingWindow(float(time_s[inside][-1]), end_s, reason, end_reason)
     error_from = int(np.argmax(good))
     a_from = _settled_from(a[inside])
     if a_from > error_from:
         reason = f"every a_i is within {100 * SETTLED_PARAMETER:g} % of its median from here on"
-        return Settled(float(time_s[inside][a_from]), end_s, reason, end_reason)
+        return AveragingWindow(float(time_s[inside][a_from]), end_s, reason, end_reason)
     reason = f"99 % of the errors from here on are within {1e3 * epsilon_v:.2f} mV"
-    return Settled(float(time_s[inside][error_from]), end_s, reason, end_reason)
+    return AveragingWindow(float(time_s[inside][error_from]), end_s, reason, end_reason)
 
 
 def _check_inside(name: str, given_s: float, first_s: float, last_s: float) -> None:
@@ -127,7 +127,7 @@ def _knee(time_s: Floats, voltage_v: Floats) -> float | None:
     return float(time_s[edges[first]])
 
 
-def averaged(time_s: Floats, a: Floats, window: Settled) -> Floats:
+def averaged(time_s: Floats, a: Floats, window: AveragingWindow) -> Floats:
     """The mean of a_i(t) over t_int..t_unst, (3.19).
 
     Args:

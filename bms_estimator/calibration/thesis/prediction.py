@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.cleaning.rests import soc_by_counting, without_glitches
+from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.model.arrays import Floats
@@ -92,7 +92,7 @@ def predict(
         UserError: No sample is good, or SOC is too low from the first one on.
     """
     name = f"capture for {cell.cell.name}"
-    good = without_glitches(samples, name)
+    good = remove_glitches(samples, name)
     elements = np.zeros(22)
     elements[1:16] = (cell.a if a is None else a)[1:16]
     floor = max(lowest_soc, _unstable_below(elements))

@@ -17,13 +17,13 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.cli.options.capture_options import OR_FUEL_CELL_HELP, AsJson, CapacityAh, SignOfCurrent
-from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.pack_options import pack_or_cell, refuse_soc, with_pack
+from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.service.alarm_monitor import AlarmWatch
+from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, open_capture
@@ -83,10 +83,10 @@ def alarms(
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:
-        refuse_soc(model, "--soc")
+        reject_soc_for_fuel_cell(model, "--soc")
         settings = with_pack(settings, initial_soc=soc)
     with _quiet(), standard_input() if str(capture) == "-" else nullcontext(capture) as path:
-        with compiling_shown():
+        with show_compile_progress():
             read = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
         source = Replay(read, longest_s=STEP_S)
         found = asyncio.run(_found(settings, model, source))
@@ -111,12 +111,12 @@ def _quiet() -> Iterator[None]:
 
 async def _found(settings: Settings, cell: PackModel, source: Replay) -> Found:
     now_s, changes = 0.0, list[Change]()
-    with compiling_shown():
+    with show_compile_progress():
         estimator = new_estimator(settings, cell)
     without_hooks = settings.alarms.model_copy(update={"hook": ()})
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # only the capture's matters
-    watch = AlarmWatch(settings, cell, estimator, source, clock, changes.append)
+    watch = AlarmMonitor(settings, cell, estimator, source, clock, changes.append)
     async for block in source:
         now_s = max(now_s, float(block["time_s"][-1]))
         watch.add(block, estimator.run(block), now_s)

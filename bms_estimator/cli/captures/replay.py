@@ -25,24 +25,24 @@ from bms_estimator.cli.options.capture_options import (
     SignOfCurrent,
     check_out,
 )
-from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.pack_options import pack_or_cell, refuse_soc, with_broker, with_pack
+from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_broker, with_pack
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.sinks.trace_file import TableSink, table_sink
 from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
 from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.store.outbox import Outbox
-from bms_estimator.telemetry.health import dropped_text, impossible_sample
+from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 
 MANY = 0.01
 """Part of the samples that is more than a glitch now and then."""
@@ -75,13 +75,13 @@ def replay(
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:
-        refuse_soc(model, "--soc")
+        reject_soc_for_fuel_cell(model, "--soc")
         settings = with_pack(settings, initial_soc=soc)
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
     if out is not None:
         check_out(out, [capture], force=force)
     with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
-        with compiling_shown():
+        with show_compile_progress():
             source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
         replayed = Replay(source, speed=speed)
         result = asyncio.run(_replay(settings, model, replayed, table_sink(out) if out else None))
@@ -106,7 +106,7 @@ def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
 
 async def _replay(settings: Settings, cell: PackModel, source: Replay, table: TableSink | None) -> Result:
     """Source -> estimator -> table, summary, broker."""
-    with compiling_shown():
+    with show_compile_progress():
         estimator, summary = new_estimator(settings, cell), Summary()
     async with AsyncExitStack() as stack:
         publisher = await _publisher(stack, settings, cell, estimator, source)
@@ -117,7 +117,7 @@ async def _replay(settings: Settings, cell: PackModel, source: Replay, table: Ta
             trace = estimator.run(block)
             summary.add(trace)
             if trace.size < block.size:
-                impossible = impossible_sample(block, estimator.settings[0]) or impossible
+                impossible = out_of_range_reason(block, estimator.settings[0]) or impossible
             if table:
                 table.write(trace)
             if publisher:
@@ -137,10 +137,12 @@ async def _publisher(
     """Who publishes, when there is a broker."""
     if settings.mqtt is None:
         return None
-    delivery = Delivery()
+    delivery = DeliveryStats()
     outbox = Outbox(None, most=settings.store.outbox_messages)
     home = settings.home_assistant
-    mqtt = MqttSink(settings.mqtt, settings.pack.name, Requests(delivery), delivery, outbox, home_assistant=home)
+    mqtt = MqttSink(
+        settings.mqtt, settings.pack.name, RequestDispatcher(delivery), delivery, outbox, home_assistant=home
+    )
     sinks = [await stack.enter_async_context(mqtt)]
     return Publisher(settings, cell, estimator, source=source, sinks=sinks, clock=Clock(), delivery=delivery)
 

@@ -10,10 +10,10 @@ import numpy as np
 import typer
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.restore import resume
+from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_out, name_of
 from bms_estimator.cli.options.pack_options import load_pack, unpacked_cell
-from bms_estimator.estimator.identified_parameters import learned_cell, learned_ocv, relative_capacity
+from bms_estimator.estimator.identified_parameters import identified_cell, ocv_correction_with_std, relative_capacity
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
@@ -71,12 +71,12 @@ def export(
             f"{settings.state.checkpoint_s:g} s (--checkpoint names another file)"
         )
     estimator = new_estimator(settings, model)
-    wrong = resume(estimator, found.state, 0.0)
+    wrong = restore_state(estimator, found.state, 0.0)
     if wrong or not estimator.record[0]["filter"]["started"]:
         raise UserError(f"{file.path}: nothing to export: {wrong or 'the identifier was off, it has learned nothing'}")
-    learned = learned_cell(estimator, cell, series)
+    learned = identified_cell(estimator, cell, series)
     renamed = learned.model_copy(update={"cell": learned.cell.model_copy(update={"name": name_of(out)})})
-    correction_v, std_v = learned_ocv(estimator.record[0], estimator.settings_record[0], TENTHS)
+    correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], TENTHS)
     capacity, cell_ah = relative_capacity(estimator.record[0]), cell.cell.capacity_ah
     result = Exported(
         out=str(out),

@@ -15,17 +15,17 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.cleaning.rests import without_glitches
-from bms_estimator.calibration.elements.generic_prior import curve, ladder_of, most_alike
-from bms_estimator.calibration.elements.initial_elements import rest_elements
+from bms_estimator.calibration.cleaning.rests import remove_glitches
+from bms_estimator.calibration.elements.generic_prior import curve, nearest_generic_cell, scaled_generic_ladder
+from bms_estimator.calibration.elements.initial_elements import initial_elements
 from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv.points import Points, max_v, rms_v
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.calibration.ocv.sources import (
-    GivenCurve,
+    ExternalCurve,
+    OcvSources,
     Recording,
-    Sources,
-    amid_usual_hysteresis,
+    center_on_typical_hysteresis,
     find_sources,
     has_plateau,
     without_branches,
@@ -155,17 +155,17 @@ def ocv(
         if columns is None:
             recordings.append(Recording(name, load_capture(path, current_sign=current_sign).rows))
         else:
-            curves.append(GivenCurve(name, *columns))
+            curves.append(ExternalCurve(name, *columns))
     good = [_moving(one) for one in recordings]
     count = _cells_in_series(np.concatenate([*good, *(curve.ocv_v for curve in curves)]), series)
     found = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
     fitted: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
     curve_v = fitted(found.points)(NODES)
-    generic = most_alike(NODES, curve_v, found.capacity_ah, count)
+    generic = nearest_generic_cell(NODES, curve_v, found.capacity_ah, count)
     ladder, elements = _elements(generic, found, recordings)
     found = without_branches(found, ladder)
     if form is Form.TABLE and found.hysteresis_v is None and has_plateau(NODES, curve_v, count):
-        found = amid_usual_hysteresis(found, np.interp(NODES, *curve(generic, "hysteresis_v")))
+        found = center_on_typical_hysteresis(found, np.interp(NODES, *curve(generic, "hysteresis_v")))
     fit = fitted(found.points)
     _check_ends(fit, found)
     result = _result(form, generic, fit, found)
@@ -185,7 +185,7 @@ def _moving(one: Recording) -> NDArray[np.float64]:
     Raises:
         UserError: It is always the same.
     """
-    voltage_v = without_glitches(one.samples, one.name)["voltage_v"]
+    voltage_v = remove_glitches(one.samples, one.name)["voltage_v"]
     if np.ptp(voltage_v) == 0.0:
         raise UserError(f"{one.name}: the voltage is {voltage_v[0]:g} V throughout: is the sensor connected?")
     return voltage_v
@@ -208,7 +208,7 @@ def _cells_in_series(voltage_v: NDArray[np.float64], told: int | None) -> int:
     return count
 
 
-def _check_ends(fit: ChenMoraFit | TableFit, found: Sources) -> None:
+def _check_ends(fit: ChenMoraFit | TableFit, found: OcvSources) -> None:
     """That the curve does not fall to nothing where no point is.
 
     Raises:
@@ -223,7 +223,7 @@ def _check_ends(fit: ChenMoraFit | TableFit, found: Sources) -> None:
     )
 
 
-def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, found: Sources) -> OcvResult:
+def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, found: OcvSources) -> OcvResult:
     tests, points = found.tests, found.points
     parameters: dict[str, dict[str, float | None]] = {}
     if isinstance(fit, ChenMoraFit):
@@ -252,7 +252,7 @@ def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, found: 
     )
 
 
-def _source_results(fit: ChenMoraFit | TableFit, found: Sources) -> list[SourceResult]:
+def _source_results(fit: ChenMoraFit | TableFit, found: OcvSources) -> list[SourceResult]:
     return [
         SourceResult(
             name=source.name,
@@ -271,17 +271,19 @@ def _or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _elements(generic: CellModel, found: Sources, recordings: list[Recording]) -> tuple[Ladder, dict[str, object]]:
+def _elements(generic: CellModel, found: OcvSources, recordings: list[Recording]) -> tuple[Ladder, dict[str, object]]:
     """Resistances over SOC, and a1..a15 by their sections: by the rests of one capture, else the generic cell's."""
     test = _warmest(found.tests)
     if test is None:
-        return ladder_of(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
-    rests = rest_elements(next(r.samples for r in recordings if r.name == test.name), test, found.capacity_ah)
-    return ladder_of(generic, rests, float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C))), dict(rests.sections)
+        return scaled_generic_ladder(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
+    rests = initial_elements(next(r.samples for r in recordings if r.name == test.name), test, found.capacity_ah)
+    return scaled_generic_ladder(generic, rests, float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C))), dict(
+        rests.sections
+    )
 
 
 def _cell(
-    name: str, series_count: int, fit: ChenMoraFit | TableFit, found: Sources, recordings: list[Recording]
+    name: str, series_count: int, fit: ChenMoraFit | TableFit, found: OcvSources, recordings: list[Recording]
 ) -> dict[str, object]:
     """Its section with limits of what a good sample is, and that of its open-circuit voltage."""
     middle_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
@@ -319,7 +321,7 @@ def _remarks(result: OcvResult) -> list[str]:
     ]
 
 
-def _table(out: Path, result: OcvResult, found: Sources) -> Table:
+def _table(out: Path, result: OcvResult, found: OcvSources) -> Table:
     """The outcome for people."""
     table = Table(title=f"{out}: written", title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")

@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sinks.trace_file import table_sink
 
 if TYPE_CHECKING:
-    from bms_estimator.fleet.identification.block_capture import Captured
+    from bms_estimator.fleet.identification.block_capture import BlockCapture
 
 FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
 FEW = 5
@@ -66,7 +66,9 @@ def epoch_s(time: datetime | None, otherwise_s: float) -> float:
     return otherwise_s if time is None else time.replace(tzinfo=UTC).timestamp()
 
 
-async def fetched(pack: str, since_s: float, until_s: float, where: tuple[str, Path | None, Path | None]) -> "Captured":
+async def fetched(
+    pack: str, since_s: float, until_s: float, where: tuple[str, Path | None, Path | None]
+) -> "BlockCapture":
     """What the server has of a pack.
 
     Raises:
@@ -79,7 +81,7 @@ async def fetched(pack: str, since_s: float, until_s: float, where: tuple[str, P
         return await fetch(nc, pack, since_s=since_s, until_s=until_s)
 
 
-def nothing(pack: str, found: "Captured") -> str:
+def nothing(pack: str, found: "BlockCapture") -> str:
     """Why there is no sample of a pack."""
     damaged = f"; {found.damaged} messages of it were no blocks" if found.damaged else ""
     return (
@@ -88,7 +90,7 @@ def nothing(pack: str, found: "Captured") -> str:
     )
 
 
-def _warnings(found: "Captured", since_s: float) -> list[str]:
+def _warnings(found: "BlockCapture", since_s: float) -> list[str]:
     first_s, _ = found.span_s
     lines = []
     if since_s > -math.inf and first_s > since_s + BLOCK_S:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.page_options import open_browser
 from bms_estimator.fleet.simulation.demo import Demo, free_port, run_demo
@@ -30,7 +30,7 @@ def demo(
     All are real processes on the loopback, with free ports and a folder that goes at the end. The edges run at ten times
     the speed. What is said comes from the workers' heartbeats and from estimates beside the simulated packs' true SOC.
     """
-    with compiling_shown():
+    with show_compile_progress():
         load_fleet_kernels()
     with tempfile.TemporaryDirectory(prefix="fleet-demo-") as folder:
         opened = open_browser if browser else _leave

@@ -19,17 +19,17 @@ from rich.table import Table
 
 from bms_estimator.cli.fleet.capture import Since, Until, epoch_s
 from bms_estimator.cli.fleet.packs import known_packs, refuse_unknown
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, Where
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.cli.options.capture_options import AsJson, Force, check_out
 from bms_estimator.cli.options.number_options import whole
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.packs.pack_registry import KnownPacks
-from bms_estimator.fleet.packs.pack_row import PackKind, stored
+from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.packs.pack_row import PackSpec, stored
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
-    from bms_estimator.fleet.identification.reidentify import Reidentified
+    from bms_estimator.fleet.identification.reidentify import ReidentificationResult
 
 RESULTS = "results.csv"
 
@@ -67,7 +67,7 @@ def identify(
     check_out(out / RESULTS, [], force=force)
     known = asyncio.run(known_packs(where))
     refuse_unknown(names, known)
-    found = list["Reidentified"]()
+    found = list["ReidentificationResult"]()
     for outcome in _outcomes(
         names, known, (epoch_s(since, -math.inf), epoch_s(until, math.inf)), where, scheduler, processes
     ):
@@ -90,22 +90,22 @@ def identify(
 
 def _outcomes(
     names: Sequence[str],
-    known: KnownPacks,
+    known: PackRegistry,
     span_s: tuple[float, float],
-    where: Where,
+    where: ServerAddress,
     scheduler: str | None,
     processes: int | None,
-) -> Iterator["Reidentified"]:
+) -> Iterator["ReidentificationResult"]:
     from bms_estimator.fleet.identification.batch import Task, reidentify_all  # noqa: PLC0415 - needs Dask and NATS
-    from bms_estimator.fleet.identification.reidentify import Reidentified  # noqa: PLC0415 - slow to import
+    from bms_estimator.fleet.identification.reidentify import ReidentificationResult  # noqa: PLC0415 - slow to import
 
     tasks, (server, creds, ca) = [], where
     for name in names:
         kind = known.kind(name)
-        if isinstance(kind, PackKind) and not known.reason(name):
+        if isinstance(kind, PackSpec) and not known.reason(name):
             tasks.append(Task(name, kind, known.cell_file(kind.cell), *span_s, server, creds, ca))
         else:
-            yield Reidentified(name, reason=known.reason(name))
+            yield ReidentificationResult(name, reason=known.reason(name))
     yield from reidentify_all(tasks, scheduler=scheduler, processes=processes or os.cpu_count() or 1)
 
 
@@ -128,7 +128,7 @@ def _listed(path: Path) -> list[str]:
     return [row[column or 0].strip() for row in listed if len(row) > (column or 0) and not row[0].startswith("#")]
 
 
-async def _put(found: Sequence["Reidentified"], known: KnownPacks, where: Where) -> list[str]:
+async def _put(found: Sequence["ReidentificationResult"], known: PackRegistry, where: ServerAddress) -> list[str]:
     """Put new cells, and let their packs' rows name them; returns the packs whose row another has changed."""
     from bms_estimator.fleet.identification.reidentify import cell_name  # noqa: PLC0415
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
@@ -139,7 +139,7 @@ async def _put(found: Sequence["Reidentified"], known: KnownPacks, where: Where)
         held = await read_bucket(nc, PACKS_BUCKET)
         for one in found:
             kind = known.kind(one.pack)
-            if not one.cell_file or not isinstance(kind, PackKind):
+            if not one.cell_file or not isinstance(kind, PackSpec):
                 continue
             if held.get(one.pack) != stored(kind):
                 changed.append(one.pack)
@@ -152,7 +152,7 @@ async def _put(found: Sequence["Reidentified"], known: KnownPacks, where: Where)
     return changed
 
 
-def _row(one: "Reidentified") -> dict[str, object]:
+def _row(one: "ReidentificationResult") -> dict[str, object]:
     """As a program reads it: no number where there is none."""
     values = asdict(one) | {"better": bool(one.cell_file)}
     del values["cell_file"]
@@ -161,7 +161,7 @@ def _row(one: "Reidentified") -> dict[str, object]:
     }
 
 
-def _write_results(path: Path, found: Sequence["Reidentified"]) -> None:
+def _write_results(path: Path, found: Sequence["ReidentificationResult"]) -> None:
     rows, table = list(map(_row, found)), io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -169,7 +169,7 @@ def _write_results(path: Path, found: Sequence["Reidentified"]) -> None:
     write_text(path, table.getvalue(), make_folder=True)
 
 
-def _table(found: Sequence["Reidentified"]) -> Table:
+def _table(found: Sequence["ReidentificationResult"]) -> Table:
     """Before and after, for people."""
     table = Table(box=box.SIMPLE_HEAD)
     for column in ("pack", "hours", "Ah", "R_s [mohm]", "RMS [mV]", "", "why not"):

@@ -9,11 +9,11 @@ from typing import Annotated
 import tomlkit
 import typer
 
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, Where
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.csv_table import CELL_FILE, PackTable, check_models, read_table, table_lines
-from bms_estimator.fleet.packs.pack_registry import KnownPacks
-from bms_estimator.fleet.packs.pack_row import PackKind, model_key, settings_of
+from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.packs.pack_row import PackSpec, model_key, settings_of
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
@@ -41,7 +41,7 @@ def load(
 def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> None:
     """Print the table that the server has, as CSV that `load` reads; what is wrong with a row goes to stderr."""
     known = asyncio.run(known_packs((server, creds, ca)))
-    kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackKind)}
+    kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackSpec)}
     of_each = {
         model_key(kind): pack for pack, kind in reversed(kinds.items())
     }  # one, whose cell stands for the others'
@@ -85,14 +85,14 @@ def show(
     typer.echo(f"{out}: {' and '.join(files)} written")
 
 
-def pack_files(pack: str, known: KnownPacks) -> dict[str, str]:
+def pack_files(pack: str, known: PackRegistry) -> dict[str, str]:
     """Texts by file name: the pack's file, and its cell's unless the package brings it.
 
     Raises:
         UserError: Its row or its cell is wrong.
     """
     kind = known.kind(pack)
-    if not isinstance(kind, PackKind) or known.reason(pack):
+    if not isinstance(kind, PackSpec) or known.reason(pack):
         raise UserError(f"{pack}: {known.reason(pack)}")
     text, cell = known.cell_file(kind.cell), kind.cell
     settings = settings_of(kind).model_dump(mode="json", exclude_unset=True)
@@ -111,7 +111,7 @@ def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:
         raise UserError(f"{', '.join(unknown)}: not in the table of packs; `fleet packs list` prints it")
 
 
-async def known_packs(where: Where) -> KnownPacks:
+async def known_packs(where: ServerAddress) -> PackRegistry:
     """All that the server has of packs."""
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.packs.pack_bucket import PackBucket  # noqa: PLC0415
@@ -122,7 +122,7 @@ async def known_packs(where: Where) -> KnownPacks:
     return bucket.packs
 
 
-async def _load(path: Path, read: PackTable, files: dict[str, str], where: Where, *, remove: bool) -> str:
+async def _load(path: Path, read: PackTable, files: dict[str, str], where: ServerAddress, *, remove: bool) -> str:
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket  # noqa: PLC0415
 
@@ -145,7 +145,7 @@ async def _load(path: Path, read: PackTable, files: dict[str, str], where: Where
     return f"{path}: {len(rows)} packs of {kinds} kinds: {said}"
 
 
-async def _remove(packs: set[str], where: Where) -> None:
+async def _remove(packs: set[str], where: ServerAddress) -> None:
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.packs.pack_bucket import read_bucket, remove_keys  # noqa: PLC0415
 

@@ -10,7 +10,7 @@ from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
 from bms_estimator.cli.options.page_options import open_browser, page_settings
 from bms_estimator.fleet.page import nats_feed
 from bms_estimator.fleet.page.fleet_page import fleet_page
-from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.page import PageSettings
 
@@ -39,7 +39,7 @@ def page(
     """Serve the page of all packs of a fleet, until SIGINT or SIGTERM."""
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
     configure_logs()
-    with drained():
+    with flush_logs():
         asyncio.run(_serve(nats_feed.Server(server, creds, ca), settings, folder, browser=browser))
 
 

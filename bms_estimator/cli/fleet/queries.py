@@ -12,11 +12,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, Where
+from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
-    from bms_estimator.fleet.queries.duckdb_queries import Answer, Question
+    from bms_estimator.fleet.queries.duckdb_queries import Answer, Query
 
 FOLDER = Path("hours")
 
@@ -30,14 +30,14 @@ def collect(
 ) -> None:
     """Write the summaries of hours to Parquet, until SIGINT or SIGTERM."""
     from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
-    from bms_estimator.process.log_setup import configure_logs, drained  # noqa: PLC0415
+    from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
 
     configure_logs()
-    with drained(), only_collector(folder):
+    with flush_logs(), only_collector(folder):
         asyncio.run(_collect((server, creds, ca), folder, period))
 
 
-async def _collect(where: Where, folder: Path, period_s: float) -> None:
+async def _collect(where: ServerAddress, folder: Path, period_s: float) -> None:
     from bms_estimator.fleet.nats.connection import connect, part  # noqa: PLC0415
     from bms_estimator.fleet.queries.collector import Collector  # noqa: PLC0415
     from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
@@ -84,11 +84,11 @@ def ask(
     if query is not None:
         answer = questions.select(folder, query, days=days)
     else:
-        answer = questions.ask(folder, name, days=days, limits=questions.Limits(within_days=within))
+        answer = questions.run_query(folder, name, days=days, limits=questions.Limits(within_days=within))
     (_print_json if json else _print_csv if csv else _print_table)(answer)
 
 
-def _list(questions: "dict[str, Question]") -> None:
+def _list(questions: "dict[str, Query]") -> None:
     for name, question in questions.items():
         typer.echo(f"{name:10}{question.help}")
     typer.echo(f"{'sql':10}SELECT on the view hours; its columns: fleet ask sql 'DESCRIBE hours'")

@@ -11,11 +11,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts
-from bms_estimator.fleet.server.nats_server import Place, Told
+from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.nats_server import serve as serving
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.settings.fleet import FleetSettings
 from bms_estimator.settings.pack import DeviceName
 from bms_estimator.settings.page import parse_listen
@@ -42,14 +42,14 @@ def serve(
     The first start makes keys for each tenant. Nodes other than the one that has them need a copy of keys/claims.json.
     """
     settings = _settings(settings_file, listen=listen, mqtt=mqtt)
-    place = Place(_folder(settings, folder), node, _nodes(settings, node, of))
+    place = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, of))
 
-    def read() -> Told:
+    def read() -> ServerSpec:
         settings = _settings(settings_file, listen=listen, mqtt=mqtt)
-        return Told(settings, _accounts(settings, place))
+        return ServerSpec(settings, _accounts(settings, place))
 
     configure_logs()
-    with drained():
+    with flush_logs():
         code = asyncio.run(serving(place, read, typer.echo))
     raise typer.Exit(code)
 
@@ -71,7 +71,7 @@ def user(
         TypeAdapter(DeviceName).validate_python(pack)
     except ValidationError:
         raise UserError(f"{pack!r}: no name of a pack: letters, digits, _ and -, 64 at most") from None
-    keys = Place(_folder(_settings(settings_file), folder)).keys
+    keys = NodeLocation(_folder(_settings(settings_file), folder)).keys
     now = datetime.now(UTC)
     typer.echo(credentials.edge_token(keys, tenant, pack, now, None if days is None else now + timedelta(days=days)))
 
@@ -128,7 +128,7 @@ def _has_port(host: str) -> bool:
     return host.rpartition(":")[2].isdigit() and (host.count(":") == 1 or "]:" in host)
 
 
-def _accounts(settings: FleetSettings, place: Place) -> Accounts | None:
+def _accounts(settings: FleetSettings, place: NodeLocation) -> Accounts | None:
     """Who may connect; keys are made on the first node alone.
 
     Raises:

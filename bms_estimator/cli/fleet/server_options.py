@@ -15,5 +15,5 @@ Ca = Annotated[
     Path | None,
     typer.Option(help="certificate of who signed the server's; else those of the system", show_default=False),
 ]
-Where = tuple[str, Path | None, Path | None]
+ServerAddress = tuple[str, Path | None, Path | None]
 """Server, credentials, authority."""

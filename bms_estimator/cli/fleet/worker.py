@@ -10,12 +10,12 @@ import structlog
 import typer
 
 from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
-from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.fleet.worker.worker import CHECKPOINT_S, Options, work
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.log_setup import configure_logs, drained
-from bms_estimator.process.signals import starting, stop_on_signal
+from bms_estimator.process.log_setup import configure_logs, flush_logs
+from bms_estimator.process.signals import startup_signals, stop_on_signal
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -37,8 +37,8 @@ def worker(
     """
     options = Options(server, _named(name), creds, ca, checkpoint_s)
     configure_logs()
-    with starting(None), drained():
-        with compiling_shown(structlog.get_logger(__name__).info):
+    with startup_signals(None), flush_logs():
+        with show_compile_progress(structlog.get_logger(__name__).info):
             load_fleet_kernels()
         asyncio.run(_work(options))
 

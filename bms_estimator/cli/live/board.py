@@ -25,8 +25,8 @@ from bms_estimator.protocols.firmware.messages import (
     set_serial_command,
 )
 from bms_estimator.settings.pack import Settings, load_settings
-from bms_estimator.sources.serial.device_detection import AskedBoard
-from bms_estimator.sources.serial.known_board_file import NO_BOARD, BoardMemory
+from bms_estimator.sources.serial.device_detection import BoardClient
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
 from bms_estimator.sources.serial.port_list import NoPortError, resolve_port
 
 
@@ -93,7 +93,7 @@ def board(
     if folder is not None:
         raise UserError(f"--folder {folder}: goes with --accept")
     try:
-        with AskedBoard(resolve_port(port), baud) as asked:
+        with BoardClient(resolve_port(port), baud) as asked:
             hello = asked.hello()
             typer.echo(_described(hello))
             if aref_v is not None:
@@ -120,7 +120,7 @@ def _accept_next(settings: Settings, folder: Path) -> None:
     """
     if settings.sensor.serial:
         raise UserError(f"sensor.serial = {settings.sensor.serial}: the settings name the board; change it there")
-    memory = BoardMemory(folder, settings.pack.name)
+    memory = KnownBoardFile(folder, settings.pack.name)
     known = memory.load()
     if not known:
         raise UserError(
@@ -135,7 +135,7 @@ def _accept_next(settings: Settings, folder: Path) -> None:
     typer.echo(f"{memory.path}: {forgotten}: the next that comes is the pack's")
 
 
-def _bandgap_v(asked: AskedBoard, hello: Hello, aref_v: float) -> float:
+def _bandgap_v(asked: BoardClient, hello: Hello, aref_v: float) -> float:
     """The bandgap with which the board's reference is ``aref_v``.
 
     Raises:
@@ -151,7 +151,7 @@ def _bandgap_v(asked: AskedBoard, hello: Hello, aref_v: float) -> float:
     return bandgap_v
 
 
-def _set_current(asked: AskedBoard, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
+def _set_current(asked: BoardClient, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
     if ratiometric is not None:
         told = asked.tell(set_ratiometric_command(ratiometric))
     if volts_per_ampere is not None:

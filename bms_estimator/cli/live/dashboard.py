@@ -9,7 +9,7 @@ import typer
 from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.cli.options.page_options import open_browser, page_settings
 from bms_estimator.page.broker_page import dashboard as serving
-from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.mqtt import MqttSettings
@@ -41,7 +41,7 @@ def dashboard(
     broker = (with_broker(settings, mqtt) if mqtt else settings).mqtt or MqttSettings()
     page = page_settings(settings.page or PageSettings(), listen=listen, token_file=token_file)
     configure_logs()
-    with drained():
+    with flush_logs():
         asyncio.run(_serve(broker, page, folder or state_folder(settings), browser=browser))
 
 

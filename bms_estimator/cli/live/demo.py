@@ -8,12 +8,12 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.page_options import open_browser
 from bms_estimator.demo.board import find_build
 from bms_estimator.demo.demo import run_demo
-from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.sinks.terminal.panels import LOG_LINES
 
@@ -51,9 +51,9 @@ def demo(
     build = None if python_board else find_build(firmware)
     log = deque[str](maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)
-    with compiling_shown():
+    with show_compile_progress():
         load_kernels()
-    with drained():
+    with flush_logs():
         totals = asyncio.run(
             run_demo(
                 build,

@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.pack_options import with_sensor
-from bms_estimator.process.log_setup import configure_logs, drained
-from bms_estimator.process.signals import starting
+from bms_estimator.process.log_setup import configure_logs, flush_logs
+from bms_estimator.process.signals import startup_signals
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.edge_service import serve_edge
 from bms_estimator.settings.pack import load_settings
@@ -24,5 +24,5 @@ def edge(
     """
     settings = with_sensor(load_settings(pack), port=port)
     configure_logs()
-    with starting(None), drained():
+    with startup_signals(None), flush_logs():
         asyncio.run(serve_edge(settings, state_folder(settings)))

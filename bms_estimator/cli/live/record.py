@@ -15,13 +15,13 @@ from rich.text import Text
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.pack_options import load_pack, with_sensor
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal, until_first_ends
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import header_of
-from bms_estimator.sources.captures.recorder import Recording
-from bms_estimator.sources.factory import open_reports
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.captures.recorder import CaptureRecorder
+from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import Source
 
 REDRAW_S = 0.25
@@ -51,19 +51,19 @@ def record(
     settings = load_pack(pack)[0] if pack else Settings()
     protocol = "text" if text else None
     settings = with_sensor(settings, port=port, baud=baud, sample_rate_hz=rate_hz, protocol=protocol)
-    with drained(), Recording(out, header_of(settings.sensor, settings.source)) as recording:
+    with flush_logs(), CaptureRecorder(out, header_of(settings.sensor, settings.source)) as recording:
         progress = asyncio.run(_record(settings, recording, seconds))
     if recording.fault:
         raise UserError(f"recording ended: {recording.fault}")
     typer.echo(progress.summary(), err=True)
 
 
-async def _record(settings: Settings, recording: Recording, seconds: float | None) -> "Progress":
+async def _record(settings: Settings, recording: CaptureRecorder, seconds: float | None) -> "Progress":
     """Source -> file, until a signal, the time's end or the disk's."""
     stop = stop_on_signal()
     console, log = Console(stderr=True), deque[str]()
     configure_logs(log if console.is_terminal else None)
-    async with open_reports(settings, tap=recording) or SerialBoard(settings.sensor, tap=recording) as source:
+    async with open_line_source(settings, tap=recording) or SerialSource(settings.sensor, tap=recording) as source:
         progress = Progress(source, recording)
         await until_first_ends(
             stop.wait(),
@@ -80,12 +80,12 @@ async def _drain(source: Source) -> None:
         pass
 
 
-async def _end(recording: Recording) -> None:
+async def _end(recording: CaptureRecorder) -> None:
     with contextlib.suppress(OSError):  # said by the caller
         await asyncio.wrap_future(recording.ended)
 
 
-async def _time_over(recording: Recording, seconds: float | None) -> None:
+async def _time_over(recording: CaptureRecorder, seconds: float | None) -> None:
     """Ends ``seconds`` after the first bytes; with None never."""
     while seconds is None or not recording.bytes:  # noqa: ASYNC110 - the tap has no event for it
         await asyncio.sleep(REDRAW_S)
@@ -106,7 +106,7 @@ async def _show(console: Console, progress: "Progress", log: deque[str]) -> None
 class Progress:
     """What has been recorded so far."""
 
-    def __init__(self, source: Source, recording: Recording) -> None:
+    def __init__(self, source: Source, recording: CaptureRecorder) -> None:
         self._source, self._recording = source, recording
         self._started_s = time.monotonic()
         self._last = (self._started_s, 0)

@@ -12,22 +12,22 @@ from typing import Annotated, Any
 import structlog
 import typer
 
-from bms_estimator.cli.options.compile_progress import compiling_shown
+from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.process.log_setup import configure_logs, drained
-from bms_estimator.process.signals import starting
+from bms_estimator.process.log_setup import configure_logs, flush_logs
+from bms_estimator.process.signals import startup_signals
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.service.multi_pack_service import serve_several
-from bms_estimator.service.pack_service import serve
-from bms_estimator.service.settings_reload import Reload, ask_all, reload_on_hangup
+from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.service.settings_reload import SettingsReload, ask_all, reload_on_hangup
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks.terminal.panels import LOG_LINES
-from bms_estimator.sinks.terminal.sink import ConsoleSink
+from bms_estimator.sinks.terminal.sink import TerminalSink
 from bms_estimator.sources.captures.raw_capture import header_of
-from bms_estimator.sources.captures.recorder import Recording
+from bms_estimator.sources.captures.recorder import CaptureRecorder
 
 
 def run(
@@ -51,8 +51,8 @@ def run(
     told = partial(_told, port=port, mqtt=mqtt)
     loaded = [(told(settings), cell) for settings, cell in map(load_pack, paths)]
     reads = [lambda path=path: told(load_settings(path)) for path in paths]
-    reloads = [Reload(settings, read) for (settings, _), read in zip(loaded, reads, strict=True)]
-    with starting(None if _on_terminal() else partial(ask_all, reloads)):
+    reloads = [SettingsReload(settings, read) for (settings, _), read in zip(loaded, reads, strict=True)]
+    with startup_signals(None if _on_terminal() else partial(ask_all, reloads)):
         if len(loaded) == 1:
             _run_one(*loaded[0], reloads[0], record, view=sys.stdout.isatty() if view is None else view)
         else:
@@ -72,31 +72,33 @@ def _on_terminal() -> bool:
     return bool(sys.stdin and sys.stdin.isatty())
 
 
-async def _reloading(service: Coroutine[Any, Any, object], reloads: Sequence[Reload]) -> None:
+async def _reloading(service: Coroutine[Any, Any, object], reloads: Sequence[SettingsReload]) -> None:
     """Serve, and read the settings anew on SIGHUP; where there is a terminal it says that this is gone, and ends us."""
     if not _on_terminal():
         reload_on_hangup(reloads)
     await service
 
 
-def _run_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[Reload]) -> None:
+def _run_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[SettingsReload]) -> None:
     configure_logs()
-    with drained():
+    with flush_logs():
         _load_kernels()
         asyncio.run(_reloading(serve_several(packs, reloads), reloads))
 
 
-def _run_one(settings: Settings, cell: PackModel, reload: Reload, record: Path | None, *, view: bool) -> None:
+def _run_one(settings: Settings, cell: PackModel, reload: SettingsReload, record: Path | None, *, view: bool) -> None:
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if view and sys.stdout.isatty() else None)
-    recorder = Recording(record, header_of(settings.sensor, settings.source)) if record else contextlib.nullcontext()
-    sinks = [ConsoleSink(log=log)] if view else []
-    with drained(), recorder as tap:
+    recorder = (
+        CaptureRecorder(record, header_of(settings.sensor, settings.source)) if record else contextlib.nullcontext()
+    )
+    sinks = [TerminalSink(log=log)] if view else []
+    with flush_logs(), recorder as tap:
         _load_kernels()
-        service = serve(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings), reload=reload)
+        service = run_pack_service(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings), reload=reload)
         asyncio.run(_reloading(service, [reload]))
 
 
 def _load_kernels() -> None:
-    with compiling_shown(structlog.get_logger(__name__).info):
+    with show_compile_progress(structlog.get_logger(__name__).info):
         load_kernels()

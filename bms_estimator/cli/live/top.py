@@ -12,14 +12,14 @@ from bms_estimator.cli.live.key_presses import keys
 from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.subscriber import Subscriber
-from bms_estimator.mqtt.topic_cache import Heard
-from bms_estimator.process.log_setup import configure_logs, drained
+from bms_estimator.mqtt.topic_cache import DeviceMessage
+from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sinks.terminal.live_view import LiveView
 from bms_estimator.sinks.terminal.panels import LOG_LINES
-from bms_estimator.sinks.terminal.scene import Lost
+from bms_estimator.sinks.terminal.scene import BrokerOutage
 
 TICK_S = 1.0
 """Also when nothing is heard the view is made anew: it says since when that is [s]."""
@@ -45,7 +45,7 @@ def top(
         raise UserError(f"{pack}: has no [mqtt]: name the broker there, or with --mqtt mqtt://host:port")
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)
-    with drained():
+    with flush_logs():
         asyncio.run(_watch(settings.mqtt, log, first=settings.pack.name if pack else ""))
 
 
@@ -53,13 +53,13 @@ async def _watch(settings: MqttSettings, log: deque[str], first: str) -> None:
     """Show until a key, a signal, or until nobody reads any more."""
     stop = stop_on_signal()
 
-    def hear(heard: Heard) -> None:
+    def hear(heard: DeviceMessage) -> None:
         view.hear(heard)
         fresh.set()
 
-    def lost() -> Lost | None:
+    def lost() -> BrokerOutage | None:
         since_s = subscriber.lost_since
-        return None if since_s is None else Lost(since_s, subscriber.trouble)
+        return None if since_s is None else BrokerOutage(since_s, subscriber.trouble)
 
     def press(meaning: str) -> None:
         if meaning == "quit":

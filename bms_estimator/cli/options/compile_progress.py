@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 from rich.console import Console
 from rich.status import Status
 
-from bms_estimator.kernels.compile_events import compiling_told
+from bms_estimator.kernels.compile_events import report_compilation
 
 Show = Callable[[str], None]
 """Takes a line."""
@@ -19,7 +19,7 @@ LINE_S = 5.0
 
 
 @contextmanager
-def compiling_shown(say: Show | None = None) -> Iterator[None]:
+def show_compile_progress(say: Show | None = None) -> Iterator[None]:
     """Show meanwhile which kernel is compiled and how many there are; nothing where they are all in the cache.
 
     Args:
@@ -33,7 +33,7 @@ def compiling_shown(say: Show | None = None) -> Iterator[None]:
             check()
             show(f"compiling kernels, once: {number}/{most} {kernel}")
 
-        with compiling_told(tell):
+        with report_compilation(tell):
             yield
 
 

@@ -60,11 +60,11 @@ def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackMode
     """The pack as one object, made of ``cell``."""
     model = load_any(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
     if settings.pack.initial_soc is not None:
-        refuse_soc(model, "pack.initial_soc")
+        reject_soc_for_fuel_cell(model, "pack.initial_soc")
     return model
 
 
-def refuse_soc(model: PackModel, told: str) -> None:
+def reject_soc_for_fuel_cell(model: PackModel, told: str) -> None:
     """Say that a fuel cell has no SOC.
 
     Args:

@@ -11,9 +11,9 @@ from bms_estimator.cli.live.ports import asking
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.cli.settings.settings_template import Given, settings_file
 from bms_estimator.edge.block_sender import check_edge
-from bms_estimator.estimator.settings_plausibility import implausible
+from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.estimator.settings_records import estimator_settings
-from bms_estimator.estimator.stability_conditions import Condition, failed
+from bms_estimator.estimator.stability_conditions import Condition, failed_conditions
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
@@ -30,8 +30,8 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.exports.influx import target
-from bms_estimator.sources.factory import make_bringer
-from bms_estimator.sources.serial.device_detection import Found
+from bms_estimator.sources.factory import make_line_producer
+from bms_estimator.sources.serial.device_detection import DetectedDevice
 from bms_estimator.sources.serial.device_detection import probe as who_is_there
 from bms_estimator.sources.serial.port_list import board_ports
 
@@ -76,12 +76,12 @@ def _probed(ports: Sequence[str]) -> Given:
     """
     if not ports:
         raise UserError("--probe: no serial port is there that may be a board's or a BMS's; name it with --port")
-    answers = dict[str, Found | str]()
+    answers = dict[str, DetectedDevice | str]()
     for port in ports:
         with asking(port):
             answers[port] = who_is_there(port)
     said = "; ".join(f"{port}: {answer}" for port, answer in answers.items())
-    found = {port: answer for port, answer in answers.items() if isinstance(answer, Found)}
+    found = {port: answer for port, answer in answers.items() if isinstance(answer, DetectedDevice)}
     if not found:
         raise UserError(f"--probe: nobody is known to be there: {said}")
     if len(found) > 1:
@@ -98,7 +98,12 @@ def _probed(ports: Sequence[str]) -> Given:
 def check(file: PackFile = Path("pack.toml")) -> None:
     """Check a settings file and its cell file; name what is wrong, warn of what will not work well."""
     settings, cell = load_pack(file)
-    warnings = [*implausible(settings, cell), *out_of_range(settings, cell), *unusable(settings), *_lemma(cell)]
+    warnings = [
+        *implausible_settings(settings, cell),
+        *out_of_range(settings, cell),
+        *unusable(settings),
+        *_lemma(cell),
+    ]
     if settings.mqtt is not None:
         mqtt, unseen = _here("mqtt", settings.mqtt)
         warnings += unseen + check_brokers(mqtt)
@@ -115,7 +120,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         unread, unseen = _unread("influx", settings.influx, "password_file", "token_file")
         warnings += unseen
         target(settings.influx.model_copy(update=dict.fromkeys(unread)))
-    make_bringer(settings)  # says what of [source] cannot be used, or is not installed
+    make_line_producer(settings)  # says what of [source] cannot be used, or is not installed
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_in_short(settings, cell)}")
@@ -181,7 +186,7 @@ def _unread(
 
 def _lemma(cell: PackModel) -> list[str]:
     """What Lemma 4.1.1 asks of the bounds and does not get; of a fuel cell it asks nothing."""
-    return [f"{cell.cell.name}: {_unmet(c)}" for c in failed(cell)] if isinstance(cell, CellModel) else []
+    return [f"{cell.cell.name}: {_unmet(c)}" for c in failed_conditions(cell)] if isinstance(cell, CellModel) else []
 
 
 def _unmet(condition: Condition) -> str:

@@ -14,10 +14,10 @@ import numpy as np
 from dask.base import compute
 from dask.delayed import delayed
 
-from bms_estimator.fleet.identification.block_capture import Captured, fetch
-from bms_estimator.fleet.identification.reidentify import Reidentified, reidentify
+from bms_estimator.fleet.identification.block_capture import BlockCapture, fetch
+from bms_estimator.fleet.identification.reidentify import ReidentificationResult, reidentify
 from bms_estimator.fleet.nats.one_shot_connection import connected
-from bms_estimator.fleet.packs.pack_row import PackKind
+from bms_estimator.fleet.packs.pack_row import PackSpec
 from bms_estimator.model.errors import UserError
 
 AT_ONCE = 8
@@ -25,7 +25,7 @@ AT_ONCE = 8
 CLUSTER_S = 10.0
 """So long a cluster's scheduler is waited for."""
 
-Work = Callable[[Sequence["Task"]], Sequence[Reidentified]]
+Work = Callable[[Sequence["Task"]], Sequence[ReidentificationResult]]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Task:
     """
 
     pack: str
-    kind: PackKind
+    kind: PackSpec
     cell_file: str | None
     since_s: float
     until_s: float
@@ -50,7 +50,7 @@ class Task:
     ca: Path | None
 
 
-def reidentify_all(tasks: Sequence[Task], *, scheduler: str | None, processes: int) -> Iterator[Reidentified]:
+def reidentify_all(tasks: Sequence[Task], *, scheduler: str | None, processes: int) -> Iterator[ReidentificationResult]:
     """What came of each pack, in their order; the first ones come while others are worked on.
 
     Args:
@@ -67,20 +67,20 @@ def reidentify_all(tasks: Sequence[Task], *, scheduler: str | None, processes: i
             yield from work(tasks[first : first + step])
 
 
-def one(task: Task) -> Reidentified:
+def one(task: Task) -> ReidentificationResult:
     """What came of one pack; whatever goes wrong with it is its own."""
     try:
         found = asyncio.run(_fetched(task))
         if not found.blocks:
-            return Reidentified(task.pack, reason="the server keeps no sample of it in this span")
+            return ReidentificationResult(task.pack, reason="the server keeps no sample of it in this span")
         return reidentify(task.pack, np.concatenate(list(found.samples())), task.kind, task.cell_file)
     except UserError as error:
-        return Reidentified(task.pack, reason=str(error))
+        return ReidentificationResult(task.pack, reason=str(error))
     except Exception as error:  # noqa: BLE001 - said of this pack; hours of work on the others are not lost
-        return Reidentified(task.pack, reason=f"a fault of the program: {type(error).__name__}: {error}")
+        return ReidentificationResult(task.pack, reason=f"a fault of the program: {type(error).__name__}: {error}")
 
 
-async def _fetched(task: Task) -> Captured:
+async def _fetched(task: Task) -> BlockCapture:
     async with connected(task.server, task.creds, task.ca) as nc:
         return await fetch(nc, task.pack, since_s=task.since_s, until_s=task.until_s)
 
@@ -90,7 +90,7 @@ def _pool(processes: int) -> Iterator[Work]:
     """Processes of this machine, for Dask's own scheduler."""
     with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
 
-        def on_pool(tasks: Sequence[Task]) -> Sequence[Reidentified]:
+        def on_pool(tasks: Sequence[Task]) -> Sequence[ReidentificationResult]:
             try:
                 return _computed(tasks, scheduler="processes", pool=pool, chunksize=1)
             except BrokenProcessPool:
@@ -118,6 +118,6 @@ def _cluster(scheduler: str) -> Iterator[Work]:
         yield lambda tasks: _computed(tasks, scheduler=client.get)
 
 
-def _computed(tasks: Sequence[Task], **how: Any) -> Sequence[Reidentified]:
-    computed: Callable[..., Sequence[Reidentified]] = compute
+def _computed(tasks: Sequence[Task], **how: Any) -> Sequence[ReidentificationResult]:
+    computed: Callable[..., Sequence[ReidentificationResult]] = compute
     return computed(*(delayed(one, pure=False)(task) for task in tasks), **how)

@@ -20,7 +20,7 @@ ROWS = 65_536
 
 
 @dataclass
-class Captured:
+class BlockCapture:
     """What was found of one pack; ``add`` its blocks in the stream's order.
 
     As workers do, a store that is older than one already met is left out: its edge has been given another.
@@ -119,7 +119,7 @@ def _wall_s(block: Block, sample: int) -> float:
     return block.store * 1e-9 + float(block.samples["time_s"][sample])
 
 
-async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: float = math.inf) -> Captured:
+async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: float = math.inf) -> BlockCapture:
     """The blocks of a pack that the stream still has.
 
     Args:
@@ -131,7 +131,7 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
     Raises:
         StreamError: The server does not answer, or has no such stream.
     """
-    found = Captured(since_s, until_s)
+    found = BlockCapture(since_s, until_s)
     first_s = None if since_s <= AHEAD_S else since_s - AHEAD_S
     async for batch in read_stream(nc, RAW_STREAM, f"p.*.raw.{pack}", since_s=first_s):
         for message in batch:

@@ -14,8 +14,8 @@ import numpy as np
 from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.estimator.identified_parameters import learned_cell
-from bms_estimator.fleet.packs.pack_row import PackKind, cell_of, settings_of
+from bms_estimator.estimator.identified_parameters import identified_cell
+from bms_estimator.fleet.packs.pack_row import PackSpec, cell_of, settings_of
 from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -47,7 +47,7 @@ ROWS = 65_536
 
 
 @dataclass(frozen=True)
-class Judged:
+class HoldoutError:
     """One cell on the samples that judge.
 
     Attributes:
@@ -60,7 +60,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Reidentified:
+class ReidentificationResult:
     """What came of one pack.
 
     Attributes:
@@ -102,7 +102,7 @@ def cell_name(pack: str) -> str:
     return f"of-{pack}"
 
 
-def reidentify(pack: str, samples: SampleBlock, kind: PackKind, cell_file: str | None) -> Reidentified:
+def reidentify(pack: str, samples: SampleBlock, kind: PackSpec, cell_file: str | None) -> ReidentificationResult:
     """Identify one pack.
 
     Args:
@@ -112,7 +112,7 @@ def reidentify(pack: str, samples: SampleBlock, kind: PackKind, cell_file: str |
         cell_file: The text of the cell file that it names, if it does.
     """
     seconds = float(np.ptp(samples["time_s"])) if samples.size else 0.0
-    outcome = Reidentified(pack, hours=seconds / 3600.0)
+    outcome = ReidentificationResult(pack, hours=seconds / 3600.0)
     try:
         cell = _battery(kind, cell_file)
         outcome = replace(outcome, capacity_before_ah=cell.cell.capacity_ah, r_s_before_ohm=_r_s(cell))
@@ -124,7 +124,7 @@ def reidentify(pack: str, samples: SampleBlock, kind: PackKind, cell_file: str |
 class _Pack:
     """One pack's samples, as those of one object of its cell file."""
 
-    def __init__(self, outcome: Reidentified, samples: SampleBlock, kind: PackKind, cell: CellModel) -> None:
+    def __init__(self, outcome: ReidentificationResult, samples: SampleBlock, kind: PackSpec, cell: CellModel) -> None:
         self._outcome, self._kind, self._cell = outcome, kind, cell
         seconds = 3600.0 * outcome.hours
         if seconds < LEAST_S:
@@ -143,7 +143,7 @@ class _Pack:
                 f"no {LEAST_PIECE_S / 60.0:g} min without a gap: the edge's link or its board is away"
             )
 
-    def found(self) -> Reidentified:
+    def found(self) -> ReidentificationResult:
         """The better of the ways, where it is better than what there is."""
         learned, soc, std = self._learn()
         ways = {"learned": learned}
@@ -179,7 +179,7 @@ class _Pack:
         soc, std = _estimated(estimator, np.concatenate(self._training))
         if not estimator.state[0]["started"]:
             raise _NotEnoughError("no sample is one that this cell can have: are series, parallel and cell right?")
-        return learned_cell(estimator, self._cell, 1), soc, std
+        return identified_cell(estimator, self._cell, 1), soc, std
 
     def _fit(self, cell: CellModel, soc: Floats, std: Floats) -> CellModel:
         """Resistances and OCV fitted to the longest piece of the training, SOC counted from where it is known best."""
@@ -196,7 +196,7 @@ class _Pack:
         start = float(np.clip(soc[where] + drawn_ah / cell.cell.capacity_ah, 0.0, 1.0))
         return identify([Columns(piece, self._outcome.pack)], cell, initial_soc=start).cell
 
-    def _judge(self, cell: CellModel) -> Judged:
+    def _judge(self, cell: CellModel) -> HoldoutError:
         """Open loop over each window of the judges, its SOC at first as an estimator with that cell has it by then."""
         estimator = self._estimator(cell)
         _estimated(estimator, np.concatenate(self._training))
@@ -206,11 +206,11 @@ class _Pack:
             try:
                 errors = validate(Columns(window, self._outcome.pack), cell, initial_soc=start).above
             except UserError:  # its SOC leaves 0..1, or most samples cannot be its own
-                return Judged(math.inf, count)
+                return HoldoutError(math.inf, count)
             if errors.samples:
                 squares, count = squares + errors.samples * errors.voltage_rms_v**2, count + errors.samples
             _estimated(estimator, window)
-        return Judged(math.sqrt(squares / count) if count else math.inf, count)
+        return HoldoutError(math.sqrt(squares / count) if count else math.inf, count)
 
     def _estimator(self, cell: CellModel) -> Estimator:
         settings = settings_of(self._kind)
@@ -236,14 +236,14 @@ class _Pack:
         return cell_text(cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name})}), remarks)
 
 
-def _battery(kind: PackKind, cell_file: str | None) -> CellModel:
+def _battery(kind: PackSpec, cell_file: str | None) -> CellModel:
     cell = cell_of(kind, cell_file)
     if not isinstance(cell, CellModel):
         raise _NotEnoughError(f"{kind.cell} is a fuel cell: `identify` finds it from polarisation curves")
     return cell
 
 
-def _of_one(samples: SampleBlock, kind: PackKind) -> SampleBlock:
+def _of_one(samples: SampleBlock, kind: PackSpec) -> SampleBlock:
     """What one object of the cell file has of the pack's voltage and current; only samples that go on in time."""
     latest_s = np.maximum.accumulate(np.r_[-math.inf, samples["time_s"][:-1]])
     one = samples[samples["time_s"] > latest_s]

@@ -167,7 +167,7 @@ class _Said:
         self._last: tuple[str, float] = ("", 0.0)
 
     async def trouble(self, error: Exception) -> None:
-        text, now_s = reason(error), time.monotonic()
+        text, now_s = error_text(error), time.monotonic()
         if not self._nc.is_connected:
             self._linked(text)
         if (text, True) != (self._last[0], now_s < self._last[1] + SAID_S):
@@ -186,7 +186,7 @@ class _Said:
         log.info("the server is back", server=self._servers)
 
 
-def reason(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Of an error of NATS, or of the line to it."""
     said = str(getattr(error, "description", None) or error).removeprefix("nats: ") or type(error).__name__
     for kind, text in _REASONS.items():

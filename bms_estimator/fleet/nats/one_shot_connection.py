@@ -8,7 +8,7 @@ import nats
 import nats.errors
 from nats.aio.client import Client
 
-from bms_estimator.fleet.nats.connection import FLUSH_S, addresses, context, readable, reason
+from bms_estimator.fleet.nats.connection import FLUSH_S, addresses, context, error_text, readable
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
 
@@ -41,9 +41,9 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
             error_cb=trouble,
         )
     except (nats.errors.Error, OSError, ValueError) as error:
-        raise UserError(f"--server {server}: {reason(troubles[-1] if troubles else error)}") from None
+        raise UserError(f"--server {server}: {error_text(troubles[-1] if troubles else error)}") from None
     try:
         async with nc:
             yield nc
     except (StreamError, nats.errors.Error) as error:  # what is not allowed is said beside the question
-        raise UserError(f"--server {server}: {reason(troubles[-1] if troubles else error)}") from None
+        raise UserError(f"--server {server}: {error_text(troubles[-1] if troubles else error)}") from None

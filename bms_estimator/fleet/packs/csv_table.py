@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from bms_estimator.fleet.packs.pack_row import COLUMNS, PackKind, known_cells, model_key, model_of, stored
+from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, known_cells, model_key, model_of, stored
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import DEVICE_NAME
 
@@ -28,7 +28,7 @@ class Line(NamedTuple):
     """A row of the table and where it stands."""
 
     number: int
-    kind: PackKind
+    kind: PackSpec
     data: bytes
     """As ``stored`` makes it of the kind."""
 
@@ -91,7 +91,7 @@ class _Reader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._kinds = dict[tuple[str, ...], tuple[PackKind, bytes]]()
+        self._kinds = dict[tuple[str, ...], tuple[PackSpec, bytes]]()
         self._files = dict[str, Path]()
 
     def table(self) -> PackTable:
@@ -137,7 +137,7 @@ class _Reader:
         _refuse(self._path, [f"{self._path}: line 1: {error}" for error in errors])
         return names
 
-    def _row(self, columns: list[str], values: list[str]) -> tuple[str, PackKind, bytes]:
+    def _row(self, columns: list[str], values: list[str]) -> tuple[str, PackSpec, bytes]:
         if len(values) != len(columns):
             raise _RowError(f"{len(values)} values in {len(columns)} columns; give one for each, empty for the default")
         place = columns.index("pack")
@@ -151,18 +151,18 @@ class _Reader:
             self._kinds[key] = kind, stored(kind)
         return name, *self._kinds[key]
 
-    def _kind(self, told: Mapping[str, str]) -> PackKind:
+    def _kind(self, told: Mapping[str, str]) -> PackSpec:
         """What packs of the same values have in common."""
         values: dict[str, object] = {column: _value(column, value) for column, value in told.items()}
         cell = told.get("cell", "")
         if cell.endswith(CELL_FILE):
             values["cell"] = self._cell_file(cell)
         try:
-            return PackKind.model_validate(values)
+            return PackSpec.model_validate(values)
         except ValidationError as error:
             detail = error.errors()[0]
             column = str(detail["loc"][0])
-            described = PackKind.model_fields[column].description
+            described = PackSpec.model_fields[column].description
             if column not in told:
                 raise _RowError(f"column {column}: is empty; give {described}") from None
             message = detail["msg"].removeprefix("Value error, ")
@@ -218,7 +218,7 @@ def _refuse(path: Path, errors: Sequence[str]) -> None:
         raise UserError("\n".join([*errors[:MOST_SAID], *([f"{path}: and {left} more"] if left > 0 else [])]))
 
 
-def table_lines(packs: Mapping[str, PackKind]) -> Iterator[str]:
+def table_lines(packs: Mapping[str, PackSpec]) -> Iterator[str]:
     """The same as CSV, lines with their ends: only the columns of which at least one pack has something."""
     told = {name: kind.model_dump(exclude_defaults=True) for name, kind in sorted(packs.items())}
     columns = [column for column in COLUMNS if column == "pack" or any(column in row for row in told.values())]

@@ -10,9 +10,9 @@ import nats.js.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.nats.connection import reason
+from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stream_reader import ANSWER_S, Stored, StreamError, read_stream
-from bms_estimator.fleet.packs.pack_registry import KnownPacks
+from bms_estimator.fleet.packs.pack_registry import PackRegistry
 
 POLL_S = 1.0
 """Between two looks for what has changed."""
@@ -46,7 +46,7 @@ class PackBucket:
     """
 
     def __init__(self, nc: Client) -> None:
-        self.packs = KnownPacks()
+        self.packs = PackRegistry()
         self.faults, self.fault = 0, ""
         self._nc = nc
         self._next = {PACKS_BUCKET: 1, CELLS_BUCKET: 1}
@@ -69,7 +69,7 @@ class PackBucket:
         try:
             state = (await self._nc.jetstream().stream_info(_stream(bucket))).state
         except nats.errors.Error as error:
-            raise StreamError(f"the server refuses to read {_stream(bucket)}: {reason(error)}") from None
+            raise StreamError(f"the server refuses to read {_stream(bucket)}: {error_text(error)}") from None
         if state.last_seq + 1 < self._next[bucket]:
             self._next[bucket] = 1  # made anew, or its end is lost: numbers come again for other values
         async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next[bucket]):

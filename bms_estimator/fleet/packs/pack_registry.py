@@ -7,7 +7,7 @@ wrong with a row makes its packs unknown, with the reason.
 from collections.abc import Collection, Iterator
 from functools import lru_cache
 
-from bms_estimator.fleet.packs.pack_row import PackKind, kind_of, known_cells, model_of, settings_of
+from bms_estimator.fleet.packs.pack_row import PackSpec, kind_of, known_cells, model_of, settings_of
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
@@ -15,10 +15,10 @@ from bms_estimator.settings.pack import Settings
 
 MOST_KINDS = 1024
 """So many kinds of packs are kept ready."""
-NOT_TOLD = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
+UNKNOWN_PACK = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
 
 
-class KnownPacks:
+class PackRegistry:
     """Rows and cell files, from which a pack's settings and model follow."""
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class KnownPacks:
         found = self._found(pack)
         return found if isinstance(found, str) else ""
 
-    def kind(self, pack: str) -> PackKind | str | None:
+    def kind(self, pack: str) -> PackSpec | str | None:
         """Its row, or what is wrong with it; None where there is none."""
         data = self._rows.get(pack)
         return None if data is None else self._kind(data)
@@ -89,20 +89,20 @@ class KnownPacks:
     def _found(self, pack: str) -> tuple[Settings, PackModel] | str:
         kind = self.kind(pack)
         if kind is None:
-            return NOT_TOLD
+            return UNKNOWN_PACK
         if isinstance(kind, str):
             return f"its row is wrong: {kind}"
         return self._made(kind, self._cells.get(kind.cell))
 
 
-def _kind(data: bytes) -> PackKind | str:
+def _kind(data: bytes) -> PackSpec | str:
     try:
         return kind_of(data)
     except ValueError as error:
         return str(error)
 
 
-def _made(kind: PackKind, cell_file: str | None) -> tuple[Settings, PackModel] | str:
+def _made(kind: PackSpec, cell_file: str | None) -> tuple[Settings, PackModel] | str:
     try:
         settings, model = settings_of(kind), model_of(kind, cell_file)
         type_estimator(settings, model)  # kept: a partition asks for the same next

@@ -27,7 +27,7 @@ CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
 _COUNT = Field(ge=1, le=10_000)
 
 
-class PackKind(Strict):
+class PackSpec(Strict):
     """What packs have in common that differ by their names alone; as ``[pack]`` and ``[sensor]`` of a pack's file."""
 
     cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
@@ -52,34 +52,34 @@ class PackKind(Strict):
     period_s: Positive | None = Field(default=None, description="between two samples; 1 s when left out")
 
 
-class PackRow(PackKind):
+class PackRow(PackSpec):
     """One pack."""
 
     pack: DeviceName = Field(description="device in topic names: 1 to 64 letters, digits, _ and -")
 
     @property
-    def kind(self) -> PackKind:
+    def kind(self) -> PackSpec:
         """All but the name."""
-        return PackKind.model_validate(self.model_dump(exclude={"pack"}, exclude_unset=True))
+        return PackSpec.model_validate(self.model_dump(exclude={"pack"}, exclude_unset=True))
 
 
-COLUMNS = ("pack", *PackKind.model_fields)
+COLUMNS = ("pack", *PackSpec.model_fields)
 """Of a table, in the order in which it is written."""
 
 
-def stored(kind: PackKind) -> bytes:
+def stored(kind: PackSpec) -> bytes:
     """What the server keeps of a pack; the same bytes for the same values."""
     return kind.model_dump_json(exclude_defaults=True).encode()
 
 
-def kind_of(data: bytes) -> PackKind:
+def kind_of(data: bytes) -> PackSpec:
     """What ``stored`` made.
 
     Raises:
         ValueError: It did not; the message says what is wrong.
     """
     try:
-        return PackKind.model_validate_json(data)
+        return PackSpec.model_validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
@@ -87,7 +87,7 @@ def kind_of(data: bytes) -> PackKind:
         raise ValueError(f"{where}: {message}" if where else message) from None
 
 
-def settings_of(row: PackKind) -> Settings:
+def settings_of(row: PackSpec) -> Settings:
     """The settings of a pack; of a kind, its name is the default one."""
     told = row.model_dump(exclude_none=True)
     if isinstance(row, PackRow):
@@ -104,7 +104,7 @@ def known_cells() -> tuple[str, ...]:
     return (*shipped_cells(), *generic_cells(), *shipped_fuel_cells())
 
 
-def model_of(kind: PackKind, cell_file: str | None) -> PackModel:
+def model_of(kind: PackSpec, cell_file: str | None) -> PackModel:
     """The pack as one object.
 
     Args:
@@ -117,12 +117,12 @@ def model_of(kind: PackKind, cell_file: str | None) -> PackModel:
     return cell_of(kind, cell_file).pack(kind.series, kind.parallel)
 
 
-def model_key(kind: PackKind) -> tuple[object, ...]:
+def model_key(kind: PackSpec) -> tuple[object, ...]:
     """Kinds with the same one have a model all of them, or none of them has."""
     return kind.cell, kind.capacity_ah is None, kind.series, kind.parallel
 
 
-def cell_of(kind: PackKind, cell_file: str | None) -> PackModel:
+def cell_of(kind: PackSpec, cell_file: str | None) -> PackModel:
     """One of the objects that the pack is made of; as ``model_of``."""
     name = kind.cell
     if name in known_cells():

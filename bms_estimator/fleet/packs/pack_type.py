@@ -13,7 +13,7 @@ from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import PackSettings, Settings
-from bms_estimator.telemetry.charge_energy import Flow, Meter
+from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
 MOST_TYPES = 256
 """Of so many the settings are kept, 40 kB each; those of more are made again and again, 50 ms each."""
@@ -38,7 +38,7 @@ class PackType:
     made_of: Digest
     meaning: Digest
     estimator: Estimator
-    meter: Meter
+    meter: ChargeEnergyMeter
     capacity_ah: float | None
 
 
@@ -49,7 +49,7 @@ class _Recipe:
     cell: PackModel = field(compare=False)
 
 
-def made_of(settings: Settings, cell: PackModel) -> Digest:
+def config_digest(settings: Settings, cell: PackModel) -> Digest:
     """Digest of all that a pack's estimator is made of."""
     sensor = settings.sensor
     parts = (
@@ -93,14 +93,14 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
         cell: The pack as one object (``CellModel.pack``).
         record: What its estimator and meter work on, shape (1,), dtype PACK_STATE.
     """
-    made = made_of(settings, cell)
+    made = config_digest(settings, cell)
     estimator = type_estimator(settings, cell).on(record["estimator"])
     return PackType(
         settings=settings.pack,
         made_of=made,
         meaning=_digest(bytes.fromhex(pack_identity(settings, cell))),
         estimator=estimator,
-        meter=Meter(Flow(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
+        meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
     )
 
@@ -112,7 +112,7 @@ def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
         settings: Of the packs.
         cell: A pack as one object (``CellModel.pack``).
     """
-    return _estimator(_Recipe(made_of(settings, cell), settings, cell))
+    return _estimator(_Recipe(config_digest(settings, cell), settings, cell))
 
 
 @lru_cache(maxsize=MOST_TYPES)

@@ -13,7 +13,7 @@ from aiohttp import web
 from bms_estimator.edge.subjects import PARTITIONS
 from bms_estimator.fleet.page.nats_feed import FleetFeed, Server
 from bms_estimator.fleet.page.view import FleetView
-from bms_estimator.page.event_stream import Newest
+from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.page.page_server import STATIC as SHARED
 from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.settings.page import PageSettings
@@ -55,7 +55,7 @@ async def fleet_page(
     Raises:
         UserError: A setting cannot be used, or the address is taken.
     """
-    newest, view = Newest(), FleetView(PARTITIONS, time.monotonic())
+    newest, view = LatestValues(), FleetView(PARTITIONS, time.monotonic())
 
     async def packs(request: web.Request) -> web.Response:
         return _json(view.packs.find(request.query.get("prefix", "")))
@@ -82,7 +82,7 @@ async def fleet_page(
             await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _draw(view: FleetView, newest: Newest, step_s: float) -> None:
+async def _draw(view: FleetView, newest: LatestValues, step_s: float) -> None:
     """A picture now and then; while the server is lost the last one stays."""
     while True:
         if view.listening:
@@ -90,7 +90,7 @@ async def _draw(view: FleetView, newest: Newest, step_s: float) -> None:
         await asyncio.sleep(step_s)
 
 
-async def _ask(hours: Path, newest: Newest) -> None:
+async def _ask(hours: Path, newest: LatestValues) -> None:
     """Questions to the hours, now and then: seconds of work for a large fleet. The process ends after the one that is asked."""
     from bms_estimator.fleet.page.query_results import ASKED, answer  # noqa: PLC0415 - duckdb is needed for nothing else
 

@@ -17,7 +17,7 @@ from bms_estimator.fleet.nats.connection import connect, context, part, readable
 from bms_estimator.fleet.nats.stream_reader import StreamError, read_stream
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
-from bms_estimator.fleet.packs.pack_row import PackKind
+from bms_estimator.fleet.packs.pack_row import PackSpec
 from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.tasks import end
@@ -180,7 +180,7 @@ class FleetFeed:
         self._linked(trouble and f"{self._server.urls}: {trouble}")
 
 
-def type_name(kind: PackKind | str) -> str:
+def type_name(kind: PackSpec | str) -> str:
     """Of a row of the table, such as ``lfp 16s2p 280 Ah``; of one that is wrong, that it is."""
     if isinstance(kind, str):
         return "wrong rows"

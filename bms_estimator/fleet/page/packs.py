@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic_core import from_json
 
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 
 ALIVE_S = 180.0
 """A pack that sends a block a minute is silent when it has not been heard for so long [s]."""
@@ -125,7 +125,7 @@ class FleetPacks:
             "pack": name,
             "type": list(self._types)[row["type"]],
             "heard_s": _ago(float(row["heard_s"]), now_s),
-            "suspects": Suspect(int(row["suspects"])).text,
+            "suspects": InputFault(int(row["suspects"])).text,
             "state": _object(self._states[place]),
             "parameters": _object(zlib.decompress(packed)) if packed else None,
         }
@@ -204,7 +204,7 @@ class FleetPacks:
 
 def _named(suspects: int) -> str:
     """In a word or two each."""
-    return ", ".join((suspect.name or "").replace("_", " ").lower() for suspect in Suspect(suspects))
+    return ", ".join((suspect.name or "").replace("_", " ").lower() for suspect in InputFault(suspects))
 
 
 def _extremes(column: NDArray[np.float64], mask: Mask) -> list[tuple[int, float]]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import duckdb
 
-from bms_estimator.fleet.queries.duckdb_queries import ask
+from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.model.errors import UserError
 
 ASKED = ("soh", "failing", "outliers", "honest")
@@ -25,7 +25,7 @@ def answer(folder: Path, name: str) -> dict[str, Any]:
         ``columns``, the first ``rows``, and how many there are (``count``); or why there is none (``reason``).
     """
     try:
-        found = ask(folder, name)
+        found = run_query(folder, name)
     except (UserError, duckdb.Error) as error:
         return {"reason": str(error)}
     rows = [row for row in found.rows if name != "soh" or row[found.columns.index("pack")] is None]

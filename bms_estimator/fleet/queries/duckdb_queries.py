@@ -19,7 +19,7 @@ import duckdb
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.queries.parquet_files import DAY, FOLDER, SCHEMA, day_folder, is_whole
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 
 SQL = resources.files("bms_estimator.fleet.queries") / "sql"
 AGED_SOC, CHARGE_ERROR = 1000.0, 0.002
@@ -31,7 +31,7 @@ LEAST_STDS = 3.0
 """Nobody is accused for less, however small the fleet."""
 
 
-class Question(NamedTuple):
+class Query(NamedTuple):
     """What can be asked by name."""
 
     needs: tuple[str, ...]
@@ -40,11 +40,11 @@ class Question(NamedTuple):
 
 
 QUESTIONS = {
-    "soh": Question(("days", "packs", "fits"), "capacity by the year with its band, of each type and pack"),
-    "outliers": Question(("days", "packs"), "packs whose capacity or R_s is not as that of their type"),
-    "failing": Question(("days", "packs", "fits"), "packs that reach a limit soon, or that are suspected of late"),
-    "honest": Question(("days", "packs"), "how often the SOC was within 2 std, judged in hindsight"),
-    "silent": Question(("days", "packs"), "packs that stopped"),
+    "soh": Query(("days", "packs", "fits"), "capacity by the year with its band, of each type and pack"),
+    "outliers": Query(("days", "packs"), "packs whose capacity or R_s is not as that of their type"),
+    "failing": Query(("days", "packs", "fits"), "packs that reach a limit soon, or that are suspected of late"),
+    "honest": Query(("days", "packs"), "how often the SOC was within 2 std, judged in hindsight"),
+    "silent": Query(("days", "packs"), "packs that stopped"),
 }
 
 
@@ -94,7 +94,7 @@ class Answer:
         return [dict(zip(self.columns, row, strict=True)) for row in self.rows]
 
 
-def ask(folder: Path, name: str, *, days: int | None = None, limits: Limits = LIMITS) -> Answer:
+def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limits = LIMITS) -> Answer:
     """Answer one of ``QUESTIONS``.
 
     Args:
@@ -209,8 +209,8 @@ def _given(now_hour: int) -> dict[str, Any]:
         "today": now_hour // 24,
         "aged_soc": AGED_SOC,
         "charge_error": CHARGE_ERROR,
-        "suspect_bits": [int(suspect) for suspect in Suspect],
-        "suspect_names": [str(suspect.name).lower().replace("_", " ") for suspect in Suspect],
+        "suspect_bits": [int(suspect) for suspect in InputFault],
+        "suspect_names": [str(suspect.name).lower().replace("_", " ") for suspect in InputFault],
     }
 
 

@@ -21,7 +21,7 @@ from bms_estimator.fleet.server import jwt_claims
 from bms_estimator.fleet.server.jwt_claims import ACCOUNT, BEARERS, OPERATOR, Key, Role, Tenant
 from bms_estimator.fleet.server.nats_config import Accounts
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.private_file import NotOursError, read_private, write_private
+from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.fleet import TenantSettings
 
 CLAIMS = "claims.json"
@@ -141,7 +141,7 @@ def _read_key(path: Path) -> Key:
 def _read(path: Path, longest: int) -> bytes:
     try:
         return read_private(path, longest)
-    except NotOursError as error:
+    except UnsafeFileError as error:
         raise UserError(f"{path}: {error}") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None

@@ -49,7 +49,7 @@ CONFIGURATION = "nats-server.conf"
 
 
 @dataclass(frozen=True)
-class Place:
+class NodeLocation:
     """Where a node is among the others, and where its files are.
 
     Attributes:
@@ -90,7 +90,7 @@ def find_server() -> Path:
 
 
 @dataclass(frozen=True)
-class Told:
+class ServerSpec:
     """What the settings say.
 
     Attributes:
@@ -102,7 +102,7 @@ class Told:
     accounts: Accounts | None = None
 
 
-def node_of(place: Place, told: Told) -> Node:
+def node_of(place: NodeLocation, told: ServerSpec) -> Node:
     """What the server is told."""
     server, tls = told.settings.server, told.settings.tls
     own = place.nodes[place.number - 1] if place.nodes else ""
@@ -147,7 +147,7 @@ def _check(tls: Tls) -> None:
         raise UserError(f"tls.cert_file = {tls.cert}, tls.key_file = {tls.key}: {error.reason or error}") from None
 
 
-async def serve(place: Place, read: Callable[[], Told], say: Callable[[str], None]) -> int:
+async def serve(place: NodeLocation, read: Callable[[], ServerSpec], say: Callable[[str], None]) -> int:
     """Run a node until it ends. SIGHUP lets it read its settings anew: tenants, limits, who is revoked.
 
     Args:
@@ -183,8 +183,8 @@ async def serve(place: Place, read: Callable[[], Told], say: Callable[[str], Non
 
 
 async def _reload_on_signal(
-    place: Place,
-    read: Callable[[], Told],
+    place: NodeLocation,
+    read: Callable[[], ServerSpec],
     process: asyncio.subprocess.Process,
     made: asyncio.Task[None],
     say: Callable[[str], None],
@@ -240,7 +240,7 @@ async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subp
             loop.remove_signal_handler(number)
 
 
-async def _make_ready(place: Place, told: Told, pid: int, say: Callable[[str], None]) -> None:
+async def _make_ready(place: NodeLocation, told: ServerSpec, pid: int, say: Callable[[str], None]) -> None:
     """Wait for the server, say where it is, then for a quorum, and make the streams of all tenants.
 
     Not any server that answers is ours: it writes a file with its number once it listens, and then has its ports.
@@ -260,7 +260,7 @@ async def _make_ready(place: Place, told: Told, pid: int, say: Callable[[str], N
             log.warning("the streams are not there yet; trying again", reason=str(error))
 
 
-async def _make_all_streams(place: Place, told: Told, say: Callable[[str], None]) -> None:
+async def _make_all_streams(place: NodeLocation, told: ServerSpec, say: Callable[[str], None]) -> None:
     """The streams of all tenants, made by one node of several: that which has the keys, or the first."""
     node = node_of(place, told)
     if place.number != 1 if node.accounts is None else not credentials.has_keys(place.keys):
@@ -272,7 +272,7 @@ async def _make_all_streams(place: Place, told: Told, say: Callable[[str], None]
         say(f"{f'tenant {name}: ' if name else ''}streams ready, {node.partitions} partitions{where}")
 
 
-async def _make_streams(place: Place, told: Told, name: str, tenant: TenantSettings) -> None:
+async def _make_streams(place: NodeLocation, told: ServerSpec, name: str, tenant: TenantSettings) -> None:
     node, server = node_of(place, told), told.settings.server
     try:
         nc = await connect(node, credentials.credentials_file(place.keys, name, Role.ADMIN) if name else None)

@@ -16,7 +16,7 @@ import paho.mqtt.client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
 from pydantic import ValidationError
 
-from bms_estimator.edge.subjects import Awaits, awaits, raw
+from bms_estimator.edge.subjects import BlockRequest, awaits, raw
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.mqtt.broker_config import brokers, password, tls_context
@@ -62,7 +62,7 @@ class _Connection:
 
     Args:
         settings: The brokers, tried in turn.
-        heard: Where the payloads of ``Awaits`` go, with their topics; None: they are not asked for.
+        heard: Where the payloads of ``BlockRequest`` go, with their topics; None: they are not asked for.
     """
 
     def __init__(self, settings: MqttSettings, heard: deque[tuple[str, bytes]] | None) -> None:
@@ -168,7 +168,7 @@ def _listen(heard: deque[tuple[str, bytes]], edges: SimulatedEdges) -> None:
     while heard:
         topic, payload = heard.popleft()
         try:
-            answer = Awaits.model_validate_json(payload)
+            answer = BlockRequest.model_validate_json(payload)
         except ValidationError:
             continue  # not a worker's
         edges.hear(topic.split("/")[1], answer, time.monotonic())

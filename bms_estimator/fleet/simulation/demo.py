@@ -51,7 +51,7 @@ Say = Callable[[str], object]
 
 
 @dataclass
-class Seen:
+class DemoObserver:
     """What was heard.
 
     Attributes:
@@ -169,7 +169,7 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
             demo.say(await _counted(nc, seen, processes, stop))
 
 
-async def _tell(demo: Demo, seen: Seen, processes: "Processes", stop: asyncio.Event) -> None:
+async def _tell(demo: Demo, seen: DemoObserver, processes: "Processes", stop: asyncio.Event) -> None:
     """Say how it goes; in the middle of it kill a worker, and see the other one take over: with the packs' next blocks."""
     begin_s, kill_s, gone_s, spoke, done = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
     while not stop.is_set():
@@ -199,17 +199,17 @@ async def _tell(demo: Demo, seen: Seen, processes: "Processes", stop: asyncio.Ev
         await asyncio.sleep(0.1)
 
 
-def _line(seen: Seen, done: int) -> str:
+def _line(seen: DemoObserver, done: int) -> str:
     rate = f"{(seen.done - done) / SAID_S:4,.0f} blocks/s estimated, {seen.worst_s:.1f} s after they came at most"
     error = f"; SOC {100.0 * float(np.mean(np.abs(seen.errors))):.1f} % off on average" if seen.errors else ""
     return f"{rate}{error}; {_who(seen)} partitions"
 
 
-def _who(seen: Seen) -> str:
+def _who(seen: DemoObserver) -> str:
     return " and ".join(f"{name} with {len(beat.partitions)}" for name, beat in sorted(seen.alive.items()))
 
 
-async def _counted(nc: Client, seen: Seen, processes: "Processes", stop: asyncio.Event) -> str:
+async def _counted(nc: Client, seen: DemoObserver, processes: "Processes", stop: asyncio.Event) -> str:
     """What came, and what was taken of it."""
     kept = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages
 
@@ -228,9 +228,9 @@ async def _counted(nc: Client, seen: Seen, processes: "Processes", stop: asyncio
     )
 
 
-async def _listen(nc: Client, fleet: SimulatedFleet) -> Seen:
+async def _listen(nc: Client, fleet: SimulatedFleet) -> DemoObserver:
     """Hear all workers, and some packs."""
-    seen = Seen({subjects.partition_of(name, subjects.PARTITIONS) for name in fleet.names})
+    seen = DemoObserver({subjects.partition_of(name, subjects.PARTITIONS) for name in fleet.names})
     index = {name: i for i, name in enumerate(fleet.names)}
 
     async def beat(message: Msg) -> None:

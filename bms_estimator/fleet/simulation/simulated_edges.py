@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bms_estimator.edge.subjects import Awaits
+from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet, Whole
 from bms_estimator.model.arrays import Floats
 
@@ -62,7 +62,7 @@ class SimulatedEdges:
         self._furthest[packs] = np.maximum(self._furthest[packs], self.next[packs])
         return Due(packs, numbers, ready_s[packs])
 
-    def hear(self, pack: str, awaits: Awaits, now_s: float) -> bool:
+    def hear(self, pack: str, awaits: BlockRequest, now_s: float) -> bool:
         """Hear from a worker at ``now_s``. Returns whether the pack is one of these, and the store its."""
         i = self._index.get(pack)
         if i is None or awaits.store != self._fleet.store[i]:

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from bms_estimator.edge.block import Block
-from bms_estimator.edge.subjects import Awaits
+from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.worker.pack_state import MOST_LOST
 
 TOLD_EACH = 10
@@ -22,7 +22,7 @@ MAX_PASSED = 20
 apart, so the server refuses the missing ones, or they are damaged on the edge's disk."""
 
 
-class Order(Enum):
+class BlockOrder(Enum):
     """What a block is to the order of its pack."""
 
     NEXT = "next"
@@ -34,33 +34,33 @@ class Order(Enum):
     """Its store is earlier than the present one."""
 
 
-def judge(d: np.void, block: Block) -> Order:
+def classify_block(d: np.void, block: Block) -> BlockOrder:
     """Where a block stands, with what its header tells.
 
     Args:
-        d: The pack's record of DELIVERY; updated but for ``NEXT`` itself, which ``taken`` notes.
+        d: The pack's record of DELIVERY; updated but for ``NEXT`` itself, which ``mark_taken`` notes.
         block: What came.
     """
     store, number = int(d["store"]), int(d["awaited"])
     if block.store < store:
-        return Order.FORMER_STORE
+        return BlockOrder.FORMER_STORE
     if block.store > store:
         d["store"], number = block.store, _await(d, 1)
     if block.oldest > number:
         number = _lose(d, block.oldest)
     if block.number < number:
-        return Order.RESENT
+        return BlockOrder.RESENT
     if block.number > number:
         d["ahead"] += 1
         _count_passed(d, block.number)
         if d["passed"] < MAX_PASSED:
-            return Order.AHEAD
+            return BlockOrder.AHEAD
         _lose(d, block.number)
-    return Order.NEXT
+    return BlockOrder.NEXT
 
 
-def taken(d: np.void) -> None:
-    """The block that was awaited is taken; ``d`` as in ``judge``."""
+def mark_taken(d: np.void) -> None:
+    """The block that was awaited is taken; ``d`` as in ``classify_block``."""
     _await(d, int(d["awaited"]) + 1)
     d["blocks"] += 1
 
@@ -84,19 +84,19 @@ def _await(d: np.void, number: int) -> int:
     return number
 
 
-def answer(order: Order, d: np.void, block: Block, *, first: bool) -> Awaits | None:
+def edge_reply(order: BlockOrder, d: np.void, block: Block, *, first: bool) -> BlockRequest | None:
     """What the edge is told of a block.
 
     Args:
         order: What it was.
-        d: As in ``judge``, after the block.
+        d: As in ``classify_block``, after the block.
         block: What came.
         first: Of this pack, since these partitions were taken over.
     """
     store, number = int(d["store"]), int(d["awaited"])
-    if order is Order.AHEAD:
+    if order is BlockOrder.AHEAD:
         due = first or int(d["ahead"]) % ASKED_EACH == 1
-        return Awaits(store=store, number=number, resend=True) if due else None
+        return BlockRequest(store=store, number=number, resend=True) if due else None
     if first or block.number % TOLD_EACH == 0:
-        return Awaits(store=store, number=number, resend=False)
+        return BlockRequest(store=store, number=number, resend=False)
     return None

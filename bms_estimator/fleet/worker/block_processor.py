@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import fields, without_observer
-from bms_estimator.checkpoint.restore import resume
+from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
@@ -17,13 +17,13 @@ from bms_estimator.fleet.worker import hour_summary
 from bms_estimator.fleet.worker.density import LONGEST_STORE_S
 from bms_estimator.fleet.worker.pack_state import PACK_STATE, Fields
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads import Report
+from bms_estimator.model.payloads import Payload
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.telemetry.charge_energy import Flow
-from bms_estimator.telemetry.parameters import parameter_report
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
-from bms_estimator.telemetry.state import estimate_report
+from bms_estimator.telemetry.state import make_state_payload
 
 LAST_WALL_S = 2.0**34
 """No wall clock shows a later time: the year 2514 [s since 1970]."""
@@ -33,7 +33,7 @@ Published = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
 """Topics ``state`` and ``parameters``, and the rows of finished hours, each with an id."""
 
 
-class Stepping:
+class BlockProcessor:
     """Steps the pack on the bench.
 
     Args:
@@ -83,7 +83,7 @@ class Stepping:
         if _digest(d["meaning"]) == of_type.meaning and known:
             saved = former if former is not None else {name: v.copy() for name, v in fields(self._record["estimator"])}
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
-            wrong = resume(of_type.estimator, saved if same else without_observer(saved), self._unseen_s(block))
+            wrong = restore_state(of_type.estimator, saved if same else without_observer(saved), self._unseen_s(block))
             self._flows["sums"]["counted"] = self._hour["outliers_before"] = self._hour["searches_before"] = 0
             self._counters["not_taken_over" if wrong else "taken_over"] += 1
         else:
@@ -107,7 +107,7 @@ class Stepping:
         """Take the samples to the estimator, and what it makes of them to hour, meter and window."""
         observer, counters = self._observer, self._counters
         accepted, steps_back = int(observer["samples"]), int(observer["time_steps_back"])
-        of_type.meter.go_on(Flow(*(float(self._flows[name]) for name in Flow._fields)))
+        of_type.meter.go_on(ChargeEnergy(*(float(self._flows[name]) for name in ChargeEnergy._fields)))
         for part in _parts(block):
             trace = of_type.estimator.run(part.samples)
             hour_summary.add(self._record["hour"], trace, part, of_type.estimator)
@@ -121,17 +121,17 @@ class Stepping:
     def _state(self, of_type: PackType, now_s: float) -> bytes | None:
         """Topic ``state`` of the window; None when no sample was accepted."""
         flow, window, d = of_type.meter.flow, self._window.take(), self._delivery
-        for name, value in zip(Flow._fields, flow, strict=True):
+        for name, value in zip(ChargeEnergy._fields, flow, strict=True):
             self._flows[name] = value
         if window is None:
             return None
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
         remaining = remaining_charge(of_type.estimator, window.current_a)
-        return _json(estimate_report(window, remaining, counters, now_s, flow, of_type.capacity_ah))
+        return _json(make_state_payload(window, remaining, counters, now_s, flow, of_type.capacity_ah))
 
     def _parameters(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
         """Topic ``parameters``; ages in it are counted from the samples' arrival, however late they are worked off."""
-        return _json(parameter_report(estimator, arrival_s).model_copy(update={"publish_time": iso_utc(now_s)}))
+        return _json(make_parameters_payload(estimator, arrival_s).model_copy(update={"publish_time": iso_utc(now_s)}))
 
     def _check_times(self, samples: SampleBlock) -> None:
         """A sample whose time cannot be has none."""
@@ -200,5 +200,5 @@ def _digest(words: NDArray[np.uint64]) -> Digest:
     return first, second
 
 
-def _json(report: Report) -> bytes:
+def _json(report: Payload) -> bytes:
     return report.model_dump_json().encode()

@@ -26,7 +26,7 @@ import numpy as np
 
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.pack_state import PACK_STATE
-from bms_estimator.kernels.packed_record import mirror_of
+from bms_estimator.kernels.packed_record import symmetry_map
 
 FORMAT = 1
 CHUNK_BYTES = 1 << 20
@@ -39,7 +39,7 @@ class CheckpointError(ValueError):
     """What is wrong with a checkpoint, and what can be done."""
 
 
-class Former(NamedTuple):
+class PreviousLayoutState(NamedTuple):
     """A pack's state as another version left it."""
 
     layout: str
@@ -63,7 +63,7 @@ def dtype_of(layout: str) -> np.dtype[Any]:
         raise ValueError(f"no layout of a record: {error}") from None
     if dtype.itemsize > _LONGEST_RECORD:
         raise ValueError(f"{dtype.itemsize} bytes: no layout of a pack's record")
-    mirror_of(dtype)  # refuses what is not made of whole words
+    symmetry_map(dtype)  # refuses what is not made of whole words
     return dtype
 
 
@@ -82,7 +82,7 @@ PRESENT = layout_of(PACK_STATE)
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class PartitionCheckpoint:
     """A partition at one moment.
 
     Attributes:
@@ -98,7 +98,7 @@ class Snapshot:
     sequence: int
     counters: Mapping[str, int] = field(default_factory=dict)
     packs: Mapping[str, bytes] = field(default_factory=dict)
-    former: Mapping[str, Former] = field(default_factory=dict)
+    former: Mapping[str, PreviousLayoutState] = field(default_factory=dict)
     deferred: Mapping[str, Span] = field(default_factory=dict)
 
     def chunks(self) -> Iterator[bytes]:
@@ -142,8 +142,8 @@ def _sealed(entries: list[bytes]) -> tuple[bytes, bytes]:
     return _CHUNK.pack(len(content), zlib.crc32(content)), content
 
 
-def read_checkpoint(data: bytes) -> Snapshot:
-    """What ``Snapshot.chunks`` wrote, all of it in one.
+def read_checkpoint(data: bytes) -> PartitionCheckpoint:
+    """What ``PartitionCheckpoint.chunks`` wrote, all of it in one.
 
     Raises:
         CheckpointError: It is none, damaged, or of a version that is not known.
@@ -156,7 +156,7 @@ def read_checkpoint(data: bytes) -> Snapshot:
         raise CheckpointError(f"a checkpoint of {len(data)} bytes is damaged: {error}") from None
 
 
-def _read(data: memoryview) -> Snapshot:
+def _read(data: memoryview) -> PartitionCheckpoint:
     magic, version, length, crc = _HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise CheckpointError("these bytes do not begin as a checkpoint does")
@@ -172,7 +172,7 @@ def _read(data: memoryview) -> Snapshot:
         if layout != PRESENT:
             dtype_of(layout)
     packs: dict[str, bytes] = {}
-    former: dict[str, Former] = {}
+    former: dict[str, PreviousLayoutState] = {}
     sequence = int(header["sequence"])
     deferred = {str(pack): Span(int(first), int(last)) for pack, (first, last) in header.get("deferred", {}).items()}
     entries = 0
@@ -183,11 +183,11 @@ def _read(data: memoryview) -> Snapshot:
         elif layouts[place] == PRESENT:
             packs[pack] = content
         else:
-            former[pack] = Former(layouts[place], content)
+            former[pack] = PreviousLayoutState(layouts[place], content)
     if entries != header["entries"]:
         raise CheckpointError(f"the checkpoint is damaged: {entries} of {header['entries']} entries")
     counters = {str(name): int(count) for name, count in header["counters"].items()}
-    return Snapshot(int(header["partition"]), sequence, counters, packs, former, deferred)
+    return PartitionCheckpoint(int(header["partition"]), sequence, counters, packs, former, deferred)
 
 
 def _entries_of(data: memoryview, at: int) -> Iterator[tuple[int, str, bytes]]:

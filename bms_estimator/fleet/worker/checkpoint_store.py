@@ -41,7 +41,7 @@ class FencedError(Exception):
     """Another worker has taken the partition over."""
 
 
-class Kept(BaseModel):
+class CheckpointInfo(BaseModel):
     """A checkpoint."""
 
     model_config = ConfigDict(frozen=True)
@@ -64,7 +64,7 @@ class Pointer(BaseModel):
     """Who has it."""
     next: str
     """The object that this worker writes next, maybe in part."""
-    kept: tuple[Kept, ...] = ()
+    kept: tuple[CheckpointInfo, ...] = ()
     """The newest first."""
 
 
@@ -77,7 +77,7 @@ class Claim:
     pointer: Pointer
 
 
-class Keeping:
+class CheckpointStore:
     """Checkpoints of one tenant.
 
     Args:
@@ -120,7 +120,7 @@ class Keeping:
             return Claim(claim.partition, *found)
         raise FencedError(found[1].worker)
 
-    async def load(self, claim: Claim) -> AsyncGenerator[tuple[Kept, bytes], None]:
+    async def load(self, claim: Claim) -> AsyncGenerator[tuple[CheckpointInfo, bytes], None]:
         """The checkpoints that can be read, the newest first; of others is said what is wrong."""
         for kept in claim.pointer.kept:
             try:
@@ -151,7 +151,7 @@ class Keeping:
         claim = await self.present(claim)
         pointer = claim.pointer
         size = await self._put(pointer.next, chunks)
-        made = Kept(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())
+        made = CheckpointInfo(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())
         kept = (made, *pointer.kept)
         try:
             claim = await self._replace(claim.partition, claim.revision, kept[:KEPT])
@@ -173,7 +173,7 @@ class Keeping:
             log.warning("what points to a checkpoint cannot be read", partition=partition, reason=str(error))
             return entry.revision or 0, Pointer(worker="", next="")
 
-    async def _replace(self, partition: int, revision: int, kept: tuple[Kept, ...]) -> Claim:
+    async def _replace(self, partition: int, revision: int, kept: tuple[CheckpointInfo, ...]) -> Claim:
         pointer = Pointer(worker=self._worker, next=f"p{partition}-{self._names.next().decode()}", kept=kept)
         self._tried[partition] = pointer
         try:

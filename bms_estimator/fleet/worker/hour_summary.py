@@ -13,9 +13,9 @@ from bms_estimator.edge.block import Block
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.estimator.identified_parameters import current_offset, relative_capacity, relative_series_resistance
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
-from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, OF_HOUR, add_rows
+from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, OF_HOUR, accumulate_hour
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS
-from bms_estimator.kernels.kalman_filter.hypotheses import pack_std
+from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.settings.pack import PackSettings
@@ -61,7 +61,7 @@ def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> No
     """
     settings = estimator.settings[0]
     rest_a = REST_C * float(settings["capacity_as"]) / HOUR_S
-    add_rows(sums, trace, int(sums["store"][0]) != block.store, float(settings["gap_s"]), rest_a)
+    accumulate_hour(sums, trace, int(sums["store"][0]) != block.store, float(settings["gap_s"]), rest_a)
     sums["store"] = block.store
     sums["dropped"] += block.samples.size - trace.size
 
@@ -158,7 +158,7 @@ def _identified(estimator: Estimator) -> dict[str, object]:
         relative_series_resistance(record, settings),
     )
     values: dict[str, object] = {
-        "soc_std": float(pack_std(f, settings["filter"])),
+        "soc_std": float(weakest_cell_soc_std(f, settings["filter"])),
         "soc_mean_std": float(f["soc_std"]),
         "capacity_ratio": capacity.value,
         "capacity_ratio_std": capacity.std,

@@ -15,7 +15,7 @@ from hashlib import blake2b
 from bms_estimator.fleet.heartbeat import DEAD_S
 
 
-def owners(partitions: int, workers: Collection[str]) -> list[str]:
+def assign_partitions(partitions: int, workers: Collection[str]) -> list[str]:
     """Which of some workers, one at least, is to have each of so many partitions."""
     most = math.ceil(partitions / len(workers))
     has = Counter[str]()
@@ -31,7 +31,7 @@ def _weight(partition: int, worker: str) -> tuple[bytes, str]:
     return blake2b(f"{partition} {worker}".encode(), digest_size=8).digest(), worker
 
 
-class Members:
+class Membership:
     """The workers that are alive.
 
     Args:
@@ -67,5 +67,7 @@ class Members:
         alive = self.alive(now_s)
         if alive != self._alive:
             self._alive = alive
-            self._share = {number for number, owner in enumerate(owners(partitions, alive)) if owner == self.me}
+            self._share = {
+                number for number, owner in enumerate(assign_partitions(partitions, alive)) if owner == self.me
+            }
         return self._share

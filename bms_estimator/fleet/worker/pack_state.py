@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import fields
-from bms_estimator.checkpoint.restore import fill
+from bms_estimator.checkpoint.restore import copy_known_fields
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
-from bms_estimator.kernels.packed_record import WORD_BYTES, mirror_of, pack, room, unpack
+from bms_estimator.kernels.packed_record import WORD_BYTES, pack, room, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 
 Fields = Mapping[str, NDArray[Any]]
@@ -49,7 +49,7 @@ FLOW = np.dtype(
     ],
     align=True,
 )
-"""All that has flowed (``telemetry.charge_energy.Flow``), and what ``Meter`` counts in."""
+"""All that has flowed (``telemetry.charge_energy.ChargeEnergy``), and what ``Meter`` counts in."""
 PACK_STATE = np.dtype(
     [("delivery", DELIVERY), ("flow", FLOW), ("hour", HOUR_SUMS), ("estimator", ESTIMATOR_STATE)], align=True
 )
@@ -59,7 +59,7 @@ class StateError(ValueError):
     """The bytes of a pack are none."""
 
 
-class Bench:
+class WorkRecord:
     """A record on which one pack after the other is worked on.
 
     Attributes:
@@ -69,7 +69,7 @@ class Bench:
     def __init__(self, dtype: np.dtype[Any] = PACK_STATE) -> None:
         self.record: NDArray[np.void] = np.zeros(1, dtype)
         self._words = self.record.view(np.uint64)
-        self._mirror = mirror_of(dtype)
+        self._mirror = symmetry_map(dtype)
         self._packed = room(self._words.size)
 
     @property
@@ -105,7 +105,7 @@ class Bench:
         Raises:
             ValueError: It is none of this layout, or the layout is none of a pack.
         """
-        former = Bench(dtype)
+        former = WorkRecord(dtype)
         former.put(packed)
         of_estimator, others = {}, {}
         for name, value in fields(former.record):
@@ -115,7 +115,7 @@ class Bench:
             else:
                 others[name] = value
         self.clear()
-        fill(self.record, others)
+        copy_known_fields(self.record, others)
         return of_estimator
 
     def count_lost(self, blocks: int) -> None:

@@ -14,14 +14,20 @@ import structlog
 from numpy.typing import NDArray
 
 from bms_estimator.edge.block import Block, BlockError, decode
-from bms_estimator.edge.subjects import Awaits
+from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
-from bms_estimator.fleet.worker.block_order import Order, answer, judge, taken
-from bms_estimator.fleet.worker.block_processor import Stepping
-from bms_estimator.fleet.worker.checkpoint_format import CheckpointError, Former, Snapshot, dtype_of, read_checkpoint
+from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken
+from bms_estimator.fleet.worker.block_processor import BlockProcessor
+from bms_estimator.fleet.worker.checkpoint_format import (
+    CheckpointError,
+    PartitionCheckpoint,
+    PreviousLayoutState,
+    dtype_of,
+    read_checkpoint,
+)
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.worker.density import density_fault
-from bms_estimator.fleet.worker.pack_state import Bench, Fields
+from bms_estimator.fleet.worker.pack_state import Fields, WorkRecord
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
@@ -31,7 +37,7 @@ Table = Callable[[str], tuple[Settings, PackModel] | None]
 log = structlog.get_logger(__name__)
 
 
-class Taken(NamedTuple):
+class BlockResult(NamedTuple):
     """What came of a block.
 
     Attributes:
@@ -44,7 +50,7 @@ class Taken(NamedTuple):
     """
 
     pack: str
-    awaits: Awaits | None = None
+    awaits: BlockRequest | None = None
     state: bytes | None = None
     parameters: bytes | None = None
     hours: tuple[tuple[str, bytes], ...] = ()
@@ -70,15 +76,15 @@ class Partition:
         self._table = table
         self._counters: Counter[str] = Counter()
         self._packs: dict[str, bytes] = {}
-        self._former: dict[str, Former] = {}
+        self._former: dict[str, PreviousLayoutState] = {}
         self._former_deliveries: dict[str, np.void] = {}
         self.deferred = Deferred()
         self._known: dict[str, PackType] = {}
         self._greeted: set[str] = set()
         self._refused: set[str] = set()
-        self._bench = Bench()
+        self._bench = WorkRecord()
         self._types = PackTypes(self._bench.record)
-        self._stepping = Stepping(self._bench.record, self._counters, wall)
+        self._stepping = BlockProcessor(self._bench.record, self._counters, wall)
 
     @classmethod
     def restore(cls, number: int, table: Table, data: bytes, *, wall: Callable[[], float] = time.time) -> Self:
@@ -98,10 +104,12 @@ class Partition:
         made.deferred = Deferred(found.deferred)
         return made
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> PartitionCheckpoint:
         """The partition as it is now, whatever comes later; costs no more than a list of its packs."""
         spans = self.deferred.spans()
-        return Snapshot(self.number, self.sequence, dict(self._counters), dict(self._packs), dict(self._former), spans)
+        return PartitionCheckpoint(
+            self.number, self.sequence, dict(self._counters), dict(self._packs), dict(self._former), spans
+        )
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -121,7 +129,7 @@ class Partition:
         self._bench.put(packed)
         return self._bench.record.copy()
 
-    def take(self, pack: str, data: bytes, sequence: int) -> Taken:
+    def take(self, pack: str, data: bytes, sequence: int) -> BlockResult:
         """Take a message of the stream, or defer it where its pack is not known or has others that wait.
 
         Args:
@@ -131,19 +139,19 @@ class Partition:
         """
         if sequence <= self.sequence:
             self._counters["repeated"] += 1
-            return Taken(pack)
+            return BlockResult(pack)
         if pack in self.deferred:
             return self.defer(pack, sequence)
         self.sequence = sequence
         block = self._decoded(data)
         if block is None:
-            return Taken(pack)
+            return BlockResult(pack)
         known = self._look_up(pack)
         if known is None:
             return self.defer(pack, sequence)
         return self._take(pack, block, known)
 
-    def defer(self, pack: str, sequence: int) -> Taken:
+    def defer(self, pack: str, sequence: int) -> BlockResult:
         """Leave a message in the stream until its pack's turn."""
         self.sequence = max(self.sequence, sequence)
         if pack in self.deferred or len(self.deferred) < MAX_UNKNOWN or self.is_known(pack):
@@ -151,28 +159,28 @@ class Partition:
             self._counters["deferred"] += 1
         else:
             self._counters["not_deferred"] += 1
-        return Taken(pack)
+        return BlockResult(pack)
 
-    def take_deferred(self, pack: str, data: bytes, sequence: int) -> Taken:
+    def take_deferred(self, pack: str, data: bytes, sequence: int) -> BlockResult:
         """Take the next message of a known pack that waits; arguments as in ``take``."""
         known = self._look_up(pack)
         if known is None or pack not in self.deferred:
-            return Taken(pack)
+            return BlockResult(pack)
         self.deferred.advance(pack, sequence)
         block = self._decoded(data)
-        return self._take(pack, block, known) if block else Taken(pack)
+        return self._take(pack, block, known) if block else BlockResult(pack)
 
     def is_known(self, pack: str) -> bool:
         """Return whether the table has the pack."""
         return self._table(pack) is not None
 
-    def refuse(self, pack: str, sequence: int) -> Taken:
+    def refuse(self, pack: str, sequence: int) -> BlockResult:
         """Leave out a message that is not in its pack's partition, whoever put it there."""
         if sequence > self.sequence:
             self.sequence = sequence
             self._counters["misplaced"] += 1
             self._log_refusal(pack, "the pack belongs to another partition")
-        return Taken(pack)
+        return BlockResult(pack)
 
     def settings_changed(self, pack: str) -> None:
         """Read the settings of a pack from the table again with its next block."""
@@ -195,16 +203,16 @@ class Partition:
             known = self._known[pack] = self._types.of(*found)
         return known
 
-    def _take(self, pack: str, block: Block, of_type: PackType) -> Taken:
+    def _take(self, pack: str, block: Block, of_type: PackType) -> BlockResult:
         former = self._open(pack)
         d = self._bench.delivery
         lost = int(d["lost_blocks"])
         self._put_former_delivery(pack)
-        order = judge(d, block)
+        order = classify_block(d, block)
         lost = int(d["lost_blocks"]) - lost
         self._bench.count_lost(lost)
-        made = Taken(pack)
-        if order is Order.NEXT:
+        made = BlockResult(pack)
+        if order is BlockOrder.NEXT:
             stepped, fault = None, density_fault(block.samples)
             if fault:
                 self._log_refusal(pack, fault)
@@ -213,23 +221,25 @@ class Partition:
             if stepped is None:  # as if it had brought nothing
                 self._open(pack)
                 self._put_former_delivery(pack)
-                judge(d, block)
+                classify_block(d, block)
                 self._bench.count_lost(lost)
                 self._counters["too_dense" if fault else "failed"] += 1
-            made = stepped or Taken(pack, failed=int(not fault))
-            taken(d)
+            made = stepped or BlockResult(pack, failed=int(not fault))
+            mark_taken(d)
             self._former.pop(pack, None)
             self._former_deliveries.pop(pack, None)
         else:
             self._counters[order.value] += 1
             if former is not None:  # its estimator is not made yet; the count of resent blocks must go on
                 self._former_deliveries[pack] = d.copy()
-        if order is Order.NEXT or former is None:  # what another version left stays as it is until a block is taken
+        if (
+            order is BlockOrder.NEXT or former is None
+        ):  # what another version left stays as it is until a block is taken
             self._counters["lost_blocks"] += lost
             self._packs[pack] = self._bench.take()
         first = pack not in self._greeted
         self._greeted.add(pack)
-        return made._replace(awaits=answer(order, d, block, first=first))
+        return made._replace(awaits=edge_reply(order, d, block, first=first))
 
     def _put_former_delivery(self, pack: str) -> None:
         """Put the counts of blocks that came since the start on the bench, for a pack that another version left."""
@@ -242,10 +252,10 @@ class Partition:
             self._refused.add(pack)
             log.warning("a block is refused", partition=self.number, pack=pack, reason=why)
 
-    def _step(self, pack: str, block: Block, of_type: PackType, former: Fields | None) -> Taken | None:
+    def _step(self, pack: str, block: Block, of_type: PackType, former: Fields | None) -> BlockResult | None:
         """What comes of the next block; None: of this one nothing can."""
         try:
-            return Taken(pack, None, *self._stepping.step(pack, block, of_type, former))
+            return BlockResult(pack, None, *self._stepping.step(pack, block, of_type, former))
         except Exception:  # a fault of ours, with one block: awaited for ever it would stop the pack
             log.exception("a block is left out", partition=self.number, pack=pack, number=block.number)
         self._stepping.forget()

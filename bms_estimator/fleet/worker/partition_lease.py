@@ -20,15 +20,15 @@ from nats.errors import Error as NatsError
 from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
-from bms_estimator.edge.block import glance
-from bms_estimator.fleet.nats.connection import reason
+from bms_estimator.edge.block import peek_header
+from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stored_messages import stored
 from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.fleet.worker.checkpoint_store import Claim, FencedError, Keeping, Kept
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
 from bms_estimator.fleet.worker.deferred import Span
-from bms_estimator.fleet.worker.partition import Partition, Table, Taken
-from bms_estimator.fleet.worker.pinned_consumer import Given, PinnedConsumer
+from bms_estimator.fleet.worker.partition import BlockResult, Partition, Table
+from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
 from bms_estimator.process.tasks import until_first_ends
 
 RETRY_S = 0.5
@@ -45,7 +45,7 @@ TROUBLES = (NatsError, TimeoutError, StreamError)
 log = structlog.get_logger(__name__)
 
 
-class Holding:
+class PartitionLease:
     """A partition that this worker tries for, and has while nobody else has claimed it.
 
     Args:
@@ -76,7 +76,7 @@ class Holding:
         nc: Client,
         number: int,
         table: Table,
-        keeping: Keeping,
+        keeping: CheckpointStore,
         inbox: str,
         turn: asyncio.Lock,
         *,
@@ -102,7 +102,7 @@ class Holding:
         self._sending = asyncio.Lock()
 
     @property
-    def kept(self) -> Kept | None:
+    def kept(self) -> CheckpointInfo | None:
         """The last checkpoint."""
         return self.claim.pointer.kept[0] if self.claim and self.claim.pointer.kept else None
 
@@ -192,12 +192,12 @@ class Holding:
             log.warning(
                 "given back without a checkpoint: who has it next reads the stream from the last one",
                 partition=self.number,
-                reason=reason(error),
+                reason=error_text(error),
             )
         try:
             await self.consumer.unpin()
         except TROUBLES as error:
-            log.warning("not given back: that takes its time", partition=self.number, reason=reason(error))
+            log.warning("not given back: that takes its time", partition=self.number, reason=error_text(error))
 
     def settings_changed(self, pack: str) -> None:
         """A pack has other settings, or is known now."""
@@ -235,7 +235,7 @@ class Holding:
         self._count(data)
         await self._publish(await self._step(pack, sequence, take))
 
-    async def _take(self, given: Given) -> None:
+    async def _take(self, given: DeliveredMessage) -> None:
         """Take a message, after those before it; until that is done, or the partition somebody else's."""
         while not await self._try(lambda: self._go_on_to(given)):
             await asyncio.sleep(RETRY_S)
@@ -247,7 +247,7 @@ class Holding:
             return
         await self._publish(await self._take_or_defer(partition, given.pack, given.data, given.sequence))
 
-    async def _go_on_to(self, given: Given) -> None:
+    async def _go_on_to(self, given: DeliveredMessage) -> None:
         """Have the state of all messages before one that was given."""
         partition = self.partition
         if given.pin != self._pin or partition is None:
@@ -318,7 +318,7 @@ class Holding:
         """Take what the stream has up to a message. Only the last that each pack's messages bring goes out."""
         if partition.sequence >= sequence:
             return
-        latest: dict[str, Taken] = {}
+        latest: dict[str, BlockResult] = {}
         subject = subjects.kept(self.number)
         messages = stored(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
         async with aclosing(messages):
@@ -329,7 +329,7 @@ class Holding:
         for taken in latest.values():
             await self._publish(taken)
 
-    async def _take_or_defer(self, partition: Partition, pack: str, data: bytes, sequence: int) -> Taken:
+    async def _take_or_defer(self, partition: Partition, pack: str, data: bytes, sequence: int) -> BlockResult:
         """Take a message, or defer it if its pack has to wait."""
         if subjects.partition_of(pack, self._partitions) != self.number:
             return partition.refuse(pack, sequence)
@@ -337,13 +337,13 @@ class Holding:
             await asyncio.sleep(0)
             partition.defer(pack, sequence)
             self._turns.set()
-            return Taken(pack)
+            return BlockResult(pack)
         taken = await self._step(pack, sequence, partial(partition.take, pack, data, sequence))
         if pack not in partition.deferred:
             self._count(data)
         return taken
 
-    async def _step(self, pack: str, sequence: int, take: Callable[[], Taken]) -> Taken:
+    async def _step(self, pack: str, sequence: int, take: Callable[[], BlockResult]) -> BlockResult:
         """Take a message when no other block is stepped; the time that it needs is charged to its pack."""
         async with self._turn:
             await asyncio.sleep(0)
@@ -352,22 +352,22 @@ class Holding:
                 taken = take()
             except Exception:  # a fault of ours with one pack, which would end one worker after the other
                 log.exception("a block is left out", partition=self.number, pack=pack, sequence=sequence)
-                taken = Taken(pack, failed=1)
+                taken = BlockResult(pack, failed=1)
             self._budget.charge(pack, time.thread_time() - begin_s)
         self._note(taken)
         return taken
 
     def _count(self, data: bytes) -> None:
-        samples, arrival_s = glance(data)
+        samples, arrival_s = peek_header(data)
         self.blocks += 1
         self.samples += samples
         self.lag_s = max(self.lag_s or 0.0, time.time() - arrival_s)
 
-    def _note(self, taken: Taken) -> None:
+    def _note(self, taken: BlockResult) -> None:
         self.faults += taken.failed
         self.hours.extend((message_id, taken.pack, row) for message_id, row in taken.hours)
 
-    async def _publish(self, taken: Taken) -> None:
+    async def _publish(self, taken: BlockResult) -> None:
         """Publish what a message brought for edges and pages, unless the server is away: the next brings the like."""
         if not self._nc.is_connected:
             return
@@ -405,7 +405,7 @@ class Holding:
             self._fenced(error)
             return False
         except TROUBLES as error:
-            if (text := reason(error)) != self.trouble:
+            if (text := error_text(error)) != self.trouble:
                 log.warning("waiting for the server", partition=self.number, reason=text)
             self.trouble = text
             return False
@@ -413,7 +413,7 @@ class Holding:
         return True
 
 
-def _later(before: Taken | None, taken: Taken) -> Taken:
+def _later(before: BlockResult | None, taken: BlockResult) -> BlockResult:
     """What is to go out of two messages of one pack."""
     if before is None:
         return taken

@@ -28,7 +28,7 @@ QUIET = frozenset({"404", "408", "409"})
 """A request that has ended: without a message, in time, or since the consumer's leader changed. The next is on its way."""
 
 
-class Given(NamedTuple):
+class DeliveredMessage(NamedTuple):
     """A message of the stream."""
 
     pack: str
@@ -59,7 +59,7 @@ class PinnedConsumer:
         self._next = f"$JS.API.CONSUMER.MSG.NEXT.{subjects.RAW_STREAM}.{consumer(partition)}"
         self._info = f"$JS.API.CONSUMER.INFO.{subjects.RAW_STREAM}.{consumer(partition)}"
         self._unpin = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
-        self.waiting: deque[Given] = deque()
+        self.waiting: deque[DeliveredMessage] = deque()
         self.trouble = ""
         self._pin = ""
         self._pins = 0
@@ -87,7 +87,7 @@ class PinnedConsumer:
         """Ask again; to be called each ``RENEW_S``. With enough waiting for one more only, which keeps the pin."""
         await self._ask(BATCH if len(self.waiting) < BATCH else 1)
 
-    async def take(self) -> Given | None:
+    async def take(self) -> DeliveredMessage | None:
         """The next message; None: none is here."""
         if not self.waiting:
             return None
@@ -134,7 +134,7 @@ class PinnedConsumer:
         follows = consumer_sequence == self._last + 1
         self._last = consumer_sequence
         pack = message.subject.rpartition(".")[2]
-        self.waiting.append(Given(pack, message.data, stream_sequence, self._pins, follows))
+        self.waiting.append(DeliveredMessage(pack, message.data, stream_sequence, self._pins, follows))
 
 
 def sequences(reply: str) -> tuple[int, int]:

@@ -15,15 +15,15 @@ from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
-from bms_estimator.fleet.nats.connection import connect, part, reason
+from bms_estimator.fleet.nats.connection import connect, error_text, part
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
-from bms_estimator.fleet.worker.checkpoint_store import Keeping
-from bms_estimator.fleet.worker.membership import Members
-from bms_estimator.fleet.worker.partition_lease import RETRY_S, TROUBLES, Holding
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.membership import Membership
+from bms_estimator.fleet.worker.partition_lease import RETRY_S, TROUBLES, PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.systemd import Notifier
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import end, until_first_ends
 
 CHECKPOINT_S = 300.0
@@ -63,7 +63,7 @@ async def work(options: Options, stop: asyncio.Event) -> None:
     Raises:
         UserError: An option cannot be used, or the server has closed the connection for good.
     """
-    notifier = Notifier([options.name])
+    notifier = SystemdNotifier([options.name])
     starting = asyncio.ensure_future(_start(options, notifier))
     await until_first_ends(asyncio.wait([starting]), stop.wait())
     if not starting.done():
@@ -77,7 +77,7 @@ async def work(options: Options, stop: asyncio.Event) -> None:
         await worker.end()
 
 
-async def _start(options: Options, notifier: Notifier) -> "Worker":
+async def _start(options: Options, notifier: SystemdNotifier) -> "Worker":
     """Connect, and find the streams; tried until it works."""
     nc = await connect(options.servers, options.name, creds=options.creds, ca=options.ca)
     said = ""
@@ -86,7 +86,7 @@ async def _start(options: Options, notifier: Notifier) -> "Worker":
             return await _found(nc, options, notifier)
         except (*TROUBLES, UserError) as error:
             _check(nc, options)
-            if (text := reason(error)) != said:
+            if (text := error_text(error)) != said:
                 log.warning("waiting for the server", reason=text)
             said = text
         await asyncio.sleep(RETRY_S)
@@ -102,7 +102,7 @@ def _check(nc: Client, options: Options) -> None:
         raise UserError(f"the server {options.servers} has closed the connection: look at --creds")
 
 
-async def _found(nc: Client, options: Options, notifier: Notifier) -> "Worker":
+async def _found(nc: Client, options: Options, notifier: SystemdNotifier) -> "Worker":
     partitions = await partitions_of(nc)
     if partitions is None:
         raise UserError(f"the server has no stream {subjects.RAW_STREAM}: make it with `bms-estimator fleet serve`")
@@ -111,7 +111,7 @@ async def _found(nc: Client, options: Options, notifier: Notifier) -> "Worker":
     states = await js.object_store(subjects.STATES_BUCKET)
     bucket = PackBucket(nc)
     await bucket.refresh()
-    keeping = Keeping(nc, options.name, checkpoints, states)
+    keeping = CheckpointStore(nc, options.name, checkpoints, states)
     return Worker(nc, options, partitions, keeping, bucket, notifier)
 
 
@@ -128,13 +128,19 @@ class Worker:
     """
 
     def __init__(
-        self, nc: Client, options: Options, partitions: int, keeping: Keeping, bucket: PackBucket, notifier: Notifier
+        self,
+        nc: Client,
+        options: Options,
+        partitions: int,
+        keeping: CheckpointStore,
+        bucket: PackBucket,
+        notifier: SystemdNotifier,
     ) -> None:
         self._nc, self._options, self._partitions = nc, options, partitions
         self._keeping, self._bucket, self._notifier = keeping, bucket, notifier
-        self._members = Members(options.name)
+        self._members = Membership(options.name)
         self._inbox = nc.new_inbox()
-        self._held: dict[int, tuple[Holding, asyncio.Task[None]]] = {}
+        self._held: dict[int, tuple[PartitionLease, asyncio.Task[None]]] = {}
         self._returning: dict[int, asyncio.Task[None]] = {}
         self._changed: asyncio.Queue[set[str]] = asyncio.Queue()
         self._started_s = time.time()
@@ -180,7 +186,7 @@ class Worker:
         await part(self._nc)
 
     @property
-    def _holdings(self) -> list[Holding]:
+    def _holdings(self) -> list[PartitionLease]:
         return [holding for holding, _ in self._held.values()]
 
     async def _hear(self, message: Msg) -> None:
@@ -248,7 +254,7 @@ class Worker:
                 await holding.consumer.renew()
 
     def _try_for(self, number: int, now_s: float) -> None:
-        holding = Holding(
+        holding = PartitionLease(
             self._nc,
             number,
             self._bucket.packs,
@@ -265,7 +271,7 @@ class Worker:
         if number not in self._returning:
             self._returning[number] = asyncio.create_task(self._return(*self._held[number]))
 
-    async def _return(self, holding: Holding, task: asyncio.Task[None]) -> None:
+    async def _return(self, holding: PartitionLease, task: asyncio.Task[None]) -> None:
         await end(task)
         async with self._few:
             if self._nc.is_connected:
@@ -287,11 +293,11 @@ class Worker:
             if holding.hours and self._nc.is_connected:
                 await self._try(holding, holding.send_hours)
 
-    async def _try(self, holding: Holding, what: Callable[[], Awaitable[None]]) -> None:
+    async def _try(self, holding: PartitionLease, what: Callable[[], Awaitable[None]]) -> None:
         try:
             await what()
         except TROUBLES as error:
-            log.warning("the server does not keep what it is given", partition=holding.number, reason=reason(error))
+            log.warning("the server does not keep what it is given", partition=holding.number, reason=error_text(error))
 
     async def _settle(self) -> None:
         """Tell the partitions of packs that have other settings, or are known now."""

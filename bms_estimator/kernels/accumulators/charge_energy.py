@@ -22,7 +22,7 @@ FLOW_SUMS = np.dtype(
 
 
 @njit(cache=True)
-def add_flow(sums: Records, trace: Records, gap_s: float) -> None:
+def accumulate_charge_energy(sums: Records, trace: Records, gap_s: float) -> None:
     """Add accepted samples: straight between them, nothing over a gap nor where the clock was set back.
 
     Args:

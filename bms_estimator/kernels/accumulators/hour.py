@@ -49,7 +49,7 @@ OF_HOUR = tuple(HOUR_SUMS.names or ())[(HOUR_SUMS.names or ()).index("samples") 
 
 
 @njit(cache=True)
-def add_rows(sums: Records, trace: Records, new_clock: bool, gap_s: float, rest_a: float) -> None:
+def accumulate_hour(sums: Records, trace: Records, new_clock: bool, gap_s: float, rest_a: float) -> None:
     """Add accepted samples.
 
     Args:
@@ -76,8 +76,8 @@ def add_step(h: Record, x: Record, known: bool, gap_s: float, rest_a: float) -> 
         h: Record of HOUR_SUMS.
         x: Record of TRACE.
         known: There is one before, on the same clock.
-        gap_s: As in ``add_rows``.
-        rest_a: As in ``add_rows``.
+        gap_s: As in ``accumulate_hour``.
+        rest_a: As in ``accumulate_hour``.
     """
     power_w, dt_s = x.voltage_v * x.current_a, x.time_s - h.last_s
     seen = known and 0.0 < dt_s <= max(gap_s, GAP_RATIO * h.step_s)

@@ -23,7 +23,7 @@ WINDOW_SUMS = np.dtype(
 
 
 @njit(cache=True)
-def add_window(sums: Records, trace: Records) -> None:
+def accumulate_window(sums: Records, trace: Records) -> None:
     """Add accepted samples.
 
     Args:

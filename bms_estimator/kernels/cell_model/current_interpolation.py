@@ -17,7 +17,7 @@ LONGEST_FLOW_S = 3600.0
 
 
 @njit(cache=True)
-def held_current(dt_s: float, before_a: float, now_a: float, unmeasured_s: float = UNMEASURED_S) -> float:
+def interpolated_current(dt_s: float, before_a: float, now_a: float, unmeasured_s: float = UNMEASURED_S) -> float:
     """Current over a step of ``dt_s``: straight between its ends; what both agree on where nobody measured [A]."""
     if dt_s <= unmeasured_s:
         return 0.5 * (before_a + now_a)
@@ -27,7 +27,7 @@ def held_current(dt_s: float, before_a: float, now_a: float, unmeasured_s: float
 
 
 @njit(cache=True)
-def along_line(change_a: float, taus: float, decay: float) -> float:
+def ramp_correction(change_a: float, taus: float, decay: float) -> float:
     """What a branch gains when the current goes straight from one sample to the next, beyond its mean [A].
 
     Args:

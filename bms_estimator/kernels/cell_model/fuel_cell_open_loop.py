@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.kernels.cell_model.current_interpolation import held_current
+from bms_estimator.kernels.cell_model.current_interpolation import interpolated_current
 from bms_estimator.kernels.cell_model.fuel_cell import advance, give_file, output, settle
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
@@ -33,7 +33,7 @@ def open_loop(
             settle(x, dx, theta, given, current_a[0])
         else:
             dt_s = time_s[j] - time_s[j - 1]
-            advance(x, dx, theta, given, held_current(dt_s, current_a[j - 1], current_a[j]), dt_s)
+            advance(x, dx, theta, given, interpolated_current(dt_s, current_a[j - 1], current_a[j]), dt_s)
         voltage_v[j] = output(x, dx, theta, given, current_a[j], psi[j])
     return voltage_v, psi
 

@@ -1,6 +1,6 @@
 """What a cell's branches do under a measured current, from rest: no voltage is looked at.
 
-Between two samples the current is taken as the filter takes it (``held_current``, ``along_line``), of a source that is no slower
+Between two samples the current is taken as the filter takes it (``interpolated_current``, ``ramp_correction``), of a source that is no slower
 than one a minute.
 """
 
@@ -9,7 +9,12 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts, rc_step
-from bms_estimator.kernels.cell_model.current_interpolation import SLOW_S, UNMEASURED_S, along_line, held_current
+from bms_estimator.kernels.cell_model.current_interpolation import (
+    SLOW_S,
+    UNMEASURED_S,
+    interpolated_current,
+    ramp_correction,
+)
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS, TREND
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
@@ -32,11 +37,11 @@ def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
     x = np.zeros((time_s.size, BRANCHES))
     for j in range(1, time_s.size):
         dt_s = time_s[j] - time_s[j - 1]
-        held_a = held_current(dt_s, current_a[j - 1], current_a[j])
+        held_a = interpolated_current(dt_s, current_a[j - 1], current_a[j])
         straight_a = current_a[j] - current_a[j - 1] if SLOW_S < dt_s <= UNMEASURED_S else 0.0
         for k in range(BRANCHES):
             decay = math.exp(-dt_s / TAUS[k])
-            x[j, k] = held_a + (x[j - 1, k] - held_a) * decay + along_line(straight_a, dt_s / TAUS[k], decay)
+            x[j, k] = held_a + (x[j - 1, k] - held_a) * decay + ramp_correction(straight_a, dt_s / TAUS[k], decay)
     return x
 
 

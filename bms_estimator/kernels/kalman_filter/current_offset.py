@@ -7,7 +7,7 @@ sensor shows at all, behind its steps and its dead band, is seen from the smalle
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
 
-from bms_estimator.kernels.kalman_filter.ekf import observe
+from bms_estimator.kernels.kalman_filter.ekf import update_state_directly
 from bms_estimator.kernels.kalman_filter.records import OFFSET
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
@@ -22,7 +22,7 @@ as that of now does."""
 
 
 @njit(cache=True)
-def watch_smallest(s: Record, current_a: float) -> None:
+def track_smallest_current(s: Record, current_a: float) -> None:
     """Keep the smallest current that was shown twice in a row and is not 0: one sample may be the mean over an edge."""
     shown_a = max(abs(current_a), abs(s.current_a))
     if current_a != 0.0 and s.current_a != 0.0 and (s.smallest_a == 0.0 or shown_a < s.smallest_a):
@@ -30,7 +30,7 @@ def watch_smallest(s: Record, current_a: float) -> None:
 
 
 @njit(cache=True)
-def learn_from_zero(s: Record, p: Record) -> None:
+def update_offset_at_rest(s: Record, p: Record) -> None:
     """Each minute of rest that shows no current tells every hypothesis the offset to ``p.zero_std_c``, or to what may be hidden.
 
     What little it shows may be the sensor's or that of a load: half of it is the offset, give or take the other half.
@@ -53,4 +53,4 @@ def learn_from_zero(s: Record, p: Record) -> None:
     for q in range(s.count):
         known_a2 = s.covariance[q, OFFSET, OFFSET]
         if known_a2 > FORGOTTEN * left_a2:
-            observe(s, q, OFFSET, half_a, known_a2 * left_a2 / (known_a2 - left_a2))
+            update_state_directly(s, q, OFFSET, half_a, known_a2 * left_a2 / (known_a2 - left_a2))

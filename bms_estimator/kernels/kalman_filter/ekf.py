@@ -8,7 +8,7 @@ import math
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, REFERENCE_C, TAUS, TREND, on_grid, resistances
 from bms_estimator.kernels.kalman_filter.noise import add_process_noise, bias_variance, resistance_std
-from bms_estimator.kernels.kalman_filter.ocv_correction import learned_v, per_node_v, place
+from bms_estimator.kernels.kalman_filter.ocv_correction import node_error_scale, node_position, ocv_correction
 from bms_estimator.kernels.kalman_filter.records import (
     B_FAST,
     B_SLOW,
@@ -59,7 +59,7 @@ VARYING_C = 0.2
 
 
 @njit(cache=True)
-def decay(s: Record, p: Record) -> None:
+def transition_diagonal(s: Record, p: Record) -> None:
     """The diagonal of F over the window into ``s.f``; the same for all hypotheses but that of CURVE."""
     f, dt_s, through = s.f, s.window.time_s, s.window.throughput_as / p.capacity_as
     for j in range(STATES):
@@ -67,14 +67,14 @@ def decay(s: Record, p: Record) -> None:
     for k in range(BRANCHES):
         f[X + k] = math.exp(-dt_s / TAUS[k])
     f[B_SLOW], f[B_FAST] = math.exp(-dt_s / p.slow_s), math.exp(-dt_s / p.fast_s)
-    f[HYST] = math.exp(-abs(trend(s, p)) / p.capacity_as / p.hysteresis_soc)
+    f[HYST] = math.exp(-abs(hysteresis_charge(s, p)) / p.capacity_as / p.hysteresis_soc)
     f[OFFSET], f[LN_Q] = math.exp(-dt_s / p.offset_s), math.exp(-through / p.aged_soc)
     if not s.sensed:
         f[LN_R0] = f[LN_R] = math.exp(-dt_s / p.unsensed_s)
 
 
 @njit(cache=True)
-def trend(s: Record, p: Record) -> float:
+def hysteresis_charge(s: Record, p: Record) -> float:
     """Charge that moves the hysteresis in the window [A s]: of the current's trend, for no regeneration turns it."""
     w = s.window
     return w.charge_as if w.gap and w.time_s > p.unmeasured_s else s.x_a[TREND] * w.time_s
@@ -98,15 +98,15 @@ def predict(s: Record, p: Record, q: int) -> None:
         for k in range(STATES if j < NODE else NODE):
             row[k] *= along * f[k]
     x[SOC] -= moved  # (2.1)
-    x[HYST] -= math.copysign(1.0 - f[HYST], trend(s, p))
+    x[HYST] -= math.copysign(1.0 - f[HYST], hysteresis_charge(s, p))
     for k in range(X, X + BRANCHES):
         x[k] -= (1.0 - f[k]) * x[OFFSET]
-    couple(cov, f, w.time_s / capacity_as, moved)
+    apply_offdiagonal_transition(cov, f, w.time_s / capacity_as, moved)
     add_process_noise(s, p, q, w.throughput_as / capacity_as, bias_v2)
 
 
 @njit(cache=True)
-def couple(cov: Floats, f: Floats, by_offset: float, moved: float) -> None:
+def apply_offdiagonal_transition(cov: Floats, f: Floats, by_offset: float, moved: float) -> None:
     """What is off the diagonal of F: SOC by the offset [1/A] and ln Q, branches by the offset."""
     for k in range(STATES):
         cov[SOC, k] += by_offset * cov[OFFSET, k] + moved * cov[LN_Q, k]
@@ -141,15 +141,15 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
     """
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     soc, variance = x[SOC], cov[SOC, SOC]
-    innovation_v, total_v2, straight_v2 = innovate(s, p, q, variance_v2, soc, variance)
+    innovation_v, total_v2, straight_v2 = compute_innovation(s, p, q, variance_v2, soc, variance)
     for _ in range(MOST_TIMES):
         to_soc = min(max(x[SOC] + ph[SOC] * innovation_v / total_v2, LOWEST), HIGHEST)
         to_variance = cov[SOC, SOC] - ph[SOC] * ph[SOC] / total_v2
         if max(abs(to_soc - soc), abs(secant_reach(to_variance) - secant_reach(variance))) < NEAR:
             break
         soc, variance = to_soc, to_variance
-        innovation_v, total_v2, straight_v2 = innovate(s, p, q, variance_v2, soc, variance)
-    correct(x, cov, ph, innovation_v, total_v2, states_to_hold(s, p, q))
+        innovation_v, total_v2, straight_v2 = compute_innovation(s, p, q, variance_v2, soc, variance)
+    apply_correction(x, cov, ph, innovation_v, total_v2, states_to_hold(s, p, q))
     x[LN_Q] = min(max(x[LN_Q], LEAST_LN_Q), MOST_LN_Q)
     most = MOST_STDS * resistance_std(s, p)
     for j in (LN_R0, LN_R):
@@ -158,7 +158,7 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
 
 
 @njit(cache=True)
-def innovate(
+def compute_innovation(
     s: Record, p: Record, q: int, variance_v2: float, about_soc: float, about_variance: float
 ) -> tuple[float, float, float]:
     """What ``update`` returns, linear about an SOC to a variance; P H' into ``s.ph``."""
@@ -214,22 +214,22 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
     h[B_SLOW] = h[B_FAST] = 1.0
     h[HYST] = s.hysteresis * on_grid(soc, p.hysteresis_v)
     h[CURVE] = math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v)
-    i, t = place(soc)
-    node_v = per_node_v(p, soc, t)
+    i, t = node_position(soc)
+    node_v = node_error_scale(p, soc, t)
     h[NODE + i], h[NODE + i + 1] = (1.0 - t) * node_v, t * node_v
     voltage_v = e_o + h[HYST] * x[HYST] + h[CURVE] * x[CURVE] + h[LN_R0] + h[LN_R] + x[B_SLOW] + x[B_FAST]
-    voltage_v += learned_v(p, x, soc) + (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
+    voltage_v += ocv_correction(p, x, soc) + (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
     voltage_v += h[SOC] * (x[SOC] - about_soc)
     return voltage_v, 0.5 * (above + below - 2.0 * e_o) * min(about_variance / (reach * reach), 1.0)
 
 
 @njit(cache=True)
-def observe(s: Record, q: int, j: int, value: float, variance: float) -> None:
+def update_state_directly(s: Record, q: int, j: int, value: float, variance: float) -> None:
     """State ``j`` of hypothesis ``q`` is ``value``, to ``variance``: a textbook update, linear."""
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     for k in range(STATES):
         ph[k] = cov[j, k]
-    correct(x, cov, ph, value - x[j], cov[j, j] + variance, HOLD_NOTHING)
+    apply_correction(x, cov, ph, value - x[j], cov[j, j] + variance, HOLD_NOTHING)
 
 
 @njit(cache=True)
@@ -261,7 +261,7 @@ def is_held(j: int, hold: int) -> bool:
 
 
 @njit(cache=True)
-def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: float, hold: int) -> None:
+def apply_correction(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: float, hold: int) -> None:
     """State and P by an innovation e of variance S: x + P H' e / S, P - P H' H P / S. ``ph`` is P H', and scratch afterwards.
 
     States that are held keep their mean and covariance: their gain is 0 (Schmidt-Kalman filter).
@@ -280,7 +280,7 @@ def correct(x: Floats, cov: Floats, ph: Floats, innovation: float, variance: flo
 
 
 @njit(cache=True)
-def inflate(s: Record, q: int, dt_s: float, u: float) -> None:
+def adapt_bias_inflation(s: Record, q: int, dt_s: float, u: float) -> None:
     """Let the variance of the biases follow what innovations have in common over a minute and over ten.
 
     The mean over a time T of a white, normalised innovation has the variance a / (2 - a) with a = dt / T, where samples are

@@ -55,7 +55,7 @@ ELEMENT_FIT = np.dtype(
 
 
 @njit(cache=True)
-def learn(m: Record, element: int, soc: float, ln_value: float, variance: float, dt_s: float) -> bool:
+def add_observation(m: Record, element: int, soc: float, ln_value: float, variance: float, dt_s: float) -> bool:
     """Add what is known of one element at ``soc`` to its bin: ln of its value and the variance of that.
 
     Returns:
@@ -72,7 +72,7 @@ def learn(m: Record, element: int, soc: float, ln_value: float, variance: float,
 
 
 @njit(cache=True)
-def age(m: Record, e: int, factor: float) -> None:
+def decay_weights(m: Record, e: int, factor: float) -> None:
     """Let row ``e`` of the map forget: what it knows counts ``factor`` times as much from now on."""
     for b in range(BINS):
         m.weight[e, b] *= factor

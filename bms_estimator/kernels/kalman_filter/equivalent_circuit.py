@@ -20,7 +20,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     resistances,
 )
 from bms_estimator.kernels.kalman_filter.noise import resistance_std
-from bms_estimator.kernels.kalman_filter.ocv_correction import learned_v
+from bms_estimator.kernels.kalman_filter.ocv_correction import ocv_correction
 from bms_estimator.kernels.kalman_filter.records import HYST, LN_R, LN_R0, OFFSET, SOC, X
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
@@ -58,7 +58,7 @@ def equivalent(f: Record, p: Record, e: Record) -> None:
     for k in range(1, RESISTANCES):
         e.ohm[k] *= others
     ratio, variance = ln_r_s_ratio(f, p)
-    half_ohm = 0.5 * within_sample(f, e)
+    half_ohm = 0.5 * branch_rise_within_sample(f, e)
     e.value[R_S] = file_ohm * math.exp(ratio) + half_ohm
     e.ln_variance[R_S] = variance + (half_ohm / e.value[R_S]) ** 2
     one_branch(e, 0, SHORT, R_TS, cov[LN_R, LN_R], p.r_std)
@@ -68,7 +68,7 @@ def equivalent(f: Record, p: Record, e: Record) -> None:
 @njit(cache=True)
 def ln_r_s_ratio(f: Record, p: Record) -> tuple[float, float]:
     """Ln of R_s over R_0 of the file at the same SOC and temperature, and its variance: by steps, else as the filter has it."""
-    if told_by_steps(f, p):
+    if r_s_identified_by_steps(f, p):
         return f.step.ln_ratio, f.step.variance + SHAPE_STD**2
     return f.mean[f.best, LN_R0], f.covariance[f.best, LN_R0, LN_R0] + SHAPE_STD**2
 
@@ -97,7 +97,7 @@ def one_branch(e: Record, first: int, end: int, at: int, scale_variance: float, 
 
 
 @njit(cache=True)
-def within_sample(f: Record, e: Record) -> float:
+def branch_rise_within_sample(f: Record, e: Record) -> float:
     """What the branches add to a step of the voltage within a sample [ohm]: nobody sees how much of it is R_s."""
     ohm = 0.0
     for k in range(BRANCHES):
@@ -106,13 +106,13 @@ def within_sample(f: Record, e: Record) -> float:
 
 
 @njit(cache=True)
-def told(f: Record, p: Record, j: int) -> bool:
+def scale_is_identified(f: Record, p: Record, j: int) -> bool:
     """Whether data have told of the scale LN_R0 or LN_R, ``j``."""
     return f.covariance[f.best, j, j] < KNOWN * resistance_std(f, p) ** 2
 
 
 @njit(cache=True)
-def told_by_steps(f: Record, p: Record) -> bool:
+def r_s_identified_by_steps(f: Record, p: Record) -> bool:
     """Whether steps of the current have told of R_s."""
     return f.step.variance < KNOWN * resistance_std(f, p) ** 2
 
@@ -124,5 +124,5 @@ def open_circuit(f: Record, p: Record, e: Record, current_a: float, voltage_v: f
     e_o = voltage_v + e.ohm[0] * (current_a - x[OFFSET])
     for k in range(BRANCHES):
         e_o += e.ohm[1 + k] * (f.x_a[k] + x[X + k])
-    e_o -= f.hysteresis * on_grid(x[SOC], p.hysteresis_v) * x[HYST] + learned_v(p, x, x[SOC])
+    e_o -= f.hysteresis * on_grid(x[SOC], p.hysteresis_v) * x[HYST] + ocv_correction(p, x, x[SOC])
     return e_o - (f.temperature_c - REFERENCE_C) * on_grid(x[SOC], p.per_kelvin_v)

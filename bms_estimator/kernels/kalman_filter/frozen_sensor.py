@@ -29,7 +29,7 @@ OUTLIERS_S = 3600.0
 
 
 @njit(cache=True)
-def watch_frozen(c: Record, f: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> bool:
+def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> bool:
     """Whether a voltage may be believed. For how long each of the two has been the same though it cannot; before ``watch_sign``."""
     counted_s = min(dt_s, FAST_S)
     fast = dt_s <= FAST_S and c.slow_v != 0.0
@@ -44,9 +44,9 @@ def watch_frozen(c: Record, f: Record, p: Record, dt_s: float, current_a: float,
     else:
         c.held_as += 0.5 * (c.last_a + current_a) * min(dt_s, p.unmeasured_s)
         loaded = current_a >= LOAD_C * p.capacity_as / 3600.0
-        moved = loaded and has_moved(c, f, p, current_a, resolved_v)
+        moved = loaded and ocv_has_moved(c, f, p, current_a, resolved_v)
         change_a = abs(current_a - c.held_a) if loaded else min(abs(current_a - c.held_a), abs(current_a - c.slow_a))
-        dropped_v = series_ohm(p) * change_a if fast else 0.0
+        dropped_v = reference_series_resistance(p) * change_a if fast else 0.0
         stuck = moved or dropped_v > max(VISIBLE_V * p.series, resolved_v)
         if stuck:
             c.frozen_v_s += counted_s
@@ -63,14 +63,14 @@ def watch_frozen(c: Record, f: Record, p: Record, dt_s: float, current_a: float,
 
 
 @njit(cache=True)
-def series_ohm(p: Record) -> float:
+def reference_series_resistance(p: Record) -> float:
     """R_0 in the middle of the SOC, at 25 C [ohm]."""
     middle = p.weak_ohm.shape[0] // 2
     return p.weak_ohm[middle, 0] + p.strong_ohm[middle, 0]
 
 
 @njit(cache=True)
-def has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: float) -> bool:
+def ocv_has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: float) -> bool:
     """Whether the charge since the voltage last changed has moved the open-circuit voltage, whatever the current drops."""
     if f.count > 1:
         return False
@@ -82,7 +82,7 @@ def has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: flo
 
 
 @njit(cache=True)
-def take_back(c: Record, f: Record, p: Record) -> None:
+def rewind_to_freeze(c: Record, f: Record, p: Record) -> None:
     """What was concluded since one of the two froze is worth nothing: the SOC of then, and counted since, if the current is one."""
     if c.frozen_a_s > FROZEN_S:
         f.soc, f.soc_std = c.same_soc, c.same_soc_std + p.load_mean_c * c.same_s / 3600.0

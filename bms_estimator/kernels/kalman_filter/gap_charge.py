@@ -23,7 +23,7 @@ IDLE_C = 0.1
 
 
 @njit(cache=True)
-def first_load(s: Record, p: Record, current_a: float) -> None:
+def initialize_load_statistics(s: Record, p: Record, current_a: float) -> None:
     """Before a load is seen: what ``switch_on`` takes one to be.
 
     The first sample tells more of a load that is small than of one that is large: that may be a peak.
@@ -37,7 +37,7 @@ def first_load(s: Record, p: Record, current_a: float) -> None:
 
 
 @njit(cache=True)
-def watch_load(s: Record, current_a: float, dt_s: float) -> None:
+def update_load_statistics(s: Record, current_a: float, dt_s: float) -> None:
     """Mean and mean square of a current of ``current_a`` over ``dt_s`` into the present and the usual load."""
     share = min(1.0, dt_s / LOAD_S)
     s.mean_a += share * (current_a - s.mean_a)
@@ -48,13 +48,13 @@ def watch_load(s: Record, current_a: float, dt_s: float) -> None:
 
 
 @njit(cache=True)
-def goes_on(s: Record, held_a: float, dt_s: float) -> float:
+def expected_excess_charge(s: Record, held_a: float, dt_s: float) -> float:
     """Charge that the present load moves in a gap of ``dt_s`` beyond ``held_a``, which both ends agree on, until it changes [A s]."""
     return (s.mean_a - held_a) * LOAD_S * (1.0 - math.exp(-dt_s / LOAD_S))
 
 
 @njit(cache=True)
-def unseen_charge(s: Record, p: Record, held_a: float, dt_s: float) -> float:
+def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
     """Std of the charge that moved in ``dt_s`` beside ``held_a`` x ``dt_s`` [A s].
 
     The current was one of the present load, and after a time of the usual one, at random and the same all the time.
@@ -67,7 +67,7 @@ def unseen_charge(s: Record, p: Record, held_a: float, dt_s: float) -> float:
 
 
 @njit(cache=True)
-def between_samples(change_a: float, dt_s: float) -> float:
+def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
     """Variance of the charge that moved in ``dt_s`` beside the straight line between two samples [A^2 s^2].
 
     Args:
@@ -78,7 +78,7 @@ def between_samples(change_a: float, dt_s: float) -> float:
 
 
 @njit(cache=True)
-def rounded_charge(s: Record, p: Record, dt_s: float, current_a: float) -> float:
+def rounding_charge_variance(s: Record, p: Record, dt_s: float, current_a: float) -> float:
     """By how much the steps of the current raise the variance of the charge within ``dt_s`` [A^2 s^2].
 
     While the same current is shown the error stays the same: its charge has the variance (error x time)^2, whatever the time.

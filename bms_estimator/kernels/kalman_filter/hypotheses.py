@@ -15,22 +15,28 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     REFERENCE_C,
     on_grid,
 )
-from bms_estimator.kernels.kalman_filter.current_offset import learn_from_zero
-from bms_estimator.kernels.kalman_filter.ekf import HIGHEST, LOWEST, OWN_R_STD, inflate, predict, update
+from bms_estimator.kernels.kalman_filter.current_offset import update_offset_at_rest
+from bms_estimator.kernels.kalman_filter.ekf import HIGHEST, LOWEST, OWN_R_STD, adapt_bias_inflation, predict, update
 from bms_estimator.kernels.kalman_filter.gap_charge import (
-    first_load,
-    watch_load,
+    initialize_load_statistics,
+    update_load_statistics,
 )
-from bms_estimator.kernels.kalman_filter.mixture import combine, copy, forget, merge, vacate
+from bms_estimator.kernels.kalman_filter.mixture import (
+    clear_hypothesis,
+    copy_hypothesis,
+    decorrelate_state,
+    mixture_moments,
+    prune_and_merge,
+)
 from bms_estimator.kernels.kalman_filter.noise import (
     bias_variance,
+    extrapolation_factor,
+    initial_branch_currents,
     measurement_variance,
     offset_variance,
-    outside,
     resistance_std,
-    switch_on,
 )
-from bms_estimator.kernels.kalman_filter.ocv_correction import forget_curve
+from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
 from bms_estimator.kernels.kalman_filter.records import (
     B_FAST,
     B_SLOW,
@@ -46,10 +52,10 @@ from bms_estimator.kernels.kalman_filter.records import (
 )
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
 from bms_estimator.kernels.kalman_filter.temperature import (
-    follow_temperature,
     is_temperature,
+    update_arrhenius_factors,
 )
-from bms_estimator.kernels.kalman_filter.window import clear, pass_time
+from bms_estimator.kernels.kalman_filter.window import prepare_transition, reset_window
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
@@ -76,9 +82,9 @@ STRAINED_STDS = 2.0
 biases have become."""
 REOPEN_STD = 0.2
 """... by as much as at switch-on."""
-TOLD_STD = 0.03
+USER_SOC_STD = 0.03
 """An SOC that is told is known to this std, ..."""
-WRONG_STD = 0.12
+WRONG_USER_SOC_STD = 0.12
 """... or it is wrong, by as much as this, ..."""
 LN_RIGHT = 3.0
 """... which is less likely by so much, in ln: one in ten in all."""
@@ -92,8 +98,8 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
     s.smallest_a = 0.0
     s.sensed = 1 if is_temperature(temperature_c) else 0
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
-    follow_temperature(s)
-    first_load(s, p, current_a)
+    update_arrhenius_factors(s)
+    initialize_load_statistics(s, p, current_a)
     s.x_a[:] = 0.0
     x, cov = s.mean[0], s.covariance[0]
     x[:] = 0.0
@@ -103,32 +109,32 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
     s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
-    forget_curve(x, cov)
-    seed(s, p, soc, p.soc_std)
-    clear(s)
+    reset_ocv_correction(x, cov)
+    spawn_hypotheses(s, p, soc, p.soc_std)
+    reset_window(s)
 
 
 @njit(cache=True)
-def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
+def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
     """Begin again at ``soc`` with all that the likeliest hypothesis knows of sensor and cell.
 
     SOC, polarisation, hysteresis and errors of the model are unknown.
     """
     known = s.mean[s.best], s.covariance[s.best]
     for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
-        forget(known[0], known[1], j)
+        decorrelate_state(known[0], known[1], j)
     for k in range(BRANCHES):
-        forget(known[0], known[1], X + k)
+        decorrelate_state(known[0], known[1], X + k)
     s.x_a[:] = 0.0
-    switch_on(p, s.current_a, known[0], known[1])
+    initial_branch_currents(p, s.current_a, known[0], known[1])
     known[1][HYST, HYST], known[1][CURVE, CURVE] = HYST_STD**2, 1.0
     s.count = HYPOTHESES if soc_std > ONE_STD else 1
     apart = 2.0 * REACH_STDS * soc_std / (HYPOTHESES - 1)
     if s.best != 0:
-        copy(s, s.best, 0)
+        copy_hypothesis(s, s.best, 0)
     for q in range(s.count - 1, -1, -1):
         if q > 0:
-            copy(s, 0, q)
+            copy_hypothesis(s, 0, q)
         away = (q - (s.count - 1) // 2) * apart
         std = OVERLAP * apart if s.count > 1 else soc_std
         s.mean[q, SOC] = min(max(soc + away, LOWEST), HIGHEST)
@@ -139,34 +145,34 @@ def seed(s: Record, p: Record, soc: float, soc_std: float) -> None:
         s.minute_u[q] = s.ten_minutes_u[q] = 0.0
         s.fast_inflation[q] = s.slow_inflation[q] = 1.0
     for q in range(s.count, HYPOTHESES):
-        vacate(s, q)
+        clear_hypothesis(s, q)
     s.best = (s.count - 1) // 2
     s.seeded_s = s.rest_s = s.rest_as = 0.0
-    combine(s)
+    mixture_moments(s)
 
 
 @njit(cache=True)
-def tell(s: Record, p: Record, soc: float) -> None:
+def set_soc(s: Record, p: Record, soc: float) -> None:
     """Begin again at an SOC that somebody told: mostly it is right, and the voltage shows where it is not."""
-    seed(s, p, soc, WRONG_STD)
-    s.covariance[s.best, SOC, SOC] = TOLD_STD**2
+    spawn_hypotheses(s, p, soc, WRONG_USER_SOC_STD)
+    s.covariance[s.best, SOC, SOC] = USER_SOC_STD**2
     s.ln_weight[s.best] += LN_RIGHT
-    combine(s)
+    mixture_moments(s)
 
 
 @njit(cache=True)
-def update_all(s: Record, p: Record) -> None:
+def update_hypotheses(s: Record, p: Record) -> None:
     """Take the window in, with every hypothesis."""
     w = s.window
     dt_s = w.time_s
     if dt_s > 0.0:
         if not w.gap:
-            watch_load(s, w.charge_as / dt_s, dt_s)
-        pass_time(s, p)
-    follow_temperature(s)
+            update_load_statistics(s, w.charge_as / dt_s, dt_s)
+        prepare_transition(s, p)
+    update_arrhenius_factors(s)
     s.seeded_s += dt_s
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
-    share, best = size_of_errors(s, p), 0
+    share, best = innovation_scale(s, p), 0
     for q in range(s.count):
         if dt_s > 0.0:
             predict(s, p, q)
@@ -175,43 +181,43 @@ def update_all(s: Record, p: Record) -> None:
         # a bend's part of S stays while nothing moves: counted each second, it would tell against the knee at full rest
         s.ln_weight[q] -= p.temper * (innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2))
         if s.count > 1:
-            s.ln_weight[q] -= p.strain * max(strain2(s, p, q) - STRAINED_STDS**2, 0.0)
+            s.ln_weight[q] -= p.strain * max(normalized_bias_squared(s, p, q) - STRAINED_STDS**2, 0.0)
         if dt_s > 0.0 and not w.gap:  # one innovation is no error that stays, however long the gap
-            inflate(s, q, dt_s, u)
+            adapt_bias_inflation(s, q, dt_s, u)
         if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
             best = q
             s.innovation_v, s.innovation_variance = innovation_v, total_v2
     s.voltage_v = w.sum_v / w.samples - s.innovation_v
     s.best = best
-    learn_from_zero(s, p)
-    merge(s)
-    combine(s)
-    reopen(s, p)
-    clear(s)
+    update_offset_at_rest(s, p)
+    prune_and_merge(s)
+    mixture_moments(s)
+    reinitialize_if_biased(s, p)
+    reset_window(s)
 
 
 @njit(cache=True)
-def size_of_errors(s: Record, p: Record) -> float:
+def innovation_scale(s: Record, p: Record) -> float:
     """What S is in truth, over what the filters take it for.
 
     R and the biases allow for loads and cells that the file fits worst. Mostly it fits better, once what was before switch-on
     is forgotten: innovations far within S would leave it to ln S to judge, and the hypothesis of the smallest S would win.
     Outside the temperatures of the cell file less of the kind is known, ``OUTSIDE_K`` away nothing.
     """
-    return min(max(math.exp(-s.seeded_s / KNOWN_S), p.least_share * outside(p, s.temperature_c) ** 2), 1.0)
+    return min(max(math.exp(-s.seeded_s / KNOWN_S), p.least_share * extrapolation_factor(p, s.temperature_c) ** 2), 1.0)
 
 
 @njit(cache=True)
-def reopen(s: Record, p: Record) -> None:
+def reinitialize_if_biased(s: Record, p: Record) -> None:
     """Begin again where the model would have to be wrong by far more than it is: then the SOC is, by any amount."""
-    if s.count == 1 and strain2(s, p, 0) > REOPEN_STDS**2:
-        forget_curve(s.mean[0], s.covariance[0])
-        seed(s, p, s.mean[0, SOC], REOPEN_STD)
+    if s.count == 1 and normalized_bias_squared(s, p, 0) > REOPEN_STDS**2:
+        reset_ocv_correction(s.mean[0], s.covariance[0])
+        spawn_hypotheses(s, p, s.mean[0, SOC], REOPEN_STD)
         s.reopened += 1
 
 
 @njit(cache=True)
-def strain2(s: Record, p: Record, q: int) -> float:
+def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
     """By how many std a hypothesis holds the model for wrong, squared.
 
     The biases take what is wrong with OCV and hysteresis, too: on a plateau that is most of it.
@@ -223,7 +229,7 @@ def strain2(s: Record, p: Record, q: int) -> float:
 
 
 @njit(cache=True)
-def pack_std(s: Record, p: Record) -> float:
+def weakest_cell_soc_std(s: Record, p: Record) -> float:
     """Std of the SOC as of the emptiest of cells in series: nobody sees how far below their mean it lies."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
     return math.hypot(max(s.soc_std, LEAST_STD, UNKNOWN_FULL * p.r_std), spread)

@@ -15,16 +15,16 @@ from bms_estimator.kernels.kalman_filter.frozen_sensor import (
     OUTLIERS_S,
     UNCOUNTED,
     VISIBLE_V,
-    series_ohm,
-    take_back,
+    reference_series_resistance,
+    rewind_to_freeze,
 )
-from bms_estimator.kernels.kalman_filter.gap_charge import first_load
-from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, seed
+from bms_estimator.kernels.kalman_filter.gap_charge import initialize_load_statistics
+from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
-from bms_estimator.kernels.kalman_filter.window import clear
+from bms_estimator.kernels.kalman_filter.window import reset_window
 from bms_estimator.model.arrays import Record
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.numba_cache import njit
 
 GATE_STDS = 6.0
@@ -58,7 +58,7 @@ MANY_SEARCHES = 4.0
 UNKNOWN_K = 5.0
 """So far outside the temperatures of the cell file nothing is known of it [K]."""
 
-SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT = (int(bit) for bit in Suspect)
+SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT = (int(bit) for bit in InputFault)
 UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT
 """No voltage is believed meanwhile."""
 
@@ -90,7 +90,7 @@ CHECKS = np.dtype(
         ("wrong_v", "f8"),  # running mean of the error that stays [V]
         ("searches", "f8"),  # times the filter began again of late
         ("seen_reopened", "i8"),
-        ("suspects", "i8"),  # bits of model.input_faults.Suspect
+        ("suspects", "i8"),  # bits of model.input_faults.InputFault
         ("good_mean", "f8", STATES),  # of the likeliest filter when it was last kept
         ("good_covariance", "f8", (STATES, STATES)),
         ("good_soc", "f8"),
@@ -111,7 +111,7 @@ COUNTERS = np.dtype(
 
 
 @njit(cache=True)
-def believed(
+def passes_innovation_gate(
     c: Record,
     n: Record,
     f: Record,
@@ -140,15 +140,15 @@ def believed(
     jump_v = (e.value[R_S] + e.value[R_TS] + e.value[R_TL]) * max(abs(away_a), abs(change_a))
     limit_v = GATE_STDS * math.sqrt(f.innovation_variance) + jump_v
     if abs(voltage_v - predicted_v) <= limit_v or dt_s > p.unmeasured_s:
-        if c.gated_in_row > 0 and not enough(c):
+        if c.gated_in_row > 0 and not gate_persists(c):
             c.outliers += c.gated_in_row
         c.gated_in_row, c.gated_s = 0, 0.0
         return True
-    if enough(c):
+    if gate_persists(c):
         return True
     c.gated_in_row += 1
     c.gated_s += dt_s
-    if enough(c):
+    if gate_persists(c):
         n.reopened += 1
         return True
     n.gated += 1
@@ -156,13 +156,13 @@ def believed(
 
 
 @njit(cache=True)
-def enough(c: Record) -> bool:
+def gate_persists(c: Record) -> bool:
     """So many samples in a row are no glitch."""
     return c.gated_in_row >= GATE_SAMPLES and c.gated_s >= GATE_S
 
 
 @njit(cache=True)
-def keep(c: Record, f: Record) -> None:
+def store_last_good_state(c: Record, f: Record) -> None:
     """Keep what the likeliest filter knows as the last good state."""
     c.good_mean[:] = f.mean[f.best]
     c.good_covariance[:, :] = f.covariance[f.best]
@@ -170,7 +170,7 @@ def keep(c: Record, f: Record) -> None:
 
 
 @njit(cache=True)
-def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
+def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
     """Back to the last good state when anything of the filter is not finite; else keep it now and then."""
     total = (
         f.temperature_c
@@ -190,7 +190,7 @@ def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
     if math.isfinite(total) and 1 <= f.count <= HYPOTHESES:
         c.good_age_s += dt_s
         if c.good_age_s >= SNAPSHOT_S:
-            keep(c, f)
+            store_last_good_state(c, f)
         return
     f.best = 0
     f.mean[0, :] = c.good_mean
@@ -198,14 +198,14 @@ def guard(c: Record, n: Record, f: Record, p: Record, dt_s: float) -> None:
     if not math.isfinite(f.temperature_c):
         f.temperature_c, f.sensed = REFERENCE_C, 0  # what is told next is taken at once
         f.weak = f.strong = f.hysteresis = 1.0
-    first_load(f, p, f.current_a)
-    seed(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + LOST_STD**2))
-    clear(f)
+    initialize_load_statistics(f, p, f.current_a)
+    spawn_hypotheses(f, p, c.good_soc, math.sqrt(c.good_soc_std**2 + LOST_STD**2))
+    reset_window(f)
     n.reset += 1
 
 
 @njit(cache=True)
-def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
+def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
     """How fast changes of the voltage go with those of the current: by -R_s when the sign is right.
 
     A ramp is no change: where the curve ends, the voltage has one by itself.
@@ -231,7 +231,7 @@ def watch_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: f
 
 
 @njit(cache=True)
-def unusable(c: Record, p: Record) -> int:
+def unusable_input_bits(c: Record, p: Record) -> int:
     """The bits of why no voltage can be believed, 0: it can."""
     if sign_is_wrong(c, p):
         return SIGN_OF_CURRENT
@@ -241,12 +241,12 @@ def unusable(c: Record, p: Record) -> int:
 @njit(cache=True)
 def sign_is_wrong(c: Record, p: Record) -> bool:
     """Whether the voltage rises with what is said to be discharge; what is suspected already is so until it falls."""
-    steep = 0.25 * series_ohm(p) * c.change_a2
+    steep = 0.25 * reference_series_resistance(p) * c.change_a2
     return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else steep) and c.sign_evidence > LEAST_EVIDENCE
 
 
 @njit(cache=True)
-def wait(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
+def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
     """A sample while voltage and current do not belong together: no voltage can be believed.
 
     With the wrong sign of the current the SOC errs by twice the charge, always the same way; a current that is not measured may be
@@ -261,38 +261,38 @@ def wait(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None
     f.soc_std = min(math.hypot(f.soc_std + wrong, f.window.unknown_as / p.capacity_as), LOST_AT_MOST)
     f.window.unknown_as = 0.0
     f.step.phase = UNHELD
-    bits = unusable(c, p)
+    bits = unusable_input_bits(c, p)
     if bits:
         c.suspects = bits
         return
     if c.suspects & SIGN_OF_CURRENT:
         soc_std = max(f.soc_std, p.soc_std)
         initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
-        seed(f, p, f.soc, soc_std)
+        spawn_hypotheses(f, p, f.soc, soc_std)
     else:
-        seed(f, p, f.soc, max(f.soc_std, LOST_STD))
-    clear(f)
+        spawn_hypotheses(f, p, f.soc, max(f.soc_std, LOST_STD))
+    reset_window(f)
     c.suspects = 0
 
 
 @njit(cache=True)
-def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
+def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
     """Set and take back the bits of ``c.suspects`` after an update of the filter over ``dt_s``."""
     before = c.suspects
     c.outliers -= c.outliers * min(1.0, dt_s / OUTLIERS_S)
-    bits = unusable(c, p)
+    bits = unusable_input_bits(c, p)
     if bits:
         if bits != SIGN_OF_CURRENT:
-            take_back(c, f, p)
+            rewind_to_freeze(c, f, p)
         c.suspects = bits
         return
     if c.outliers > (FEW_OUTLIERS if before & OUTLIERS else MANY_OUTLIERS):
         bits |= OUTLIERS
     x, cov = f.mean[f.best], f.covariance[f.best]
     offset_a = OFFSET_STDS * p.offset_c * p.capacity_as / 3600.0
-    if beyond(x[OFFSET], cov[OFFSET, OFFSET], offset_a, before & OFFSET_BIT):
+    if is_significant_bias(x[OFFSET], cov[OFFSET, OFFSET], offset_a, before & OFFSET_BIT):
         bits |= OFFSET_BIT
-    if beyond(x[LN_Q], cov[LN_Q, LN_Q], CAPACITY_STDS * p.capacity_std, before & CAPACITY):
+    if is_significant_bias(x[LN_Q], cov[LN_Q, LN_Q], CAPACITY_STDS * p.capacity_std, before & CAPACITY):
         bits |= CAPACITY
     c.wrong_v += min(1.0, dt_s / WRONG_S) * (x[B_SLOW] - c.wrong_v)
     c.searches += f.reopened - c.seen_reopened - min(1.0, dt_s / SEARCHES_S) * c.searches
@@ -307,7 +307,7 @@ def judge(c: Record, f: Record, p: Record, dt_s: float) -> None:
 
 
 @njit(cache=True)
-def beyond(value: float, variance: float, expected: float, before: int) -> bool:
+def is_significant_bias(value: float, variance: float, expected: float, before: int) -> bool:
     """Whether a bias is more than it was expected to be, and known to be so."""
     part = TAKEN_BACK if before else 1.0
     return expected > 0.0 and abs(value) > part * max(expected, PRESENT_STDS * math.sqrt(variance))

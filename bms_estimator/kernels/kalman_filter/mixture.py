@@ -16,7 +16,7 @@ ALIKE_STDS = 0.7
 
 
 @njit(cache=True)
-def forget(mean: Record, covariance: Record, j: int) -> None:
+def decorrelate_state(mean: Record, covariance: Record, j: int) -> None:
     """State ``j`` is 0 and belongs to none."""
     mean[j] = 0.0
     covariance[j, :] = 0.0
@@ -24,7 +24,7 @@ def forget(mean: Record, covariance: Record, j: int) -> None:
 
 
 @njit(cache=True)
-def copy(s: Record, source: int, to: int) -> None:
+def copy_hypothesis(s: Record, source: int, to: int) -> None:
     """Hypothesis ``to`` becomes as ``source``."""
     s.mean[to, :] = s.mean[source]
     s.covariance[to, :, :] = s.covariance[source]
@@ -34,7 +34,7 @@ def copy(s: Record, source: int, to: int) -> None:
 
 
 @njit(cache=True)
-def vacate(s: Record, q: int) -> None:
+def clear_hypothesis(s: Record, q: int) -> None:
     """Row ``q`` holds no hypothesis: all 0, so that a state that is kept without its zeros costs what it knows."""
     s.mean[q, :] = 0.0
     s.covariance[q, :, :] = 0.0
@@ -42,27 +42,27 @@ def vacate(s: Record, q: int) -> None:
 
 
 @njit(cache=True)
-def merge(s: Record) -> None:
+def prune_and_merge(s: Record) -> None:
     """Drop what is unlikely, and make one of neighbours that agree."""
     top, q = s.ln_weight[s.best], 0
     while q < s.count:
         s.ln_weight[q] -= top
         if s.ln_weight[q] < UNLIKELY:
-            remove(s, q)
+            remove_hypothesis(s, q)
         else:
             q += 1
     q = 1
     while q < s.count:
         apart = abs(s.mean[q, SOC] - s.mean[q - 1, SOC])
         if apart * apart < ALIKE_STDS**2 * min(s.covariance[q, SOC, SOC], s.covariance[q - 1, SOC, SOC]):
-            unite(s, q - 1, q)
-            remove(s, q)
+            merge_pair(s, q - 1, q)
+            remove_hypothesis(s, q)
         else:
             q += 1
 
 
 @njit(cache=True)
-def unite(s: Record, a: int, b: int) -> None:
+def merge_pair(s: Record, a: int, b: int) -> None:
     """Hypothesis ``a`` becomes the normal distribution with mean and covariance of both."""
     most = max(s.ln_weight[a], s.ln_weight[b])
     weight_a, weight_b = math.exp(s.ln_weight[a] - most), math.exp(s.ln_weight[b] - most)
@@ -81,18 +81,18 @@ def unite(s: Record, a: int, b: int) -> None:
 
 
 @njit(cache=True)
-def remove(s: Record, q: int) -> None:
+def remove_hypothesis(s: Record, q: int) -> None:
     """Close the row."""
     for j in range(q, s.count - 1):
-        copy(s, j + 1, j)
+        copy_hypothesis(s, j + 1, j)
     s.count -= 1
-    vacate(s, s.count)
+    clear_hypothesis(s, s.count)
     if s.best > q:
         s.best -= 1
 
 
 @njit(cache=True)
-def combine(s: Record) -> None:
+def mixture_moments(s: Record) -> None:
     """Mean and std of SOC of the mixture."""
     total = mean = variance = 0.0
     for q in range(s.count):

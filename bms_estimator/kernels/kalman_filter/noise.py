@@ -56,13 +56,13 @@ OUTSIDE_K = 30.0
 
 
 @njit(cache=True)
-def outside(p: Record, temperature_c: float) -> float:
+def extrapolation_factor(p: Record, temperature_c: float) -> float:
     """Factor on errors of the model beyond the temperatures that the cell file was made for."""
     return 1.0 + max(p.low_c - temperature_c, temperature_c - p.high_c, 0.0) / OUTSIDE_K
 
 
 @njit(cache=True)
-def known_c(p: Record) -> float:
+def max_known_temperature(p: Record) -> float:
     """Above it a cell that the file does not know has smaller resistances, but nothing is surer [C]."""
     return max(p.high_c, REFERENCE_C)
 
@@ -85,7 +85,11 @@ def offset_variance(p: Record) -> float:
 def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> float:
     """R [V^2] of the mean voltage of a window: what the ladder leaves, far more than the sensor's noise."""
     measured_c = s.temperature_c if s.sensed else REFERENCE_C  # what is estimated makes nothing surer
-    model_v = p.model_v * arrhenius(p.model_j, min(measured_c, known_c(p))) * outside(p, s.temperature_c)
+    model_v = (
+        p.model_v
+        * arrhenius(p.model_j, min(measured_c, max_known_temperature(p)))
+        * extrapolation_factor(p, s.temperature_c)
+    )
     return model_v * model_v / min(max(dt_s, 1.0), INDEPENDENT_S) + p.sensor_v2 / samples
 
 
@@ -110,13 +114,13 @@ def bias_variance(s: Record, p: Record, q: int) -> float:
     floor_a = FLOOR_C * p.capacity_as / 3600.0
     wrong_ohm2 = (p.bias_relative * ohm) ** 2 + (p.bias_grown * grown) ** 2 + (0.5 * steep) ** 2
     wrong_v2 = scale * scale * wrong_ohm2 * max(s.rms_a2, floor_a * floor_a) + early_v * early_v
-    return outside(p, s.temperature_c) ** 2 * wrong_v2
+    return extrapolation_factor(p, s.temperature_c) ** 2 * wrong_v2
 
 
 @njit(cache=True)
 def total_resistance(s: Record, p: Record, soc: float) -> float:
     """Sum of the resistances at ``soc``, no smaller than where the file knows them [ohm]."""
-    weak, strong, most_c = s.weak, s.strong, known_c(p)
+    weak, strong, most_c = s.weak, s.strong, max_known_temperature(p)
     if s.temperature_c > most_c:
         weak, strong = arrhenius(WEAK_J, most_c), arrhenius(STRONG_J, most_c)
     resistances(soc, p.weak_ohm, p.strong_ohm, weak, strong, s.ohm)
@@ -140,7 +144,7 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
     cov, f, w = s.covariance[q], s.f, s.window
     dt_s = w.time_s
     if w.unknown_as > 0.0:
-        add_unseen(p, cov, f, w.unknown_as / dt_s, dt_s / p.capacity_as)
+        add_gap_noise(p, cov, f, w.unknown_as / dt_s, dt_s / p.capacity_as)
     cov[SOC, SOC] += p.charge_error**2 * moved
     if w.between_as2 + w.rounded_as2 > 0.0:
         cov[SOC, SOC] += (w.between_as2 + w.rounded_as2) / (p.capacity_as * p.capacity_as)
@@ -162,7 +166,7 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
 
 
 @njit(cache=True)
-def add_unseen(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
+def add_gap_noise(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
     """A current that nobody saw: the same all the time it moved the SOC and the branches together.
 
     It changed, too, by as much: the branches, which know the last seconds or minutes, are of another mean than the SOC. Without
@@ -181,19 +185,19 @@ def add_unseen(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float
             added = by_j * (-soc_per_a if k == SOC else 1.0 - f[k])
             if k >= X:
                 since = math.sqrt((1.0 - f[j] * f[j]) * (1.0 - f[k] * f[k]))
-                added += since * changing(p.load_s, TAUS[j - X], TAUS[k - X])
+                added += since * branch_covariance(p.load_s, TAUS[j - X], TAUS[k - X])
             cov[j, k] += std_a * std_a * added
             cov[k, j] = cov[j, k]
 
 
 @njit(cache=True)
-def changing(t: float, tau_k: float, tau_m: float) -> float:
+def branch_covariance(t: float, tau_k: float, tau_m: float) -> float:
     """Stationary covariance of branches of ``tau_k`` and ``tau_m`` [s] under a Gauss-Markov load of ``t`` [s], over its variance."""
     return (t / (t + tau_m) / tau_k + t / (t + tau_k) / tau_m) / (1.0 / tau_k + 1.0 / tau_m)
 
 
 @njit(cache=True)
-def switch_on(p: Record, current_a: float, mean: Floats, covariance: Floats) -> None:
+def initial_branch_currents(p: Record, current_a: float, mean: Floats, covariance: Floats) -> None:
     """x_k of a load that nobody saw: mean and covariance, given the current at switch-on.
 
     The load was a level, normal with mean ``load_mean_c`` and std ``load_level_c``, and on it a Gauss-Markov process of
@@ -213,5 +217,5 @@ def switch_on(p: Record, current_a: float, mean: Floats, covariance: Floats) -> 
         mean[X + k] += with_k / (level_a2 + load_a2) * (current_a - p.load_mean_c * one_c)
         for m in range(BRANCHES):
             with_m = level_a2 + load_a2 * t / (t + TAUS[m])
-            both = level_a2 + load_a2 * changing(t, TAUS[k], TAUS[m])
+            both = level_a2 + load_a2 * branch_covariance(t, TAUS[k], TAUS[m])
             covariance[X + k, X + m] = both - with_k * with_m / (level_a2 + load_a2)

@@ -25,7 +25,7 @@ NEIGHBOURS = math.exp(-1.0 / (NODES - 1) / ALIKE_SOC)
 
 
 @njit(cache=True)
-def place(soc: float) -> tuple[int, float]:
+def node_position(soc: float) -> tuple[int, float]:
     """The node below ``soc``, and how far it is on the way to the next."""
     position = min(max(soc, 0.0), 1.0) * (NODES - 1)
     i = min(int(position), NODES - 2)
@@ -33,21 +33,21 @@ def place(soc: float) -> tuple[int, float]:
 
 
 @njit(cache=True)
-def per_node_v(p: Record, soc: float, t: float) -> float:
+def node_error_scale(p: Record, soc: float, t: float) -> float:
     """Error of the curve at ``soc`` by nodes of 1 on both sides [V]: of the same variance between nodes as at them."""
     kept = 1.0 - 2.0 * t * (1.0 - t) * (1.0 - NEIGHBOURS)
     return on_grid(soc, p.curve_error_v) * math.sqrt(p.learned / kept)
 
 
 @njit(cache=True)
-def learned_v(p: Record, x: Floats, soc: float) -> float:
+def ocv_correction(p: Record, x: Floats, soc: float) -> float:
     """What the true curve is above that of the cell file, as far as it was learned [V]."""
-    i, t = place(soc)
-    return per_node_v(p, soc, t) * ((1.0 - t) * x[NODE + i] + t * x[NODE + i + 1])
+    i, t = node_position(soc)
+    return node_error_scale(p, soc, t) * ((1.0 - t) * x[NODE + i] + t * x[NODE + i + 1])
 
 
 @njit(cache=True)
-def forget_curve(x: Floats, covariance: Floats) -> None:
+def reset_ocv_correction(x: Floats, covariance: Floats) -> None:
     """Nothing is learned yet."""
     x[NODE : NODE + NODES] = 0.0
     covariance[NODE : NODE + NODES, :] = 0.0

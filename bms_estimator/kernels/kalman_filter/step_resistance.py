@@ -30,7 +30,7 @@ SHAPE_STD = 0.3
 
 
 @njit(cache=True)
-def watch_steps(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: float) -> None:
+def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: float) -> None:
     """Take one sample, after ``count_on``: the current changed by ``change_a`` [A] within ``dt_s`` [s]."""
     step, least_a = s.step, LEAST_C * p.capacity_as / 3600.0
     before, step.phase = step.phase, UNHELD
@@ -39,7 +39,7 @@ def watch_steps(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: f
         return
     stepped_a = abs(s.current_a - step.current_a)
     if before == STEPPED and stepped_a >= least_a and abs(change_a) <= HELD_SHARE * stepped_a:
-        take_step(s, p, voltage_v)
+        update_r_s_from_step(s, p, voltage_v)
     elif before == HELD and abs(change_a) >= least_a:
         step.phase = STEPPED
     if abs(change_a) <= HELD_SHARE * least_a:
@@ -50,7 +50,7 @@ def watch_steps(s: Record, p: Record, dt_s: float, change_a: float, voltage_v: f
 
 
 @njit(cache=True)
-def take_step(s: Record, p: Record, voltage_v: float) -> None:
+def update_r_s_from_step(s: Record, p: Record, voltage_v: float) -> None:
     """Learn of the step that ends with this voltage [V]."""
     x, step = s.mean[s.best], s.step
     resistances(x[SOC], p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)

@@ -43,7 +43,7 @@ WARMEST_C = 80.0
 
 
 @njit(cache=True)
-def warm(s: Record, p: Record) -> None:
+def propagate_self_heating(s: Record, p: Record) -> None:
     """The temperature at the end of the window under the losses i^2 R_0 + sum x_k^2 R_k, in a room of ``REFERENCE_C``."""
     w, x = s.window, s.mean[s.best]
     resistances(s.soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
@@ -63,7 +63,7 @@ def is_temperature(temperature_c: float) -> bool:
 
 
 @njit(cache=True)
-def follow_temperature(s: Record) -> None:
+def update_arrhenius_factors(s: Record) -> None:
     """The Arrhenius factors at the cell's temperature."""
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     s.hysteresis = arrhenius(HYSTERESIS_J, s.temperature_c)

@@ -5,25 +5,30 @@
 
 import math
 
-from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, SLOW_S, along_line, held_current
+from bms_estimator.kernels.cell_model.current_interpolation import (
+    LONGEST_FLOW_S,
+    SLOW_S,
+    interpolated_current,
+    ramp_correction,
+)
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
     TAUS,
 )
-from bms_estimator.kernels.kalman_filter.current_offset import watch_smallest
-from bms_estimator.kernels.kalman_filter.ekf import decay
+from bms_estimator.kernels.kalman_filter.current_offset import track_smallest_current
+from bms_estimator.kernels.kalman_filter.ekf import transition_diagonal
 from bms_estimator.kernels.kalman_filter.gap_charge import (
-    between_samples,
-    goes_on,
-    rounded_charge,
-    unseen_charge,
+    expected_excess_charge,
+    gap_charge_std,
+    interpolation_charge_variance,
+    rounding_charge_variance,
 )
 from bms_estimator.kernels.kalman_filter.temperature import (
     FASTEST_K_S,
     SETTLED_S,
     TEMPERATURE_S,
     is_temperature,
-    warm,
+    propagate_self_heating,
 )
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
@@ -35,7 +40,7 @@ SAME_STEP = 0.005
 
 
 @njit(cache=True)
-def clear(s: Record) -> None:
+def reset_window(s: Record) -> None:
     """Begin a new window."""
     w = s.window
     w.samples = w.gap = 0
@@ -45,7 +50,7 @@ def clear(s: Record) -> None:
 
 
 @njit(cache=True)
-def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, temperature_c: float) -> None:
+def integrate_current(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, temperature_c: float) -> None:
     """Charge and branches from the sample before to this one; ``gap``: samples are missing between them."""
     if is_temperature(temperature_c):
         share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
@@ -53,11 +58,11 @@ def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, tem
         s.temperature_c += min(max(share * (temperature_c - s.temperature_c), -most_k), most_k)
         s.sensed = 1
     w = s.window
-    held_a, change_a = held_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
+    held_a, change_a = interpolated_current(dt_s, s.current_a, current_a, p.unmeasured_s), current_a - s.current_a
     unseen = gap or dt_s > p.unmeasured_s
     charge_as = held_a * min(dt_s, LONGEST_FLOW_S)
     if gap and dt_s > p.unmeasured_s:
-        charge_as += goes_on(s, held_a, dt_s)
+        charge_as += expected_excess_charge(s, held_a, dt_s)
         held_a = charge_as / dt_s
     if abs(dt_s - s.decay_s) > SAME_STEP * dt_s:
         s.decay_s = dt_s
@@ -66,25 +71,25 @@ def count_on(s: Record, p: Record, dt_s: float, gap: bool, current_a: float, tem
     for k in range(BRANCHES):
         s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
         if dt_s > SLOW_S and not unseen:
-            s.x_a[k] += along_line(change_a, dt_s / TAUS[k], s.decay[k])
+            s.x_a[k] += ramp_correction(change_a, dt_s / TAUS[k], s.decay[k])
     w.time_s += dt_s
     w.charge_as += charge_as
     w.throughput_as += abs(charge_as)
     if gap:
         w.gap = 1
     if unseen:
-        w.unknown_as += unseen_charge(s, p, held_a, dt_s)
+        w.unknown_as += gap_charge_std(s, p, held_a, dt_s)
     else:
-        w.between_as2 += between_samples(change_a, dt_s)
+        w.between_as2 += interpolation_charge_variance(change_a, dt_s)
     if p.current_step_a > 0.0 or p.dead_band_a > 0.0:
-        w.rounded_as2 += rounded_charge(s, p, dt_s, current_a)
+        w.rounded_as2 += rounding_charge_variance(s, p, dt_s, current_a)
     s.soc = min(max(s.soc - charge_as / p.capacity_as, 0.0), 1.0)
-    watch_smallest(s, current_a)
+    track_smallest_current(s, current_a)
     s.current_a = current_a
 
 
 @njit(cache=True)
-def gather(s: Record, current_a: float, voltage_v: float) -> None:
+def add_to_window(s: Record, current_a: float, voltage_v: float) -> None:
     """Add a sample to the window."""
     w = s.window
     w.samples += 1
@@ -96,8 +101,8 @@ def gather(s: Record, current_a: float, voltage_v: float) -> None:
 
 
 @njit(cache=True)
-def pass_time(s: Record, p: Record) -> None:
+def prepare_transition(s: Record, p: Record) -> None:
     """What the time of the window does to the temperature, where nobody measures it, and to F."""
     if not s.sensed:
-        warm(s, p)
-    decay(s, p)
+        propagate_self_heating(s, p)
+    transition_diagonal(s, p)

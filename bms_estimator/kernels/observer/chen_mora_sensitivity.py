@@ -17,7 +17,7 @@ E_O = 5
 
 
 @njit(cache=True)
-def give(given: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - a fuel cell's needs it
+def load_constants(given: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - a fuel cell's needs it
     """E_o and the cell file's elements at ``soc`` into ``given``; ``p`` is a record of ESTIMATOR_SETTINGS.
 
     Elements are those of ``p.learning.soc_floor`` below it: there a capacitance may be negative (E14).

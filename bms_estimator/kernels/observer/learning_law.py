@@ -6,9 +6,9 @@ the observer's.
 
 import math
 
-from bms_estimator.kernels.cell_model.current_interpolation import held_current
-from bms_estimator.kernels.observer.learning_model import advance, give, output, settle, write
-from bms_estimator.kernels.observer.observer import change_of_lock, update_margins
+from bms_estimator.kernels.cell_model.current_interpolation import interpolated_current
+from bms_estimator.kernels.observer.learning_model import advance, give, output, steady_state, write
+from bms_estimator.kernels.observer.observer import lock_transition, update_margins
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
@@ -21,20 +21,20 @@ RESTING_C = 0.02
 
 
 @njit(cache=True)
-def begin_learning(s: Record, p: Record, voltage_v: float) -> None:
+def initialize_learning(s: Record, p: Record, voltage_v: float) -> None:
     """The file's parameters, nothing remembered, and a cell at rest."""
     m, q = s.learning, p.learning
     for j in range(q.count):
         m.theta[j] = 0.0
-    empty_memory(m, q)
+    reset_information(m, q)
     s.observer.k = max(p.observer.k0, 1.0)
-    take_as_rest(s, p, voltage_v)
+    initialize_states_at_rest(s, p, voltage_v)
     if abs(s.observer.current_a) <= RESTING_C * p.observer.capacity_as / 3600.0:
         m.settle_s = 0.0
 
 
 @njit(cache=True)
-def empty_memory(m: Record, q: Record) -> None:
+def reset_information(m: Record, q: Record) -> None:
     """Nothing is remembered."""
     m.waited_s = 0.0
     for j in range(q.count):
@@ -44,21 +44,21 @@ def empty_memory(m: Record, q: Record) -> None:
 
 
 @njit(cache=True)
-def take_as_rest(s: Record, p: Record, voltage_v: float) -> None:
+def initialize_states_at_rest(s: Record, p: Record, voltage_v: float) -> None:
     """The states of a cell at rest. What else is in the voltage is the offset's, and tells nothing of the parameters.
 
     Nothing is learned until the states would have forgotten that they were otherwise.
     """
     m, q, o = s.learning, p.learning, s.observer
     give(q.model, m.given, p, o.soc, m.temperature_c)
-    settle(q.model, m.x, m.dx, m.theta, m.given, o.current_a)
+    steady_state(q.model, m.x, m.dx, m.theta, m.given, o.current_a)
     injects = math.isfinite(q.offset_s)
     m.offset_v = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) if injects else 0.0
     for j in range(q.count):
         m.d_offset[j] = -m.psi[j] if injects else 0.0
     m.settle_s = q.settle_s
     o.innovation_v = 0.0
-    show(s, p, voltage_v)
+    write_observer_state(s, p, voltage_v)
 
 
 @njit(cache=True)
@@ -67,34 +67,34 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
     m, q, o = s.learning, p.learning, s.observer
     give(q.model, m.given, p, o.soc, m.temperature_c)
     unmeasured_s = p.observer.unmeasured_s
-    held_a = held_current(dt_s, before_a, o.current_a, unmeasured_s)
+    held_a = interpolated_current(dt_s, before_a, o.current_a, unmeasured_s)
     advance(q.model, m.x, m.dx, m.theta, m.given, held_a, dt_s)
     e = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) - m.offset_v
     o.innovation_v = e
-    inject(m, q, dt_s, e)
+    inject_output_error(m, q, dt_s, e)
     o.adapting = 0 if o.soc <= q.soc_floor else 1  # without a SOC always
     m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= unmeasured_s else q.settle_s
     if o.adapting and m.settle_s == 0.0:
-        remember(m, q, dt_s, e)
+        accumulate_information(m, q, dt_s, e)
         m.waited_s += dt_s
         if m.waited_s >= LEARN_EVERY_S:
-            if find_step(m, q):
-                take_step(m, q, -math.expm1(-q.rate * o.k * m.waited_s))
+            if solve_parameter_step(m, q):
+                apply_parameter_step(m, q, -math.expm1(-q.rate * o.k * m.waited_s))
                 m.waited_s = 0.0
             else:
-                empty_memory(m, q)
+                reset_information(m, q)
         excess = max(abs(e) - p.observer.dead_zone_v, 0.0) / q.cells
         o.k = min(o.k + excess * excess * dt_s, FASTEST_HZ / q.rate)  # (3.13) with the dead zone of E2
     estimate = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) + m.offset_v
-    show(s, p, estimate)
+    write_observer_state(s, p, estimate)
     broken = not math.isfinite(estimate)
-    change_of_lock(o, p.observer, dt_s, broken)
+    lock_transition(o, p.observer, dt_s, broken)
     if broken:
-        begin_learning(s, p, voltage_v)
+        initialize_learning(s, p, voltage_v)
 
 
 @njit(cache=True)
-def inject(m: Record, q: Record, dt_s: float, e: float) -> None:
+def inject_output_error(m: Record, q: Record, dt_s: float, e: float) -> None:
     """The offset follows e, and the sensitivities know: ``m.psi`` becomes that of y^ with the offset."""
     share = -math.expm1(-dt_s / q.offset_s)
     m.offset_v += share * e
@@ -104,13 +104,13 @@ def inject(m: Record, q: Record, dt_s: float, e: float) -> None:
 
 
 @njit(cache=True)
-def remember(m: Record, q: Record, dt_s: float, e: float) -> None:
+def accumulate_information(m: Record, q: Record, dt_s: float, e: float) -> None:
     """Kreisselmeier's filters: psi psi' and psi (e + psi' theta). What is remembered is forgotten while a load tells anew."""
     told, known = 0.0, e
     for j in range(q.count):
         told += m.psi[j] * m.psi[j]
         known += m.psi[j] * m.theta[j]
-    forget(m, q, dt_s / q.memory_s * told / (told + q.told_v * q.told_v))
+    discount_information(m, q, dt_s / q.memory_s * told / (told + q.told_v * q.told_v))
     for j in range(q.count):
         m.pull[j] += dt_s * m.psi[j] * known
         for i in range(j + 1):
@@ -118,7 +118,7 @@ def remember(m: Record, q: Record, dt_s: float, e: float) -> None:
 
 
 @njit(cache=True)
-def forget(m: Record, q: Record, times: float) -> None:
+def discount_information(m: Record, q: Record, times: float) -> None:
     """What is remembered counts e^-times as much."""
     keep = math.exp(-times)
     for j in range(q.count):
@@ -128,14 +128,14 @@ def forget(m: Record, q: Record, times: float) -> None:
 
 
 @njit(cache=True)
-def find_step(m: Record, q: Record) -> bool:
+def solve_parameter_step(m: Record, q: Record) -> bool:
     """The way from theta to where memory and leakage balance, into ``m.step``; False where there is none."""
     n = q.count
     for j in range(n):
         m.step[j] = m.pull[j] + q.leak_v2s[j] * (q.middle[j] - m.theta[j])
         for i in range(n):
             m.step[j] -= m.information[max(i, j), min(i, j)] * m.theta[i]
-    if not factorise(m, q):
+    if not cholesky_factor(m, q):
         return False
     for j in range(n):
         for i in range(j):
@@ -149,7 +149,7 @@ def find_step(m: Record, q: Record) -> bool:
 
 
 @njit(cache=True)
-def factorise(m: Record, q: Record) -> bool:
+def cholesky_factor(m: Record, q: Record) -> bool:
     """Cholesky's factor of information and leakage; False where that is no positive matrix, by rounding or a damaged state."""
     for j in range(q.count):
         rest = m.information[j, j] + q.leak_v2s[j]
@@ -166,7 +166,7 @@ def factorise(m: Record, q: Record) -> bool:
 
 
 @njit(cache=True)
-def take_step(m: Record, q: Record, share: float) -> None:
+def apply_parameter_step(m: Record, q: Record, share: float) -> None:
     """Move theta within its bounds, and the states with it: as though it had been so all along.
 
     Sensitivities were of another theta: what is remembered fades with the square of the way that is to be gone.
@@ -180,11 +180,11 @@ def take_step(m: Record, q: Record, share: float) -> None:
         m.offset_v += m.d_offset[j] * m.step[j]
         for branch in range(2):
             m.x[branch] += m.dx[branch, j] * m.step[j]
-    forget(m, q, share * way / (q.reach * q.reach))
+    discount_information(m, q, share * way / (q.reach * q.reach))
 
 
 @njit(cache=True)
-def show(s: Record, p: Record, estimate_v: float) -> None:
+def write_observer_state(s: Record, p: Record, estimate_v: float) -> None:
     """What the observer's record says of the law: states, parameters, gain, estimated voltage."""
     m, q, o = s.learning, p.learning, s.observer
     o.v_ts, o.v_tl = m.x[0], m.x[1]

@@ -8,7 +8,7 @@ solved exactly, so the step is stable for every N >= 0 and every step length. ``
 import math
 
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, soc_from_ocv
-from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, held_current
+from bms_estimator.kernels.cell_model.current_interpolation import LONGEST_FLOW_S, interpolated_current
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
@@ -19,7 +19,7 @@ LOST, REGAINED = -1, 1
 
 
 @njit(cache=True)
-def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float) -> None:
+def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float) -> None:
     """Initial conditions of Algorithm 1 at the first sample."""
     s.time_s = time_s
     s.current_a = current_a
@@ -48,7 +48,7 @@ def start(s: Record, p: Record, time_s: float, current_a: float, voltage_v: floa
 def count_charge(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     """SOC by coulomb counting (3.1); none of a fuel cell."""
     if p.capacity_as > 0.0:
-        charge_as = held_current(dt_s, s.current_a, current_a, p.unmeasured_s) * min(dt_s, LONGEST_FLOW_S)
+        charge_as = interpolated_current(dt_s, s.current_a, current_a, p.unmeasured_s) * min(dt_s, LONGEST_FLOW_S)
         s.soc_coulomb = min(max(s.soc_coulomb - charge_as / p.capacity_as, 0.0), 1.0)
     s.current_a = current_a
 
@@ -58,8 +58,8 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     """Advance the observer by one sample at the SOC it finds: Algorithm 1, lines 2 to 7."""
     e_o = ocv(s.soc, p.ocv_v, p.ocv_slope_v)
 
-    s.adapting = 1 if s.soc > floor(s, p) else 0
-    soc = max(s.soc, floor(s, p))
+    s.adapting = 1 if s.soc > stability_floor(s, p) else 0
+    soc = max(s.soc, stability_floor(s, p))
     ohm_s = p.output_r_s * r_s(soc, s.a) if p.output_r_s > 0.0 else 0.0
     loop = max(1.0 + s.gain * ohm_s, SMALLEST_LOOP)
     e = (voltage_v - e_o + s.v_ts + s.v_tl) / loop  # (3.15) with (3.14) or (4.1)
@@ -70,7 +70,7 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     mean_square = integral_of_exponential(2.0 * rate_e * dt_s, 1.0)  # mean of e^2 over the sample / e^2 at its start
 
     if s.adapting:
-        adapt(s, p, dt_s, e * e * mean_square)
+        adapt_parameters(s, p, dt_s, e * e * mean_square)
         update_margins(s)
 
     excess = max(abs(e) - p.dead_zone_v, 0.0)
@@ -80,11 +80,11 @@ def observer_step(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
     s.voltage_estimate_v = e_o - s.v_ts - s.v_tl  # (4.1)
     if p.output_r_s > 0.0:
         s.voltage_estimate_v = voltage_v - (voltage_v - s.voltage_estimate_v) / loop  # (3.14), u = -N e
-    watch_lock(s, p, dt_s, voltage_v, e_o)
+    track_lock(s, p, dt_s, voltage_v, e_o)
 
 
 @njit(cache=True)
-def adapt(s: Record, p: Record, dt_s: float, e_squared: float) -> None:
+def adapt_parameters(s: Record, p: Record, dt_s: float, e_squared: float) -> None:
     """Adaptation laws (3.16)-(3.18), a' = drive e^2 + rate (target - a), exact for an e^2 held at its mean over the sample."""
     if dt_s != s.decay_dt_s:
         s.decay_dt_s = dt_s
@@ -103,7 +103,7 @@ def update_margins(s: Record) -> None:
 
 
 @njit(cache=True)
-def floor(s: Record, p: Record) -> float:
+def stability_floor(s: Record, p: Record) -> float:
     """SOC down to which the elements are evaluated: below it a capacitance may be negative (E14)."""
     return max(s.delta_1, s.delta_2) + p.margin_guard
 
@@ -142,7 +142,7 @@ def integral_of_exponential(rate: float, dt_s: float) -> float:
 
 
 @njit(cache=True)
-def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) -> None:
+def track_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) -> None:
     """Loss of lock (E2), detected and recovered from.
 
     Lost is lock when the error stays beyond ``lock_error_v`` for ``lock_time_s``, or gets there under a gain whose
@@ -153,9 +153,9 @@ def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) 
     beyond = not abs(s.innovation_v) <= p.lock_error_v
     turned = beyond and s.gain <= 0.0
     overflow = not (math.isfinite(s.v_ts) and math.isfinite(s.v_tl) and abs(s.gain) < p.gain_limit)
-    change = change_of_lock(s, p, dt_s, turned or overflow)
+    change = lock_transition(s, p, dt_s, turned or overflow)
     if change == LOST:
-        recover(s, p, voltage_v, e_o)
+        reinitialize_from_measurement(s, p, voltage_v, e_o)
     elif change == 0 and s.gain < p.rearm_gain and not beyond and nussbaum_gain(p.k0, p) > p.rearm_gain:
         s.k = p.k0
         s.gain = nussbaum_gain(s.k, p)
@@ -163,7 +163,7 @@ def watch_lock(s: Record, p: Record, dt_s: float, voltage_v: float, e_o: float) 
 
 
 @njit(cache=True)
-def change_of_lock(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
+def lock_transition(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
     """``LOST`` when the error has been beyond for long enough, or ``at_once``; ``REGAINED`` when it has been within; else 0."""
     beyond = not abs(s.innovation_v) <= p.lock_error_v
     if beyond == (s.lock == 1):
@@ -184,7 +184,7 @@ def change_of_lock(s: Record, p: Record, dt_s: float, at_once: bool) -> int:
 
 
 @njit(cache=True)
-def recover(s: Record, p: Record, voltage_v: float, e_o: float) -> None:
+def reinitialize_from_measurement(s: Record, p: Record, voltage_v: float, e_o: float) -> None:
     """Start again from the measurement: e = 0, k = k0, parameters at their limit."""
     s.k = p.k0
     s.gain = nussbaum_gain(s.k, p)

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, ocv, r_tl, r_ts, rc_step
-from bms_estimator.kernels.observer.observer import floor
+from bms_estimator.kernels.observer.observer import stability_floor
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
@@ -66,7 +66,7 @@ def series_resistance_step(s: Record, p: Record, dt_s: float, before_a: float, s
         voltage_v: Measured [V].
     """
     r, o = s.series_resistance, s.observer
-    middle = max(0.5 * (soc + o.soc), floor(o, p.observer))
+    middle = max(0.5 * (soc + o.soc), stability_floor(o, p.observer))
     ohm_ts, ohm_tl = r_ts(middle, o.a), r_tl(middle, o.a)
     r.v_ts = rc_step(r.v_ts, before_a, ohm_ts, ohm_ts * c_ts(middle, o.a), dt_s)  # (2.2)
     r.v_tl = rc_step(r.v_tl, before_a, ohm_tl, ohm_tl * c_tl(middle, o.a), dt_s)  # (2.3)

@@ -13,7 +13,7 @@ LAG_S, LAG_STEPS = 60.0, 3
 waited would have come at once [s]."""
 
 
-class ToldClock:
+class DeviceClock:
     """Seconds since the first sample, never less than before.
 
     Samples that waited come late, and at once: their own times place them. A time that steps back, or one that lies

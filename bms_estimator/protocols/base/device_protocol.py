@@ -22,7 +22,7 @@ class Command:
     """Why the device does not do it, for people."""
 
 
-class Dialect(ABC):
+class DeviceProtocol(ABC):
     """Bytes with arrival times to samples, and the bytes that are to be sent. Does no I/O, and never raises on bytes.
 
     All that it yields follows from the calls of ``feed`` alone: a recording of them replays to the same bits.

@@ -8,7 +8,7 @@ from enum import Enum
 
 from bms_estimator.model.sample import LEAST_C, MOST_C, CurrentSign
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.protocols.base.reading_protocol import MeterDialect
+from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
 PACE_S = 1.0
 """A round of questions begins so often [s]: as dbus-serialbattery asks them."""
@@ -25,7 +25,7 @@ FRESH_S = 3.0
 """What came in an answer of its own, and is older, stands beside no sample [s]."""
 
 
-class Look(Enum):
+class ParseResult(Enum):
     """What stands where a frame might begin, if its length is not known."""
 
     MORE = "its beginning has not come yet"
@@ -33,7 +33,7 @@ class Look(Enum):
     LENGTH = "a frame with a length that none has"
 
 
-class AskedDialect(MeterDialect):
+class PolledProtocol(ReadingProtocol):
     """Frames to samples, and the questions at their own pace. It takes no commands.
 
     What is no frame is skipped byte by byte, so that the next whole frame is found wherever it begins; how the bytes are
@@ -72,7 +72,7 @@ class AskedDialect(MeterDialect):
         """Ways of asking, each the questions of one round: the first that is answered is kept to."""
 
     @abstractmethod
-    def _look(self, data: bytes, at: int) -> int | Look:
+    def _look(self, data: bytes, at: int) -> int | ParseResult:
         """Length of the frame that begins at ``at`` with ``start``, checksum and all [bytes]."""
 
     @abstractmethod
@@ -124,7 +124,7 @@ class AskedDialect(MeterDialect):
         while at >= 0:
             look = self._look(rest, at)
             if isinstance(look, int) and at + look > len(rest):
-                look = Look.MORE
+                look = ParseResult.MORE
             if isinstance(look, int) and self._is_whole(rest[at : at + look]):
                 if waiting >= 0:
                     self._blame("short_frames", "an answer broke off: interference, or a second master on the line?")
@@ -134,13 +134,13 @@ class AskedDialect(MeterDialect):
                 at = self._next(rest, done)
                 continue
             if waiting < 0:  # else it is looked at again when the frame that has begun before it is over
-                if look is Look.MORE:
+                if look is ParseResult.MORE:
                     waiting = at
-                elif look is Look.LENGTH:
+                elif look is ParseResult.LENGTH:
                     self._blame(
                         "length_errors", "answers come with impossible lengths: interference, or a wrong baud rate?"
                     )
-                elif look is not Look.NOISE:
+                elif look is not ParseResult.NOISE:
                     self._blame(
                         "crc_errors", "answers come with wrong checksums: interference, or a second master on the line?"
                     )

@@ -118,7 +118,7 @@ def _told(said: Iterable[Said]) -> Reading | None:
     return Reading(voltage_v, current_a, temperature_c, tuple(found.get("cells_v", ())), time_s)
 
 
-def report_line(
+def sample_json_line(
     voltage_v: float,
     current_a: float,
     *,

@@ -17,11 +17,11 @@ from bms_estimator.model.sample import (
     SampleBlock,
     forget_beyond,
 )
-from bms_estimator.protocols.base.device_protocol import Dialect, cell_block
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
 from bms_estimator.protocols.base.reading import Reading
 
 
-class MeterDialect(Dialect):
+class ReadingProtocol(DeviceProtocol):
     """Bytes to readings, readings to samples. It takes no commands.
 
     Readings carry no clock: those of one read share the time since the read before evenly.
@@ -88,7 +88,7 @@ class MeterDialect(Dialect):
         return times
 
 
-class Beside:
+class RecentCellVoltages:
     """Cell voltages that came in an answer of their own, for the sample that comes next.
 
     Args:

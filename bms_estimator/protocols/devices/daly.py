@@ -13,7 +13,7 @@ import struct
 from collections.abc import Mapping, Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.polled_protocol import FRESH_S, AskedDialect, Look
+from bms_estimator.protocols.base.polled_protocol import FRESH_S, ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
 
 PACK, STATUS, CELLS, PROBES = 0x90, 0x94, 0x95, 0x96
@@ -38,7 +38,7 @@ def question(host: int, command: int) -> bytes:
     return sealed(bytes((START, host, command, DATA_BYTES)) + bytes(DATA_BYTES))
 
 
-class DalyDialect(AskedDialect):
+class DalyDialect(PolledProtocol):
     """The conversation with a Daly BMS: how many cells it has until that is known, then cells, probes, pack in each round.
 
     Args:
@@ -72,13 +72,13 @@ class DalyDialect(AskedDialect):
         commands = (CELLS, PROBES, PACK) if self._known else (STATUS, CELLS, PROBES, PACK)
         return [[question(host, command) for command in commands] for host in HOSTS]
 
-    def _look(self, data: bytes, at: int) -> int | Look:
+    def _look(self, data: bytes, at: int) -> int | ParseResult:
         head = data[at + 1 : at + 4]
         if any(byte not in allowed for byte, allowed in zip(head, (PACKS, COMMANDS), strict=False)):
-            return Look.NOISE
+            return ParseResult.NOISE
         if len(head) < 3:
-            return Look.MORE
-        return FRAME_BYTES if head[2] == DATA_BYTES else Look.LENGTH
+            return ParseResult.MORE
+        return FRAME_BYTES if head[2] == DATA_BYTES else ParseResult.LENGTH
 
     def _is_whole(self, frame: bytes) -> bool:
         return sealed(frame[:-1]) == frame

@@ -10,9 +10,9 @@ import struct
 from collections.abc import Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.polled_protocol import FRESH_S, AskedDialect, Look
+from bms_estimator.protocols.base.polled_protocol import FRESH_S, ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.protocols.base.reading_protocol import Beside
+from bms_estimator.protocols.base.reading_protocol import RecentCellVoltages
 
 BASIC, CELLS, NAME = 0x03, 0x04, 0x05
 START, END, READ = 0xDD, 0x77, 0xA5
@@ -36,7 +36,7 @@ def question(register: int) -> bytes:
     return bytes((START, READ, register, 0)) + checksum(bytes((register, 0))) + bytes((END,))
 
 
-class JbdDialect(AskedDialect):
+class JbdDialect(PolledProtocol):
     """The conversation with a JBD BMS: name until it is known, then cells and basic information in each round.
 
     Args:
@@ -45,7 +45,7 @@ class JbdDialect(AskedDialect):
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__("JBD BMS", re.compile(b"\xdd"), current_sign)
-        self._beside = Beside(FRESH_S)
+        self._beside = RecentCellVoltages(FRESH_S)
         self._model = ""
         self._cells: int | None = None
 
@@ -58,13 +58,13 @@ class JbdDialect(AskedDialect):
         registers = (CELLS, BASIC) if self._model else (NAME, CELLS, BASIC)
         return ([question(register) for register in registers],)
 
-    def _look(self, data: bytes, at: int) -> int | Look:
+    def _look(self, data: bytes, at: int) -> int | ParseResult:
         if len(data) < at + HEAD:
-            return Look.MORE if len(data) < at + 2 or data[at + 1] in (BASIC, CELLS, NAME) else Look.NOISE
+            return ParseResult.MORE if len(data) < at + 2 or data[at + 1] in (BASIC, CELLS, NAME) else ParseResult.NOISE
         _, register, status, length = data[at : at + HEAD]
         if register not in (BASIC, CELLS, NAME) or status not in (0, REFUSED):
-            return Look.NOISE
-        return HEAD + length + TAIL if length <= MOST_DATA else Look.LENGTH
+            return ParseResult.NOISE
+        return HEAD + length + TAIL if length <= MOST_DATA else ParseResult.LENGTH
 
     def _is_whole(self, frame: bytes) -> bool:
         return frame[-1] == END and checksum(frame[2:-TAIL]) == frame[-TAIL:-1]

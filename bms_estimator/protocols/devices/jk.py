@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.polled_protocol import AskedDialect, Look
+from bms_estimator.protocols.base.polled_protocol import ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
 
 OLD_START, START = b"\x4e\x57", b"\x55\xaa\xeb\x90"
@@ -71,7 +71,7 @@ def question(address: int) -> bytes:
     return frame + crc16(frame)
 
 
-class JkDialect(AskedDialect):
+class JkDialect(PolledProtocol):
     """The conversation with a JK-BMS.
 
     Args:
@@ -112,23 +112,23 @@ class JkDialect(AskedDialect):
         """The question, unless another asks and its answers are heard."""
         return b"" if now_s - self._overheard_s < LISTEN_S else super().due(now_s)
 
-    def _look(self, data: bytes, at: int) -> int | Look:
+    def _look(self, data: bytes, at: int) -> int | ParseResult:
         return self._look_old(data, at) if data[at] == OLD_START[0] else self._look_newer(data, at)
 
-    def _look_old(self, data: bytes, at: int) -> int | Look:
+    def _look_old(self, data: bytes, at: int) -> int | ParseResult:
         if len(data) < at + OLD_HEAD:
-            return Look.MORE
+            return ParseResult.MORE
         length = int.from_bytes(data[at + 2 : at + 4], "big") + len(OLD_START)
         if not OLD_HEAD + OLD_TAIL <= length <= OLD_MOST:
-            return Look.LENGTH
+            return ParseResult.LENGTH
         command, _, kind = data[at + 8 : at + OLD_HEAD]
-        return length if (command, kind) == (READ_ALL, ANSWER) else Look.NOISE
+        return length if (command, kind) == (READ_ALL, ANSWER) else ParseResult.NOISE
 
-    def _look_newer(self, data: bytes, at: int) -> int | Look:
+    def _look_newer(self, data: bytes, at: int) -> int | ParseResult:
         if len(data) <= at + len(START):
-            return Look.MORE
+            return ParseResult.MORE
         if data[at + len(START)] not in KINDS:
-            return Look.NOISE
+            return ParseResult.NOISE
         record = data[at + FRAME_BYTES : at + FRAME_BYTES + RECORD_BYTES]
         follows = len(record) < RECORD_BYTES or crc16(record[:-2]) == record[-2:]
         return FRAME_BYTES + RECORD_BYTES if follows else FRAME_BYTES

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.protocols.base.reading_protocol import MeterDialect
+from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
 ADDRESS = 1
 """As it is delivered."""
@@ -28,7 +28,7 @@ VALUE_DIGITS = 12
 TOO_LONG = "bytes come that are no lines of a Junctek monitor: it has 115200 baud"
 
 
-class JunctekDialect(MeterDialect):
+class JunctekDialect(ReadingProtocol):
     """Lines of a battery monitor to samples. It is asked once a second.
 
     Args:

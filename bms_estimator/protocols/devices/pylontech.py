@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.protocols.base.reading_protocol import Beside, MeterDialect
+from bms_estimator.protocols.base.reading_protocol import ReadingProtocol, RecentCellVoltages
 
 ROUND_S = 2.0
 """It is asked for all batteries so often [s]; then for the cells of one of them."""
@@ -31,7 +31,7 @@ DIGITS = 9
 ABSENT = "-"
 
 
-class PylontechDialect(MeterDialect):
+class PylontechDialect(ReadingProtocol):
     """The tables of a console to samples: mean voltage, sum of the currents, mean temperature of the cells.
 
     Cells are those of all batteries one after the other, each battery's as it told them last, if that was of late.
@@ -43,7 +43,7 @@ class PylontechDialect(MeterDialect):
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__(current_sign, ("text_errors", "length_errors"))
         self._rest = b""
-        self._cells = dict[int, Beside]()
+        self._cells = dict[int, RecentCellVoltages]()
         self._batteries: tuple[int, ...] = ()
         self._answers = 0
         self._round_s = self._asked_s = -math.inf
@@ -124,7 +124,7 @@ class PylontechDialect(MeterDialect):
         if not 1 <= battery <= BATTERIES or len(rows) > CELLS:
             raise ValueError(answer)
         cells_v = [1e-3 * _whole(row[1]) for row in rows]
-        self._cells.setdefault(battery, Beside(CELLS_S)).keep(arrival_s, cells_v)
+        self._cells.setdefault(battery, RecentCellVoltages(CELLS_S)).keep(arrival_s, cells_v)
 
     def _stack(self, arrival_s: float, names: Sequence[str], rows: Sequence[Sequence[str]]) -> Reading | None:
         """All batteries as one.

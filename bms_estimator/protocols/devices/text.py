@@ -16,8 +16,8 @@ from bms_estimator.model.sample import (
     SampleBlock,
     forget_beyond,
 )
-from bms_estimator.protocols.base.device_clock import ToldClock
-from bms_estimator.protocols.base.device_protocol import Dialect, cell_block
+from bms_estimator.protocols.base.device_clock import DeviceClock
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
 from bms_estimator.protocols.base.reading import Reading, read_line
 
 LINE_BYTES = 4096
@@ -26,7 +26,7 @@ SHOWN_BYTES = 60
 """So much of a line that says nothing is shown."""
 
 
-class TextDialect(Dialect):
+class TextDialect(DeviceProtocol):
     """Lines of a board to samples. It takes no commands.
 
     Lines that say nothing are counted and skipped. Lines that tell no ``time_s`` share the time since the read before
@@ -41,7 +41,7 @@ class TextDialect(Dialect):
         self._rest = b""
         self._overlong = False  # the line is too long, its rest is skipped
         self._in_step = False  # once a line has ended: what came before may be half a line
-        self._clock, self._last_s = ToldClock(), math.nan
+        self._clock, self._last_s = DeviceClock(), math.nan
         self._bytes = self._samples = self._errors = self._too_long = self._implausible = 0
         self._bad: bytes | None = None  # the first line since the last good one that said nothing
         self._good: Reading | None = None
@@ -78,7 +78,7 @@ class TextDialect(Dialect):
         return f"prints text, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is since the first sample, as ``ToldClock`` has it."""
+        """Decode one read of the line; ``time_s`` is since the first sample, as ``DeviceClock`` has it."""
         self._bytes += len(data)
         *lines, self._rest = (self._rest + data).split(b"\n")
         readings = [reading for line in lines if (reading := self._end_line(line)) is not None]

@@ -13,7 +13,7 @@ from math import nan
 from bms_estimator.model.decimal_text import number
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.protocols.base.reading_protocol import MeterDialect
+from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
 BLOCK_BYTES = 2048
 """No block is longer: 22 fields of at most 44 bytes each."""
@@ -21,7 +21,7 @@ HEX = re.compile(rb":[0-9A-Fa-f]*\r?\n")
 END = b"Checksum\t"
 
 
-class VeDirectDialect(MeterDialect):
+class VeDirectDialect(ReadingProtocol):
     """Blocks of a battery monitor to samples. It speaks by itself and is sent nothing.
 
     Args:

@@ -148,7 +148,7 @@ def cobs_decode(frame: Bytes, length: int, packet: Bytes) -> int:
 
 
 @njit(cache=True)
-def take(packet: Bytes, offset: int, size: int) -> int:
+def read_unsigned(packet: Bytes, offset: int, size: int) -> int:
     """Unsigned little-endian number."""
     value = 0
     for i in range(size):
@@ -157,7 +157,7 @@ def take(packet: Bytes, offset: int, size: int) -> int:
 
 
 @njit(cache=True)
-def open_packet(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
+def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
     """Unpack the buffered frame into ``packet``. Returns its message type, 0 when it is bad; faults are counted by kind."""
     counted = d.in_step  # before the first delimiter half a frame is no fault
     if d.overlong:
@@ -171,7 +171,7 @@ def open_packet(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
     if length < 4:
         d.length_errors += counted
         return 0
-    if crc16(packet, 0, length - 2) != take(packet, length - 2, 2):
+    if crc16(packet, 0, length - 2) != read_unsigned(packet, length - 2, 2):
         d.crc_errors += counted
         return 0
     d.heard_at = d.bytes_received
@@ -198,28 +198,28 @@ def open_packet(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
 def take_hello(d: Record, s: Record) -> None:
     """The board's scaling; and whether the board was reset, or is another one."""
     p = d.packet
-    boot_id, serial = take(p, 6, 2), take(p, 8, 4)
+    boot_id, serial = read_unsigned(p, 6, 2), read_unsigned(p, 8, 4)
     anew = boot_id != d.boot_id or serial != d.serial
-    behind = (take(p, 12, 4) - d.expected) & _MASK >= _HALF
+    behind = (read_unsigned(p, 12, 4) - d.expected) & _MASK >= _HALF
     if d.started and (behind or (d.boot_id >= 0 and anew)):
         d.reset_pending = 1
     if anew:
         forget_readings(s)
     d.boot_id, d.serial = boot_id, serial
-    d.period_us = take(p, 22, 4) * 1e-3
-    s.full_scale = float(1 << min(take(p, 26, 1), 24))
-    channels = take(p, 27, 1)
+    d.period_us = read_unsigned(p, 22, 4) * 1e-3
+    s.full_scale = float(1 << min(read_unsigned(p, 26, 1), 24))
+    channels = read_unsigned(p, 27, 1)
     s.ntc_fitted = channels & 1
     s.ratiometric = channels >> 1 & 1
-    s.divider = take(p, 28, 4) * 1e-6
-    s.volts_per_ampere = take(p, 32, 4) * 1e-6
-    s.current_zero = take(p, 36, 4) * 1e-6
-    s.bandgap_v = take(p, 40, 4) * 1e-6
-    if s.bandgap_weight == 0.0 and take(p, 48, 2) > 0:
-        take_bandgap(s, float(take(p, 44, 4)), float(take(p, 48, 2)), take(p, 16, 4))
-    s.ntc_series_ohm = float(take(p, 50, 4))
-    s.ntc_r25_ohm = float(take(p, 54, 4))
-    s.ntc_beta_k = float(take(p, 58, 2))
+    s.divider = read_unsigned(p, 28, 4) * 1e-6
+    s.volts_per_ampere = read_unsigned(p, 32, 4) * 1e-6
+    s.current_zero = read_unsigned(p, 36, 4) * 1e-6
+    s.bandgap_v = read_unsigned(p, 40, 4) * 1e-6
+    if s.bandgap_weight == 0.0 and read_unsigned(p, 48, 2) > 0:
+        take_bandgap(s, float(read_unsigned(p, 44, 4)), float(read_unsigned(p, 48, 2)), read_unsigned(p, 16, 4))
+    s.ntc_series_ohm = float(read_unsigned(p, 50, 4))
+    s.ntc_r25_ohm = float(read_unsigned(p, 54, 4))
+    s.ntc_beta_k = float(read_unsigned(p, 58, 2))
     s.known = 1
 
 
@@ -230,7 +230,7 @@ def is_early(d: Record, arrival_s: float, time_s: float) -> bool:
 
 
 @njit(cache=True)
-def agree(d: Record, samples: int, step_us: int) -> bool:
+def is_consistent_with_clock(d: Record, samples: int, step_us: int) -> bool:
     """Whether one board can have taken so many samples in that time of its clock."""
     apart_us = abs(samples * d.period_us - step_us)
     return apart_us <= max(_MOST_APART * step_us, _REORDER_WINDOW * d.period_us)
@@ -251,7 +251,11 @@ def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
         step_us += max(turns, 0) * MODULUS
     time_s = d.origin_s + (d.elapsed_us + step_us) * _US
     haste_s = (step_us - (lost + 1) * d.period_us) * _US - (arrival_s - d.arrival_s)
-    if haste_s > HASTE_S or is_early(d, arrival_s, time_s) or (lost > 0 and not agree(d, lost + 1, step_us)):
+    if (
+        haste_s > HASTE_S
+        or is_early(d, arrival_s, time_s)
+        or (lost > 0 and not is_consistent_with_clock(d, lost + 1, step_us))
+    ):
         return False
     d.least_late_s = min(d.least_late_s + SLOWEST * step_us * _US, arrival_s - time_s)
     d.elapsed_us += step_us
@@ -270,7 +274,7 @@ def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
 
 
 @njit(cache=True)
-def doubt(d: Record, arrival_s: float) -> None:
+def require_new_hello(d: Record, arrival_s: float) -> None:
     """Another board may have been wired to the open port, with another scaling: only a hello tells."""
     d.boot_id = -1
     d.doubted_s = arrival_s
@@ -288,7 +292,7 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
         behind = MODULUS - ahead if ahead >= _HALF else 0
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
-                doubt(d, arrival_s)  # its hello was lost: the next one is no further reset
+                require_new_hello(d, arrival_s)  # its hello was lost: the next one is no further reset
             run_s = board_us * _US  # since its reset
             if is_early(d, arrival_s, d.time_s + run_s):
                 run_s = 0.0
@@ -307,7 +311,7 @@ def follow_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) -
             if not follow_clock(d, board_us, arrival_s, ahead):
                 restart_clock(d, arrival_s, 0.0)
                 d.clock_jumps += 1
-                doubt(d, arrival_s)
+                require_new_hello(d, arrival_s)
             d.frames_lost += ahead
             status = _GAP if ahead else 0
     d.expected = (sequence + 1) & _MASK
@@ -324,7 +328,7 @@ def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     if not s.known:
         d.before_hello += 1
         return 0
-    place = follow_sequence(d, take(p, 2, 4), take(p, 6, 4), arrival_s)
+    place = follow_sequence(d, read_unsigned(p, 2, 4), read_unsigned(p, 6, 4), arrival_s)
     if place < 0:
         return 0
     if d.boot_id < 0 and arrival_s - d.doubted_s < LONGEST_DOUBT_S:
@@ -338,16 +342,16 @@ def take_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     aux_count = float(p[20])
     if aux_count > 0.0:
         if bits & _AUX_IS_NTC:
-            take_ntc(s, float(take(p, 18, 2)), aux_count, d.board_us)
+            take_ntc(s, float(read_unsigned(p, 18, 2)), aux_count, d.board_us)
         else:
-            take_bandgap(s, float(take(p, 18, 2)), aux_count, d.board_us)
+            take_bandgap(s, float(read_unsigned(p, 18, 2)), aux_count, d.board_us)
     if bits & _OVERRUN:
         d.overruns += 1
-    count = float(take(p, 16, 2))
+    count = float(read_unsigned(p, 16, 2))
     reference_v = reference(s)
     out.time_s = d.time_s
-    out.voltage_v = voltage(s, float(take(p, 10, 3)), count, reference_v)
-    out.current_a = d.current_sign * current(s, float(take(p, 13, 3)), count, reference_v)
+    out.voltage_v = voltage(s, float(read_unsigned(p, 10, 3)), count, reference_v)
+    out.current_a = d.current_sign * current(s, float(read_unsigned(p, 13, 3)), count, reference_v)
     out.temperature_c = temperature(s)
     if out.temperature_c < LEAST_C or out.temperature_c > MOST_C:
         out.temperature_c = math.nan
@@ -402,7 +406,7 @@ def decode(
         counted = i
         if length > 0:
             d.length = length
-            kind = open_packet(d)
+            kind = unpack_frame(d)
             if kind == MESSAGE_SAMPLE:
                 while ends[read] < i:
                     read += 1

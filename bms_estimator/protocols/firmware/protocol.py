@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign, SampleBlock
-from bms_estimator.protocols.base.device_protocol import Command, Dialect
+from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import (
@@ -38,7 +38,7 @@ class _Told(Command):
     acknowledged: bool = False
 
 
-class BoardDialect(Dialect):
+class BoardDialect(DeviceProtocol):
     """The conversation with a board. It samples by itself: before a whole frame has come it is sent nothing.
 
     Args:

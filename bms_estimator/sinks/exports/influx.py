@@ -20,7 +20,7 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Snapshot
-from bms_estimator.process.backoff import FIRST_DELAY_S, Pauses
+from bms_estimator.process.backoff import FIRST_DELAY_S, Backoff
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.process.systemd import credential
 from bms_estimator.settings.exports import InfluxSettings
@@ -63,7 +63,7 @@ class InfluxSink:
 
     Args:
         settings: The server.
-        first_delay_s: Before a server that is away is tried once more; then longer, as ``Pauses`` has it [s].
+        first_delay_s: Before a server that is away is tried once more; then longer, as ``Backoff`` has it [s].
 
     Raises:
         UserError: A file of ``settings`` cannot be used.
@@ -72,7 +72,7 @@ class InfluxSink:
     def __init__(self, settings: InfluxSettings, *, first_delay_s: float = FIRST_DELAY_S) -> None:
         target(settings)  # what cannot be used is said at start
         self._settings = settings
-        self._pauses = Pauses(first_delay_s)
+        self._pauses = Backoff(first_delay_s)
         self._waiting: deque[str] = deque()
         self._batch: list[str] = []  # on its way
         self._before: Snapshot | None = None

@@ -37,7 +37,7 @@ NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
 """All that ``[home_assistant.names]`` may name."""
 
 
-class Described(NamedTuple):
+class DiscoveryInputs(NamedTuple):
     """On what depends which entities there are."""
 
     info: Info
@@ -70,7 +70,7 @@ def discovery_topic(settings: HomeAssistantSettings, device: str) -> str:
 
 
 def discovery(
-    settings: HomeAssistantSettings, described: Described, root: str, sample_period_s: float
+    settings: HomeAssistantSettings, described: DiscoveryInputs, root: str, sample_period_s: float
 ) -> dict[str, Any]:
     """The discovery message.
 
@@ -118,7 +118,7 @@ def discovery(
     }
 
 
-def _removed(described: Described) -> dict[str, dict[str, str]]:
+def _removed(described: DiscoveryInputs) -> dict[str, dict[str, str]]:
     """What it may know from before: by its platform alone it goes, what is left out stays."""
     platforms = FORMER | {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
     platforms |= {name: made("")["platform"] for name, made in _COMMANDS.items() if name not in described.commands}

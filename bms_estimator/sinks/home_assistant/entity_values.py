@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from bms_estimator.model.payloads import Snapshot
-from bms_estimator.sinks.home_assistant.discovery import Described
+from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs
 from bms_estimator.sinks.home_assistant.entities import Entity, cell_key, entities
 
 MOST_ROWS = 18
@@ -20,7 +20,7 @@ HEARTBEAT_S = 10.0
 """Values that have not changed are said again, so that they do not expire [s]."""
 
 
-class Shown(NamedTuple):
+class EntityStates(NamedTuple):
     """What Home Assistant was told last. Times are on a monotonic clock [s]."""
 
     values: Mapping[str, float | None] = {}
@@ -30,7 +30,9 @@ class Shown(NamedTuple):
     """When a value was shown anew, in the last minute."""
 
 
-def next_values(shown: Shown, snapshot: Snapshot, described: Described, now_s: float, *, sign: float = 1.0) -> Shown:
+def values_to_publish(
+    shown: EntityStates, snapshot: Snapshot, described: DiscoveryInputs, now_s: float, *, sign: float = 1.0
+) -> EntityStates:
     """What to tell of the values; ``shown`` itself where nothing is to be told.
 
     Args:
@@ -92,7 +94,7 @@ def _times(factor: float, value: float | None) -> float | None:
     return None if value is None else factor * value
 
 
-def _moved(shown: Shown, key: str, value: float | None, entity: Entity, now_s: float) -> bool:
+def _moved(shown: EntityStates, key: str, value: float | None, entity: Entity, now_s: float) -> bool:
     """Whether a value is to be shown anew."""
     if key not in shown.values:
         return True

@@ -6,8 +6,8 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import structlog
 
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.mqtt.denied_topics import Refusals
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.denied_topics import DeniedTopics
 from bms_estimator.mqtt.message import Message
 
 CORRECTION_S = 5.0
@@ -20,7 +20,7 @@ ECHO_S = 10.0
 log = structlog.get_logger(__name__)
 
 
-class Availability:
+class AvailabilityMonitor:
     """Hears what the broker gives back.
 
     Args:
@@ -34,8 +34,8 @@ class Availability:
     def __init__(
         self,
         own: Callable[[], Sequence[Message]],
-        delivery: Delivery,
-        refusals: Refusals,
+        delivery: DeliveryStats,
+        refusals: DeniedTopics,
         wake: Callable[[], object],
         echo_s: float = ECHO_S,
     ) -> None:

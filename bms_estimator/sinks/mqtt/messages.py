@@ -6,28 +6,34 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from bms_estimator.model.events import events
-from bms_estimator.model.payloads import Health, Report, Snapshot
+from bms_estimator.model.payloads import Health, Payload, Snapshot
 from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.sinks.home_assistant.discovery import VALUES, Described, check_names, discovery, discovery_topic
-from bms_estimator.sinks.home_assistant.entity_values import Shown, next_values
+from bms_estimator.sinks.home_assistant.discovery import (
+    VALUES,
+    DiscoveryInputs,
+    check_names,
+    discovery,
+    discovery_topic,
+)
+from bms_estimator.sinks.home_assistant.entity_values import EntityStates, values_to_publish
 from bms_estimator.sinks.mqtt.topics import schema
 
 AVAILABILITY, SENSOR_AVAILABILITY = "availability", "sensor/availability"
 """Topics below the device's."""
 
 
-class Sent(NamedTuple):
+class PublishedState(NamedTuple):
     """What the broker got last; at first nothing."""
 
     snapshot: Snapshot | None = None
-    shown: Shown = Shown()
-    described: Described | None = None
+    shown: EntityStates = EntityStates()
+    described: DiscoveryInputs | None = None
     """To Home Assistant."""
 
 
-class Messages:
+class MessageBuilder:
     """The messages of one pack.
 
     Args:
@@ -70,7 +76,7 @@ class Messages:
         """What it is told last; the last of these is the will, too."""
         return [self._retained(SENSOR_AVAILABILITY, b"offline"), self._retained(AVAILABILITY, b"offline")]
 
-    def availability(self, sent: Sent) -> list[Message]:
+    def availability(self, sent: PublishedState) -> list[Message]:
         """What the two availabilities hold, unless somebody else writes there."""
         sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
         return [self._retained(AVAILABILITY, b"online"), *sensor]
@@ -85,7 +91,7 @@ class Messages:
         happened = [self._kept("event", event) for event in events(before, snapshot)]
         return happened + ([self._kept("state", snapshot.estimate)] if snapshot.estimate else [])
 
-    def due(self, sent: Sent, snapshot: Snapshot, now_s: float) -> tuple[list[Message], Sent]:
+    def due(self, sent: PublishedState, snapshot: Snapshot, now_s: float) -> tuple[list[Message], PublishedState]:
         """What a snapshot brings that the broker has not got yet, beside what is ``kept``.
 
         Args:
@@ -115,32 +121,32 @@ class Messages:
         known_alarms = before.alarms if before else ()
         messages += [self._retained(f"alarm/{a.name}", _report(a)) for a in alarms if a not in known_alarms]
         told, shown = self._home_assistant(sent.shown, snapshot, described, now_s)
-        return messages + told, Sent(snapshot, shown, described)
+        return messages + told, PublishedState(snapshot, shown, described)
 
-    def _described(self, sent: Sent, snapshot: Snapshot) -> Described:
+    def _described(self, sent: PublishedState, snapshot: Snapshot) -> DiscoveryInputs:
         """Cells that were measured once stay."""
         cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
         known = sent.described.cells if sent.described else 0
         alarms = tuple(alarm.name for alarm in snapshot.alarms)
-        return Described(snapshot.info, max(cells, known), alarms, self.commands, self._unwatched)
+        return DiscoveryInputs(snapshot.info, max(cells, known), alarms, self.commands, self._unwatched)
 
     def _home_assistant(
-        self, before: Shown, snapshot: Snapshot, described: Described, now_s: float
-    ) -> tuple[list[Message], Shown]:
+        self, before: EntityStates, snapshot: Snapshot, described: DiscoveryInputs, now_s: float
+    ) -> tuple[list[Message], EntityStates]:
         if not self._home.enabled:
             return [], before
         sign = 1.0 if self._home.current_sign == "discharge_positive" else -1.0
-        shown = next_values(before, snapshot, described, now_s, sign=sign)
+        shown = values_to_publish(before, snapshot, described, now_s, sign=sign)
         return ([] if shown is before else [self._live(VALUES, _json(shown.values))]), shown
 
     def _sensor(self, health: Health) -> Message:
         return self._retained(SENSOR_AVAILABILITY, b"online" if health.sensor_online else b"offline")
 
-    def _discovery(self, described: Described) -> bytes:
+    def _discovery(self, described: DiscoveryInputs) -> bytes:
         """Empty, which removes the device, where Home Assistant is to know none."""
         return _json(discovery(self._home, described, self.root, self._sample_period_s)) if self._home.enabled else b""
 
-    def _kept(self, topic: str, report: Report) -> Message:
+    def _kept(self, topic: str, report: Payload) -> Message:
         return Message(f"{self.root}/{topic}", _report(report), 1, retain=False)
 
     def _live(self, topic: str, payload: bytes) -> Message:
@@ -156,7 +162,7 @@ def _schema() -> bytes:
     return _json(schema())
 
 
-def _report(report: Report) -> bytes:
+def _report(report: Payload) -> bytes:
     return report.model_dump_json().encode()
 
 

@@ -14,7 +14,7 @@ from typing import Any, get_args
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.mqtt import Command
 
 COMMANDS = get_args(Command)
@@ -35,7 +35,7 @@ Handler = Callable[[Mapping[str, Any]], Awaitable[Mapping[str, Any]]]
 log = structlog.get_logger(__name__)
 
 
-class Requests:
+class RequestDispatcher:
     """Handlers by name, and who may call them how often.
 
     Args:
@@ -46,14 +46,14 @@ class Requests:
 
     def __init__(
         self,
-        delivery: Delivery,
+        delivery: DeliveryStats,
         commands: Collection[Command] = (),
         *,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._counts, self._allowed, self._monotonic = delivery.requests, commands, monotonic
         self._handlers: dict[str, Handler] = {}
-        self._reads, self._commands = Rate(READS_PER_MIN, monotonic), Rate(COMMANDS_PER_MIN, monotonic)
+        self._reads, self._commands = RateLimiter(READS_PER_MIN, monotonic), RateLimiter(COMMANDS_PER_MIN, monotonic)
         self._logged_s: dict[str, float] = {}
 
     def offer(self, name: str, handler: Handler) -> None:
@@ -122,7 +122,7 @@ class Requests:
         return self._handlers[name]
 
 
-class Rate:
+class RateLimiter:
     """So many in a minute, at once or spread.
 
     Args:

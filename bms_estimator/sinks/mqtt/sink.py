@@ -15,20 +15,20 @@ import structlog
 
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import Connect, Connection, Hello, Received
-from bms_estimator.mqtt.delivery_stats import Delivery
-from bms_estimator.mqtt.denied_topics import Refusals
+from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, ReceivedMessage
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.denied_topics import DeniedTopics
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.protocol_negotiation import Dial
-from bms_estimator.mqtt.queue_sender import Sending
-from bms_estimator.mqtt.reconnect_loop import Link
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.queue_sender import QueueSender
+from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
 from bms_estimator.process.backoff import FIRST_DELAY_S
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.sinks.mqtt.availability import ECHO_S, Availability
-from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, Messages, Sent
-from bms_estimator.sinks.mqtt.requests import MOST_SHOWN, Requests
+from bms_estimator.sinks.mqtt.availability import ECHO_S, AvailabilityMonitor
+from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, MessageBuilder, PublishedState
+from bms_estimator.sinks.mqtt.requests import MOST_SHOWN, RequestDispatcher
 from bms_estimator.store.outbox import Outbox
 
 BIRTH_DELAY_S = 2.0
@@ -66,8 +66,8 @@ class MqttSink:
         self,
         settings: MqttSettings,
         device: str,
-        requests: Requests,
-        delivery: Delivery,
+        requests: RequestDispatcher,
+        delivery: DeliveryStats,
         outbox: Outbox,
         *,
         connect: Connect | None = None,
@@ -79,22 +79,24 @@ class MqttSink:
         echo_s: float = ECHO_S,
     ) -> None:
         self._requests, self._delivery = requests, delivery
-        self._refusals = Refusals(delivery, self._say_again, first_delay_s)
-        self._backlog = Backlog(outbox, delivery, self._refusals, first_delay_s)
+        self._refusals = DeniedTopics(delivery, self._say_again, first_delay_s)
+        self._backlog = OutboxSender(outbox, delivery, self._refusals, first_delay_s)
         self._birth_delay_s = birth_delay_s
-        self._messages = Messages(settings.base_topic, device, sample_period_s, home_assistant, alarms)
+        self._messages = MessageBuilder(settings.base_topic, device, sample_period_s, home_assistant, alarms)
         self._birth_topic = (home_assistant or HomeAssistantSettings()).status_topic
         identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.farewell()[-1]
-        hello = Hello(identifier, will, lambda kind, topic: requests.refuse(kind, topic[:MOST_SHOWN]))
+        hello = ConnectOptions(identifier, will, lambda kind, topic: requests.refuse(kind, topic[:MOST_SHOWN]))
         for warning in check(settings):
             log.warning("a secret that is none", reason=warning)
-        self._link = Link(brokers(settings), hello, connect or Dial(settings), self._serve, delivery, first_delay_s)
+        self._link = ReconnectLoop(
+            brokers(settings), hello, connect or BrokerConnector(settings), self._serve, delivery, first_delay_s
+        )
         self._slot: Snapshot | None = None
         self._before: Snapshot | None = None  # the last one that was taken
-        self._sent = Sent()  # only the sending task sets it
+        self._sent = PublishedState()  # only the sending task sets it
         self._again = True  # the broker may hold nothing: send all of it
         self._wake = asyncio.Event()
-        self._availability = Availability(
+        self._availability = AvailabilityMonitor(
             lambda: self._messages.availability(self._sent), delivery, self._refusals, self._wake.set, echo_s
         )
         self._task: asyncio.Task[None] | None = None
@@ -169,7 +171,7 @@ class MqttSink:
             await self._wake.wait()
             self._wake.clear()
             if self._again:
-                self._again, self._sent = False, Sent()
+                self._again, self._sent = False, PublishedState()
                 self._availability.told()
                 await self._publish(connection, self._messages.greeting())
             await self._availability.correct(lambda messages: self._publish(connection, messages))
@@ -199,7 +201,7 @@ class MqttSink:
             else:
                 await self._answer(connection, message)
 
-    async def _answer(self, connection: Connection, message: Received) -> None:
+    async def _answer(self, connection: Connection, message: ReceivedMessage) -> None:
         name = message.topic.rsplit("/", 1)[-1]
         if message.retain:  # it would be granted again with each connection
             self._requests.refuse("retained", name[:MOST_SHOWN])
@@ -217,17 +219,17 @@ class MqttSink:
         return f"{self._messages.root}/{name}"
 
 
-class Backlog(Sending):
+class OutboxSender(QueueSender):
     """Fills and empties an outbox.
 
     Args:
         outbox: The outbox.
-        delivery: As ``Sending`` has it.
-        refusals: As ``Sending`` has it.
-        first_delay_s: As ``Sending`` has it [s].
+        delivery: As ``QueueSender`` has it.
+        refusals: As ``QueueSender`` has it.
+        first_delay_s: As ``QueueSender`` has it [s].
     """
 
-    def __init__(self, outbox: Outbox, delivery: Delivery, refusals: Refusals, first_delay_s: float) -> None:
+    def __init__(self, outbox: Outbox, delivery: DeliveryStats, refusals: DeniedTopics, first_delay_s: float) -> None:
         super().__init__(outbox, delivery, refusals, first_delay_s)
         self._filled = outbox
 

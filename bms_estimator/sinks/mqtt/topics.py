@@ -8,13 +8,13 @@ reader relied on. What is added does not raise it: a reader passes over what it 
 from typing import Any, NamedTuple
 
 from bms_estimator.model.events import Event
-from bms_estimator.model.payloads import PAYLOAD_VERSION, Alarm, Estimate, Health, Info, ParameterReport, Report
+from bms_estimator.model.payloads import PAYLOAD_VERSION, Alarm, Estimate, Health, Info, ParameterReport, Payload
 
 
 class Topic(NamedTuple):
     """A topic whose payload is a model."""
 
-    model: type[Report]
+    model: type[Payload]
     qos: int
     retain: bool
     when: str

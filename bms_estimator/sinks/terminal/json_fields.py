@@ -8,7 +8,7 @@ LONGEST_TEXT = 400
 """Texts are shown so far [characters]."""
 
 
-class Fields:
+class JsonFields:
     """The fields of a JSON object; of anything else none.
 
     Args:
@@ -41,9 +41,9 @@ class Fields:
         """Whether it is there and null."""
         return name in self._of and self._of[name] is None
 
-    def fields(self, name: str) -> "Fields":
+    def fields(self, name: str) -> "JsonFields":
         """An object."""
-        return Fields(self._of.get(name))
+        return JsonFields(self._of.get(name))
 
     def texts(self, name: str) -> list[str]:
         """A list of texts."""

@@ -10,7 +10,7 @@ from rich.text import Text
 GAP = "  "
 
 
-class Flow:
+class FlowLayout:
     """Texts beside each other, as many as a line takes; none is broken that a line can hold.
 
     Args:
@@ -35,7 +35,7 @@ class Flow:
         yield row
 
 
-class Block(NamedTuple):
+class LayoutBlock(NamedTuple):
     """A part of the screen, as wide as that is."""
 
     rank: int
@@ -43,7 +43,7 @@ class Block(NamedTuple):
     content: RenderableType
 
 
-def fitted(blocks: Sequence[Block], console: Console, options: ConsoleOptions) -> RenderResult:
+def fitted(blocks: Sequence[LayoutBlock], console: Console, options: ConsoleOptions) -> RenderResult:
     """Blocks below each other.
 
     Where they are higher than the room there is, those of the highest rank are left out, the lowest on the screen first.

@@ -14,10 +14,10 @@ from typing import IO, Self, TypeVar, cast
 from rich.console import Console
 from rich.live import Live
 
-from bms_estimator.mqtt.topic_cache import Device, Heard
-from bms_estimator.sinks.terminal.json_fields import Fields
-from bms_estimator.sinks.terminal.panels import View
-from bms_estimator.sinks.terminal.scene import Lost, Pack, Scene
+from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics
+from bms_estimator.sinks.terminal.json_fields import JsonFields
+from bms_estimator.sinks.terminal.panels import Screen
+from bms_estimator.sinks.terminal.scene import BrokerOutage, PackView, ScreenState
 from bms_estimator.sinks.terminal.text_line import line
 
 REDRAW_S = 0.25
@@ -58,12 +58,12 @@ class LiveView:
 
     def __init__(
         self,
-        devices: Mapping[str, Device],
+        devices: Mapping[str, DeviceTopics],
         *,
         log: Iterable[str] = (),
         hint: str = "",
         true_soc: Callable[[], float | None] = lambda: None,
-        lost: Callable[[], Lost | None] = lambda: None,
+        lost: Callable[[], BrokerOutage | None] = lambda: None,
         first: str = "",
         wall: Callable[[], float] = time.time,
     ) -> None:
@@ -72,7 +72,7 @@ class LiveView:
         self._devices, self._log, self._hint, self._wall = devices, log, hint, wall
         self._true_soc, self._lost, self._selected = true_soc, lost, first
         self._curves: dict[str, Curves] = {}
-        self._scene: deque[Scene] = deque(maxlen=1)  # only the newest is worth waiting
+        self._scene: deque[ScreenState] = deque(maxlen=1)  # only the newest is worth waiting
         self._lines: deque[str] = deque(maxlen=WAITING_LINES)
         self._due, self._closing = threading.Event(), threading.Event()
         self._error: OSError | None = None
@@ -91,7 +91,7 @@ class LiveView:
         self._due.set()
         await asyncio.to_thread(self._thread.join, CLOSE_S)
 
-    def hear(self, heard: Heard) -> None:
+    def hear(self, heard: DeviceMessage) -> None:
         """Take a message of a pack, which ``devices`` holds already; without a screen it may be a line."""
         if heard.device not in self._devices:
             self._curves.pop(heard.device, None)
@@ -120,27 +120,27 @@ class LiveView:
             self._selected = names[(at + step) % len(names)]
         self.show()
 
-    def _remember(self, heard: Heard) -> None:
+    def _remember(self, heard: DeviceMessage) -> None:
         if len(self._curves) > len(self._devices):  # some devices were replaced
             self._curves = {name: curves for name, curves in self._curves.items() if name in self._devices}
         curves = self._curves.setdefault(heard.device, Curves())
-        state = Fields(heard.payload)
+        state = JsonFields(heard.payload)
         voltage_v, current_a = state.number("voltage_v"), state.number("current_a")
         if voltage_v is not None and current_a is not None:
             curves.voltage_v.append(voltage_v)
             curves.current_a.append(current_a)
 
-    def _scene_now(self) -> Scene:
+    def _scene_now(self) -> ScreenState:
         """A copy: the drawing thread must not see what changes."""
         now_s, lost = self._wall(), self._lost()
         packs = [
-            Pack(name, dict(device.topics), max(device.heard_s.values()), now_s, lost)
+            PackView(name, dict(device.topics), max(device.heard_s.values()), now_s, lost)
             for name, device in self._devices.items()
         ]
         shown = next((pack for pack in packs if pack.device == self._selected), None)
-        shown = shown or (packs[0] if packs else Pack(now_s=now_s, lost=lost))
+        shown = shown or (packs[0] if packs else PackView(now_s=now_s, lost=lost))
         curves = self._curves.get(shown.device, Curves())
-        return Scene(
+        return ScreenState(
             shown.device,
             shown.topics,
             shown.heard_s,
@@ -165,15 +165,15 @@ class LiveView:
 
     def _draw_screens(self) -> None:
         """The newest scene, at most one each ``REDRAW_S``; the last one stays on the terminal."""
-        scene: Scene | None = None
+        scene: ScreenState | None = None
         with Live(
             console=self._console, auto_refresh=False, screen=True, redirect_stdout=False, redirect_stderr=False
         ) as live:
             for scene in self._taken(self._scene):
-                live.update(View(scene), refresh=True)
+                live.update(Screen(scene), refresh=True)
                 self._closing.wait(REDRAW_S)
         if scene is not None:
-            self._console.print(View(scene), height=max(self._console.height - END_LINES, 1))
+            self._console.print(Screen(scene), height=max(self._console.height - END_LINES, 1))
 
     def _write_lines(self) -> None:
         for text in self._taken(self._lines):

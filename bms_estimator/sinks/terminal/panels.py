@@ -14,9 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.sinks.terminal.json_fields import Fields
-from bms_estimator.sinks.terminal.layout import Block, Flow, fitted
-from bms_estimator.sinks.terminal.scene import Scene
+from bms_estimator.sinks.terminal.json_fields import JsonFields
+from bms_estimator.sinks.terminal.layout import FlowLayout, LayoutBlock, fitted
+from bms_estimator.sinks.terminal.scene import ScreenState
 
 WIDE_CELLS, WIDE_LINES = 76, 18
 """Two columns of panels need so much room."""
@@ -59,10 +59,10 @@ COUNTED = {"lock_losses": "lock losses", "reconnects": "reconnects"}
 """Fault counter of the health -> name on the screen."""
 
 
-class View:
+class Screen:
     """The whole screen."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: ScreenState) -> None:
         self._scene = scene
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -71,49 +71,62 @@ class View:
         yield from fitted(_blocks(self._scene, options.max_width, wide=wide), console, options)
 
 
-def _blocks(scene: Scene, width: int, *, wide: bool) -> list[Block]:
+def _blocks(scene: ScreenState, width: int, *, wide: bool) -> list[LayoutBlock]:
     """The parts of the screen from top to bottom, each with its rank."""
-    hint = Block(2, Text(scene.hint, style="cyan"))
-    packs = [Block(1, _packs(scene))] if len(scene.packs) > 1 else []
+    hint = LayoutBlock(2, Text(scene.hint, style="cyan"))
+    packs = [LayoutBlock(1, _packs(scene))] if len(scene.packs) > 1 else []
     if not scene.device:
-        return [Block(0, _header(scene, wide=wide)), Block(0, Text("no pack has published anything yet")), hint]
+        return [
+            LayoutBlock(0, _header(scene, wide=wide)),
+            LayoutBlock(0, Text("no pack has published anything yet")),
+            hint,
+        ]
     state, health, parameters = scene.state, scene.health, scene.parameters
     charge = [] if scene.has_no_charge else _charge(scene, width - PANEL_CELLS if wide else width)
-    wrong = [Block(0, _alarms(scene.alarms)), Block(0, _health(health, parameters))]
+    wrong = [LayoutBlock(0, _alarms(scene.alarms)), LayoutBlock(0, _health(health, parameters))]
     below = [
-        Block(4, _cells(state)),
-        Block(5, _energy(state)),
-        Block(5, _observer(state)),
-        Block(6, _link(state, health)),
-        Block(9, _log(scene.log)),
+        LayoutBlock(4, _cells(state)),
+        LayoutBlock(5, _energy(state)),
+        LayoutBlock(5, _observer(state)),
+        LayoutBlock(6, _link(state, health)),
+        LayoutBlock(9, _log(scene.log)),
         hint,
     ]
-    header, elements = Block(1, _header(scene, wide=wide)), _elements(parameters.fields("elements"))
+    header, elements = LayoutBlock(1, _header(scene, wide=wide)), _elements(parameters.fields("elements"))
     if not wide:
-        sparks = Block(7, _sparks(scene, width))
-        parts = [header, *packs, *charge, Block(0, Flow(*_measured(state))), *wrong, sparks, Block(8, elements), *below]
+        sparks = LayoutBlock(7, _sparks(scene, width))
+        parts = [
+            header,
+            *packs,
+            *charge,
+            LayoutBlock(0, FlowLayout(*_measured(state))),
+            *wrong,
+            sparks,
+            LayoutBlock(8, elements),
+            *below,
+        ]
         return _shown(parts)
     columns = Table.grid(expand=True)
     columns.add_column(ratio=1)
     columns.add_column(ratio=1)
     left = Group(*_measured(state, VALUE_CELLS), _sparks(scene, width // 2 - PANEL_CELLS))
     columns.add_row(_panel(left, "Measured"), _panel(elements, "Elements at this SOC" if charge else "Learned"))
-    soc = [Block(0, _panel(Group(*(block.content for block in charge)), "State of charge"))] if charge else []
-    return _shown([header, *packs, *soc, *wrong, Block(0, columns), *below])
+    soc = [LayoutBlock(0, _panel(Group(*(block.content for block in charge)), "State of charge"))] if charge else []
+    return _shown([header, *packs, *soc, *wrong, LayoutBlock(0, columns), *below])
 
 
-def _shown(blocks: Sequence[Block]) -> list[Block]:
+def _shown(blocks: Sequence[LayoutBlock]) -> list[LayoutBlock]:
     """Without those that have nothing to say."""
-    return [block for block in blocks if not (isinstance(block.content, Flow) and block.content.is_empty())]
+    return [block for block in blocks if not (isinstance(block.content, FlowLayout) and block.content.is_empty())]
 
 
-def _charge(scene: Scene, cells: int) -> list[Block]:
+def _charge(scene: ScreenState, cells: int) -> list[LayoutBlock]:
     """What a battery holds."""
     state = scene.state
     return [
-        Block(0, _soc(state, scene.true_soc)),
-        Block(4, _bar(state, scene.true_soc, cells)),
-        Block(3, _left(state)),
+        LayoutBlock(0, _soc(state, scene.true_soc)),
+        LayoutBlock(4, _bar(state, scene.true_soc, cells)),
+        LayoutBlock(3, _left(state)),
     ]
 
 
@@ -127,7 +140,7 @@ def sparkline(values: Sequence[float], cells: int) -> str:
     return "".join(SPARKS[round((value - low) * scale)] for value in shown)
 
 
-def _packs(scene: Scene) -> Table:
+def _packs(scene: ScreenState) -> Table:
     """All packs, a line each, around the one that is shown below."""
     names = [pack.device for pack in scene.packs]
     first = max(min(names.index(scene.device) - MOST_PACKS // 2, len(names) - MOST_PACKS), 0)
@@ -146,7 +159,7 @@ def _packs(scene: Scene) -> Table:
     return table
 
 
-def _header(scene: Scene, *, wide: bool) -> RenderableType:
+def _header(scene: ScreenState, *, wide: bool) -> RenderableType:
     info = scene.info
     left = Text.assemble((f" {scene.device or 'no pack'} ", "bold reverse"), overflow="ellipsis")
     if wide and info:
@@ -162,7 +175,7 @@ def _header(scene: Scene, *, wide: bool) -> RenderableType:
     return row
 
 
-def _soc(state: Fields, true_soc: float | None) -> Flow:
+def _soc(state: JsonFields, true_soc: float | None) -> FlowLayout:
     """The estimate with its band; beside it the truth, where it is known."""
     soc = state.number("soc")
     texts = [
@@ -172,10 +185,10 @@ def _soc(state: Fields, true_soc: float | None) -> Flow:
         texts.append(Text.assemble(("true ", "dim"), (f"{true_soc:.2%}", "bold magenta")))
         if soc is not None:
             texts.append(Text.assemble(("error ", "dim"), f"{soc - true_soc:+.2%}"))
-    return Flow(*texts)
+    return FlowLayout(*texts)
 
 
-def _bar(state: Fields, true_soc: float | None, cells: int) -> Text:
+def _bar(state: JsonFields, true_soc: float | None, cells: int) -> Text:
     """Filled to the SOC, its band hatched, a tick where the truth is."""
     soc, band = state.number("soc") or 0.0, BAND_STDS * (state.number("soc_std") or 0.0)
     colour = "green" if soc > LOW_SOC else "yellow"
@@ -192,7 +205,7 @@ def _bar(state: Fields, true_soc: float | None, cells: int) -> Text:
     return Text.assemble(*((mark * len(list(same)), style) for (mark, style), same in parts))
 
 
-def _left(state: Fields) -> Flow:
+def _left(state: JsonFields) -> FlowLayout:
     """What is left, and how long it lasts."""
     empty_s, full_s = state.number("time_to_empty_s"), state.number("time_to_full_s")
     lasts = "empty in - : no load"
@@ -201,10 +214,10 @@ def _left(state: Fields) -> Flow:
     elif full_s is not None:
         lasts = f"full in {_duration(full_s)} at this current"
     ah, wh = state.number("remaining_capacity_ah"), state.number("remaining_energy_wh")
-    return Flow(Text(lasts), Text(f"{_number(ah, '.3f')} Ah"), Text(f"{_number(wh, '.2f')} Wh left"))
+    return FlowLayout(Text(lasts), Text(f"{_number(ah, '.3f')} Ah"), Text(f"{_number(wh, '.2f')} Wh left"))
 
 
-def _measured(state: Fields, cells: int = 0) -> list[Text]:
+def _measured(state: JsonFields, cells: int = 0) -> list[Text]:
     """Means of the publish window, each number right-aligned in ``cells``."""
     v, i = state.number("voltage_v"), state.number("current_a")
     p, t = state.number("power_w"), state.number("temperature_c")
@@ -217,14 +230,14 @@ def _measured(state: Fields, cells: int = 0) -> list[Text]:
     ]
 
 
-def _sparks(scene: Scene, width: int) -> Text:
+def _sparks(scene: ScreenState, width: int) -> Text:
     """How voltage and current went over the last publications."""
     cells = width - 2
     voltage, current = sparkline(scene.voltage_v, cells), sparkline(scene.current_a, cells)
     return Text.assemble(("V ", "dim"), (voltage, "cyan"), ("\nA ", "dim"), (current, "magenta"))
 
 
-def _elements(elements: Fields) -> Table:
+def _elements(elements: JsonFields) -> Table:
     """Each element with its standard deviation and where it comes from; bold where it is valid."""
     table = Table.grid(padding=(0, 1))
     table.add_column(style="dim", no_wrap=True)
@@ -244,7 +257,7 @@ def _elements(elements: Fields) -> Table:
     return table
 
 
-def _alarms(alarms: Sequence[Fields]) -> Flow:
+def _alarms(alarms: Sequence[JsonFields]) -> FlowLayout:
     """Raised and unwatched alarms, the critical first."""
     worst = sorted(alarms, key=lambda alarm: alarm.text("severity") != "critical")
     texts = [
@@ -255,37 +268,37 @@ def _alarms(alarms: Sequence[Fields]) -> Flow:
         for alarm in worst[:MOST_ALARMS]
     ]
     more = len(worst) - len(texts)
-    return Flow(*texts, *([Text(f"and {more} more", style="bold red")] if more else []))
+    return FlowLayout(*texts, *([Text(f"and {more} more", style="bold red")] if more else []))
 
 
-def _unwatched(alarm: Fields) -> str:
+def _unwatched(alarm: JsonFields) -> str:
     """An alarm without a text: it cannot be watched."""
     return f"{alarm.text('name')} cannot be raised: {alarm.text('unwatched_reason')}"
 
 
-def _health(health: Fields, parameters: Fields) -> Flow:
+def _health(health: JsonFields, parameters: JsonFields) -> FlowLayout:
     """What is wrong, in full; else how worn the pack is."""
     message = health.text("sensor_message")
     wrong = [Text(message, style="bold red")] if message else []
     wrong += [Text(f"suspected: {suspect}", style="bold yellow") for suspect in health.texts("suspects")]
     if wrong or not health:
-        return Flow(*wrong)
+        return FlowLayout(*wrong)
     known = []
     for key, name in WORN.items():
         worn = parameters.fields("state_of_health").fields(key)
         value, std = worn.number("value"), worn.number("std")
         if worn.flag("valid") and value and std:
             known.append(Text(f"{name} {value:.2f} ± {std:.2f} of new"))
-    return Flow(Text.assemble(("health ", "dim"), ("good", "bold green")), *known)
+    return FlowLayout(Text.assemble(("health ", "dim"), ("good", "bold green")), *known)
 
 
-def _cells(state: Fields) -> Flow:
+def _cells(state: JsonFields) -> FlowLayout:
     """Single cells, where they are measured: how many, the lowest and the highest with their numbers."""
     low_v, high_v = state.number("cell_lowest_v"), state.number("cell_highest_v")
     if low_v is None or high_v is None:
-        return Flow()
+        return FlowLayout()
     count = len(state.numbers("cells_v"))
-    return Flow(
+    return FlowLayout(
         Text.assemble(("cells ", "dim"), str(count) if count else ""),
         Text(f"lowest {low_v:.3f} V{_cell(state, 'cell_lowest')}"),
         Text(f"highest {high_v:.3f} V{_cell(state, 'cell_highest')}"),
@@ -293,30 +306,30 @@ def _cells(state: Fields) -> Flow:
     )
 
 
-def _cell(state: Fields, name: str) -> str:
+def _cell(state: JsonFields, name: str) -> str:
     """A cell's number in brackets, where it is known."""
     number = state.number(name)
     return "" if number is None else f" (cell {number:.0f})"
 
 
-def _energy(state: Fields) -> Flow:
+def _energy(state: JsonFields) -> FlowLayout:
     """What went in and out since counting began."""
     out_kwh, in_kwh, cycles = (state.number(key) for key in ("energy_out_kwh", "energy_in_kwh", "equivalent_cycles"))
     if out_kwh is None or in_kwh is None:
-        return Flow()
+        return FlowLayout()
     factor, unit = (1.0, "kWh") if max(out_kwh, in_kwh) >= 1.0 else (1e3, "Wh")
     counted = [
         Text.assemble(("energy ", "dim"), f"{factor * out_kwh:.2f} {unit} out"),
         Text(f"{factor * in_kwh:.2f} {unit} in"),
     ]
-    return Flow(*counted, *([] if cycles is None else [Text(f"{cycles:.1f} cycles")]))
+    return FlowLayout(*counted, *([] if cycles is None else [Text(f"{cycles:.1f} cycles")]))
 
 
-def _observer(state: Fields) -> Flow:
+def _observer(state: JsonFields) -> FlowLayout:
     """The thesis's observer: where its model stays stable, its gain, and whether it tracks."""
     margin = state.number("stability_margin")
     narrow = margin is not None and margin < NARROW_MARGIN
-    return Flow(
+    return FlowLayout(
         Text.assemble(("observer ", "dim"), ("lock", "green") if state.flag("lock") else ("NO LOCK", "bold red")),
         Text(f"δ1 {_number(state.number('delta_1'), '.4f')}"),
         Text(f"δ2 {_number(state.number('delta_2'), '.4f')}"),
@@ -326,7 +339,7 @@ def _observer(state: Fields) -> Flow:
     )
 
 
-def _gain(state: Fields) -> Text:
+def _gain(state: JsonFields) -> Text:
     """N(k) of a printed law, gamma k of the learning law."""
     adaptation_hz = state.number("adaptation_gain_hz")
     if adaptation_hz is not None:
@@ -334,7 +347,7 @@ def _gain(state: Fields) -> Text:
     return Text(f"N {_number(state.number('nussbaum_gain'), '.4f')}")
 
 
-def _link(state: Fields, health: Fields) -> Flow:
+def _link(state: JsonFields, health: JsonFields) -> FlowLayout:
     """The line and the service; faults are red."""
     line, samples = health.fields("line"), health.fields("samples")
     dropped = sum(samples.count(name) for name in samples.names() if name.startswith("dropped_"))
@@ -344,7 +357,7 @@ def _link(state: Fields, health: Fields) -> Flow:
         "samples dropped": dropped,
     } | {name: health.count(key) for key, name in COUNTED.items()}
     faults = [Text(f"{count:,} {name}", style="bold red") for name, count in counts.items() if count]
-    return Flow(
+    return FlowLayout(
         Text.assemble(("link ", "dim"), f"{line.count('frames_received'):,} frames"),
         Text(f"{_number(state.number('sample_rate_hz'), '.1f')} Hz"),
         *(faults or [Text("no faults")]),
@@ -363,7 +376,7 @@ def _panel(content: RenderableType, title: str) -> Panel:
     return Panel(content, title=title, title_align="left", box=box.ROUNDED, border_style="dim")
 
 
-def band_text(state: Fields, unit: str = "") -> str:
+def band_text(state: JsonFields, unit: str = "") -> str:
     """`` ± 1.20%``, or nothing where no error is known."""
     std = state.number("soc_std")
     return "" if std is None else f" ± {100.0 * BAND_STDS * std:.2f}{unit}"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
-from bms_estimator.sinks.terminal.json_fields import Fields
+from bms_estimator.sinks.terminal.json_fields import JsonFields
 
 SILENT_S = 10.0
 """A service says its health each second; silent for longer, it is not there, though it has not said so [s]."""
@@ -15,7 +15,7 @@ ALARM = "alarm/"
 """Topics of alarms begin so."""
 
 
-class Lost(NamedTuple):
+class BrokerOutage(NamedTuple):
     """There is no broker."""
 
     since_s: float
@@ -24,7 +24,7 @@ class Lost(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Pack:
+class PackView:
     """What one pack published last."""
 
     device: str = ""
@@ -35,27 +35,27 @@ class Pack:
     """When the last of them came, seconds since 1970."""
     now_s: float = 0.0
     """Now."""
-    lost: Lost | None = None
+    lost: BrokerOutage | None = None
 
     @cached_property
-    def state(self) -> Fields:
+    def state(self) -> JsonFields:
         """Topic ``state``."""
-        return Fields(self.topics.get("state"))
+        return JsonFields(self.topics.get("state"))
 
     @cached_property
-    def health(self) -> Fields:
+    def health(self) -> JsonFields:
         """Topic ``health``."""
-        return Fields(self.topics.get("health"))
+        return JsonFields(self.topics.get("health"))
 
     @cached_property
-    def info(self) -> Fields:
+    def info(self) -> JsonFields:
         """Topic ``info``."""
-        return Fields(self.topics.get("info"))
+        return JsonFields(self.topics.get("info"))
 
     @cached_property
-    def parameters(self) -> Fields:
+    def parameters(self) -> JsonFields:
         """Topic ``parameters``."""
-        return Fields(self.topics.get("parameters"))
+        return JsonFields(self.topics.get("parameters"))
 
     @property
     def has_no_charge(self) -> bool:
@@ -63,10 +63,10 @@ class Pack:
         return self.info.is_null("capacity_ah")
 
     @cached_property
-    def alarms(self) -> list[Fields]:
+    def alarms(self) -> list[JsonFields]:
         """Those that are raised, and while samples come those that cannot be watched."""
-        told = [Fields(payload) for topic, payload in self.topics.items() if topic.startswith(ALARM)]
-        online = Fields(self.topics.get("health")).flag("sensor_online")
+        told = [JsonFields(payload) for topic, payload in self.topics.items() if topic.startswith(ALARM)]
+        online = JsonFields(self.topics.get("health")).flag("sensor_online")
         return [alarm for alarm in told if alarm.flag("active") or (online and alarm.text("unwatched_reason"))]
 
     @cached_property
@@ -86,10 +86,10 @@ class Pack:
 
 
 @dataclass(frozen=True)
-class Scene(Pack):
+class ScreenState(PackView):
     """All that is shown at one moment."""
 
-    packs: Sequence[Pack] = ()
+    packs: Sequence[PackView] = ()
     """All there are, this one too."""
     voltage_v: Sequence[float] = ()
     """Voltages of the last publications, oldest first."""

@@ -6,15 +6,15 @@ from typing import Self
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.topic_cache import Published
-from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from bms_estimator.mqtt.topic_cache import TopicCache
+from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.terminal.live_view import LiveView
 
 BASE_TOPIC = "bms"
 """Nobody sees these topics."""
 
 
-class ConsoleSink:
+class TerminalSink:
     """Shows snapshots as a subscriber would see them. ``publish`` returns at once, however long stdout is blocked.
 
     Args:
@@ -33,11 +33,11 @@ class ConsoleSink:
         clock: Clock | None = None,
     ) -> None:
         self._clock = clock or Clock()
-        self._published = Published(BASE_TOPIC)
+        self._published = TopicCache(BASE_TOPIC)
         self._view = LiveView(self._published.devices, log=log, hint=hint, true_soc=true_soc, wall=self._clock.wall)
-        self._messages: Messages | None = None
+        self._messages: MessageBuilder | None = None
         self._before: Snapshot | None = None
-        self._sent = Sent()
+        self._sent = PublishedState()
 
     async def __aenter__(self) -> Self:
         """Take the screen."""
@@ -64,7 +64,7 @@ class ConsoleSink:
         """What a broker would get."""
         greeting: list[Message] = []
         if self._messages is None:
-            self._messages = Messages(BASE_TOPIC, snapshot.info.device)
+            self._messages = MessageBuilder(BASE_TOPIC, snapshot.info.device)
             greeting = self._messages.greeting()
         kept = self._messages.kept(self._before, snapshot)
         due, self._sent = self._messages.due(self._sent, snapshot, self._clock.monotonic())

@@ -1,19 +1,19 @@
 """A line for what is heard of a pack, where no screen is: a file or a pipe. Pure."""
 
-from bms_estimator.mqtt.topic_cache import Heard
-from bms_estimator.sinks.terminal.json_fields import Fields
+from bms_estimator.mqtt.topic_cache import DeviceMessage
+from bms_estimator.sinks.terminal.json_fields import JsonFields
 from bms_estimator.sinks.terminal.panels import band_text
 from bms_estimator.sinks.terminal.scene import ALARM
 
 
-def line(heard: Heard, true_soc: float | None = None) -> str | None:
+def line(heard: DeviceMessage, true_soc: float | None = None) -> str | None:
     """One line; None of what is worth none.
 
     Args:
         heard: A message of a pack.
         true_soc: SOC 0..1 of a simulated pack.
     """
-    fields = Fields(heard.payload)
+    fields = JsonFields(heard.payload)
     if heard.topic == "state" and fields:
         return _state(heard.device, fields, true_soc)
     if heard.topic == "health" and fields and not fields.flag("sensor_online"):
@@ -23,7 +23,7 @@ def line(heard: Heard, true_soc: float | None = None) -> str | None:
     return None
 
 
-def _state(device: str, e: Fields, true_soc: float | None) -> str:
+def _state(device: str, e: JsonFields, true_soc: float | None) -> str:
     def number(name: str, form: str, factor: float = 1.0) -> str:
         value = e.number(name)
         return "-" if value is None else f"{value * factor:{form}}"

@@ -12,16 +12,16 @@ from bleak import AdvertisementData, BleakScanner, BLEDevice
 from bleak.exc import BleakError
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.reading import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.sources.bluetooth.bms_sample import reading_of
-from bms_estimator.sources.line_source import Bringer, NothingComesError
+from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 SCAN_S = 15.0
 """A BMS advertises every few seconds at least; one that a phone is connected to does not [s]."""
 
 
-class BleBringer(Bringer):
+class BleBringer(LineProducer):
     """Asks a BMS. It stays connected: most take seconds to connect.
 
     Args:
@@ -72,11 +72,11 @@ class BleBringer(Bringer):
                     await asyncio.sleep(next_s - loop.time())
                     sample = await bms.async_update()
         except PermissionError:
-            raise NothingComesError("it wants a password; take that away in its app") from None
+            raise SourceUnavailableError("it wants a password; take that away in its app") from None
         except TimeoutError:
-            raise NothingComesError("no answer") from None
+            raise SourceUnavailableError("no answer") from None
         except FileNotFoundError:  # the socket of D-Bus
-            raise NothingComesError("no Bluetooth: are D-Bus and bluetoothd running?") from None
+            raise SourceUnavailableError("no Bluetooth: are D-Bus and bluetoothd running?") from None
         except (
             BleakError,
             EOFError,
@@ -85,7 +85,7 @@ class BleBringer(Bringer):
             LookupError,
             AssertionError,
         ) as error:  # bytes that nobody foresaw
-            raise NothingComesError(str(error) or type(error).__name__) from None
+            raise SourceUnavailableError(str(error) or type(error).__name__) from None
 
     def _line(self, sample: Mapping[str, object]) -> bytes | None:
         reading = reading_of(sample)
@@ -94,7 +94,7 @@ class BleBringer(Bringer):
             self._fault = "it answers, but tells no voltage or no current"
             return None
         self._fault = None
-        return report_line(
+        return sample_json_line(
             reading.voltage_v, reading.current_a, temperature_c=reading.temperature_c, cells_v=reading.cells_v
         )
 
@@ -114,9 +114,11 @@ class BleBringer(Bringer):
 
         device = await BleakScanner.find_device_by_filter(is_it, timeout=SCAN_S)
         if device is None:
-            raise NothingComesError("it does not advertise: is it near and on, and no phone connected to it?")
+            raise SourceUnavailableError("it does not advertise: is it near and on, and no phone connected to it?")
         told = self._settings.bms
         kind = await (bms_cls(f"{told.removesuffix('_bms')}_bms") if told else bms_identify(heard[0], device.address))
         if kind is None:
-            raise NothingComesError(f"{device.name or device.address}: no kind that aiobmsble knows; set source.bms")
+            raise SourceUnavailableError(
+                f"{device.name or device.address}: no kind that aiobmsble knows; set source.bms"
+            )
         return device, kind

@@ -5,13 +5,13 @@ import sys
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.line_source import Bringer
+from bms_estimator.sources.line_source import LineProducer
 
 NEEDED_PYTHON = 0x030C0000
 """3.12, as aiobmsble needs it."""
 
 
-def bringer(settings: Settings) -> Bringer:
+def bringer(settings: Settings) -> LineProducer:
     """What ``[source]`` asks for.
 
     Raises:

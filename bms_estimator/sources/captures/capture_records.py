@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.numba_cache import njit
-from bms_estimator.protocols.firmware.framing import Bytes, crc16, take
+from bms_estimator.protocols.firmware.framing import Bytes, crc16, read_unsigned
 
 ARRIVAL_BYTES = 8
 LENGTH_BYTES = 4
@@ -37,16 +37,16 @@ def split_records(
     while records < ends.size:
         if raw.size - position < RECORD_OVERHEAD_BYTES:
             return position, records, filled, 0
-        length = take(raw, position + ARRIVAL_BYTES, LENGTH_BYTES)
+        length = read_unsigned(raw, position + ARRIVAL_BYTES, LENGTH_BYTES)
         if length > longest:
             return position, records, filled, 1
         body = position + HEAD_BYTES
         end = body + length
         if raw.size - end < CRC_BYTES:
             return position, records, filled, 0
-        if crc16(raw, position, end) != take(raw, end, CRC_BYTES):
+        if crc16(raw, position, end) != read_unsigned(raw, end, CRC_BYTES):
             return position, records, filled, 1
-        arrival_bits[records] = take(raw, position, ARRIVAL_BYTES)
+        arrival_bits[records] = read_unsigned(raw, position, ARRIVAL_BYTES)
         payload[filled : filled + length] = raw[body:end]
         filled += length
         ends[records] = filled

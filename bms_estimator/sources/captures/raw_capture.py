@@ -35,7 +35,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.polled_source import ReportSource
+from bms_estimator.settings.polled_source import PolledSource
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES, split_records
 
@@ -75,7 +75,7 @@ class CaptureHeader:
 _VERSIONED, _HEADER = TypeAdapter(_Versioned), TypeAdapter(CaptureHeader)
 
 
-def header_of(sensor: SensorSettings, source: ReportSource | None = None) -> CaptureHeader:
+def header_of(sensor: SensorSettings, source: PolledSource | None = None) -> CaptureHeader:
     """What a capture of this board's line says of it, or of lines that another source has brought."""
     if source is not None:
         return CaptureHeader(sensor.protocol, source.described, 0, sensor.current_sign)

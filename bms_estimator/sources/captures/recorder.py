@@ -23,7 +23,7 @@ END_S = 5.0
 log = structlog.get_logger(__name__)
 
 
-class Recording:
+class CaptureRecorder:
     """A tap that writes a capture in a thread of its own; a context manager, whose end writes what waits.
 
     A disk that fails, or stays behind for too long, ends the recording and nothing else. What is in the file is whole.

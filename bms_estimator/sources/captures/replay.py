@@ -18,7 +18,7 @@ from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, sensor_of
-from bms_estimator.sources.captures.tables import READERS, ByName, Sign, samples_of, table_reader
+from bms_estimator.sources.captures.tables import READERS, ColumnTable, Sign, samples_of, table_reader
 
 TICK_S = 0.05
 """A paced replay hands over what has become due this often [s]."""
@@ -224,7 +224,7 @@ def open_capture(
     raise UserError(f"{path}: neither a raw capture nor a table; the name of a table ends in {', '.join(READERS)}")
 
 
-def load_capture(source: str | Path | ByName, *, current_sign: CurrentSign | None = None) -> Columns:
+def load_capture(source: str | Path | ColumnTable, *, current_sign: CurrentSign | None = None) -> Columns:
     """All samples of a capture in memory.
 
     Args:

@@ -24,7 +24,7 @@ SHOWN = 40
 """Of what is no number so many characters are told."""
 
 
-class Spelling(NamedTuple):
+class ColumnNaming(NamedTuple):
     """How a table calls the columns of ``SAMPLE``, and which sign its current has."""
 
     time_s: str
@@ -36,8 +36,8 @@ class Spelling(NamedTuple):
 
 
 SPELLINGS = (
-    Spelling("time_s", "current_a", "voltage_v", "temperature_c", None),
-    Spelling("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", "charge_positive"),
+    ColumnNaming("time_s", "current_a", "voltage_v", "temperature_c", None),
+    ColumnNaming("Test Time / s", "Current / A", "Voltage / V", "Surface Temperature / degC", "charge_positive"),
 )
 """Ours, and the Battery Data Format."""
 
@@ -50,12 +50,12 @@ class Sign(NamedTuple):
     otherwise: CurrentSign = "discharge_positive"
     """Where neither ``given`` nor the names of the columns tell."""
 
-    def of(self, spelling: Spelling) -> float:
+    def of(self, spelling: ColumnNaming) -> float:
         """Factor that makes discharge positive."""
         return 1.0 if (self.given or spelling.current_sign or self.otherwise) == "discharge_positive" else -1.0
 
 
-class ByName(Protocol):
+class ColumnTable(Protocol):
     """A table in memory, such as a dict of arrays or a DataFrame."""
 
     def __iter__(self) -> Iterator[str]:
@@ -226,7 +226,7 @@ def table_reader(path: Path, sign: Sign) -> CsvTable | ParquetTable | None:
     return next((reader(path, sign) for suffix, reader in READERS.items() if name.endswith(suffix)), None)
 
 
-def samples_of(table: ByName, sign: Sign) -> SampleBlock:
+def samples_of(table: ColumnTable, sign: Sign) -> SampleBlock:
     """The samples of a table in memory.
 
     Raises:
@@ -281,7 +281,7 @@ def _columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
     return _Columns(tuple(header.index(name) for name in names), names, sign.of(spelling))
 
 
-def _wanted(spelling: Spelling) -> str:
+def _wanted(spelling: ColumnNaming) -> str:
     return f"{','.join(spelling[:3])}[,{spelling.temperature_c}]"
 
 

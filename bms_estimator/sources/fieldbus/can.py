@@ -11,11 +11,11 @@ from typing import Any
 import can
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.reading import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.fieldbus.can_signals import CanMap
-from bms_estimator.sources.line_source import Bringer, NothingComesError
+from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 LISTEN_S = 0.2
 """So often the thread looks whether it is to end [s]."""
@@ -27,7 +27,7 @@ BUS_OFF = 0x40
 Deliver = Callable[[bytes | Exception], None]
 
 
-class CanBringer(Bringer):
+class CanBringer(LineProducer):
     """Listens to a bus in a thread of its own: most adapters can only be waited for.
 
     Args:
@@ -117,7 +117,7 @@ class CanBringer(Bringer):
                 **further,
             )
         except Exception as error:  # each interface raises what its library does
-            raise NothingComesError(f"cannot be opened: {error}") from error
+            raise SourceUnavailableError(f"cannot be opened: {error}") from error
 
     def _next(self, bus: can.BusABC) -> can.Message | None:
         """The next frame, if one comes soon.
@@ -131,7 +131,7 @@ class CanBringer(Bringer):
             self._junk += 1
             return None
         except Exception as error:  # as of _open
-            raise NothingComesError(f"lost: {error}") from error
+            raise SourceUnavailableError(f"lost: {error}") from error
 
     def _take(self, message: can.Message | None, deliver: Deliver) -> None:
         if message is None or message.is_remote_frame:
@@ -148,7 +148,7 @@ class CanBringer(Bringer):
         """What is whole with this frame."""
         data = bytes(message.data)
         reading = self._map.feed(time.monotonic(), message.arbitration_id, message.is_extended_id, data)
-        return reading and report_line(
+        return reading and sample_json_line(
             reading.voltage_v, reading.current_a, temperature_c=reading.temperature_c, cells_v=reading.cells_v
         )
 

@@ -25,7 +25,7 @@ SHOWN = 20
 """So many names of a DBC file are shown."""
 
 
-class Place(NamedTuple):
+class FrameId(NamedTuple):
     """Which frame holds a value."""
 
     id: int
@@ -91,7 +91,7 @@ class CanMap:
     """
 
     def __init__(self, settings: CanSource) -> None:
-        self._frames: dict[Place, _Frame] = {}
+        self._frames: dict[FrameId, _Frame] = {}
         database = _load(settings.dbc) if settings.dbc is not None else None
         for key, signal in _signals(settings):
             self._want(key, signal, database)
@@ -107,7 +107,7 @@ class CanMap:
         return {"short_frames": self._short, "not_measured": self._absent}
 
     @property
-    def places(self) -> Sequence[Place]:
+    def places(self) -> Sequence[FrameId]:
         """The frames that are looked at."""
         return tuple(self._frames)
 
@@ -131,7 +131,7 @@ class CanMap:
             extended: Whether it has 29 bits.
             data: What the frame holds.
         """
-        frame = self._frames.get(Place(identifier, extended))
+        frame = self._frames.get(FrameId(identifier, extended))
         if frame is None:
             return None
         values = dict(frame.values(data))
@@ -155,10 +155,10 @@ class CanMap:
             UserError: The DBC file does not know it, or knows several.
         """
         if signal.id is not None:
-            self._frames.setdefault(Place(signal.id, signal.extended), _Frame()).signals.append((key, signal))
+            self._frames.setdefault(FrameId(signal.id, signal.extended), _Frame()).signals.append((key, signal))
         elif signal.signal is not None and database is not None:
             message = _message(key[0], signal.signal, database)
-            frame = self._frames.setdefault(Place(message.frame_id, message.is_extended_frame), _Frame())
+            frame = self._frames.setdefault(FrameId(message.frame_id, message.is_extended_frame), _Frame())
             frame.message = message
             frame.signals.append((key, signal))
 

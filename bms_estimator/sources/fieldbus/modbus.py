@@ -10,11 +10,11 @@ from pymodbus import FramerType
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
-from bms_estimator.protocols.base.reading import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.fieldbus.modbus_registers import Request, Table, plan, reading_of, split, values_of
-from bms_estimator.sources.line_source import Bringer, NothingComesError
+from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 Client = AsyncModbusSerialClient | AsyncModbusTcpClient
 
@@ -43,7 +43,7 @@ class _RefusedError(Exception):
         self.code = code
 
 
-class ModbusBringer(Bringer):
+class ModbusBringer(LineProducer):
     """Asks a device for its registers.
 
     Quantities that a device refuses are found by asking for each by itself: without voltage or current nothing comes;
@@ -100,9 +100,9 @@ class ModbusBringer(Bringer):
         what = "no connection" if self._settings.port is None else "the port cannot be opened"
         try:
             if not await client.connect():
-                raise NothingComesError(what)
+                raise SourceUnavailableError(what)
         except (ValueError, termios.error) as error:  # pyserial, of a baud rate or a device that is no serial port
-            raise NothingComesError(f"{what}: {error}") from None
+            raise SourceUnavailableError(f"{what}: {error}") from None
 
     def _line(self, words: Mapping[tuple[Table, int], int]) -> bytes | None:
         """What the registers say; None where it is not voltage and current."""
@@ -112,7 +112,7 @@ class ModbusBringer(Bringer):
             self._fault = "it answers, but measures no voltage or no current (absent, or not a number)"
             return None
         self._fault = None
-        return report_line(
+        return sample_json_line(
             reading.voltage_v, reading.current_a, temperature_c=reading.temperature_c, cells_v=reading.cells_v
         )
 
@@ -150,7 +150,7 @@ class ModbusBringer(Bringer):
             if not any(value.needed for value in request.values):
                 self._leave_out(request, error)
                 return ()
-        raise NothingComesError(f"{request.described}: {error}")
+        raise SourceUnavailableError(f"{request.described}: {error}")
 
     def _leave_out(self, request: Request, error: _RefusedError) -> None:
         """Say so once."""
@@ -165,11 +165,11 @@ class ModbusBringer(Bringer):
             answer = await read(request.address, count=request.words, device_id=self._settings.unit)
         except ModbusException:
             timeout_s = self._settings.timeout_s
-            raise NothingComesError(f"no answer within {timeout_s:g} s, asked for {request.described}") from None
+            raise SourceUnavailableError(f"no answer within {timeout_s:g} s, asked for {request.described}") from None
         if answer.isError():
             raise _RefusedError(answer.exception_code)
         if len(answer.registers) != request.words:
-            raise NothingComesError(f"{len(answer.registers)} registers came, asked for {request.described}")
+            raise SourceUnavailableError(f"{len(answer.registers)} registers came, asked for {request.described}")
         return answer.registers
 
 

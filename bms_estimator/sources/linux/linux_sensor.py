@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from bms_estimator.process.disk_thread import DiskThread
-from bms_estimator.protocols.base.reading import CONNECTED, report_line
+from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.linux_source import LinuxSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.line_source import SILENT_PERIODS, Bringer, NothingComesError
+from bms_estimator.sources.line_source import SILENT_PERIODS, LineProducer, SourceUnavailableError
 from bms_estimator.sources.linux.sysfs import SYS, Channel, JunkError, find_channel, find_chip, read_number
 
 LEAST_INTERVAL_S = 0.1
@@ -34,7 +34,7 @@ class _Chip(NamedTuple):
     interval_s: float
 
 
-class LinuxSensor(Bringer):
+class LinuxSensor(LineProducer):
     """Polls the files of a chip.
 
     Args:
@@ -90,7 +90,7 @@ class LinuxSensor(Bringer):
         future = asyncio.get_running_loop().run_in_executor(self._thread, call)
         try:
             await self._wait(future)
-        except NothingComesError:
+        except SourceUnavailableError:
             future.add_done_callback(lambda late: late.exception())  # nobody asks for it any more
             self._left = future
             raise
@@ -100,7 +100,7 @@ class LinuxSensor(Bringer):
         """Raises: NothingComesError: The bus hangs."""
         done, _ = await asyncio.wait({future}, timeout=self._hung_s)
         if not done:
-            raise NothingComesError(f"the bus has not answered for {self._hung_s:g} s")
+            raise SourceUnavailableError(f"the bus has not answered for {self._hung_s:g} s")
 
     def _find(self) -> _Chip:
         """In the thread."""
@@ -119,7 +119,7 @@ class LinuxSensor(Bringer):
         shunt_ohm = self._settings.shunt_ohm
         if current.kind == "in":
             if shunt_ohm is None:
-                raise NothingComesError(f"{current.path}: a voltage; tell by source.shunt_ohm over which shunt")
+                raise SourceUnavailableError(f"{current.path}: a voltage; tell by source.shunt_ohm over which shunt")
             return 1.0 / shunt_ohm
         if shunt_ohm is None:
             return 1.0
@@ -127,7 +127,7 @@ class LinuxSensor(Bringer):
         try:
             return 1e-6 * read_number(taken) / shunt_ohm
         except (OSError, JunkError) as error:
-            raise NothingComesError(
+            raise SourceUnavailableError(
                 f"{taken}: {_why(error)}: nobody knows which shunt the driver takes; tell the ratio by "
                 "source.current_scale, without source.shunt_ohm"
             ) from None
@@ -143,7 +143,9 @@ class LinuxSensor(Bringer):
         except (OSError, JunkError):
             return self._settings.period_s
         if own_s > SILENT_PERIODS * self._settings.period_s:
-            raise NothingComesError(f"the chip measures each {own_s:g} s only; say so by source.interval_s = {own_s:g}")
+            raise SourceUnavailableError(
+                f"the chip measures each {own_s:g} s only; say so by source.interval_s = {own_s:g}"
+            )
         return max(own_s, LEAST_INTERVAL_S)
 
     def _sample(self, chip: _Chip) -> bytes:
@@ -157,7 +159,7 @@ class LinuxSensor(Bringer):
         temperature_c = self._value(chip.temperature) if chip.temperature else None
         if voltage is None or current is None:
             return b""
-        return report_line(
+        return sample_json_line(
             told.voltage_scale * voltage + told.voltage_offset_v,
             chip.amperes * current + told.current_offset_a,
             temperature_c=temperature_c,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bms_estimator.model.decimal_text import number
-from bms_estimator.sources.line_source import NothingComesError
+from bms_estimator.sources.line_source import SourceUnavailableError
 
 SYS = Path("/sys")
 LONGEST_BYTES = 4096
@@ -75,16 +75,16 @@ def find_chip(chip: str, root: Path = SYS) -> Path:
     """
     if chip.startswith("/"):
         if not Path(chip).is_dir():
-            raise NothingComesError(f"{chip}: no such folder; is the driver loaded?")
+            raise SourceUnavailableError(f"{chip}: no such folder; is the driver loaded?")
         return Path(chip)
     chips = list(_chips(root))
     found = [path for path, name in chips if chip == name or chip in path.resolve().parts]
     if len(found) > 1:
         places = ", ".join(map(_place, found))
-        raise NothingComesError(f"{chip}: there are {len(found)} ({places}); name one by its place on the bus")
+        raise SourceUnavailableError(f"{chip}: there are {len(found)} ({places}); name one by its place on the bus")
     if not found:
         there = ", ".join(sorted({name for _, name in chips})) or "none at all"
-        raise NothingComesError(f"{chip}: no such chip in hwmon or iio; there: {there}. Is its driver loaded?")
+        raise SourceUnavailableError(f"{chip}: no such chip in hwmon or iio; there: {there}. Is its driver loaded?")
     return found[0]
 
 
@@ -103,9 +103,11 @@ def find_channel(name: str, chip: str, root: Path = SYS) -> Channel:
     channel = Channel(find_chip(folder or chip, root) / file)
     needed = _beside(channel.path, "raw") if _is_iio(channel.path) else channel.path
     if not needed.exists():
-        raise NothingComesError(f"{needed}: no such file; the chip has {', '.join(_readable(needed.parent)) or 'none'}")
+        raise SourceUnavailableError(
+            f"{needed}: no such file; the chip has {', '.join(_readable(needed.parent)) or 'none'}"
+        )
     if not channel.kind:
-        raise NothingComesError(f"{channel.path}: neither a voltage, a current nor a temperature")
+        raise SourceUnavailableError(f"{channel.path}: neither a voltage, a current nor a temperature")
     return channel
 
 

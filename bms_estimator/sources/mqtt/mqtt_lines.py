@@ -11,15 +11,15 @@ import structlog
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import Connect, Connection, Hello, LinkError, Received
+from bms_estimator.mqtt.connection import BrokerConnectionError, Connect, Connection, ConnectOptions, ReceivedMessage
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.protocol_negotiation import Dial
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.line_source import Bringer, NothingComesError
-from bms_estimator.sources.mqtt.sample_assembler import Assembly
+from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
+from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 
 MOST_WAITING = 2000
 """Messages that wait to be read: a broker hands out at once all that it has kept of a wildcard."""
@@ -29,7 +29,7 @@ MOST_BYTES = 65_536
 log = structlog.get_logger(__name__)
 
 
-class MqttReports(Bringer):
+class MqttReports(LineProducer):
     """Subscribes, asks where the publisher has to be asked, and puts samples together.
 
     Args:
@@ -52,13 +52,13 @@ class MqttReports(Bringer):
     ) -> None:
         check(mqtt)
         self._settings, self._monotonic = settings, monotonic
-        self._assembly = Assembly(settings)
+        self._assembly = SampleAssembler(settings)
         found = brokers(mqtt)
         self._broker, self._brokers = found[0], itertools.cycle(found)
-        self._connect = connect or Dial(mqtt)
+        self._connect = connect or BrokerConnector(mqtt)
         self._conflicting = False
         self._lost: Counter[str] = Counter({"too_long": 0, "overflow": 0})
-        self._hello = Hello(f"bms-source-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
+        self._hello = ConnectOptions(f"bms-source-{secrets.token_hex(4)}", None, self._lose, MOST_WAITING, MOST_BYTES)
 
     @property
     def name(self) -> str:
@@ -85,16 +85,16 @@ class MqttReports(Bringer):
         try:
             async with self._connect(self._broker, self._hello) as connection:
                 for topic, why in (await connection.subscribe(None, self._assembly.topics)).items():
-                    raise NothingComesError(f"not allowed to read {topic}: {why}")
+                    raise SourceUnavailableError(f"not allowed to read {topic}: {why}")
                 yield CONNECTED
                 async for line in self._lines(connection):
                     yield line
-        except LinkError as error:
-            raise NothingComesError(str(error)) from None
+        except BrokerConnectionError as error:
+            raise SourceUnavailableError(str(error)) from None
 
     async def _lines(self, connection: Connection) -> AsyncGenerator[bytes, None]:
-        """Raises ``LinkError`` when the connection is lost."""
-        receiving: asyncio.Future[Received] | None = None
+        """Raises ``BrokerConnectionError`` when the connection is lost."""
+        receiving: asyncio.Future[ReceivedMessage] | None = None
         asked_s = -float("inf")
         try:
             while True:
@@ -126,7 +126,7 @@ class MqttReports(Bringer):
             message = Message(self._settings.filled(topic), payload.encode(), 0, retain=False)
             refusal = await connection.publish(message)
             if refusal is not None:
-                raise NothingComesError(f"not allowed to write {message.topic}: {refusal.why}")
+                raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.why}")
 
     def _log_conflict(self) -> None:
         """Log the first message of a second publisher, and its end."""

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from bms_estimator.model.decimal_text import number
-from bms_estimator.settings.mqtt_source import Place
+from bms_estimator.settings.mqtt_source import ValueLocation
 
 SHOWN = 40
 """So much of what is no number is shown."""
@@ -17,14 +17,14 @@ MOST_CELLS = 400
 CELL = re.compile(r"\{cell\}")
 
 
-class NoNumberError(Exception):
+class InvalidValueError(Exception):
     """A payload does not tell the quantity; the message says what it tells."""
 
     kind = "no_number"
     """Under which it is counted."""
 
 
-class MissingError(NoNumberError):
+class MissingError(InvalidValueError):
     """It is JSON, but has not what the path leads to."""
 
     kind = "missing"
@@ -35,7 +35,7 @@ def cell_pattern(text: str) -> re.Pattern[str]:
     return re.compile(r"0*([0-9]{1,3})".join(map(re.escape, CELL.split(text))))
 
 
-def one(payload: bytes, place: Place, path: str) -> float:
+def read_value(payload: bytes, place: ValueLocation, path: str) -> float:
     """The quantity [SI].
 
     Raises:
@@ -44,7 +44,7 @@ def one(payload: bytes, place: Place, path: str) -> float:
     return _si(_found(_parsed(payload, path), path), place)
 
 
-def many(payload: bytes, place: Place, path: str) -> dict[int, float]:
+def read_cells(payload: bytes, place: ValueLocation, path: str) -> dict[int, float]:
     """Cells by their numbers from 1: of a list, or of what ``{cell}`` in the path stands for. A cell that has no number is NaN.
 
     Raises:
@@ -55,10 +55,10 @@ def many(payload: bytes, place: Place, path: str) -> dict[int, float]:
     for cell, value in found.items():
         try:
             cells[cell] = _si(value, place)
-        except NoNumberError:
+        except InvalidValueError:
             cells[cell] = math.nan
     if all(map(math.isnan, cells.values())):
-        raise NoNumberError(f"{path or 'payload'}: no cells in {_shown(payload.decode('utf-8', 'replace'))}")
+        raise InvalidValueError(f"{path or 'payload'}: no cells in {_shown(payload.decode('utf-8', 'replace'))}")
     return cells
 
 
@@ -67,7 +67,7 @@ def _cells(value: Any, path: str) -> Iterator[tuple[int, Any]]:
     if not cell:
         listed = _found(value, path)
         if not isinstance(listed, list):
-            raise NoNumberError(f"{path or 'payload'}: no list of cells: {_shown(listed)}")
+            raise InvalidValueError(f"{path or 'payload'}: no list of cells: {_shown(listed)}")
         yield from enumerate(listed[:MOST_CELLS], start=1)
         return
     *above, begin = before.split(".")
@@ -87,7 +87,7 @@ def _parsed(payload: bytes, path: str) -> Any:
         return json.loads(text, parse_constant=str) if path else text
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are one
         what = "no JSON" if path else "no text"
-        raise NoNumberError(f"{what}: {_shown(payload.decode('utf-8', 'replace'))}") from None
+        raise InvalidValueError(f"{what}: {_shown(payload.decode('utf-8', 'replace'))}") from None
 
 
 def _found(value: Any, path: str) -> Any:
@@ -106,18 +106,18 @@ def _found(value: Any, path: str) -> Any:
     return value
 
 
-def _si(value: Any, place: Place) -> float:
+def _si(value: Any, place: ValueLocation) -> float:
     if place.unit == "iso":
         return _epoch_s(value)
     try:
         found = number(value) if isinstance(value, str) else value
         if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
-            raise NoNumberError(f"no number: {_shown(value)}")
+            raise InvalidValueError(f"no number: {_shown(value)}")
         made = place.si(float(found))
     except (ValueError, OverflowError):
-        raise NoNumberError(f"no number: {_shown(value)}") from None
+        raise InvalidValueError(f"no number: {_shown(value)}") from None
     if not math.isfinite(made):
-        raise NoNumberError(f"no number: {_shown(value)}")
+        raise InvalidValueError(f"no number: {_shown(value)}")
     return made
 
 
@@ -127,7 +127,7 @@ def _epoch_s(value: Any) -> float:
         moment = datetime.fromisoformat(value)
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
     except (ValueError, TypeError, OverflowError):
-        raise NoNumberError(f"no time: {_shown(value)}") from None
+        raise InvalidValueError(f"no time: {_shown(value)}") from None
 
 
 def _shown(value: Any) -> str:

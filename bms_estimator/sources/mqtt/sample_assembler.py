@@ -5,33 +5,33 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from bms_estimator.protocols.base.reading import report_line
-from bms_estimator.settings.mqtt_source import MqttSource, Place
-from bms_estimator.sources.mqtt.payload_value import MOST_CELLS, NoNumberError, cell_pattern, many, one
+from bms_estimator.protocols.base.reading import sample_json_line
+from bms_estimator.settings.mqtt_source import MqttSource, ValueLocation
+from bms_estimator.sources.mqtt.payload_value import MOST_CELLS, InvalidValueError, cell_pattern, read_cells, read_value
 from bms_estimator.sources.mqtt.publisher_conflict import MIN_JUMPS, PublisherConflict
 
 NEEDED = ("voltage", "current")
 
 
-class _Way(NamedTuple):
+class _TopicBinding(NamedTuple):
     """A topic on which a quantity comes."""
 
     quantity: str
-    place: Place
+    place: ValueLocation
     path: str
     topic: str
     pattern: re.Pattern[str]
     """Of the topic; with a group where it holds the number of a cell."""
 
 
-class _Told(NamedTuple):
+class _TimestampedValue(NamedTuple):
     """A value, and when it came [s]."""
 
     value: float
     at_s: float
 
 
-class Assembly:
+class SampleAssembler:
     """Takes messages, gives lines.
 
     A sample is complete when voltage and current have come again, or one of them has and the other has not within
@@ -42,14 +42,14 @@ class Assembly:
     def __init__(self, settings: MqttSource) -> None:
         self._settings = settings
         self._ways = [
-            _Way(quantity, place, settings.filled(place.path), topic, cell_pattern(topic))
+            _TopicBinding(quantity, place, settings.filled(place.path), topic, cell_pattern(topic))
             for quantity, place in settings.places()
             for topic in settings.topics(place)
         ]
         self._availability = settings.filled(settings.availability_topic or "")
         self._offline = ""  # what the publisher, or its will, said of it
-        self._told: dict[str, _Told] = {}
-        self._cells: dict[int, _Told] = {}
+        self._told: dict[str, _TimestampedValue] = {}
+        self._cells: dict[int, _TimestampedValue] = {}
         self._faults: dict[str, str] = {}  # of each quantity what was wrong last
         self._new: dict[str, float] = {}  # of voltage and current those that have come since the last sample, and when
         self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
@@ -120,7 +120,7 @@ class Assembly:
             cell = int(match[1]) if match.re.groups else None
             try:
                 self._put(way, payload, cell, now_s)
-            except NoNumberError as error:
+            except InvalidValueError as error:
                 self._drop(way.quantity, cell)
                 self._counters[error.kind] += 1
                 self._faults[way.quantity] = f"{way.quantity}: {topic}: {error}"
@@ -138,7 +138,7 @@ class Assembly:
         if voltage_v is None or current_a is None:
             self._miss("current" if current_a is None else "voltage")
             return b""
-        return report_line(
+        return sample_json_line(
             voltage_v,
             current_a,
             temperature_c=self._value("temperature", now_s, self._settings.slow_max_age_s),
@@ -146,20 +146,22 @@ class Assembly:
             time_s=self._value("time", now_s, self._settings.settle_s),
         )
 
-    def _put(self, way: _Way, payload: bytes, cell: int | None, now_s: float) -> None:
+    def _put(self, way: _TopicBinding, payload: bytes, cell: int | None, now_s: float) -> None:
         """Keep what a payload tells.
 
         Raises:
             NoNumberError: Nothing.
         """
         if way.quantity != "cells":
-            self._told[way.quantity] = _Told(one(payload, way.place, way.path), now_s)
+            self._told[way.quantity] = _TimestampedValue(read_value(payload, way.place, way.path), now_s)
             if way.quantity in NEEDED:
                 self._new.setdefault(way.quantity, now_s)
         elif cell is None:
-            self._cells |= {number: _Told(v, now_s) for number, v in many(payload, way.place, way.path).items()}
+            self._cells |= {
+                number: _TimestampedValue(v, now_s) for number, v in read_cells(payload, way.place, way.path).items()
+            }
         elif 1 <= cell <= MOST_CELLS:
-            self._cells[cell] = _Told(one(payload, way.place, way.path), now_s)
+            self._cells[cell] = _TimestampedValue(read_value(payload, way.place, way.path), now_s)
 
     def _drop(self, quantity: str, cell: int | None) -> None:
         """Forget a quantity that is no longer measured; ``cell`` None: all cells."""
@@ -170,7 +172,7 @@ class Assembly:
             for each in gone:
                 self._cells.pop(each, None)
 
-    def _has_conflict(self, way: _Way, now_s: float) -> bool:
+    def _has_conflict(self, way: _TopicBinding, now_s: float) -> bool:
         """Return whether two publishers write the value that has just come on this topic."""
         key = way.quantity, way.topic
         detector = self._detectors.get(key)

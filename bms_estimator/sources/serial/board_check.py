@@ -10,11 +10,11 @@ from threading import Thread
 
 import structlog
 
-from bms_estimator.protocols.base.device_protocol import Dialect
-from bms_estimator.sources.serial.known_board_file import NO_BOARD, REMEMBERED, BoardMemory
-from bms_estimator.sources.source import Read
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, REMEMBERED, KnownBoardFile
+from bms_estimator.sources.source import Chunk
 
-HELD_READS = 4096
+MAX_PENDING_READS = 4096
 """So many reads are kept for a board that has not told its serial number yet: seconds at any rate."""
 
 RETRY_S = 60.0
@@ -27,7 +27,7 @@ class OtherBoardError(Exception):
     """The board's serial number is not that of the pack's."""
 
 
-class Doorkeeper:
+class BoardCheck:
     """Lets the reads of one board pass; those of a port opened anew wait until its serial number is known.
 
     Args:
@@ -36,15 +36,17 @@ class Doorkeeper:
         memory: What outlives a restart; None: nothing does.
     """
 
-    def __init__(self, make: Callable[[], Dialect], serial: str = "", memory: BoardMemory | None = None) -> None:
+    def __init__(
+        self, make: Callable[[], DeviceProtocol], serial: str = "", memory: KnownBoardFile | None = None
+    ) -> None:
         self._make, self._told, self._memory = make, serial, memory
         self._known: Mapping[str, str] = memory.load() if memory else {}
         self._kept = self._known  # on disk
         self._nameless = self._looking = self._keeping = self._failed = self._refused = False
         self._tried_s = -math.inf
-        self.stranger: Dialect | None = None
+        self.stranger: DeviceProtocol | None = None
         """What hears a board that is not known yet."""
-        self._held = deque[Read]()
+        self._held = deque[Chunk]()
         self.unadmitted_bytes = 0
         """Of boards that were refused, of ports lost before their board was known, and of reads that found no room."""
 
@@ -66,7 +68,7 @@ class Doorkeeper:
             self._looking = True
             Thread(target=self._look, args=(self._memory,), daemon=True).start()
 
-    def _look(self, memory: BoardMemory) -> None:
+    def _look(self, memory: KnownBoardFile) -> None:
         """In a thread of its own: a disk that hangs holds up nothing."""
         try:
             if memory.load() == NO_BOARD:
@@ -74,7 +76,7 @@ class Doorkeeper:
         finally:
             self._looking = False
 
-    def admit(self, read: Read, dialect: Dialect) -> Sequence[Read]:
+    def admit(self, read: Chunk, dialect: DeviceProtocol) -> Sequence[Chunk]:
         """The reads that ``dialect``, which hears the pack's board, may be fed now.
 
         Raises:
@@ -87,7 +89,7 @@ class Doorkeeper:
             if self.serial and (swapped := dialect.serial_in(read[1])) is not None:
                 self._check(swapped, (read,))
             return (read,)
-        if len(self._held) == HELD_READS:
+        if len(self._held) == MAX_PENDING_READS:
             self._drop((self._held.popleft(),))
         self._held.append(read)
         self.stranger.feed(*read)
@@ -134,7 +136,7 @@ class Doorkeeper:
         self._keeping, self._tried_s = True, now_s
         Thread(target=self._keep, args=(self._memory, self._known), daemon=True).start()
 
-    def _keep(self, memory: BoardMemory, board: Mapping[str, str]) -> None:
+    def _keep(self, memory: KnownBoardFile, board: Mapping[str, str]) -> None:
         """In a thread of its own."""
         try:
             if board != self._kept or memory.is_gone():
@@ -147,10 +149,10 @@ class Doorkeeper:
         finally:
             self._keeping = False
 
-    def _drop(self, reads: Iterable[Read]) -> None:
+    def _drop(self, reads: Iterable[Chunk]) -> None:
         self.unadmitted_bytes += sum(len(data) for _, data in reads)
 
-    def _check(self, found: str, reads: Sequence[Read]) -> None:
+    def _check(self, found: str, reads: Sequence[Chunk]) -> None:
         """Let the board that has sent ``reads`` in.
 
         Raises:

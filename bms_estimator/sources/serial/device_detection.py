@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self, TypeVar
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices.text import TextDialect
 from bms_estimator.protocols.firmware.frame_decoder import FrameFault
 from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command
@@ -19,11 +19,11 @@ from bms_estimator.sources.serial.port_list import NoPortError, open_port
 if TYPE_CHECKING:
     import serial
 
-PATIENCE_S = 3.0
+BOOT_TIMEOUT_S = 3.0
 """A board that was reset by the opening of its port spends two seconds in its boot loader [s]."""
-EACH_S = 1.5
+PROTOCOL_TIMEOUT_S = 1.5
 """So much longer takes a baud rate for each protocol that is tried at it, in turns with the others [s]."""
-TURN_S = 0.3
+QUERY_INTERVAL_S = 0.3
 """For an answer before another protocol's question goes out [s]."""
 READ_S = 0.1
 """A read waits so long [s]."""
@@ -39,7 +39,7 @@ Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True)
-class Found:
+class DetectedDevice:
     """Who answers on a port."""
 
     protocol: str
@@ -55,7 +55,7 @@ class Found:
         return self.described if usual else f"{self.described}; protocol {self.protocol}, {self.baud} baud"
 
 
-def probe(port: str, baud: int | None = None) -> Found | str:
+def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
     """Who is on ``port``, or for people why nobody is known to be.
 
     A board of the firmware is looked for first. Then every protocol that ``sensor.protocol`` knows is tried at its own baud
@@ -74,9 +74,9 @@ def probe(port: str, baud: int | None = None) -> Found | str:
                 line.baudrate = rate
                 line.reset_input_buffer()
                 dialects = {name: _prober(name) for name in protocols}
-                patience_s = PATIENCE_S if rate == BAUD and baud is None else EACH_S * len(dialects)
+                patience_s = BOOT_TIMEOUT_S if rate == BAUD and baud is None else PROTOCOL_TIMEOUT_S * len(dialects)
                 if (found := _ask_in_turns(line, dialects, patience_s)) is not None:
-                    return Found(found, rate, *_described(dialects[found]))
+                    return DetectedDevice(found, rate, *_described(dialects[found]))
                 if silence == "silent":
                     silence = _silence(list(dialects.values()))
     except NoPortError as error:
@@ -97,13 +97,13 @@ def _rates() -> Mapping[int, Sequence[str]]:
     return {rate: rates[rate] for rate in sorted(rates, key=lambda rate: (rate != BAUD, -rate))}
 
 
-def _prober(protocol: str) -> Dialect:
+def _prober(protocol: str) -> DeviceProtocol:
     dialect = DIALECTS[protocol](SensorSettings.model_validate({"protocol": protocol}))
     dialect.probing = True
     return dialect
 
 
-def _ask_in_turns(line: "serial.Serial", dialects: Mapping[str, Dialect], patience_s: float) -> str | None:
+def _ask_in_turns(line: "serial.Serial", dialects: Mapping[str, DeviceProtocol], patience_s: float) -> str | None:
     """Have all hear, and one of them ask at a time. Returns the protocol of the first that knows who is there.
 
     Raises:
@@ -116,7 +116,7 @@ def _ask_in_turns(line: "serial.Serial", dialects: Mapping[str, Dialect], patien
             questions = (dialect.due(now_s) for dialect in itertools.islice(turns, len(dialects)))
             if question := next(filter(None, questions), b""):
                 line.write(question)
-                next_s = now_s + TURN_S
+                next_s = now_s + QUERY_INTERVAL_S
         data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
         for name, dialect in dialects.items():
             dialect.feed(now_s, data)
@@ -125,12 +125,12 @@ def _ask_in_turns(line: "serial.Serial", dialects: Mapping[str, Dialect], patien
     return None
 
 
-def _described(dialect: Dialect) -> tuple[str, int | None]:
+def _described(dialect: DeviceProtocol) -> tuple[str, int | None]:
     """What it is, and its cells."""
     return dialect.described or "", dialect.cells.shape[1] or None
 
 
-class AskedBoard:
+class BoardClient:
     """A board that does nothing but answer; a context manager.
 
     Args:
@@ -191,7 +191,7 @@ class AskedBoard:
         return self._ask([now], measured, REFERENCE_S)
 
     def _ask(
-        self, dialects: Sequence[Dialect], answer: Callable[[], Answer | None], patience_s: float | None = None
+        self, dialects: Sequence[DeviceProtocol], answer: Callable[[], Answer | None], patience_s: float | None = None
     ) -> Answer:
         """The answer.
 
@@ -215,7 +215,7 @@ class AskedBoard:
 
 def _converse(
     line: "serial.Serial",
-    dialects: Sequence[Dialect],
+    dialects: Sequence[DeviceProtocol],
     answer: Callable[[], Answer | None],
     patience_s: float | None = None,
 ) -> Answer | None:
@@ -224,7 +224,7 @@ def _converse(
     Raises:
         OSError: The port is lost.
     """
-    end_s = time.monotonic() + (PATIENCE_S if patience_s is None else patience_s)
+    end_s = time.monotonic() + (BOOT_TIMEOUT_S if patience_s is None else patience_s)
     while (now_s := time.monotonic()) < end_s:
         if (answered := answer()) is not None:
             return answered
@@ -236,7 +236,7 @@ def _converse(
     return answer()
 
 
-def _silence(dialects: Sequence[Dialect]) -> str:
+def _silence(dialects: Sequence[DeviceProtocol]) -> str:
     """Why none of them knows who is there."""
     if not dialects[0].counters["bytes_received"]:
         return "silent"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import structlog
 
-from bms_estimator.process.private_file import NotOursError, read_private, write_private
+from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 
 REMEMBERED = ("serial", "divider", "volts_per_ampere", "bandgap_v")
 """Of what a board says of itself."""
@@ -20,7 +20,7 @@ LONGEST_FILE = 4096
 log = structlog.get_logger(__name__)
 
 
-class BoardMemory:
+class KnownBoardFile:
     """``<pack.name>.board.json`` in the state folder, for its owner alone.
 
     A file of its own, not the checkpoint: that one is kept for each meaning of the state and begins anew with another
@@ -45,7 +45,7 @@ class BoardMemory:
             return _checked(json.loads(read_private(self.path, LONGEST_FILE)))
         except FileNotFoundError:
             return {}
-        except (OSError, NotOursError, ValueError, RecursionError) as error:
+        except (OSError, UnsafeFileError, ValueError, RecursionError) as error:
             log.warning("the board of the last run is not known", file=str(self.path), reason=str(error))
             return {}
 

@@ -7,13 +7,13 @@ from collections.abc import Callable
 
 from bms_estimator.sources.serial.port_list import NoPortError, board_ports, resolve_port
 
-LEFT_S = 60.0
+WRONG_PORT_RETRY_S = 60.0
 """A port with another board is not opened again for so long while there are others: opening may reset who is there [s]."""
-HELD_S = 1.0
+BUSY_PORT_RETRY_S = 1.0
 """One that cannot be opened is tried again after so long: who held it may have looked for a board, too [s]."""
 
 
-class Whereabouts:
+class PortDiscovery:
     """Which port is tried next.
 
     Args:

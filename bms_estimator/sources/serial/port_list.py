@@ -38,7 +38,7 @@ class NoPortError(Exception):
     """The board's port cannot be told or opened; the message is the port and why. It may come yet."""
 
 
-class HeldPortError(NoPortError):
+class PortBusyError(NoPortError):
     """Somebody has the port at ``path`` open.
 
     Its text names who: that is looked for in all processes, milliseconds long, whenever the text is asked for.
@@ -110,7 +110,7 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
         return serial.Serial(path, baud, timeout=timeout_s, write_timeout=WRITE_S, exclusive=True)
     except (OSError, termios.error, ValueError, OverflowError) as error:  # a port may die while it is opened
         if isinstance(error, OSError) and error.errno in (errno.EBUSY, errno.EAGAIN):
-            raise HeldPortError(path) from None
+            raise PortBusyError(path) from None
         raise NoPortError(f"{path}: cannot be opened: {error}") from None
 
 

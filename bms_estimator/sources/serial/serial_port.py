@@ -13,8 +13,8 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.process.backoff import FIRST_RETRY_S, LONGEST_RETRY_S
-from bms_estimator.sources.serial.port_list import HeldPortError, NoPortError
-from bms_estimator.sources.source import Read
+from bms_estimator.sources.serial.port_list import NoPortError, PortBusyError
+from bms_estimator.sources.source import Chunk
 
 if TYPE_CHECKING:
     import serial
@@ -25,7 +25,7 @@ READ_BYTES = 1 << 16
 log = structlog.get_logger(__name__)
 
 
-class Line:
+class SerialPort:
     """A port, its bytes as they come, and what is sent.
 
     Arrival times are the wall clock at start plus a clock that never steps since; it goes on while the machine sleeps.
@@ -54,7 +54,7 @@ class Line:
         self._open_next, self._say = open_next, say
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
-        self._reads: asyncio.Queue[Read | None] = asyncio.Queue()
+        self._reads: asyncio.Queue[Chunk | None] = asyncio.Queue()
         self._port: serial.Serial | None = None
         self.openings = 0
         self.lost = asyncio.Event()
@@ -81,7 +81,7 @@ class Line:
             self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
             try:
                 path, self._port = self._open_next()
-            except HeldPortError as error:  # who holds it is looked for: samples of other packs must not wait
+            except PortBusyError as error:  # who holds it is looked for: samples of other packs must not wait
                 reason = await asyncio.to_thread(str, error)
             except (NoPortError, OSError) as error:
                 reason = str(error)
@@ -109,7 +109,7 @@ class Line:
         """Let who reads come to an end."""
         self._reads.put_nowait(None)
 
-    async def read(self) -> Read | None:
+    async def read(self) -> Chunk | None:
         """What came next; without bytes where the port was opened, None at the end."""
         return await self._reads.get()
 

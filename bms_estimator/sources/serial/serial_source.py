@@ -13,17 +13,17 @@ from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S
-from bms_estimator.protocols.base.device_protocol import Command, Dialect
+from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog
-from bms_estimator.sources.serial.board_check import Doorkeeper, OtherBoardError
-from bms_estimator.sources.serial.known_board_file import BoardMemory
-from bms_estimator.sources.serial.port_discovery import HELD_S, LEFT_S, Whereabouts
+from bms_estimator.sources.serial.board_check import BoardCheck, OtherBoardError
+from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.port_discovery import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
-from bms_estimator.sources.serial.serial_port import Line
-from bms_estimator.sources.source import Pulse, Read, Tap
+from bms_estimator.sources.serial.serial_port import SerialPort
+from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
 
 if TYPE_CHECKING:
     import serial
@@ -42,11 +42,11 @@ ANSWER_S = 4.0
 log = structlog.get_logger(__name__)
 
 
-class SerialBoard:
+class SerialSource:
     """Async source of SAMPLE blocks from a board.
 
     All that makes a sample passes ``dialect.feed(arrival_s, data)``: a capture of these calls replays to the same bits.
-    It stays with the pack's board, and looks for it on other ports, as ``Doorkeeper`` and ``Whereabouts`` say.
+    It stays with the pack's board, and looks for it on other ports, as ``BoardCheck`` and ``PortDiscovery`` say.
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
@@ -62,8 +62,8 @@ class SerialBoard:
         self,
         settings: SensorSettings,
         *,
-        memory: BoardMemory | None = None,
-        tap: Tap | None = None,
+        memory: KnownBoardFile | None = None,
+        tap: ReadTap | None = None,
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
         first_retry_s: float = FIRST_RETRY_S,
@@ -76,9 +76,9 @@ class SerialBoard:
         make_dialect(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
         self._dialect = make_dialect(settings)
         tells_serial = settings.protocol == "binary"  # what prints text could never be told from another
-        self._door = Doorkeeper(lambda: make_dialect(settings), settings.serial or "", memory if tells_serial else None)
-        self._where = Whereabouts(settings.port, monotonic)
-        self._line = Line(
+        self._door = BoardCheck(lambda: make_dialect(settings), settings.serial or "", memory if tells_serial else None)
+        self._where = PortDiscovery(settings.port, monotonic)
+        self._line = SerialPort(
             self._open_next,
             say=self._say,
             wall=wall,
@@ -126,10 +126,10 @@ class SerialBoard:
         """How much faster the board's clock runs than the monotonic one."""
         return self._dialect.clock_ppm
 
-    def pulse(self) -> Pulse:
+    def pulse(self) -> SourceHealth:
         """Whether line and task live."""
         now_s = self._line.now_s
-        return Pulse(self._monotonic() - self._tended_s, now_s - self._arrived_s, self._line.waiting)
+        return SourceHealth(self._monotonic() - self._tended_s, now_s - self._arrived_s, self._line.waiting)
 
     async def __aenter__(self) -> Self:
         """Begin to open the port; it need not be there yet."""
@@ -160,7 +160,7 @@ class SerialBoard:
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 
-    def _admit(self, read: Read) -> Sequence[Read]:
+    def _admit(self, read: Chunk) -> Sequence[Chunk]:
         """The reads that are decoded now."""
         if not read[1]:
             self._openings += 1
@@ -177,11 +177,11 @@ class SerialBoard:
         """What is on the port is not taken: look elsewhere."""
         self._say(message)
         self._refused = True
-        self._where.leave(self._path, LEFT_S)
+        self._where.leave(self._path, WRONG_PORT_RETRY_S)
         self._line.lost.set()
 
     @property
-    def _listener(self) -> Dialect:
+    def _listener(self) -> DeviceProtocol:
         """Who hears the device that has been heard last."""
         return self._door.stranger or self._dialect
 
@@ -255,7 +255,7 @@ class SerialBoard:
         try:
             return path, open_port(path, self._settings.baud)
         except NoPortError:
-            self._where.leave(path, HELD_S)
+            self._where.leave(path, BUSY_PORT_RETRY_S)
             raise
 
     async def _stay_open(self) -> None:

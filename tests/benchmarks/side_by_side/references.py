@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
-from bms_estimator.calibration.cleaning.rests import resting_samples, runs
+from bms_estimator.calibration.cleaning.rests import resting_samples, true_runs
 from bms_estimator.model.arrays import Floats
 from tests.benchmarks.pulses import AROUND, pulses
 from tests.benchmarks.side_by_side.trials import Block
@@ -53,7 +53,7 @@ class Pulses:
 def relaxations(block: Block, capacity_ah: float) -> Relaxations:
     """Fit every rest that is good for it."""
     samples = block.samples
-    rests = [(a, b) for a, b in runs(resting_samples(samples, capacity_ah)) if a > 0]
+    rests = [(a, b) for a, b in true_runs(resting_samples(samples, capacity_ah)) if a > 0]
     found, soc_before = [], float(block.soc[0])
     for first, end in rests:
         time_s = samples["time_s"][first:end] - samples["time_s"][first - 1]

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import without_glitches
-from bms_estimator.calibration.elements.two_branch_fit import sections
+from bms_estimator.calibration.cleaning.rests import remove_glitches
+from bms_estimator.calibration.elements.two_branch_fit import cell_file_sections
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius, weak_share
 from bms_estimator.model.arrays import Floats
@@ -91,7 +91,7 @@ TRIALS = (
 def block(part: Part, capacity_ah: float) -> Block:
     """Read a part of a capture."""
     rows, soc = load(part.name, capacity_ah, part.initial_soc)
-    samples = without_glitches(rows, part.name)
+    samples = remove_glitches(rows, part.name)
     inside = (samples["time_s"] >= part.begin_s) & (samples["time_s"] < part.end_s)
     samples = samples[inside]
     return Block(samples, np.interp(samples["time_s"], rows["time_s"], soc))
@@ -122,7 +122,7 @@ def at_temperature(cell: CellModel, temperature_c: float) -> CellModel:
                 "strong_ohm": _times(cell.ladder.strong_ohm, strong),
             }
         )
-        update |= sections(ladder)
+        update |= cell_file_sections(ladder)
     return cell.model_copy(update=update)
 
 

@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.elements.generic_prior import RESTS_STD, curve, ladder_of, most_alike
-from bms_estimator.calibration.elements.initial_elements import RestElements
+from bms_estimator.calibration.elements.generic_prior import (
+    RESTS_STD,
+    curve,
+    nearest_generic_cell,
+    scaled_generic_ladder,
+)
+from bms_estimator.calibration.elements.initial_elements import InitialElements
 from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.captures.curves import read_curve
 
@@ -15,7 +20,7 @@ SOC = np.linspace(0.0, 1.0, 51)
 @pytest.mark.parametrize("series_count", [1, 4])
 def test_a_curve_is_most_like_the_generic_one_of_its_kind(name, series_count):
     off_v = 0.01 * series_count * np.sin(9.0 * SOC)
-    found = most_alike(
+    found = nearest_generic_cell(
         SOC, series_count * np.interp(SOC, *curve(load_cell(name, 1.0), "ocv_v")) + off_v, 7.0, series_count
     )
     assert found == load_cell(name, 7.0).pack(series_count, 1)
@@ -23,13 +28,15 @@ def test_a_curve_is_most_like_the_generic_one_of_its_kind(name, series_count):
 
 def test_a_real_layered_oxide_is_no_lfp(data):
     soc, ocv_v, _ = read_curve(data / "lgm50" / "ocv_25c.csv")
-    assert most_alike(soc, ocv_v, 5.0, 1).cell.name in {"nca", "nmc"}
+    assert nearest_generic_cell(soc, ocv_v, 5.0, 1).cell.name in {"nca", "nmc"}
 
 
 def test_rests_say_how_large_resistances_are_and_the_generic_cell_how_they_go():
     generic = load_cell("nmc", 3.0)
-    assert ladder_of(generic, None) == generic.ladder
-    found = ladder_of(generic, RestElements(r_s_ohm=0.05, r_ts_ohm=0.01, tau_ts_s=9.0, r_tl_ohm=0.02, tau_tl_s=300.0))
+    assert scaled_generic_ladder(generic, None) == generic.ladder
+    found = scaled_generic_ladder(
+        generic, InitialElements(r_s_ohm=0.05, r_ts_ohm=0.01, tau_ts_s=9.0, r_tl_ohm=0.02, tau_tl_s=300.0)
+    )
 
     def ohm(ladder):
         return np.array(ladder.weak_ohm), np.array(ladder.strong_ohm)
@@ -45,8 +52,8 @@ def test_rests_say_how_large_resistances_are_and_the_generic_cell_how_they_go():
 def test_resistances_of_cold_rests_are_brought_to_25_c():
     """An 18650 NCA cell's: 29 and 39 mohm by rests at 25 C, 62 and 101 at 0 C, of which the generic growth leaves 27 and 37."""
     generic = load_cell("nca", 2.9)
-    cold = ladder_of(
-        generic, RestElements(r_s_ohm=0.0619, r_ts_ohm=0.05, tau_ts_s=9.0, r_tl_ohm=0.0507, tau_tl_s=300.0), 0.0
+    cold = scaled_generic_ladder(
+        generic, InitialElements(r_s_ohm=0.0619, r_ts_ohm=0.05, tau_ts_s=9.0, r_tl_ohm=0.0507, tau_tl_s=300.0), 0.0
     )
     middle_ohm = (np.array(cold.weak_ohm) + np.array(cold.strong_ohm))[:, cold.soc.index(0.5)]
     assert middle_ohm[0] == pytest.approx(0.029, rel=0.2)

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 from scipy.stats import gmean
 
-from bms_estimator.calibration.cleaning.capture_checks import contradictions
-from bms_estimator.calibration.cleaning.clean_capture import whole_load
+from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
+from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.elements import identify as module
 from bms_estimator.calibration.elements import two_branch_fit
 from bms_estimator.calibration.elements.identify import identify, initial_soc
 from bms_estimator.calibration.elements.replay_score import interval_score
-from bms_estimator.calibration.ocv.overpotential import hats
+from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
 from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts
@@ -101,7 +101,7 @@ def test_the_two_branches_of_the_file_are_those_of_the_ladder(identified):
     ladder, a = identified.cell.ladder, identified.cell.a
     for soc in (0.35, 0.5, 0.9):
         rows = np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)
-        ohm = rows @ hats(np.array([soc]), np.array(ladder.soc))[0]
+        ohm = rows @ linear_interpolation_matrix(np.array([soc]), np.array(ladder.soc))[0]
         assert r_s(soc, a) == pytest.approx(ohm[0], rel=0.1)
         assert r_ts(soc, a) == pytest.approx(ohm[1:4].sum(), rel=0.1)
         assert r_tl(soc, a) == pytest.approx(ohm[4:].sum(), rel=0.1)
@@ -111,7 +111,7 @@ def test_the_two_branches_of_the_file_are_those_of_the_ladder(identified):
 
 def test_capacitances_of_a_flat_ladder_are_positive_down_to_empty():
     flat = LADDER.model_copy(update={"weak_ohm": ((0.02,) * 3,) * 7, "strong_ohm": ((0.0,) * 3,) * 7})
-    made = two_branch_fit.sections(flat)
+    made = two_branch_fit.cell_file_sections(flat)
     assert made["r_s"].offset_ohm == pytest.approx(0.02, rel=1e-3)
     for name in ("c_ts", "c_tl"):
         assert 0.0 < made[name].amplitude_farad < made[name].offset_farad
@@ -122,7 +122,7 @@ def test_branches_that_a_slow_capture_does_not_tell_are_written_all_the_same():
     untold = LADDER.model_copy(
         update={"weak_ohm": tuple((0.0 if 0 < k < 4 else 0.02,) * 3 for k in range(7)), "strong_ohm": ((0.0,) * 3,) * 7}
     )
-    made = two_branch_fit.sections(untold)
+    made = two_branch_fit.cell_file_sections(untold)
     assert 0.0 < made["r_ts"].offset_ohm < 1e-3 * made["r_tl"].offset_ohm
     assert 1.0 < made["r_ts"].offset_ohm * made["c_ts"].offset_farad < 30.0
 
@@ -162,7 +162,7 @@ def test_captures_too_short_for_a_replay_are_identified_all_the_same():
 
 
 def test_the_score_is_worse_for_a_band_that_is_wrong():
-    load = whole_load("steps", capture(steps()), TRUTH)
+    load = clean_capture("steps", capture(steps()), TRUTH)
     soc = 0.98 - load.discharged_ah / TRUTH.cell.capacity_ah
     good = interval_score(TRUTH, load, soc)
     assert 0.0 < good < 10.0
@@ -336,10 +336,10 @@ def test_bad_input_is_named_with_its_numbers(samples, cell, words):
 
 
 def test_a_good_capture_contradicts_nothing_but_an_soc_that_it_does_not_start_at():
-    load = whole_load("good", capture(steps()), TRUTH)
+    load = clean_capture("good", capture(steps()), TRUTH)
     start = initial_soc(load, TRUTH)
-    assert contradictions(load, TRUTH, start) == []
-    (line,) = contradictions(load, TRUTH, start - 0.4)
+    assert capture_contradictions(load, TRUTH, start) == []
+    (line,) = capture_contradictions(load, TRUTH, start - 0.4)
     assert "outside 0..1" in line
 
 

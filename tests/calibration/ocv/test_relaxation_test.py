@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.cleaning.rests import soc_by_counting, without_glitches
+from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
 from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora
 from bms_estimator.calibration.ocv.points import pooled
 from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
@@ -169,7 +169,7 @@ def test_nan_and_repeated_time_stamps_are_dropped():
     samples["voltage_v"][10] = np.nan
     samples["time_s"][20] = samples["time_s"][19]
     samples["time_s"][30] = 0.0
-    kept = without_glitches(samples, "mine")
+    kept = remove_glitches(samples, "mine")
     assert kept.size == samples.size - 3
     assert (np.diff(kept["time_s"]) > 0.0).all()
 
@@ -215,7 +215,7 @@ def test_several_captures_in_one_file_are_none():
         with pytest.raises(
             UserError, match=rf"mine: time goes back {more} times, first from \d.* to 0 s, .* a file of its own"
         ):
-            without_glitches(together, "mine")
+            remove_glitches(together, "mine")
     late = pulse.copy()
     late["time_s"][50] -= 30.0  # one stamp
-    assert without_glitches(late, "mine").size == pulse.size - 1
+    assert remove_glitches(late, "mine").size == pulse.size - 1

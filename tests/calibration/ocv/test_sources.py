@@ -8,9 +8,9 @@ from bms_estimator.calibration.ocv.sources import (
     PLATEAU_SHARE,
     REST_SHARE_STD,
     USUAL_STD,
-    GivenCurve,
+    ExternalCurve,
     Recording,
-    amid_usual_hysteresis,
+    center_on_typical_hysteresis,
     find_sources,
     without_branches,
 )
@@ -71,7 +71,7 @@ def test_a_lone_discharge_is_off_by_its_hysteresis_and_knows_it():
 @pytest.mark.parametrize(("direction", "lifted"), [(1.0, 1.0), (-1.0, -1.0)])
 def test_a_lone_branch_is_brought_to_the_middle_of_what_is_usual(direction, lifted):
     found, usual_v = of(slow((direction,)), capacity_ah=CAPACITY_AH), hysteresis_v(NODES)
-    moved = amid_usual_hysteresis(found, usual_v)
+    moved = center_on_typical_hysteresis(found, usual_v)
     plain, points = found.points, moved.points
     assert points.ocv_v - plain.ocv_v == pytest.approx(lifted * hysteresis_v(plain.soc), abs=1e-4)
     assert (points.common_v > plain.common_v).all()
@@ -105,14 +105,14 @@ def test_a_cold_lone_curve_is_further_from_rest():
 
 def test_pairs_rests_and_given_curves_have_nothing_to_take_out():
     soc, ladder = np.linspace(0.0, 1.0, 101), load_cell("nca", CAPACITY_AH).ladder
-    found = of(slow((1.0, -1.0)), relaxation(), curves=[GivenCurve("book", soc, true_v(soc), None)])
+    found = of(slow((1.0, -1.0)), relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)])
     assert without_branches(found, ladder) == found
 
 
 def test_rests_after_a_discharge_and_a_curve_given_without_hysteresis_are_brought_there_too():
     soc = np.linspace(0.0, 1.0, 101)
-    found = of(relaxation(), curves=[GivenCurve("book", soc, true_v(soc), None)], capacity_ah=TRUTH.cell.capacity_ah)
-    moved = amid_usual_hysteresis(found, np.full(NODES.size, 0.01))
+    found = of(relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)], capacity_ah=TRUTH.cell.capacity_ah)
+    moved = center_on_typical_hysteresis(found, np.full(NODES.size, 0.01))
     for before, after in zip(found.sources, moved.sources, strict=True):
         assert after.points.ocv_v - before.points.ocv_v == pytest.approx(0.01)
         assert after.points.std_v == pytest.approx(before.points.std_v)
@@ -135,7 +135,7 @@ def test_a_slow_curve_of_an_older_cell_is_counted_against_its_own_capacity():
 
 def test_a_given_curve_and_its_hysteresis():
     soc = np.linspace(0.0, 1.0, 101)
-    found = of(curves=[GivenCurve("book", soc, true_v(soc), hysteresis_v(soc))], capacity_ah=5.0)
+    found = of(curves=[ExternalCurve("book", soc, true_v(soc), hysteresis_v(soc))], capacity_ah=5.0)
     assert [source.kind for source in found.sources] == ["given curve, 101 points"]
     assert np.abs(off_v(found)).max() < 2e-3
     assert found.hysteresis_v == pytest.approx(hysteresis_v(NODES), abs=1e-3)
@@ -145,7 +145,7 @@ def test_a_given_curve_and_its_hysteresis():
 def test_rests_tell_how_much_of_the_hysteresis_they_keep_and_are_moved_by_it(share):
     soc, rests = np.linspace(0.0, 1.0, 101), relaxation()
     plain = of(rests, capacity_ah=TRUTH.cell.capacity_ah).points
-    book = GivenCurve("book", soc, fit_table(plain)(soc) + share * 0.02, np.full(soc.size, 0.02))
+    book = ExternalCurve("book", soc, fit_table(plain)(soc) + share * 0.02, np.full(soc.size, 0.02))
     found = of(rests, curves=[book], capacity_ah=TRUTH.cell.capacity_ah)
     moved = found.points.ocv_v[found.points.source == 1]
     assert moved == pytest.approx(plain.ocv_v + share * 0.02, abs=1e-3)

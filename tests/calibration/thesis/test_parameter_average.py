@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
-from bms_estimator.calibration.thesis.parameter_average import Settled, averaged, settled
+from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, settled
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
@@ -54,7 +54,7 @@ def test_a_simulated_discharge_is_averaged_from_where_it_settles_to_where_it_tur
 def test_override_of_both_ends():
     """From the first sample on the mean holds the way from a_i(t0): limit + (a_i(t0) - limit) / (rate t), by (4.5)."""
     found = run(discharge(CELL, 0.055, 0.01)[:50_000], t_int_s=0.0, t_unst_s=400.0)
-    assert found.window == Settled(0.0, 400.0, "given", "given")
+    assert found.window == AveragingWindow(0.0, 400.0, "given", "given")
     for i in (1, 3, 4, 6, 8, 12):
         bounds = CELL.bounds(i)
         way = (bounds.initial - bounds.limit) / (bounds.rate * 400.0)
@@ -124,11 +124,11 @@ def test_mean_over_uneven_steps_is_the_integral():
     time_s = np.cumsum(np.random.default_rng(1).uniform(0.01, 2.0, 5000))
     a = np.tile(time_s[:, None], (1, 16))  # a_i(t) = t, whose mean is the middle
     inside = time_s[(time_s >= 500.0) & (time_s <= 2000.0)]
-    found = averaged(time_s, a, Settled(500.0, 2000.0, "given", "given"))
+    found = averaged(time_s, a, AveragingWindow(500.0, 2000.0, "given", "given"))
     assert found == pytest.approx(np.full(16, 0.5 * (inside[0] + inside[-1])), rel=1e-9)
 
 
 def test_mean_over_nothing_is_the_last_value():
     a = np.tile(TIME_S[:, None], (1, 16))
-    assert averaged(TIME_S, a, Settled(5000.0, 6000.0, "given", "given"))[1] == TIME_S[-1]
-    assert averaged(TIME_S, a, Settled(10.0, 10.5, "given", "given"))[1] == 10.0
+    assert averaged(TIME_S, a, AveragingWindow(5000.0, 6000.0, "given", "given"))[1] == TIME_S[-1]
+    assert averaged(TIME_S, a, AveragingWindow(10.0, 10.5, "given", "given"))[1] == 10.0

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, Ledger
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import TableOcv, load_cell
@@ -40,7 +40,7 @@ def pack(tmp_path_factory) -> Path:
     estimator = new_estimator(settings, cell)
     estimator.run(drive(1).samples)
     (folder / "state").mkdir()
-    CheckpointFile(folder / "state", settings, cell).save(estimator.record, Ledger(0, new_totals(0.0)))
+    CheckpointFile(folder / "state", settings, cell).save(estimator.record, RunCounters(0, new_totals(0.0)))
     return file
 
 

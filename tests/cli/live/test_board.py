@@ -41,14 +41,14 @@ def virtual(**options):
 @pytest.fixture
 def patient(monkeypatch):
     """For boards that answer."""
-    monkeypatch.setattr(device_detection, "PATIENCE_S", LONG_S)
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(device_detection, "REFERENCE_S", LONG_S)
 
 
 @pytest.fixture
 def impatient(monkeypatch):
     """For those that never do."""
-    monkeypatch.setattr(device_detection, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.5)
 
 
 @pytest.mark.usefixtures("patient")

@@ -57,7 +57,7 @@ def test_it_names_the_ports_that_are_there_and_no_others(capsys):
     ],
 )
 def test_a_board_answers_the_probe_and_goes_on(capsys, monkeypatch, options, answer):
-    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PATIENCE_S", LONG_S)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", LONG_S)
     with simulated(*options) as (path, process):
         for _ in range(2):
             code, out = ports(capsys, "--probe", path)
@@ -69,8 +69,8 @@ def test_a_board_answers_the_probe_and_goes_on(capsys, monkeypatch, options, ans
 
 def test_what_is_no_board_is_not_called_one(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "500")  # no row is folded
-    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PATIENCE_S", 0.3)
-    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.EACH_S", 0.1)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", 0.1)
     master, slave = os.openpty()
     try:
         silent = os.ttyname(slave)

@@ -9,7 +9,7 @@ import pytest
 
 from bms_estimator.cli.live.key_presses import meanings
 from bms_estimator.model.payloads import Snapshot
-from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.command_line import PROGRAM, run
 from tests.mosquitto import Broker, Listener
 from tests.pseudo_terminal import BACK, PseudoTerminal
@@ -23,8 +23,12 @@ def of(device: str, voltage_v: float) -> Snapshot:
 
 
 async def publish(client: Listener, device: str, voltage_v: float) -> None:
-    messages, snapshot = Messages("bms", device), of(device, voltage_v)
-    for message in (*messages.greeting(), *messages.due(Sent(), snapshot, NOW)[0], *messages.kept(None, snapshot)):
+    messages, snapshot = MessageBuilder("bms", device), of(device, voltage_v)
+    for message in (
+        *messages.greeting(),
+        *messages.due(PublishedState(), snapshot, NOW)[0],
+        *messages.kept(None, snapshot),
+    ):
         await client.publish(message.topic, message.payload, qos=1, retain=message.retain)
 
 

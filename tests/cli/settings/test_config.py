@@ -66,8 +66,8 @@ def test_every_setting_is_in_the_file_and_is_accepted_when_uncommented(pack, cap
 
 @pytest.fixture
 def long_probe(monkeypatch):
-    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PATIENCE_S", 0.1)
-    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.EACH_S", LONG_S)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
 
 
 def test_init_finds_out_what_is_there_and_sets_it(pack, capsys, long_probe):

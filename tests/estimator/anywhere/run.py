@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.kalman_filter.hypotheses import pack_std
-from bms_estimator.kernels.step import Verdict
+from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
+from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 
@@ -47,6 +47,6 @@ def run_of(estimator: Estimator, samples: SampleBlock) -> Run:
     out = np.zeros((samples.size, 5))
     for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
         verdict = estimator.step(time_s, current_a, voltage_v, status, temperature_c)
-        updated = verdict is Verdict.ACCEPTED and gathered[0] == 0
-        out[n] = soc[0], pack_std(f[0], p), innovation_v[0], variance_v2[0], updated
+        updated = verdict is SampleOutcome.ACCEPTED and gathered[0] == 0
+        out[n] = soc[0], weakest_cell_soc_std(f[0], p), innovation_v[0], variance_v2[0], updated
     return Run(samples["time_s"], *out[:, :4].T, updated=out[:, 4] == 1.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.fleet.identification.block_capture import Captured
+from bms_estimator.fleet.identification.block_capture import BlockCapture
 from bms_estimator.model.sample import SAMPLE
 
 STORE = 1_700_000_000 * 10**9
@@ -25,7 +25,7 @@ def block(number, store=STORE, first_s=None):
 
 
 def captured(*blocks, **span):
-    found = Captured(**span)
+    found = BlockCapture(**span)
     for data in blocks:
         found.add(data)
     return found

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from bms_estimator.fleet.identification.reidentify import reidentify
-from bms_estimator.fleet.packs.pack_row import PackKind
+from bms_estimator.fleet.packs.pack_row import PackSpec
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.config_file import parse_toml
 from tests.calibration.simulated_load import TRUTH, capture, wrong_start
 
 SERIES, PARALLEL = 14, 4
-KIND = PackKind(
+KIND = PackSpec(
     cell="own", series=SERIES, parallel=PARALLEL, voltage_resolution_v=0.01, current_resolution_a=0.01, period_s=5.0
 )
 WRONG = cell_text(wrong_start(1.3, 0.8))
@@ -76,9 +76,9 @@ def test_what_is_no_better_is_not_taken(samples):
         (lambda s: s[: 720 * 3], KIND, "3.0 h of samples: at least 6 h are needed"),
         (lambda s: s[:0], KIND, "0.0 h of samples"),
         (lambda s: s[::20], KIND, "0.00 capacities were moved"),
-        (lambda s: s[:60], PackKind(cell="pem_30w"), "pem_30w is a fuel cell"),
+        (lambda s: s[:60], PackSpec(cell="pem_30w"), "pem_30w is a fuel cell"),
         (lambda s: s, KIND.model_copy(update={"series": 7}), "no sample is one that this cell can have"),
-        (lambda s: s, PackKind(cell="nowhere"), "nowhere: no cell file of this name was loaded"),
+        (lambda s: s, PackSpec(cell="nowhere"), "nowhere: no cell file of this name was loaded"),
     ],
 )
 def test_why_a_pack_cannot_be_identified_is_said(samples, change, kind, reason):

@@ -3,13 +3,13 @@
 import pytest
 
 from bms_estimator.fleet.packs.csv_table import check_models, read_table, table_lines
-from bms_estimator.fleet.packs.pack_registry import NOT_TOLD, KnownPacks
-from bms_estimator.fleet.packs.pack_row import COLUMNS, PackKind, PackRow, known_cells, settings_of, stored
+from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK, PackRegistry
+from bms_estimator.fleet.packs.pack_row import COLUMNS, PackRow, PackSpec, known_cells, settings_of, stored
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.errors import UserError
 
-LFP = PackKind(cell="lfp", capacity_ah=100.0, series=16, voltage_resolution_v=0.01)
+LFP = PackSpec(cell="lfp", capacity_ah=100.0, series=16, voltage_resolution_v=0.01)
 ROW = "house,lfp,100,16"
 
 
@@ -37,8 +37,8 @@ def test_packs_are_read_with_either_separator_and_a_byte_order_mark(table, separ
     text = "pack,cell,capacity_ah,series\nhouse,lfp,100,16\n\n boat , nmc ,1.5e2,\n"
     read = read_table(table(text.replace(",", separator).replace("\n", end), encoding))
     assert {name: line.kind for name, line in read.packs.items()} == {
-        "house": PackKind(cell="lfp", capacity_ah=100.0, series=16),
-        "boat": PackKind(cell="nmc", capacity_ah=150.0),
+        "house": PackSpec(cell="lfp", capacity_ah=100.0, series=16),
+        "boat": PackSpec(cell="nmc", capacity_ah=150.0),
     }
     assert [line.number for line in read.packs.values()] == [2, 4]
 
@@ -97,7 +97,7 @@ def test_a_cell_file_beside_the_table_is_found_under_its_name(table, tmp_path):
     (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
     path = table("pack,cell\nhouse,own.toml\n")
     read = read_table(path)
-    assert read.packs["house"].kind == PackKind(cell="own")
+    assert read.packs["house"].kind == PackSpec(cell="own")
     assert read.cell_files == {"own": tmp_path / "own.toml"}
     check_models(path, read, {"own": (tmp_path / "own.toml").read_text()})
     with pytest.raises(UserError, match=r"packs\.csv: line 2: own: no cell file of this name was loaded"):
@@ -125,17 +125,17 @@ def test_settings_are_those_of_a_pack_file_with_the_same_values():
 
 def test_all_cells_of_the_package_can_be_named():
     for name in known_cells():
-        assert PackKind(cell=name).cell == name
+        assert PackSpec(cell=name).cell == name
 
 
 def test_a_table_is_written_as_it_is_read(table):
-    kinds = {"b": LFP, "a": PackKind(cell="ncr18650", protocol="jbd")}
+    kinds = {"b": LFP, "a": PackSpec(cell="ncr18650", protocol="jbd")}
     read = read_table(table("".join(table_lines(kinds))))
     assert {name: line.kind for name, line in read.packs.items()} == kinds
 
 
 def test_packs_of_one_kind_share_settings_and_model():
-    known = KnownPacks()
+    known = PackRegistry()
     for i in range(1000):
         known.set_row(f"p{i}", stored(LFP.model_copy(update={"series": 14 + i % 5})))
     made = [known(f"p{i}") for i in range(1000)]
@@ -163,7 +163,7 @@ def test_packs_of_one_kind_share_settings_and_model():
     ],
 )
 def test_whatever_is_wrong_makes_a_pack_unknown_with_the_reason(data, reason):
-    known = KnownPacks()
+    known = PackRegistry()
     known.set_cell("broken", b"= 1")
     known.set_row("house", data)
     assert known("house") is None or reason == ""
@@ -171,11 +171,11 @@ def test_whatever_is_wrong_makes_a_pack_unknown_with_the_reason(data, reason):
 
 
 def test_a_pack_becomes_known_with_its_row_and_its_cell():
-    known = KnownPacks()
+    known = PackRegistry()
     assert known("house") is None
-    assert known.reason("house") == NOT_TOLD
-    assert known.set_row("house", stored(PackKind(cell="own", series=2)))
-    assert not known.set_row("house", stored(PackKind(cell="own", series=2)))
+    assert known.reason("house") == UNKNOWN_PACK
+    assert known.set_row("house", stored(PackSpec(cell="own", series=2)))
+    assert not known.set_row("house", stored(PackSpec(cell="own", series=2)))
     assert known("house") is None
     assert known.set_cell("own", cell_text(load_cell("ncr18650")).encode())
     assert known.made_of({"own", "other"}) == {"house"}
@@ -186,5 +186,5 @@ def test_a_pack_becomes_known_with_its_row_and_its_cell():
     assert not known.set_cell("own", None)
     assert known("house") is None
     assert known.set_row("house", None)
-    assert known.reason("house") == NOT_TOLD
+    assert known.reason("house") == UNKNOWN_PACK
     assert not known.set_row("house", None)

@@ -9,13 +9,13 @@ from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.nats.stream_reader import BATCH, StreamError
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import PackBucket, Written, read_bucket, remove_keys, write_bucket
-from bms_estimator.fleet.packs.pack_row import PackKind, stored
+from bms_estimator.fleet.packs.pack_row import PackSpec, stored
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from tests.fleet.engine import connected, running
 from tests.patience import LONG_S
 
-LFP = stored(PackKind(cell="lfp", capacity_ah=100.0, series=16))
+LFP = stored(PackSpec(cell="lfp", capacity_ah=100.0, series=16))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ async def test_only_what_differs_is_written_and_rows_go_only_when_asked(nc):
 
 
 async def test_a_worker_sees_all_rows_and_then_what_changes(nc):
-    await write_bucket(nc, PACKS_BUCKET, {"a": LFP, "b": b"{broken", "c": stored(PackKind(cell="own"))})
+    await write_bucket(nc, PACKS_BUCKET, {"a": LFP, "b": b"{broken", "c": stored(PackSpec(cell="own"))})
     bucket = PackBucket(nc)
     assert await bucket.refresh() >= {"a", "b", "c"}
     assert await bucket.refresh() == set()
@@ -67,7 +67,7 @@ async def test_a_worker_sees_all_rows_and_then_what_changes(nc):
 
 
 async def test_what_changed_is_told_though_the_table_is_lost_meanwhile_and_made_anew(nc):
-    await write_bucket(nc, PACKS_BUCKET, {"a": stored(PackKind(cell="own")), "b": LFP, "c": LFP})
+    await write_bucket(nc, PACKS_BUCKET, {"a": stored(PackSpec(cell="own")), "b": LFP, "c": LFP})
     bucket = PackBucket(nc)
     await bucket.refresh()
     await nc.jetstream().delete_stream(f"KV_{PACKS_BUCKET}")

@@ -24,7 +24,7 @@ from bms_estimator.fleet.page.fleet_page import FILES, STATIC, fleet_page
 from bms_estimator.fleet.page.nats_feed import FleetFeed, Server
 from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.page import PageSettings
 from tests.fleet.engine import Engine, connected, running
 from tests.fleet.fleets import BEGIN, FIRST_STD, capacities, write_fleet
@@ -115,7 +115,7 @@ async def work(nc: Client) -> None:
             for pack in PACKS:
                 await publish(nc, pack.name, pack.state)
             await nc.publish(subjects.unknown(NASTY), b"no <b>row</b>")
-            await nc.publish(subjects.hours("van-1"), json.dumps({"suspects": int(Suspect.OFFSET)}).encode())
+            await nc.publish(subjects.hours("van-1"), json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
             await nc.publish("bms.home-1.parameters", ONE.parameters.model_dump_json().encode())
         await asyncio.sleep(0.1)
 
@@ -354,7 +354,7 @@ async def test_why_nothing_more_is_heard_is_said(fleet: Fleet, monkeypatch: pyte
 
 @in_module
 async def test_what_the_last_hour_said_before_the_page_was_there_is_read(fleet: Fleet) -> None:
-    hour = json.dumps({"suspects": int(Suspect.OCV)}).encode()
+    hour = json.dumps({"suspects": int(InputFault.OCV)}).encode()
     late = await nats.connect(fleet.engine.url)
     await late.jetstream(timeout=LONG_S).publish(subjects.hours("early-1"), hour)
     await late.close()

@@ -9,7 +9,7 @@ from bms_estimator.fleet.page.nats_feed import type_name
 from bms_estimator.fleet.page.packs import ALIVE_S, LISTED, OTHER, UNLISTED, FleetPacks
 from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.fleet.page.workers import FleetWorkers
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from tests.fleet.many_packs import HOME, many, state
 from tests.sinks.snapshots import ONE
 
@@ -86,9 +86,9 @@ def test_who_needs_attention_is_listed_by_how_much_and_counted_once():
             "dumb": fine(soc=None, soc_std=None, stability_margin=None),
         }
     )
-    both = Suspect.CAPACITY | Suspect.SIGN_OF_CURRENT
+    both = InputFault.CAPACITY | InputFault.SIGN_OF_CURRENT
     packs.hear_hour("wide", json.dumps({"suspects": int(both)}).encode())
-    packs.hear_hour("fine", json.dumps({"suspects": int(Suspect.OCV)}).encode())
+    packs.hear_hour("fine", json.dumps({"suspects": int(InputFault.OCV)}).encode())
     shown = packs.picture(1.0, 0.0)
     concerns = shown["concerns"]
     assert {kind: each["count"] for kind, each in concerns.items()} == {
@@ -127,7 +127,7 @@ def test_names_are_found_by_how_they_begin():
 def test_all_that_is_known_of_one_pack():
     packs = heard({"a": fine()}, 5.0)
     packs.hear_parameters("a", ONE.parameters.model_dump_json().encode())
-    packs.hear_hour("a", json.dumps({"suspects": int(Suspect.OFFSET)}).encode())
+    packs.hear_hour("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
     found = packs.one("a", 7.0)
     assert found
     assert (found["pack"], found["type"], found["heard_s"]) == ("a", "lfp 16s1p", 2.0)

@@ -5,11 +5,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bms_estimator.fleet.queries.duckdb_queries import AGED_SOC, CHARGE_ERROR, QUESTIONS, ask, select
+from bms_estimator.fleet.queries.duckdb_queries import AGED_SOC, CHARGE_ERROR, QUESTIONS, run_query, select
 from bms_estimator.fleet.queries.parquet_files import SCHEMA, compact, write
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from tests.fleet.fleets import BEGIN, FIRST_STD, an_hour, capacities, states_of_charge, write_fleet
 
 
@@ -37,7 +37,7 @@ def ageing(tmp_path_factory):
 
 def test_trends_are_in_their_bands_as_often_as_is_said(ageing):
     folder, slopes = ageing
-    packs = {row["pack"]: row for row in ask(folder, "soh").records if row["pack"]}
+    packs = {row["pack"]: row for row in run_query(folder, "soh").records if row["pack"]}
     inside = [
         packs[f"p{n}"]["percent_per_year_low"] < 100 * slope < packs[f"p{n}"]["percent_per_year_high"]
         for n, slope in enumerate(slopes)
@@ -51,7 +51,7 @@ def test_trends_are_in_their_bands_as_often_as_is_said(ageing):
 
 
 def test_a_type_has_a_trend_and_its_packs_spread(ageing):
-    (row,) = [row for row in ask(ageing[0], "soh").records if not row["pack"]]
+    (row,) = [row for row in run_query(ageing[0], "soh").records if not row["pack"]]
     assert (row["type"], row["packs"], row["days"]) == ("ncr18650 1s1p 3 Ah", PACKS, DAYS)
     assert row["percent_per_year_low"] < 100 * PER_YEAR < row["percent_per_year_high"]
     assert row["percent_per_year_high"] - row["percent_per_year_low"] < 1.0
@@ -70,7 +70,7 @@ def test_estimates_that_repeat_themselves_tell_nothing_of_a_trend(tmp_path):
         tmp_path, BEGIN + 24 * np.arange(days), capacity_ratio=ratio, capacity_ratio_std=ratio * np.sqrt(variance),
         capacity_first_std=FIRST_STD, charge_out_ah=3.0,
     )  # fmt: skip
-    assert ask(tmp_path, "soh").rows == []
+    assert run_query(tmp_path, "soh").rows == []
 
 
 def test_outliers_are_found_and_who_knows_little_is_not_accused(tmp_path):
@@ -87,7 +87,7 @@ def test_outliers_are_found_and_who_knows_little_is_not_accused(tmp_path):
         tmp_path, np.array([BEGIN]), capacity_ratio=found, capacity_ratio_std=std, capacity_first_std=FIRST_STD,
         r_s_ratio=r_s, r_s_ratio_std=0.02 * r_s, r_s_unlearned_s=10.0,
     )  # fmt: skip
-    answer = ask(tmp_path, "outliers").records
+    answer = run_query(tmp_path, "outliers").records
     assert {(row["pack"], row["quantity"]) for row in answer} == {
         ("p500", "capacity_ratio"), ("p501", "capacity_ratio"), ("p502", "r_s_ratio"),
     }  # fmt: skip
@@ -100,7 +100,7 @@ def test_a_type_of_few_packs_is_judged_by_nobody(tmp_path):
     write_fleet(
         tmp_path, np.array([BEGIN]), capacity_ratio=found, capacity_ratio_std=0.01, capacity_first_std=FIRST_STD
     )
-    assert ask(tmp_path, "outliers").rows == []
+    assert run_query(tmp_path, "outliers").rows == []
 
 
 def test_who_is_about_to_fail_is_found_in_time(tmp_path):
@@ -114,14 +114,14 @@ def test_who_is_about_to_fail_is_found_in_time(tmp_path):
     margin = 0.3 + 0.05 * rng.standard_normal((500, days))
     margin[9] -= 0.27 * np.arange(days) / days  # 0.03 left, 7 days
     suspects = np.zeros((500, days), int)
-    suspects[10, -4:] = Suspect.CAPACITY
-    suspects[11, :] = Suspect.OFFSET  # always was
+    suspects[10, -4:] = InputFault.CAPACITY
+    suspects[11, :] = InputFault.OFFSET  # always was
     write_fleet(
         tmp_path, BEGIN + 24 * np.arange(days), capacity_ratio=np.exp(found), charge_out_ah=3.0,
         capacity_ratio_std=np.exp(found) * np.sqrt(variance), capacity_first_std=FIRST_STD, r_s_ratio=r_s,
         r_s_ratio_std=0.05 * r_s, r_s_unlearned_s=10.0, stability_margin_min=margin, suspects=suspects,
     )  # fmt: skip
-    answer = {row["pack"]: row for row in ask(tmp_path, "failing").records}
+    answer = {row["pack"]: row for row in run_query(tmp_path, "failing").records}
     assert {pack: row["quantity"] for pack, row in answer.items()} == {
         "p7": "capacity_ratio", "p8": "r_s_ratio", "p9": "stability_margin_min", "p10": "suspect: capacity",
     }  # fmt: skip
@@ -139,7 +139,7 @@ def test_bands_are_honest_when_they_are_and_not_when_they_are_too_narrow(tmp_pat
         current_offset_a=0.0, current_offset_std_a=1e-9, soc_capacity_correlation=0.0, soc_offset_correlation=0.0,
         capacity_offset_correlation=0.0, temperature_c=25.0, **columns,
     )  # fmt: skip
-    answer = ask(tmp_path, "honest").records
+    answer = run_query(tmp_path, "honest").records
     whole, groups = answer[0], {(row["of"], row["which"]) for row in answer[1:]}
     assert {("type", "ncr18650 1s1p 3 Ah"), ("temperature", "20 to 30 C"), ("age", "first day")} <= groups
     assert least < whole["within_2_std"] < most
@@ -151,7 +151,7 @@ def test_bands_are_honest_when_they_are_and_not_when_they_are_too_narrow(tmp_pat
 def test_who_stopped_is_named_with_what_was_known_last(tmp_path):
     write(tmp_path, [an_hour("lives", BEGIN + n) for n in range(30)])
     write(tmp_path, [an_hour("stopped", BEGIN + n, soc=0.1 * n) for n in range(5)])
-    (row,) = ask(tmp_path, "silent").records
+    (row,) = run_query(tmp_path, "silent").records
     assert (row["pack"], row["hours_silent"], row["silent_since"]) == ("stopped", 25, "2025-11-24T05:00:00Z")
     assert row["soc"] == pytest.approx(0.4)
 
@@ -173,19 +173,19 @@ def test_files_of_a_version_that_knew_less_are_read(tmp_path):
     (file,) = tmp_path.glob("*/*.parquet")
     pq.write_table(pq.read_table(file).drop_columns(["capacity_first_std", "r_s_ratio"]), file)
     for name in QUESTIONS:
-        assert ask(tmp_path, name).rows == []
+        assert run_query(tmp_path, name).rows == []
     pq.write_table(pa.table({"x": [1]}), file)
     with pytest.raises(UserError, match="no columns pack and hour"):
-        ask(tmp_path, "soh")
+        run_query(tmp_path, "soh")
 
 
 def test_what_cannot_be_answered_is_said(tmp_path):
     with pytest.raises(UserError, match="no such question; there are soh, outliers"):
-        ask(tmp_path, "nonsense")
+        run_query(tmp_path, "nonsense")
     with pytest.raises(UserError, match="no such folder; `bms-estimator fleet collect"):
-        ask(tmp_path / "none", "soh")
+        run_query(tmp_path / "none", "soh")
     with pytest.raises(UserError, match="no hours of packs in it yet"):
-        ask(tmp_path, "soh")
+        run_query(tmp_path, "soh")
     write(tmp_path, [an_hour("a", BEGIN)])
     for query, why in (
         ("SELEC 1", "syntax error"), ("SELECT * FROM read_csv('/etc/passwd')", "disabled"),
@@ -196,7 +196,7 @@ def test_what_cannot_be_answered_is_said(tmp_path):
     (file,) = tmp_path.glob("*/*.parquet")
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(UserError, match=r"batch-.*\.parquet: not a whole Parquet file"):
-        ask(tmp_path, "soh")
+        run_query(tmp_path, "soh")
 
 
 def test_the_columns_are_those_of_the_row():

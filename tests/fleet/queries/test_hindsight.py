@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator import load_capture, load_cell
-from bms_estimator.fleet.queries.duckdb_queries import ask
+from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.fleet.queries.parquet_files import write
 from tests.benchmarks.hindsight import judged, limits, slots
 
@@ -26,7 +26,7 @@ def packs(data):
 
 def test_a_real_cell_is_judged_in_hindsight_as_by_the_truth(packs, tmp_path):
     write(tmp_path, [known.hour for pack in packs for known in pack])
-    (whole, *_) = ask(tmp_path, "honest", limits=limits(SLOT_S)).records
+    (whole, *_) = run_query(tmp_path, "honest", limits=limits(SLOT_S)).records
     there = np.abs([x for pack in packs for x in judged(pack)]) <= 2.0
     assert whole["packs"] == len(packs)
     assert whole["within_2_std"] == pytest.approx(there.mean(), abs=0.1)
@@ -40,4 +40,4 @@ def test_a_real_band_that_is_far_too_narrow_is_seen(packs, tmp_path):
         for known in pack
     ]
     write(tmp_path, narrow)
-    assert ask(tmp_path, "honest", limits=limits(SLOT_S)).records[0]["within_2_std"] < 0.6
+    assert run_query(tmp_path, "honest", limits=limits(SLOT_S)).records[0]["within_2_std"] < 0.6

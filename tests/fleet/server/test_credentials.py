@@ -267,7 +267,7 @@ async def _work(fleet: Fleet) -> None:
         await edge.subscribe("edge/real/awaits")
         await edge.publish("raw/real", block, qos=1)
         assert b"soc" in (await states.next_msg(LONG_S)).data
-        awaited = subjects.Awaits.model_validate_json(str((await anext(edge.messages)).payload, "utf-8"))
+        awaited = subjects.BlockRequest.model_validate_json(str((await anext(edge.messages)).payload, "utf-8"))
         assert (awaited.store, awaited.number) == (1, 2)
         stop.set()
         await working

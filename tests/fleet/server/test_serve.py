@@ -22,7 +22,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import NoAnswerError
 from bms_estimator.fleet.server import credentials, nats_server
 from bms_estimator.fleet.server.jwt_claims import Role
-from bms_estimator.fleet.server.nats_server import Place, Told, find_server
+from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec, find_server
 from bms_estimator.fleet.server.nats_server import serve as serving
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
@@ -219,9 +219,9 @@ async def test_a_server_that_does_not_answer_in_time_is_asked_again(
 
     monkeypatch.setattr(nats_server, "make_streams", busy)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
-    told = Told(FleetSettings(server=ServerSettings(**ports, partitions=4)))
+    told = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4)))
     said: list[str] = []
-    task = asyncio.create_task(serving(Place(tmp_path), lambda: told, said.append))
+    task = asyncio.create_task(serving(NodeLocation(tmp_path), lambda: told, said.append))
     await until(lambda: "streams ready, 4 partitions" in said or task.done())
     assert len(asked) == 2
     task.cancel()
@@ -230,7 +230,7 @@ async def test_a_server_that_does_not_answer_in_time_is_asked_again(
 
 async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authority) -> None:
     of = tuple(f"127.0.0.1:{free_port()}" for _ in range(3))
-    places = [Place(tmp_path / str(i), i, of) for i in (1, 2, 3)]
+    places = [NodeLocation(tmp_path / str(i), i, of) for i in (1, 2, 3)]
     said: list[str] = []
     tasks = []
     for place in places:
@@ -241,8 +241,10 @@ async def test_three_nodes_keep_three_copies(tmp_path: Path, authority: Authorit
             credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC))
         else:
             shutil.copy(places[0].keys / "claims.json", place.keys)
-        told = Told(settings, credentials.read_accounts(place.keys))
-        tasks.append(asyncio.create_task(serving(place, partial(Told, told.settings, told.accounts), said.append)))
+        told = ServerSpec(settings, credentials.read_accounts(place.keys))
+        tasks.append(
+            asyncio.create_task(serving(place, partial(ServerSpec, told.settings, told.accounts), said.append))
+        )
     try:
         ready = ("streams ready", "made by the node that has the keys")
         await until(

@@ -9,7 +9,7 @@ import nats
 import pytest
 
 from bms_estimator.edge.block import decode
-from bms_estimator.edge.subjects import RAW_STREAM, Awaits, awaits, raw
+from bms_estimator.edge.subjects import RAW_STREAM, BlockRequest, awaits, raw
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
 from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
@@ -39,7 +39,7 @@ async def sent(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]], i
     sending = asyncio.create_task(
         run_edges(fleet, edges, MqttSettings(url=mqtt), connections=2, stop=stop, said=str, quiet_s=LONG_S)
     )
-    asks = Awaits(store=int(fleet.store[0]), number=AGAIN, resend=True).model_dump_json().encode()
+    asks = BlockRequest(store=int(fleet.store[0]), number=AGAIN, resend=True).model_dump_json().encode()
 
     async def see(timeout_s: float) -> None:
         message = await coming.next_msg(timeout=timeout_s)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.edge.block import decode
-from bms_estimator.edge.subjects import Awaits
+from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, KINDS, SimulatedFleet
@@ -85,23 +85,23 @@ def test_edges_send_again_from_the_block_that_a_worker_awaits() -> None:
     assert edges.done
     assert edges.sent == 8
     store = int(some.store[1])
-    assert not edges.hear("someone-else", Awaits(store=store, number=2, resend=True), 0.0)
-    assert not edges.hear(some.names[1], Awaits(store=store + 1, number=2, resend=True), 0.0)
-    assert edges.hear(some.names[1], Awaits(store=store, number=3, resend=True), 0.0)
+    assert not edges.hear("someone-else", BlockRequest(store=store, number=2, resend=True), 0.0)
+    assert not edges.hear(some.names[1], BlockRequest(store=store + 1, number=2, resend=True), 0.0)
+    assert edges.hear(some.names[1], BlockRequest(store=store, number=3, resend=True), 0.0)
     assert not edges.done
     again = [edges.due(100.0, 10) for _ in range(3)]
     assert [list(zip(due.packs, due.numbers, strict=True)) for due in again] == [[(1, 3)], [(1, 4)], []]
     assert (edges.again, edges.resends, edges.safe[1]) == (2, 1, 3)
-    edges.hear(some.names[1], Awaits(store=store, number=3, resend=True), RESEND_S / 2.0)  # it has been sent
-    edges.hear(some.names[1], Awaits(store=store, number=2, resend=True), RESEND_S)  # said long ago: it is safe
+    edges.hear(some.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S / 2.0)  # it has been sent
+    edges.hear(some.names[1], BlockRequest(store=store, number=2, resend=True), RESEND_S)  # said long ago: it is safe
     assert edges.done
-    edges.hear(some.names[1], Awaits(store=store, number=3, resend=True), RESEND_S)
+    edges.hear(some.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S)
     assert not edges.done
 
 
 def test_an_edge_does_not_send_what_is_safe_already() -> None:
     some = fleet(1)
     edges = SimulatedEdges(some, start_s=0.0, speed=60.0)
-    edges.hear(some.names[0], Awaits(store=int(some.store[0]), number=40, resend=False), 0.0)
+    edges.hear(some.names[0], BlockRequest(store=int(some.store[0]), number=40, resend=False), 0.0)
     assert edges.due(30.0, 10).packs.size == 0
     assert edges.due(41.0, 10).numbers.tolist() == [40]

@@ -14,14 +14,14 @@ from bms_estimator.fleet.worker.checkpoint_format import (
     CHUNK_BYTES,
     PRESENT,
     CheckpointError,
-    Former,
-    Snapshot,
+    PartitionCheckpoint,
+    PreviousLayoutState,
     dtype_of,
     layout_of,
     read_checkpoint,
 )
 from bms_estimator.fleet.worker.deferred import Span
-from bms_estimator.fleet.worker.pack_state import PACK_STATE, Bench
+from bms_estimator.fleet.worker.pack_state import PACK_STATE, WorkRecord
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.payloads import Estimate
 from tests.estimator.simulated_cell import pulses
@@ -29,30 +29,30 @@ from tests.fleet.an_edge import SAMPLES, Stream, blocks_of, deliver, table
 
 names = st.text(max_size=10)
 snapshots = st.builds(
-    Snapshot,
+    PartitionCheckpoint,
     st.integers(0, 63),
     st.integers(0, 2**63),
     st.dictionaries(names, st.integers(0)),
     st.dictionaries(names, st.binary(max_size=40)),
     st.dictionaries(
-        names, st.builds(Former, st.just(layout_of(np.dtype([("x", "<f8", (2,))]))), st.binary(max_size=9))
+        names, st.builds(PreviousLayoutState, st.just(layout_of(np.dtype([("x", "<f8", (2,))]))), st.binary(max_size=9))
     ),
     st.dictionaries(names, st.builds(Span, st.integers(0, 2**63), st.integers(0, 2**63))),
 )
 
 
-def whole(snapshot: Snapshot) -> bytes:
+def whole(snapshot: PartitionCheckpoint) -> bytes:
     return b"".join(snapshot.chunks())
 
 
 @given(snapshots)
-def test_all_that_a_snapshot_holds_comes_back(snapshot: Snapshot) -> None:
+def test_all_that_a_snapshot_holds_comes_back(snapshot: PartitionCheckpoint) -> None:
     assert read_checkpoint(whole(snapshot)) == snapshot
 
 
 def test_many_packs_come_in_chunks() -> None:
     packs = {f"pack{n}": bytes([n % 256]) * 1000 for n in range(3000)}
-    snapshot = Snapshot(0, 9, packs=packs)
+    snapshot = PartitionCheckpoint(0, 9, packs=packs)
     chunks = list(snapshot.chunks())
     assert len(chunks) == 3
     assert max(map(len, chunks)) < CHUNK_BYTES + 10_000
@@ -61,7 +61,7 @@ def test_many_packs_come_in_chunks() -> None:
 
 @given(snapshots, st.data())
 @settings(max_examples=200)
-def test_whatever_is_damaged_is_said_and_no_other_exception(snapshot: Snapshot, data) -> None:
+def test_whatever_is_damaged_is_said_and_no_other_exception(snapshot: PartitionCheckpoint, data) -> None:
     good = whole(snapshot)
     bad = bytearray(good)
     at = data.draw(st.integers(0, len(good) - 1))
@@ -79,7 +79,7 @@ def test_whatever_is_damaged_is_said_and_no_other_exception(snapshot: Snapshot, 
 
 
 def test_no_byte_can_be_another_unseen() -> None:
-    good = whole(Snapshot(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
+    good = whole(PartitionCheckpoint(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
     for at in range(len(good)):
         with pytest.raises(CheckpointError):
             read_checkpoint(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
@@ -87,8 +87,8 @@ def test_no_byte_can_be_another_unseen() -> None:
 
 def test_blocks_that_an_earlier_version_kept_are_read_from_the_stream_again(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [checkpoint_format._entry(0, "known", b"12345678"), checkpoint_format._entry(255, "unknown", b"block")]
-    monkeypatch.setattr(Snapshot, "_entries", lambda *_: iter(entries))
-    read = read_checkpoint(whole(Snapshot(3, 7, packs={"known": b"", "unknown": b""})))
+    monkeypatch.setattr(PartitionCheckpoint, "_entries", lambda *_: iter(entries))
+    read = read_checkpoint(whole(PartitionCheckpoint(3, 7, packs={"known": b"", "unknown": b""})))
     assert (read.packs, read.deferred) == ({"known": b"12345678"}, {"unknown": Span(1, 7)})
 
 
@@ -100,12 +100,12 @@ def test_bytes_that_are_no_checkpoint_are_refused(data: bytes) -> None:
 
 def test_one_of_another_partition_is_refused() -> None:
     with pytest.raises(CheckpointError, match="of partition 3, not of 4"):
-        Partition.restore(4, table, whole(Snapshot(3, 0)))
+        Partition.restore(4, table, whole(PartitionCheckpoint(3, 0)))
 
 
 def test_one_of_a_format_to_come_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoint_format, "FORMAT", 2)
-    later = whole(Snapshot(3, 0))
+    later = whole(PartitionCheckpoint(3, 0))
     monkeypatch.undo()
     with pytest.raises(CheckpointError, match="is of format 2, this version reads 1: start the version that wrote it"):
         read_checkpoint(later)
@@ -142,12 +142,12 @@ class TestAnotherVersion:
         estimator[:] = [each for each in reversed(estimator) if each[0] != "fit_age_s"]
         described[0][1].append(["once_known", "<i8", []])
         dtype = np.dtype(checkpoint_format._fields(described))
-        bench = Bench(dtype)
+        bench = WorkRecord(dtype)
         for part in dtype.names:
             for name in set(dtype[part].names) & set(PACK_STATE[part].names):
                 bench.record[part][name] = state[part][name]
         bench.record["delivery"]["once_known"] = 7
-        former = Former(layout_of(dtype), bench.take())
+        former = PreviousLayoutState(layout_of(dtype), bench.take())
         snapshot = stream.partition.snapshot()
         return stream, whole(replace(snapshot, packs={}, former={"a": former}))
 
@@ -198,7 +198,7 @@ class TestAnotherVersion:
         assert (partition.counters["lost_blocks"], partition.counters["too_dense"]) == (1, 1)
 
     def test_whose_bytes_are_none_of_its_layout_begins_anew(self, samples) -> None:
-        former = Former(layout_of(np.dtype([("x", "<f8")])), b"1234567")
-        partition = Partition.restore(5, table, whole(Snapshot(5, 0, former={"a": former})))
+        former = PreviousLayoutState(layout_of(np.dtype([("x", "<f8")])), b"1234567")
+        partition = Partition.restore(5, table, whole(PartitionCheckpoint(5, 0, former={"a": former})))
         assert partition.take("a", blocks_of(samples)[0], 1).state
         assert partition.counters["damaged_states"] == 1

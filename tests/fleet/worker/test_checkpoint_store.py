@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint_store import Claim, FencedError, Keeping
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.fleet.engine import running
 from tests.fleet.workers import PERIOD_S, SAMPLES, block, end_states, estimated, know, send, until
@@ -36,13 +36,13 @@ async def nc(url) -> AsyncIterator[Client]:
         yield nc
 
 
-async def _keeping(nc: Client, worker: str) -> Keeping:
+async def _keeping(nc: Client, worker: str) -> CheckpointStore:
     js = nc.jetstream()
     states = await js.object_store(subjects.STATES_BUCKET)
-    return Keeping(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
+    return CheckpointStore(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
 
 
-async def _load(keeping: Keeping, claim: Claim) -> list[bytes]:
+async def _load(keeping: CheckpointStore, claim: Claim) -> list[bytes]:
     return [data async for _, data in keeping.load(claim)]
 
 

@@ -14,7 +14,7 @@ from bms_estimator.estimator.estimator import estimator_of
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.worker import partition as partition_module
 from bms_estimator.fleet.worker.block_order import ASKED_EACH, MAX_PASSED, TOLD_EACH
-from bms_estimator.fleet.worker.block_processor import AT_ONCE, Stepping
+from bms_estimator.fleet.worker.block_processor import AT_ONCE, BlockProcessor
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import load_any
@@ -447,7 +447,7 @@ class TestFaultsOfAnEdge:
         blocks = blocks_of(samples[:400])
         deliver(stream, "a", blocks[:9])
         with monkeypatch.context() as patched, capture_logs() as logs:
-            patched.setattr(Stepping, "_state", fail)  # after the estimator has taken the samples
+            patched.setattr(BlockProcessor, "_state", fail)  # after the estimator has taken the samples
             taken = stream.send("a", blocks[9])
             stream.send("new", blocks[0])
         assert (taken.state, taken.failed, taken.awaits.number, taken.awaits.resend) == (None, 1, 11, False)

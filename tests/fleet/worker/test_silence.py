@@ -11,9 +11,9 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint_store import Keeping
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.partition import Table
-from bms_estimator.fleet.worker.partition_lease import Holding
+from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.fleet.engine import running
@@ -105,10 +105,12 @@ def _packs_of(partition: int) -> int:
     return sum(subjects.partition_of(pack, PARTITIONS) == partition for pack in PACKS)
 
 
-async def _holding_first_blocks(nc: Client, table: Table) -> tuple[Holding, asyncio.Task[None]]:
+async def _holding_first_blocks(nc: Client, table: Table) -> tuple[PartitionLease, asyncio.Task[None]]:
     """A worker's only partition, once it has stepped the first block of each pack; and what goes on with it."""
     inbox = nc.new_inbox()
-    holding = Holding(nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock(), partitions=1, is_busy=lambda: False)
+    holding = PartitionLease(
+        nc, 0, table, await _keeping(nc, "w"), inbox, asyncio.Lock(), partitions=1, is_busy=lambda: False
+    )
     await _subscribe(nc, f"{inbox}.0.*", holding.receive)
     taking = asyncio.create_task(holding.run())
     for pack in PACKS:
@@ -135,7 +137,7 @@ async def _subscribe(nc: Client, subject: str, receive) -> None:
     await nc.subscribe(subject, cb=received)
 
 
-async def _keeping(nc: Client, worker: str) -> Keeping:
+async def _keeping(nc: Client, worker: str) -> CheckpointStore:
     js = nc.jetstream()
     states = await js.object_store(subjects.STATES_BUCKET)
-    return Keeping(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
+    return CheckpointStore(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.membership import owners
+from bms_estimator.fleet.worker.membership import assign_partitions
 from bms_estimator.fleet.worker.partition import Partition
 from tests.fleet.engine import connected, running
 from tests.fleet.workers import Heartbeats, Process, block, end_states, estimated, know, send
@@ -92,9 +92,9 @@ def _expected_hours(known, sent: int) -> dict[str, bytes]:
 
 
 def test_each_worker_has_its_part_and_few_partitions_move() -> None:
-    before, after = owners(64, ["a", "b"]), owners(64, ["a", "b", "c"])
+    before, after = assign_partitions(64, ["a", "b"]), assign_partitions(64, ["a", "b", "c"])
     assert sorted(Counter(before).values()) == [32, 32]
     assert max(Counter(after).values()) == 22
     moved = sum(old != new for old, new in zip(before, after, strict=True))
     assert moved <= 28  # 20 at least
-    assert owners(3, ["a", "b"]) == owners(3, ["b", "a"])
+    assert assign_partitions(3, ["a", "b"]) == assign_partitions(3, ["b", "a"])

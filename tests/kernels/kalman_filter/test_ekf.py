@@ -13,7 +13,7 @@ from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
 from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, temperature, window
 from bms_estimator.kernels.kalman_filter import noise as ekf_noise
-from bms_estimator.kernels.kalman_filter.mixture import combine, merge, unite
+from bms_estimator.kernels.kalman_filter.mixture import merge_pair, mixture_moments, prune_and_merge
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
@@ -44,8 +44,8 @@ def somewhere(p, seed=1, time_s=1.0):
     s["covariance"][0] = (mixed @ mixed.T / STATES) * std[:, None] * std
     s["x_a"] = rng.normal(1.0, 0.5, BRANCHES)
     for current_a, voltage_v in zip(rng.normal(1.5, 0.5, 5), rng.normal(3.6, 0.01, 5), strict=True):
-        window.count_on(s, p, time_s / 5, False, current_a, 12.0)
-        window.gather(s, current_a, voltage_v)
+        window.integrate_current(s, p, time_s / 5, False, current_a, 12.0)
+        window.add_to_window(s, current_a, voltage_v)
     return s
 
 
@@ -94,7 +94,7 @@ def test_p_goes_by_the_derivative_of_the_mean() -> None:
     def after(mean, covariance):
         s = somewhere(p, time_s=20.0)
         s["mean"][0], s["covariance"][0] = mean, covariance
-        ekf.decay(s, p)
+        ekf.transition_diagonal(s, p)
         ekf.predict(s, p, 0)
         return s["mean"][0].copy(), s["covariance"][0].copy()
 
@@ -152,7 +152,7 @@ def test_an_update_over_the_bend_near_empty_is_that_of_bayes(
     grid = np.linspace(-0.05, 0.6, 4000)
     ocv_v = np.interp(grid, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
     voltage_v = np.interp(true_soc, grid, ocv_v)
-    window.gather(s, 0.0, voltage_v)
+    window.add_to_window(s, 0.0, voltage_v)
     ekf.update(s, p, 0, noise_v**2)
     weight = np.exp(-0.5 * ((grid - before) / std) ** 2 - 0.5 * ((ocv_v - voltage_v) / noise_v) ** 2)
     mean = np.average(grid, weights=weight)
@@ -183,7 +183,7 @@ def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
     p = settings()
     s = np.zeros(1, EKF_STATE)[0]
     mean, covariance = s["mean"][0], s["covariance"][0]
-    ekf_noise.switch_on(p, 2.0, mean, covariance)
+    ekf_noise.initial_branch_currents(p, 2.0, mean, covariance)
     one_c, size = p["capacity_as"] / 3600.0, BRANCHES + 1
     a = -np.diag(np.concatenate([[1.0 / p["load_s"]], 1.0 / TAUS]))
     a[1:, 0] = 1.0 / TAUS
@@ -214,7 +214,7 @@ def test_the_load_in_a_gap_after_a_peak_may_have_gone_on_or_ended(first_c: float
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
     hypotheses.initialize_filter(s, p, 0.55, first_c * one_c, 12.0)
-    unknown_c = gap_charge.unseen_charge(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
+    unknown_c = gap_charge.gap_charge_std(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
     assert first_c - 1.29 < unknown_c < first_c
 
 
@@ -233,7 +233,7 @@ def test_above_the_temperatures_of_the_cell_file_nothing_is_surer() -> None:
     s = somewhere(p)
     sizes = []
     for s["temperature_c"] in (30.0, 45.0, 60.0):
-        temperature.follow_temperature(s)
+        temperature.update_arrhenius_factors(s)
         sizes.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0)))
     assert sizes[1] == pytest.approx(1.5**2 * np.array(sizes[0]), rel=0.01)
     assert sizes[2] == pytest.approx(2.0**2 * np.array(sizes[0]), rel=0.01)
@@ -244,11 +244,11 @@ def test_inflation_is_one_for_white_innovations_and_follows_those_that_stay() ->
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
     rng, slow = np.random.default_rng(3), []
     for u in rng.standard_normal(20_000):
-        ekf.inflate(s, 0, 1.0, u)
+        ekf.adapt_bias_inflation(s, 0, 1.0, u)
         slow.append(s["slow_inflation"][0])
     assert np.mean(slow) == pytest.approx(1.3, abs=0.3)  # what is below 1 counts as 1
     for _ in range(7200):
-        ekf.inflate(s, 0, 1.0, 0.2)
+        ekf.adapt_bias_inflation(s, 0, 1.0, 0.2)
     assert s["slow_inflation"][0] > 30.0
     assert s["fast_inflation"][0] > 3.0
 
@@ -259,7 +259,7 @@ def test_inflation_of_white_innovations_is_small_however_far_samples_are_apart(d
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
     rng, both = np.random.default_rng(4), []
     for u in rng.standard_normal(20_000):
-        ekf.inflate(s, 0, dt_s, u)
+        ekf.adapt_bias_inflation(s, 0, dt_s, u)
         both.append((s["fast_inflation"][0], s["slow_inflation"][0]))
     assert np.mean(both, axis=0) == pytest.approx([1.3, 1.3], abs=0.3)
 
@@ -288,7 +288,7 @@ def test_branches_in_a_gap_are_as_unsure_as_of_a_load_that_nobody_saw() -> None:
         process_a += load_a * np.sqrt(1.0 - np.exp(-2.0 / t)) * rng.standard_normal(4000)
     covariance, f = np.zeros((STATES, STATES)), np.ones(STATES)
     f[BRANCH] = np.exp(-gap_s / TAUS)
-    ekf_noise.add_unseen(p, covariance, f, load_a, gap_s / p["capacity_as"])
+    ekf_noise.add_gap_noise(p, covariance, f, load_a, gap_s / p["capacity_as"])
     assert np.sqrt(np.diag(covariance)[BRANCH]) == pytest.approx(x.std(axis=1), rel=0.15)
 
 
@@ -296,7 +296,7 @@ def test_branches_in_a_gap_are_as_unsure_as_of_a_load_that_nobody_saw() -> None:
 def test_what_a_gap_adds_is_a_covariance(gap_s: float) -> None:
     p, covariance, f = settings(), np.zeros((STATES, STATES)), np.ones(STATES)
     f[BRANCH] = np.exp(-gap_s / TAUS)
-    ekf_noise.add_unseen(p, covariance, f, 2.0, gap_s / p["capacity_as"])
+    ekf_noise.add_gap_noise(p, covariance, f, 2.0, gap_s / p["capacity_as"])
     assert covariance == pytest.approx(covariance.T)
     assert np.linalg.eigvalsh(covariance).min() > -1e-12
 
@@ -327,17 +327,17 @@ def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
     p = settings(series=series)
     s, weight = several(p)
     mean, covariance = mixture(s["mean"][:3], s["covariance"][:3], weight)
-    combine(s)
+    mixture_moments(s)
     assert s["soc"] == pytest.approx(mean[SOC])
     assert s["soc_std"] == pytest.approx(np.sqrt(covariance[SOC, SOC]))
     spread = p["cell_spread"] * (1.0 - mean[SOC]) if series > 1.0 else 0.0
-    assert hypotheses.pack_std(s, p) == pytest.approx(np.sqrt(covariance[SOC, SOC] + spread**2))
+    assert hypotheses.weakest_cell_soc_std(s, p) == pytest.approx(np.sqrt(covariance[SOC, SOC] + spread**2))
 
 
 def test_two_that_become_one_keep_mean_and_covariance() -> None:
     s, weight = several(settings(), 2)
     mean, covariance = mixture(s["mean"][:2], s["covariance"][:2], weight)
-    unite(s, 0, 1)
+    merge_pair(s, 0, 1)
     assert s["mean"][0] == pytest.approx(mean)
     assert s["covariance"][0] == pytest.approx(covariance)
     assert np.exp(s["ln_weight"][0]) == pytest.approx(weight.sum())
@@ -348,7 +348,7 @@ def test_what_is_unlikely_goes_and_what_agrees_becomes_one() -> None:
     s["covariance"][:4, SOC, SOC] = 0.02**2
     s["mean"][:4, SOC] = 0.3, 0.5, 0.505, 0.7
     s["ln_weight"][:4] = 0.0, -0.1, -0.1, -20.0
-    merge(s)
+    prune_and_merge(s)
     assert s["count"] == 2
     assert s["mean"][:2, SOC] == pytest.approx([0.3, 0.5025])
 
@@ -367,10 +367,10 @@ def test_a_hypothesis_that_holds_its_model_for_wrong_loses_against_one_that_does
     s["ln_weight"][:2] = 0.0
     assert abs(s["mean"][1 - true, B_SLOW]) > 0.2
     for _ in range(60):
-        window.count_on(s, p, 1.0, False, s["current_a"], 25.0)
+        window.integrate_current(s, p, 1.0, False, s["current_a"], 25.0)
         s["window"]["samples"] = 0
-        window.gather(s, s["current_a"], voltage_v)
-        hypotheses.update_all(s, p)
+        window.add_to_window(s, s["current_a"], voltage_v)
+        hypotheses.update_hypotheses(s, p)
     likely = s["mean"][: s["count"], SOC][s["ln_weight"][: s["count"]] > -3.0]
     assert likely == pytest.approx([apart[true]], abs=0.05)
 
@@ -476,7 +476,7 @@ def test_of_a_hypothesis_that_went_nothing_is_left(drive) -> None:
         assert not any(f[name][f["count"] :].any() for name in rows)
     assert len(counts) > 1
     for soc_std, count in ((0.2, len(f["mean"])), (0.01, 1)):
-        hypotheses.seed(f, estimator.settings_record[0]["filter"], 0.5, soc_std)
+        hypotheses.spawn_hypotheses(f, estimator.settings_record[0]["filter"], 0.5, soc_std)
         assert f["count"] == count
     assert not any(f[name][1:].any() for name in rows)
 
@@ -507,7 +507,7 @@ def test_an_soc_that_was_known_and_is_wrong_by_far_is_given_up(drive) -> None:
     """0.3 too low, known to 0.01: within ten minutes the truth is inside the band, and after twenty nearby."""
     estimator = start(drive)
     estimator.run(drive.samples[:600])
-    hypotheses.seed(
+    hypotheses.spawn_hypotheses(
         estimator.record[0]["filter"], estimator.settings_record[0]["filter"], float(drive.soc[600]) - 0.3, 0.01
     )
     trace = estimator.run(drive.samples[600:2400])

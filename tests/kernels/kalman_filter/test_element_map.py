@@ -13,9 +13,9 @@ from bms_estimator.kernels.kalman_filter.element_map import (
     ELEMENTS,
     EXPONENT_MAX,
     EXPONENT_MIN,
-    age,
+    add_observation,
+    decay_weights,
     fit_element,
-    learn,
 )
 from bms_estimator.model.cell import load_cell
 
@@ -28,7 +28,7 @@ def filled(low: float, high: float, noise: float = 0.0) -> np.ndarray:
     table = np.zeros(1, dtype=ELEMENT_MAP)
     for soc in np.arange(low, high, 0.001):
         for e, function in enumerate(FUNCTIONS):
-            learn(table[0], e, soc, math.log(function(soc, TRUTH)) + rng.normal(0, noise), 0.02**2, 1.0)
+            add_observation(table[0], e, soc, math.log(function(soc, TRUTH)) + rng.normal(0, noise), 0.02**2, 1.0)
     return table
 
 
@@ -78,7 +78,7 @@ def test_an_exponent_beyond_the_searched_range_is_taken_at_its_end(exponent: flo
 
 def test_a_singular_fit_says_nothing_of_its_error() -> None:
     table = np.zeros(1, dtype=ELEMENT_MAP)
-    learn(table[0], 0, 0.5, -3.0, 0.1**2, 10.0)
+    add_observation(table[0], 0, 0.5, -3.0, 0.1**2, 10.0)
     table["moment"][0, 0, 12] = math.nan
     fit = fitted(table, TRUTH)
     assert np.isnan(fit["std"][1:4]).all()
@@ -96,15 +96,15 @@ def test_a_fit_takes_no_memory() -> None:
 
 def test_a_value_that_is_not_known_adds_nothing() -> None:
     table = np.zeros(1, dtype=ELEMENT_MAP)
-    learn(table[0], 0, 0.5, -3.0, 0.5**2, 10.0)
-    learn(table[0], 0, 0.5, -3.0, math.nan, 10.0)
+    add_observation(table[0], 0, 0.5, -3.0, 0.5**2, 10.0)
+    add_observation(table[0], 0, 0.5, -3.0, math.nan, 10.0)
     assert table["weight"].sum() == 0.0
 
 
 def test_new_evidence_outweighs_aged_evidence() -> None:
     table = np.zeros(1, dtype=ELEMENT_MAP)
-    learn(table[0], 4, 0.5, math.log(0.1), 0.01**2, 100.0)
-    age(table[0], 4, 0.01)
-    learn(table[0], 4, 0.5, math.log(0.2), 0.01**2, 100.0)
+    add_observation(table[0], 4, 0.5, math.log(0.1), 0.01**2, 100.0)
+    decay_weights(table[0], 4, 0.01)
+    add_observation(table[0], 4, 0.5, math.log(0.2), 0.01**2, 100.0)
     value = math.exp(table["moment"][0, 4, 12] / table["weight"][0, 4, 12])
     assert value == pytest.approx(0.2, rel=0.02)

@@ -3,8 +3,13 @@
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.identified_parameters import learned_ocv
-from bms_estimator.kernels.kalman_filter.ocv_correction import forget_curve, learned_v, per_node_v, place
+from bms_estimator.estimator.identified_parameters import ocv_correction_with_std
+from bms_estimator.kernels.kalman_filter.ocv_correction import (
+    node_error_scale,
+    node_position,
+    ocv_correction,
+    reset_ocv_correction,
+)
 from bms_estimator.kernels.kalman_filter.records import NODE, NODES, STATES
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE
@@ -17,13 +22,13 @@ GENERIC = load_cell("nmc", 3.0)
 def test_the_first_variance_is_the_curve_s_at_nodes_and_between() -> None:
     p = Estimator(GENERIC).settings_record[0]["filter"]
     x, covariance = np.ones(STATES), np.ones((STATES, STATES))
-    forget_curve(x, covariance)
+    reset_ocv_correction(x, covariance)
     assert (x[NODE:] == 0.0).all()
     assert (covariance[:NODE, NODE:] == 0.0).all()
     for soc in (0.0, 0.3, 0.325, 0.34, 0.9876, 1.0):
-        i, t = place(soc)
+        i, t = node_position(soc)
         row = np.zeros(STATES)
-        row[NODE + i], row[NODE + i + 1] = per_node_v(p, soc, t) * np.array([1.0 - t, t])
+        row[NODE + i], row[NODE + i + 1] = node_error_scale(p, soc, t) * np.array([1.0 - t, t])
         error_v = np.interp(soc, np.linspace(0.0, 1.0, 41), p["curve_error_v"])
         assert np.isclose(row @ covariance @ row, p["learned"] * error_v**2, rtol=1e-12)
 
@@ -34,9 +39,9 @@ def test_it_is_that_of_the_nodes_in_units_of_the_error() -> None:
     x[NODE:] = np.arange(NODES)
     for soc in (0.05, 0.5, 0.95):
         error_v = np.interp(soc, np.linspace(0.0, 1.0, 41), p["curve_error_v"])
-        assert np.isclose(learned_v(p, x, soc), soc * (NODES - 1) * error_v * np.sqrt(p["learned"]))
-    assert learned_v(p, x, -0.1) == learned_v(p, x, 0.0)
-    assert learned_v(p, x, 1.1) == learned_v(p, x, 1.0)
+        assert np.isclose(ocv_correction(p, x, soc), soc * (NODES - 1) * error_v * np.sqrt(p["learned"]))
+    assert ocv_correction(p, x, -0.1) == ocv_correction(p, x, 0.0)
+    assert ocv_correction(p, x, 1.1) == ocv_correction(p, x, 1.0)
 
 
 def test_a_curve_with_a_plateau_is_left_as_it_is() -> None:
@@ -47,7 +52,7 @@ def test_a_curve_with_a_plateau_is_left_as_it_is() -> None:
     f = estimator.record[0]["filter"]
     assert (f["mean"][f["best"]][NODE:] == 0.0).all()
     soc = np.linspace(0.0, 1.0, 41)
-    correction_v, std_v = learned_ocv(estimator.record[0], estimator.settings_record[0], soc)
+    correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], soc)
     assert (correction_v == 0.0).all()
     assert np.allclose(std_v, estimator.settings_record[0]["filter"]["curve_error_v"])
 
@@ -86,7 +91,7 @@ def test_a_generic_curve_is_learned_as_far_as_the_soc_is_known() -> None:
     error, std, estimator = partial_cycles(GENERIC, 6)
     assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95
     soc = np.linspace(0.4, 0.8, 9)
-    correction_v, std_v = learned_ocv(estimator.record[0], estimator.settings_record[0], soc)
+    correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], soc)
     p = estimator.settings_record[0]["filter"]
     wrong_v = np.interp(soc, np.linspace(0.0, 1.0, 401), OXIDE.ocv_v - p["ocv_v"])
     assert (np.abs(wrong_v - correction_v) < 2.0 * std_v).all()

@@ -67,7 +67,7 @@ def test_the_step_leads_where_memory_and_leakage_balance(seed: int) -> None:
     q["count"], q["leak_v2s"][:COUNT], q["middle"][:COUNT] = COUNT, 1e-3, rng.normal(size=COUNT)
     m["information"][:COUNT, :COUNT] = np.tril(psi.T @ psi)
     m["pull"][:COUNT], m["theta"][:COUNT] = psi.T @ rng.normal(size=3), rng.normal(size=COUNT)
-    assert learning_law.find_step(state[0], settings[0])
+    assert learning_law.solve_parameter_step(state[0], settings[0])
     ridge = np.diag(q["leak_v2s"][:COUNT])
     balance = np.linalg.solve(psi.T @ psi + ridge, m["pull"][:COUNT] + ridge @ q["middle"][:COUNT])
     assert m["theta"][:COUNT] + m["step"][:COUNT] == pytest.approx(balance, rel=1e-6, abs=1e-6)
@@ -77,4 +77,4 @@ def test_where_rounding_has_left_no_positive_matrix_theta_stays() -> None:
     state, settings = np.zeros(1, LEARNING_STATE), np.zeros(1, LEARNING_SETTINGS)
     settings["count"], settings["leak_v2s"] = COUNT, 1e-6
     state["information"][0, 2, 2] = -1.0
-    assert not learning_law.find_step(state[0], settings[0])
+    assert not learning_law.solve_parameter_step(state[0], settings[0])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.protocols.base.device_clock import LAG_S, ToldClock
+from bms_estimator.protocols.base.device_clock import LAG_S, DeviceClock
 from bms_estimator.protocols.devices.text import TextDialect
 
 
@@ -23,13 +23,13 @@ from bms_estimator.protocols.devices.text import TextDialect
     ],
 )
 def test_times(stamps: list[tuple[float, float]], placed: list[float], jumps: int):
-    clock = ToldClock()
+    clock = DeviceClock()
     assert [clock.place(*stamp) for stamp in stamps] == placed
     assert clock.jumps == jumps
 
 
 def test_a_clock_that_is_slow_loses_no_time():
-    clock = ToldClock()
+    clock = DeviceClock()
     placed = [clock.place(float(second), 1e-3 * second) for second in range(200)]
     assert placed[-1] == pytest.approx(199.0)
     assert max(b - a for a, b in itertools.pairwise(placed)) <= LAG_S + 2.0
@@ -37,7 +37,7 @@ def test_a_clock_that_is_slow_loses_no_time():
 
 
 def test_samples_that_came_in_bursts_are_no_slow_clock():
-    clock = ToldClock()
+    clock = DeviceClock()
     placed = [clock.place(100.0 * (second // 100 + 1), float(second)) for second in range(1000)]
     assert placed == [float(second) for second in range(1000)]
     assert clock.jumps == 0
@@ -45,7 +45,7 @@ def test_samples_that_came_in_bursts_are_no_slow_clock():
 
 @given(st.lists(st.tuples(st.floats(0, 10), st.floats() | st.just(1.0))))
 def test_it_never_runs_back_and_never_far_ahead_of_the_arrivals(stamps: list[tuple[float, float]]):
-    clock, arrival_s, last_s = ToldClock(), 0.0, 0.0
+    clock, arrival_s, last_s = DeviceClock(), 0.0, 0.0
     for step_s, told_s in stamps:
         arrival_s += step_s
         placed_s = clock.place(arrival_s, told_s)

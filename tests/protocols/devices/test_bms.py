@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
-from bms_estimator.protocols.base.polled_protocol import GAP_S, PACE_S, UNANSWERED_ROUNDS, AskedDialect
+from bms_estimator.protocols.base.polled_protocol import GAP_S, PACE_S, UNANSWERED_ROUNDS, PolledProtocol
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.daly import sealed
 from bms_estimator.protocols.registry import make_dialect
@@ -40,11 +40,11 @@ streams = st.lists(
 ).map(b"".join)
 
 
-def dialect(protocol: str, **options: object) -> AskedDialect:
-    return cast("AskedDialect", make_dialect(SensorSettings.model_validate({"protocol": protocol, **options})))
+def dialect(protocol: str, **options: object) -> PolledProtocol:
+    return cast("PolledProtocol", make_dialect(SensorSettings.model_validate({"protocol": protocol, **options})))
 
 
-def fed(dialect: AskedDialect, *reads: bytes, arrival_s: float = 1.0) -> tuple[SampleBlock, list[list[float]]]:
+def fed(dialect: PolledProtocol, *reads: bytes, arrival_s: float = 1.0) -> tuple[SampleBlock, list[list[float]]]:
     """Samples of reads that come at once, and their cells."""
     blocks, cells = [], []
     for read in reads:
@@ -53,7 +53,7 @@ def fed(dialect: AskedDialect, *reads: bytes, arrival_s: float = 1.0) -> tuple[S
     return np.concatenate(blocks), cells
 
 
-def faults(dialect: AskedDialect) -> dict[str, int]:
+def faults(dialect: PolledProtocol) -> dict[str, int]:
     return {name: count for name in FAULTS if (count := dialect.counters[name])}
 
 
@@ -266,7 +266,7 @@ def test_the_baud_rate_is_the_protocols_unless_it_is_told(protocol: str, baud: i
     assert SensorSettings.model_validate({"protocol": protocol, "baud": 19_200}).baud == 19_200
 
 
-def questions(device: AskedDialect, seconds: float, answer: bytes = b"") -> list[tuple[float, bytes]]:
+def questions(device: PolledProtocol, seconds: float, answer: bytes = b"") -> list[tuple[float, bytes]]:
     """When what is asked, looked at 20 times a second; each question gets an answer."""
     asked = []
     for tick in range(round(20 * seconds)):

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.protocols.base.device_protocol import Dialect
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices.junctek import ASK, JunctekDialect
 from bms_estimator.protocols.devices.pylontech import PylontechDialect
 from bms_estimator.protocols.devices.vedirect import VeDirectDialect
@@ -19,7 +19,7 @@ from bms_estimator.protocols.registry import make_dialect
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_adc import Reading
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import LONG_S
 
 
@@ -91,7 +91,7 @@ def bat(battery: int, cells_mv: list[int]) -> bytes:
 
 US2000_CELLS = [3379, 3379, 3379, 3379, 3381, 3378, 3378, 3378, 3380, 3379, 3380, 3380, 3378, 3380, 3380]
 
-DIALECTS: Mapping[str, Callable[[], Dialect]] = {
+DIALECTS: Mapping[str, Callable[[], DeviceProtocol]] = {
     "vedirect": VeDirectDialect,
     "junctek": JunctekDialect,
     "pylontech": PylontechDialect,
@@ -288,7 +288,7 @@ async def test_a_device_on_a_line_is_heard_and_asked_as_it_wants(name: str, cell
     with METERS[name](lambda _: Reading(-3.25, 49.87, 21.0), 1.0) as meter:
         sensor = SensorSettings.model_validate({"protocol": name, "port": meter.path})
         running = asyncio.create_task(meter.run())
-        async with asyncio.timeout(LONG_S), SerialBoard(sensor) as source:
+        async with asyncio.timeout(LONG_S), SerialSource(sensor) as source:
             async for block in source:
                 assert values(block) == [(49.87, -3.25)] * block.size
                 assert set(block["temperature_c"]) == {21.0}

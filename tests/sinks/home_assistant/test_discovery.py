@@ -12,8 +12,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Alarm, Parameter, Snapshot
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.sinks.home_assistant.discovery import Described, discovery
-from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
+from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.sinks.snapshots import ONE, STACK
 
 ROOT = "bms/pack"
@@ -25,12 +25,12 @@ def described(found: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {key: component for key, component in found["components"].items() if set(component) != {"platform"}}
 
 
-COMPONENTS = described(discovery(HOME, Described(ONE.info), ROOT, 0.0))
+COMPONENTS = described(discovery(HOME, DiscoveryInputs(ONE.info), ROOT, 0.0))
 SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
 MOST_ROWS_PER_MIN = 20
 
 
-OF_STACK = described(discovery(HOME, Described(STACK.info), ROOT, 0.0))
+OF_STACK = described(discovery(HOME, DiscoveryInputs(STACK.info), ROOT, 0.0))
 
 
 def with_values(**values: float | None) -> Snapshot:
@@ -84,7 +84,7 @@ def restless(seconds: float, period_s: float = 0.1, one: Snapshot = ONE) -> Iter
 
 def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str, dict[str, object]]]:
     """When Home Assistant is told what on which of its topics."""
-    messages, sent = Messages("bms", "pack"), Sent()
+    messages, sent = MessageBuilder("bms", "pack"), PublishedState()
     for now_s, each in stream:
         due, sent = messages.due(sent, each, now_s)
         for message in due:
@@ -113,7 +113,9 @@ def rows(
 def test_home_assistant_records_at_most_20_rows_in_any_minute(
     stream: Callable[[float], Iterator[tuple[float, Snapshot]]],
 ) -> None:
-    components = described(discovery(HOME, Described(ONE.info, CELLS), ROOT, 0.0)) if stream is restless else COMPONENTS
+    components = (
+        described(discovery(HOME, DiscoveryInputs(ONE.info, CELLS), ROOT, 0.0)) if stream is restless else COMPONENTS
+    )
     written = np.array(rows(stream(900.0), components))
     assert written.size > 100
     assert max(np.count_nonzero((written >= t) & (written < t + 60.0)) for t in written) <= MOST_ROWS_PER_MIN
@@ -147,7 +149,7 @@ def test_noise_alone_makes_no_rows() -> None:
 @pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.0, 4.0, 10.0])
 def test_values_never_expire_while_estimates_come(rate_hz: float) -> None:
     info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(HOME, Described(info), ROOT, 0.0)["components"].values()
+    components = discovery(HOME, DiscoveryInputs(info), ROOT, 0.0)["components"].values()
     expiry_s = min(c["expire_after"] for c in components if "expire_after" in c)
     rng = np.random.default_rng(3)
     late_s = [float(rng.uniform(0.0, 0.9 / rate_hz)) for _ in range(round(600 * rate_hz))]
@@ -205,7 +207,7 @@ def test_raw_observer_values_are_disabled_until_the_user_wants_them() -> None:
 
 
 def test_discovery_describes_every_entity_with_both_availabilities() -> None:
-    found = discovery(HOME, Described(ONE.info), ROOT, 0.0)
+    found = discovery(HOME, DiscoveryInputs(ONE.info), ROOT, 0.0)
     assert (found["device"]["identifiers"], found["device"]["serial_number"]) == (["bms_pack"], "A1")
     assert found["origin"]["name"] == "bms_estimator"
     assert found["availability_mode"] == "all"
@@ -222,13 +224,13 @@ def test_a_value_expires_after_three_periods_and_half_a_minute_at_least(
     rate_hz: float, sample_period_s: float, expire_s: int
 ) -> None:
     info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(HOME, Described(info), ROOT, sample_period_s)["components"].values()
+    components = discovery(HOME, DiscoveryInputs(info), ROOT, sample_period_s)["components"].values()
     assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
 
 
 def discoveries(*snapshots: Snapshot, commands: tuple[str, ...] = (), **settings: Any) -> list[dict[str, Any]]:
     """All that is told while ``snapshots`` come."""
-    messages, sent = Messages("bms", "pack", home_assistant=HomeAssistantSettings(**settings)), Sent()
+    messages, sent = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(**settings)), PublishedState()
     messages.commands = commands
     found = []
     for i, each in enumerate(snapshots):
@@ -266,9 +268,9 @@ def test_commands_are_there_where_they_are_allowed() -> None:
 
 
 def test_what_is_not_there_any_more_is_removed() -> None:
-    messages = Messages("bms", "pack", alarms=[name for name in ALARMS if name != "soc_low"])
+    messages = MessageBuilder("bms", "pack", alarms=[name for name in ALARMS if name != "soc_low"])
     messages.commands = ("set_soc",)
-    due, _ = messages.due(Sent(), ONE, 0.0)
+    due, _ = messages.due(PublishedState(), ONE, 0.0)
     [found] = [json.loads(m.payload) for m in due if m.topic.endswith("/device/bms_pack/config")]
     removed = {key: c["platform"] for key, c in found["components"].items() if key not in described(found)}
     assert removed == {
@@ -331,14 +333,14 @@ def test_an_unknown_name_is_refused_with_what_there_is() -> None:
 
 
 def test_charging_may_be_positive() -> None:
-    messages = Messages("bms", "pack", home_assistant=HomeAssistantSettings(current_sign="charge_positive"))
-    due, _ = messages.due(Sent(), with_values(current_a=2.0, power_w=8.0, voltage_v=4.0), 0.0)
+    messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(current_sign="charge_positive"))
+    due, _ = messages.due(PublishedState(), with_values(current_a=2.0, power_w=8.0, voltage_v=4.0), 0.0)
     values = next(json.loads(m.payload) for m in due if m.topic == f"{ROOT}/home_assistant")
     assert (values["current_a"], values["power_w"], values["voltage_v"]) == (-2.0, -8.0, 4.0)
 
 
 def test_of_a_pack_that_it_is_not_to_know_home_assistant_is_told_nothing_but_that() -> None:
-    messages = Messages("bms", "pack", home_assistant=HomeAssistantSettings(enabled=False, discovery_prefix="ha"))
-    due, _ = messages.due(Sent(), ONE, 0.0)
+    messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(enabled=False, discovery_prefix="ha"))
+    due, _ = messages.due(PublishedState(), ONE, 0.0)
     told = [m for m in due if "home_assistant" in m.topic or not m.topic.startswith("bms/")]
     assert [(m.topic, m.payload, m.retain) for m in told] == [("ha/device/bms_pack/config", b"", True)]

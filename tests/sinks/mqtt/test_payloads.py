@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.model.payloads import PAYLOAD_VERSION
 from bms_estimator.sinks.mqtt.asyncapi import ARGUMENTS, document
-from bms_estimator.sinks.mqtt.messages import Messages, Sent
+from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.requests import COMMANDS, NAMES
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from tests.command_line import run
@@ -42,18 +42,20 @@ def test_a_field_that_is_gone_or_of_another_type_is_found() -> None:
 
 
 def test_the_version_is_published() -> None:
-    messages = Messages("bms", "pack")
+    messages = MessageBuilder("bms", "pack")
     said = {
-        m.topic.removeprefix("bms/pack/"): m.payload for m in (*messages.greeting(), *messages.due(Sent(), ONE, NOW)[0])
+        m.topic.removeprefix("bms/pack/"): m.payload
+        for m in (*messages.greeting(), *messages.due(PublishedState(), ONE, NOW)[0])
     }
     assert json.loads(said["info"])["payload_version"] == PAYLOAD_VERSION
     assert json.loads(said["schema"])["payload_version"] == PAYLOAD_VERSION
 
 
 def test_every_message_goes_out_as_the_table_of_topics_says() -> None:
-    messages, told = Messages("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
+    messages, told = MessageBuilder("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
     sent = {
-        m.topic.removeprefix("bms/pack/"): m for m in (*messages.kept(None, told), *messages.due(Sent(), told, NOW)[0])
+        m.topic.removeprefix("bms/pack/"): m
+        for m in (*messages.kept(None, told), *messages.due(PublishedState(), told, NOW)[0])
     }
     assert sent["alarm/soc_low"].qos == TOPICS["alarm"].qos
     assert sent["alarm/soc_low"].retain

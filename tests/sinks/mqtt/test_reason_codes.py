@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.queue_sender import WINDOW
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
@@ -42,11 +42,11 @@ async def test_a_wrong_password_is_called_that_and_is_nowhere_itself(
 ) -> None:
     (tmp_path / "password").write_text("s3cret")
     (tmp_path / "password").chmod(0o600)
-    delivery = Delivery()
+    delivery = DeliveryStats()
     async with Proxy(locked_broker.port, knows_5=knows_5) as proxy:
         settings = MqttSettings(url=proxy.url, username="meter", password_file=tmp_path / "password")
         with structlog.testing.capture_logs() as logs:
-            async with MqttSink(settings, "pack", Requests(delivery), delivery, Outbox(None, most=4)):
+            async with MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, most=4)):
                 await until(lambda: delivery.trouble)
     assert [line["event"] for line in logs] == ["broker not reachable"]
     assert logs[0]["reason"].startswith(WRONG)

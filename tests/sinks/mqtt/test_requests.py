@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.sinks.mqtt.requests import (
     COMMANDS_PER_MIN,
     LOG_S,
     MOST_PAYLOAD_BYTES,
     NAMES,
     READS_PER_MIN,
-    Requests,
+    RequestDispatcher,
 )
 
 
@@ -25,8 +25,8 @@ class Asked:
     """Requests with a clock that the test sets, and handlers that note their calls."""
 
     def __init__(self, *commands: Any) -> None:
-        self.delivery, self.now_s, self.granted = Delivery(), 0.0, list[str]()
-        self.requests = Requests(self.delivery, commands, monotonic=lambda: self.now_s)
+        self.delivery, self.now_s, self.granted = DeliveryStats(), 0.0, list[str]()
+        self.requests = RequestDispatcher(self.delivery, commands, monotonic=lambda: self.now_s)
         for name in NAMES:
             self.requests.offer(name, self._handler(name))
 

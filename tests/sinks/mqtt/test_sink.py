@@ -15,16 +15,16 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.client import PATIENCE, Client
-from bms_estimator.mqtt.connection import Connection, Hello
-from bms_estimator.mqtt.delivery_stats import Delivery
+from bms_estimator.mqtt.connection import Connection, ConnectOptions
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.protocol_negotiation import Dial
-from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING, Inbox
-from bms_estimator.mqtt.reconnect_loop import Link
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.receive_queue import MOST_BYTES, MOST_WAITING, ReceiveQueue
+from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
 from bms_estimator.process.backoff import LONGEST_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.availability import CORRECTION_S
-from bms_estimator.sinks.mqtt.requests import Requests
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
@@ -37,7 +37,7 @@ MOST_KEPT = 4
 AT_START = len(events(None, ONE))
 RETAINED = ("info", "availability", "sensor/availability", "schema", "health")
 DISCOVERY = "homeassistant/device/bms_pack/config"
-HELLO = Hello("test", Message("bms/pack/availability", b"offline", 1, retain=True), lambda *_: None)
+HELLO = ConnectOptions("test", Message("bms/pack/availability", b"offline", 1, retain=True), lambda *_: None)
 DYNAMIC_SECURITY = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
 
 
@@ -66,7 +66,7 @@ async def test_topics_and_retained_flags_are_as_documented(broker: Broker, url: 
     assert live.all("bms/pack/sensor/availability") == [b"online", b"offline"]
     seen = {name for name, _, _ in live.messages}
     assert {"bms/pack/state", "bms/pack/parameters", "bms/pack/home_assistant"} <= seen
-    assert sink.delivery == Delivery()
+    assert sink.delivery == DeliveryStats()
 
 
 async def test_retained_messages_are_sent_again_when_home_assistant_is_born(broker: Broker) -> None:
@@ -126,14 +126,14 @@ async def test_a_connection_that_comes_after_it_was_given_up_leaves_nothing_to_t
 async def test_a_lost_broker_is_tried_again_at_least_every_half_minute(tmp_path: Path) -> None:
     pauses: list[float] = []
 
-    class Impatient(Link):
+    class Impatient(ReconnectLoop):
         async def _pause(self, delay_s: float) -> None:
             pauses.append(delay_s)
             if len(pauses) == 12:
                 self.closing.set()
 
     settings = MqttSettings(url=Broker(tmp_path).url)
-    await Impatient(brokers(settings), HELLO, Dial(settings), never, Delivery()).run()
+    await Impatient(brokers(settings), HELLO, BrokerConnector(settings), never, DeliveryStats()).run()
     assert max(pauses) <= LONGEST_DELAY_S == 30.0
     assert pauses[0] <= 5.0 < pauses[3]
     assert len(set(pauses[-6:])) > 1, "clients of one broker do not come back all at once"
@@ -274,8 +274,8 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
 
 
 def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
-    delivery = Delivery()
-    inbox = Inbox(Requests(delivery).refuse, MOST_BYTES, MOST_WAITING)
+    delivery = DeliveryStats()
+    inbox = ReceiveQueue(RequestDispatcher(delivery).refuse, MOST_BYTES, MOST_WAITING)
     for length in (MOST_BYTES - 1, 200_000_000) * (2 * MOST_WAITING):
         payload = bytes(1) * min(length, 2 * MOST_BYTES)
         inbox.put_nowait(aiomqtt.Message("t", payload, 1, retain=False, mid=1, properties=None))
@@ -415,7 +415,9 @@ async def test_name_password_and_tls_reach_the_broker(secure_broker: Broker, tmp
     tls = aiomqtt.TLSParameters(ca_certs=str(certificate))
     async with (
         Listener(secure_broker, "bms/#", username="meter", password="s3cret", tls_params=tls) as live,
-        MqttSink(settings, "pack", Requests(Delivery()), Delivery(), Outbox(None, most=MOST_KEPT)) as mqtt,
+        MqttSink(
+            settings, "pack", RequestDispatcher(DeliveryStats()), DeliveryStats(), Outbox(None, most=MOST_KEPT)
+        ) as mqtt,
     ):
         mqtt.publish(ONE)
         await live.wait("bms/pack/state")

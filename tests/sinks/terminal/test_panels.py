@@ -10,16 +10,16 @@ from rich.console import Console
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.input_faults import Suspect
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.mqtt.topic_cache import Heard, Published
+from bms_estimator.mqtt.topic_cache import DeviceMessage, TopicCache
 from bms_estimator.service.live_loop import new_estimator
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sinks.mqtt.messages import Messages, Sent
-from bms_estimator.sinks.terminal.panels import View
-from bms_estimator.sinks.terminal.scene import Lost, Pack, Scene
+from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
+from bms_estimator.sinks.terminal.panels import Screen
+from bms_estimator.sinks.terminal.scene import BrokerOutage, PackView, ScreenState
 from bms_estimator.sinks.terminal.text_line import line
 from tests.collector import Collector
 from tests.scripted_source import ScriptedSource
@@ -28,7 +28,7 @@ from tests.sinks.snapshots import NOW, STACK
 SILENT = (
     "/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0 at 500000 baud: bytes come, but no valid frame among them"
 )
-SUSPECTS = [suspect.text for suspect in Suspect][:1]
+SUSPECTS = [suspect.text for suspect in InputFault][:1]
 LOG = [f"12:00:0{n}Z [warning] faults on the line frames_lost={n} crc_errors={n} overruns={n}" for n in range(5)]
 HINT = "firmware in simavr; in a second terminal: mosquitto_sub -p 18833 -t 'bms/#' -v"
 
@@ -47,23 +47,27 @@ def snapshot() -> Snapshot:
     return next(each for each in sink.snapshots if each.estimate)
 
 
-def scene(snapshot: Snapshot, topics: dict[str, Any] | None = None, **told: Any) -> Scene:
+def scene(snapshot: Snapshot, topics: dict[str, Any] | None = None, **told: Any) -> ScreenState:
     """What a subscriber sees, with some topics changed."""
-    device, published = snapshot.info.device, Published("bms")
-    messages = Messages("bms", device)
-    for message in (*messages.greeting(), *messages.kept(None, snapshot), *messages.due(Sent(), snapshot, NOW)[0]):
+    device, published = snapshot.info.device, TopicCache("bms")
+    messages = MessageBuilder("bms", device)
+    for message in (
+        *messages.greeting(),
+        *messages.kept(None, snapshot),
+        *messages.due(PublishedState(), snapshot, NOW)[0],
+    ):
         published.take(message.topic, message.payload, NOW)
-    return Scene(device, published.devices[device].topics | (topics or {}), NOW, told.pop("now_s", NOW), **told)
+    return ScreenState(device, published.devices[device].topics | (topics or {}), NOW, told.pop("now_s", NOW), **told)
 
 
-def text_of(scene: Scene, columns: int = 100, rows: int = 40) -> str:
+def text_of(scene: ScreenState, columns: int = 100, rows: int = 40) -> str:
     return " ".join(" ".join(drawn(scene, columns, rows)).split())
 
 
-def drawn(scene: Scene, columns: int, rows: int) -> list[str]:
+def drawn(scene: ScreenState, columns: int, rows: int) -> list[str]:
     console = Console(file=io.StringIO(), width=columns, height=rows, force_terminal=True, color_system=None)
     with console.capture() as capture:
-        console.print(View(scene))
+        console.print(Screen(scene))
     return capture.get().splitlines()
 
 
@@ -159,7 +163,7 @@ def test_it_says_since_when_values_are_stale_and_why(snapshot: Snapshot) -> None
     made = snapshot.health.publish_time[11:19]
     assert f"service offline since {made}Z" in text_of(scene(snapshot, {"availability": "offline"}))
     assert "silent since 22:13:20Z" in text_of(scene(snapshot, now_s=NOW + 11.0))
-    gone = text_of(scene(snapshot, lost=Lost(NOW - 60.0, "the connection broke")))
+    gone = text_of(scene(snapshot, lost=BrokerOutage(NOW - 60.0, "the connection broke")))
     assert "no broker since 22:12:20Z: the connection broke" in gone
     assert "live" not in gone
 
@@ -167,7 +171,7 @@ def test_it_says_since_when_values_are_stale_and_why(snapshot: Snapshot) -> None
 def test_several_packs_are_listed_and_one_is_in_full(snapshot: Snapshot) -> None:
     packs = [scene(snapshot._replace(info=snapshot.info.model_copy(update={"device": f"p{n}"}))) for n in range(20)]
     shown = packs[15]
-    listed = Scene(shown.device, shown.topics, NOW, NOW, packs=packs)
+    listed = ScreenState(shown.device, shown.topics, NOW, NOW, packs=packs)
     lines = drawn(listed, 100, 40)
     rows = [row for row in lines if " V " in row and "live" in row and "cell" not in row]
     assert [row.split()[0] for row in rows] == ["p11", "p12", "p13", "p14", "▸", "p16", "p17", "p18"]
@@ -181,15 +185,15 @@ def test_whatever_is_published_there_is_a_screen_and_nothing_controls_the_termin
     topics = ["state", "health", "info", "parameters", "availability", "alarm/x"]
     evil = {"text": "\x1b[2J\x07evil", "active": True, "severity": 7, "cell": "\x1b[31m", "sensor_message": "\x1b]0;x"}
     for payload in (garbage, evil, {"elements": {"r_s_ohm": garbage}}, {"time_to_empty_s": 10**400}):
-        pack = Scene("pack", dict.fromkeys(topics, payload), NOW, NOW)
-        text = "".join(drawn(Scene(pack.device, pack.topics, NOW, NOW, packs=[pack, Pack("other")]), 80, 24))
+        pack = ScreenState("pack", dict.fromkeys(topics, payload), NOW, NOW)
+        text = "".join(drawn(ScreenState(pack.device, pack.topics, NOW, NOW, packs=[pack, PackView("other")]), 80, 24))
         assert all(character.isprintable() for character in text)
         for topic in topics:
-            told = line(Heard("pack", topic, payload))
+            told = line(DeviceMessage("pack", topic, payload))
             assert told is None or told.isprintable()
 
 
 def test_without_a_pack_there_is_a_screen_too() -> None:
-    text = text_of(Scene(hint="bms/# at mqtt://localhost:1883"))
+    text = text_of(ScreenState(hint="bms/# at mqtt://localhost:1883"))
     assert "no pack has published anything yet" in text
     assert "bms/# at mqtt://localhost:1883" in text

@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.ble_source import BleSource
-from bms_estimator.sources.line_source import Bringer, NothingComesError
+from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 from tests.patience import LONG_S
 
 WHY = "aiobmsble is not installed: it needs Python 3.12 and the extra ble"
@@ -25,8 +25,8 @@ TOLD = {"voltage_v": 15.6, "current_a": -2.87, "temperature_c": 22.133, "cells_v
 """Charge is positive."""
 
 
-def bringer(**told: object) -> Bringer:
-    made: Bringer = ble_bms.BleBringer(BleSource.model_validate({"kind": "ble", "poll_s": 0.5} | told))
+def bringer(**told: object) -> LineProducer:
+    made: LineProducer = ble_bms.BleBringer(BleSource.model_validate({"kind": "ble", "poll_s": 0.5} | told))
     return made
 
 
@@ -44,10 +44,10 @@ async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeyp
             assert await anext(brought) == CONNECTED
             assert [json.loads(await anext(brought)) for _ in range(2)] == 2 * [TOLD]
             stack.leave()
-            with pytest.raises(NothingComesError):
+            with pytest.raises(SourceUnavailableError):
                 await to_the_end(brought)
         monkeypatch.setattr(ble_bms, "SCAN_S", 0.2)
-        with pytest.raises(NothingComesError, match="does not advertise"):
+        with pytest.raises(SourceUnavailableError, match="does not advertise"):
             await to_the_end(asked.bring())
         monkeypatch.undo()
         stack.near = True

@@ -11,7 +11,7 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.bluetooth.bms_sample import reading_of
 from bms_estimator.sources.bluetooth.source import NEEDED_PYTHON
-from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.factory import open_line_source
 
 
 class Sensor:
@@ -78,4 +78,4 @@ def test_settings_that_cannot_be(told: dict[str, object]) -> None:
 @pytest.mark.skipif(sys.hexversion >= NEEDED_PYTHON, reason="this Python is new enough")
 def test_an_old_python_is_told_what_is_needed() -> None:
     with pytest.raises(UserError, match=r"needs Python 3\.12 or newer; this is 3\."):
-        open_reports(Settings.model_validate({"source": {"kind": "ble", "name": "a"}}))
+        open_line_source(Settings.model_validate({"source": {"kind": "ble", "name": "a"}}))

@@ -14,8 +14,8 @@ import pytest
 
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter, read_capture
-from bms_estimator.sources.captures.recorder import Recording
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.captures.recorder import CaptureRecorder
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
@@ -51,14 +51,14 @@ def recorded(path: Path) -> list[tuple[float, bytes]]:
     return [read for batch in read_capture(path) for read in batch]
 
 
-def give(recording: Recording) -> None:
+def give(recording: CaptureRecorder) -> None:
     for read in READS:
         recording.write(*read)
 
 
 def test_a_disk_that_hangs_holds_nobody_up_and_has_all_in_order_at_the_end(tmp_path: Path, disk: Disk) -> None:
     disk.works.clear()
-    with Recording(tmp_path / "line.bms", CaptureHeader()) as recording:
+    with CaptureRecorder(tmp_path / "line.bms", CaptureHeader()) as recording:
         give(recording)
         assert recorded(tmp_path / "line.bms") == []
         disk.works.set()
@@ -70,7 +70,7 @@ def test_a_disk_that_hangs_holds_nobody_up_and_has_all_in_order_at_the_end(tmp_p
 
 def test_a_disk_that_stays_behind_ends_the_recording_and_what_was_missed_is_counted(tmp_path: Path, disk: Disk) -> None:
     disk.works.clear()
-    with Recording(tmp_path / "line.bms", CaptureHeader(), waiting_reads=10) as recording:
+    with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(), waiting_reads=10) as recording:
         give(recording)
         disk.works.set()
     kept = recorded(tmp_path / "line.bms")
@@ -82,9 +82,9 @@ def test_a_disk_that_stays_behind_ends_the_recording_and_what_was_missed_is_coun
 
 async def test_a_full_disk_ends_the_recording_and_not_the_samples(tmp_path: Path, disk: Disk, line: Line) -> None:
     line.plug()
-    with Recording(tmp_path / "line.bms", CaptureHeader(mode="text")) as recording:
+    with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(mode="text")) as recording:
         settings = SensorSettings(port=str(line.path), protocol="text")
-        async with SerialBoard(settings, tap=recording) as source, asyncio.timeout(LONG_S):
+        async with SerialSource(settings, tap=recording) as source, asyncio.timeout(LONG_S):
             while "no frame yet" not in (source.message or ""):  # noqa: ASYNC110 - the source has no event for it
                 await asyncio.sleep(0.01)
             blocks = aiter(source)
@@ -108,7 +108,7 @@ def test_the_disk_takes_what_is_recorded_while_it_grows(tmp_path: Path, monkeypa
         synced_reads.put(len(recorded(path)))
 
     monkeypatch.setattr(os, "fdatasync", watched)
-    with Recording(path, CaptureHeader(), sync_s=0.02) as recording:
+    with CaptureRecorder(path, CaptureHeader(), sync_s=0.02) as recording:
         for times in (1, 2):
             give(recording)
             while synced_reads.get(timeout=LONG_S) < times * len(READS):
@@ -120,7 +120,7 @@ def test_a_disk_that_does_not_take_it_ends_the_recording(tmp_path: Path, monkeyp
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "fdatasync", fails)
-    with Recording(tmp_path / "line.bms", CaptureHeader(), sync_s=0.02) as recording:
+    with CaptureRecorder(tmp_path / "line.bms", CaptureHeader(), sync_s=0.02) as recording:
         give(recording)
         assert isinstance(error := recording.ended.exception(LONG_S), OSError)
     assert error.errno == errno.EIO

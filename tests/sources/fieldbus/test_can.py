@@ -14,9 +14,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.fieldbus.can import BUS_OFF, CanBringer
-from bms_estimator.sources.line_source import NothingComesError
+from bms_estimator.sources.line_source import SourceUnavailableError
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
@@ -88,7 +88,7 @@ async def test_a_controller_that_is_bus_off_is_said_until_it_is_back(channel: st
 
 async def test_an_adapter_that_is_unplugged_and_plugged_in_again(line: Line) -> None:
     bringer = CanBringer(slcan(line))
-    with pytest.raises(NothingComesError, match=r"cannot be opened: .*No such file"):
+    with pytest.raises(SourceUnavailableError, match=r"cannot be opened: .*No such file"):
         async with aclosing(bringer.bring()) as brought:
             await next_of(brought)
     for _ in range(2):
@@ -98,7 +98,7 @@ async def test_an_adapter_that_is_unplugged_and_plugged_in_again(line: Line) -> 
             line.write(SLCAN)
             assert json.loads(await next_of(brought)) == TOLD
             line.unplug()
-            with pytest.raises(NothingComesError, match="lost: "):
+            with pytest.raises(SourceUnavailableError, match="lost: "):
                 await next_of(brought)
 
 
@@ -111,7 +111,7 @@ async def test_junk_of_an_adapter_is_no_frame(line: Line) -> None:
         assert json.loads(await next_of(brought)) == TOLD
         assert bringer.counters["junk"] == 2
         line.write(b"\xff\xfe\r")
-        with pytest.raises(NothingComesError, match="lost: "):
+        with pytest.raises(SourceUnavailableError, match="lost: "):
             await next_of(brought)
     async with aclosing(bringer.bring()) as brought:
         assert await next_of(brought) == CONNECTED
@@ -121,7 +121,7 @@ async def test_junk_of_an_adapter_is_no_frame(line: Line) -> None:
 
 async def test_samples_are_positive_on_discharge(channel: str, sender: can.BusABC) -> None:
     told = {"kind": "can", "profile": "pylontech-can", "interface": "virtual", "channel": channel}
-    reports = open_reports(Settings.model_validate({"source": told}))
+    reports = open_line_source(Settings.model_validate({"source": told}))
     assert reports is not None
     async with asyncio.timeout(LONG_S), reports:
         blocks = aiter(reports)
@@ -136,7 +136,7 @@ async def test_samples_are_positive_on_discharge(channel: str, sender: can.BusAB
 
 async def test_an_option_that_the_interface_does_not_have() -> None:
     bringer = CanBringer(source(interface="socketcand", channel="can0", options={"hots": "127.0.0.1"}))
-    with pytest.raises(NothingComesError, match=r"cannot be opened: .*host"):
+    with pytest.raises(SourceUnavailableError, match=r"cannot be opened: .*host"):
         async with aclosing(bringer.bring()) as brought:
             await next_of(brought)
 
@@ -168,5 +168,5 @@ async def test_an_interface_of_the_kernel_that_goes_down(vcan: str) -> None:
             bus.send(PYLONTECH)
             assert json.loads(await next_of(brought)) == TOLD
         await asyncio.to_thread(subprocess.run, ["ip", "link", "set", vcan, "down"], check=True)
-        with pytest.raises(NothingComesError, match="lost: "):
+        with pytest.raises(SourceUnavailableError, match="lost: "):
             await next_of(brought)

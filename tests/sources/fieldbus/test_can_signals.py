@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.can_source import CanSource, CellSignals, Signal
-from bms_estimator.sources.fieldbus.can_signals import KEPT_S, CanMap, Place, bits_of
+from bms_estimator.sources.fieldbus.can_signals import KEPT_S, CanMap, FrameId, bits_of
 
 PYLONTECH = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])
 """52.34 V, -12.3 A (charge is positive), 21.5 degC, as frame 0x356 has them."""
@@ -92,7 +92,7 @@ def test_a_known_bus_is_read() -> None:
     steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
     assert given.sensor == {"current_sign": "charge_positive", **steps}
     map_ = CanMap(given)
-    assert map_.places == (Place(0x356, False),)
+    assert map_.places == (FrameId(0x356, False),)
     assert map_.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
     assert map_.feed(0.0, 0x355, False, bytes(4)) is None
     reading = map_.feed(0.0, 0x356, False, PYLONTECH)
@@ -154,7 +154,7 @@ def dbc(tmp_path: Path) -> Path:
 
 def test_signals_by_their_names_in_a_dbc_file(named: CanSource) -> None:
     map_ = CanMap(named)
-    assert set(map_.places) == {Place(0x500, False), Place(0x501, False), Place(0x18FF0000, True)}
+    assert set(map_.places) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
     assert map_.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
     assert map_.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
     assert map_.feed(0.0, 0x501, False, bytes([1, 0xE6, 0x0C])) is None

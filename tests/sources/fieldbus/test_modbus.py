@@ -13,9 +13,9 @@ from pymodbus.constants import ExcCodes
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.factory import open_reports
+from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.fieldbus.modbus import ModbusBringer
-from bms_estimator.sources.line_source import NothingComesError
+from bms_estimator.sources.line_source import SourceUnavailableError
 from tests.free_port import free_port
 from tests.patience import LONG_S
 from tests.sources.fieldbus.modbus_device import Registers, float_words, serial_device, tcp_device
@@ -41,7 +41,7 @@ async def lines(bringer: ModbusBringer, count: int) -> list[dict[str, object]]:
 
 async def failure(bringer: ModbusBringer) -> str:
     """Why nothing comes."""
-    with pytest.raises(NothingComesError) as raised:
+    with pytest.raises(SourceUnavailableError) as raised:
         await lines(bringer, 1_000_000)
     return str(raised.value)
 
@@ -157,7 +157,7 @@ async def test_a_device_that_goes_and_comes_back() -> None:
     async with aclosing(bringer.bring()) as brought:
         async with tcp_device(registers, UNIT, port):
             await until(brought, lambda: len(registers.asked) > 2)
-        with pytest.raises(NothingComesError):
+        with pytest.raises(SourceUnavailableError):
             await until(brought, lambda: False)
     assert await failure(bringer) == "no connection"
     async with tcp_device(registers, UNIT, port):
@@ -196,7 +196,7 @@ async def test_samples_are_positive_on_discharge_and_come_again_after_the_device
     told = {"kind": "modbus", "profile": "victron-gx", "host": "127.0.0.1", "tcp_port": port, "unit": UNIT}
     settings = Settings.model_validate({"source": told | {"poll_s": 0.02, "timeout_s": 1.0}})
     assert settings.sensor.voltage_resolution_v == 0.01
-    source = open_reports(settings)
+    source = open_line_source(settings)
     assert source is not None
     async with asyncio.timeout(LONG_S), source:
         blocks = aiter(source)

@@ -11,7 +11,7 @@ import pytest
 
 from bms_estimator.protocols.base.reading import CONNECTED, Reading, read_line
 from bms_estimator.settings.linux_source import LinuxSource
-from bms_estimator.sources.line_source import NothingComesError
+from bms_estimator.sources.line_source import SourceUnavailableError
 from bms_estimator.sources.linux.linux_sensor import LinuxSensor
 from tests.patience import LONG_S
 from tests.sources.linux.sysfs_folder import hwmon, iio
@@ -102,7 +102,7 @@ async def test_what_is_not_there_is_said_with_what_to_do(settings: dict[str, Any
     hwmon(tmp_path, **INA226)
     for number, place in ((4, "1-0041"), (5, "1-0042")):
         hwmon(tmp_path, "ina219", place, number, in1_input=1, curr1_input=1)
-    with pytest.raises(NothingComesError) as caught:
+    with pytest.raises(SourceUnavailableError) as caught:
         await first(sensor(tmp_path, **settings).bring())
     assert str(caught.value).endswith(said)
 
@@ -146,7 +146,7 @@ async def test_a_bus_that_hangs_holds_up_nothing_and_is_left_until_it_answers(tm
     ina = sensor(tmp_path)
     before = set(threading.enumerate())
     for _ in range(3):
-        with pytest.raises(NothingComesError, match=r"the bus has not answered for 0.05 s"):
+        with pytest.raises(SourceUnavailableError, match=r"the bus has not answered for 0.05 s"):
             await first(ina.bring())
     assert len(set(threading.enumerate()) - before) == 1
     writer = os.open(folder / "curr1_input", os.O_RDWR | os.O_NONBLOCK)
@@ -175,6 +175,6 @@ def test_it_is_polled_as_fast_as_the_chip_is_set_but_not_faster_than_anybody_nee
 
 async def test_a_chip_slower_than_it_is_taken_for_says_what_to_set(tmp_path: Path):
     hwmon(tmp_path, **INA226 | {"update_interval": "17000"})
-    with pytest.raises(NothingComesError, match=r"measures each 17 s only; .*source\.interval_s = 17$"):
+    with pytest.raises(SourceUnavailableError, match=r"measures each 17 s only; .*source\.interval_s = 17$"):
         await first(sensor(tmp_path, interval_s=None).bring())
     assert await first(sensor(tmp_path, interval_s=17.0).bring())

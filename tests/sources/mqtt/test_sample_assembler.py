@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from bms_estimator.protocols.devices.text import TextDialect
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.mqtt.payload_value import MOST_CELLS, NoNumberError, many, one
-from bms_estimator.sources.mqtt.sample_assembler import Assembly
+from bms_estimator.sources.mqtt.payload_value import MOST_CELLS, InvalidValueError, read_cells, read_value
+from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 
 Messages = list[tuple[str, str]]
 
@@ -29,7 +29,9 @@ def own(**settings: Any) -> MqttSource:
     return source(**{"topic": "home/pack", "voltage": "u", "current": "i"} | settings)
 
 
-def told(assembly: Assembly, messages: Messages, at_s: float = 0.0, *, retained: bool = False) -> list[dict[str, Any]]:
+def told(
+    assembly: SampleAssembler, messages: Messages, at_s: float = 0.0, *, retained: bool = False
+) -> list[dict[str, Any]]:
     """The samples that messages make, and what follows of them after the time to settle."""
     lines = []
     for topic, payload in messages:
@@ -150,7 +152,7 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
 @pytest.mark.parametrize("project", PROJECTS)
 def test_what_a_project_publishes_is_a_sample(project: str) -> None:
     table, messages, sample, sign = PROJECTS[project]
-    assembly = Assembly(source(**table))
+    assembly = SampleAssembler(source(**table))
     first = told(assembly, messages)
     assert first == [sample]
     assert told(assembly, messages, 10.0)[0]["current_a"] == sample["current_a"]
@@ -162,7 +164,7 @@ def test_what_a_project_publishes_is_a_sample(project: str) -> None:
 
 def test_a_batch_that_ends_with_cells_tells_them_with_the_next_sample() -> None:
     table, messages, _, _ = PROJECTS["batmon-ha"]
-    assembly = Assembly(source(**table))
+    assembly = SampleAssembler(source(**table))
     told(assembly, messages)
     assert told(assembly, messages, 5.0)[0]["cells_v"] == [3.301, 3.302]
 
@@ -199,11 +201,11 @@ def test_a_batch_that_ends_with_cells_tells_them_with_the_next_sample() -> None:
     ],
 )
 def test_paths_units_scales_and_times(where: dict[str, Any], payload: str, sample: dict[str, Any]) -> None:
-    assert told(Assembly(own(**where)), [("home/pack", payload)]) == [sample]
+    assert told(SampleAssembler(own(**where)), [("home/pack", payload)]) == [sample]
 
 
 def test_a_pack_with_as_many_cells_as_are_taken_is_a_sample_of_the_dialect() -> None:
-    assembly, dialect = Assembly(own(cells="c")), TextDialect()
+    assembly, dialect = SampleAssembler(own(cells="c")), TextDialect()
     payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MOST_CELLS})
     assembly.take("home/pack", payload.encode(), 0.0, retained=False)
     assert dialect.feed(0.0, assembly.line(0.0)).size == 1
@@ -211,7 +213,7 @@ def test_a_pack_with_as_many_cells_as_are_taken_is_a_sample_of_the_dialect() -> 
 
 
 def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ever() -> None:
-    assembly = Assembly(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
+    assembly = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
     assert told(assembly, [("v", "52")]) == []
     assert assembly.fault == "current: nothing comes on i"
     assert told(assembly, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
@@ -228,7 +230,7 @@ def test_of_two_topics_the_one_that_says_nothing_new_is_as_it_was_but_not_for_ev
 
 
 def test_temperature_and_cells_may_be_older() -> None:
-    assembly = Assembly(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature={"topic": "t"}))
+    assembly = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature={"topic": "t"}))
     both = [("v", "52"), ("i", "1")]
     told(assembly, [("t", "21.5")])
     assert told(assembly, both, 299.0)[0]["temperature_c"] == 21.5
@@ -236,7 +238,7 @@ def test_temperature_and_cells_may_be_older() -> None:
 
 
 def test_what_the_broker_had_kept_is_not_taken() -> None:
-    assembly = Assembly(own(availability_topic="home/status"))
+    assembly = SampleAssembler(own(availability_topic="home/status"))
     assert told(assembly, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
     assert assembly.counters["retained"] == 1
     assert assembly.fault == "nothing comes on home/pack, but what the broker has kept from earlier"
@@ -266,7 +268,7 @@ def test_what_the_broker_had_kept_is_not_taken() -> None:
     ],
 )
 def test_a_payload_that_tells_nothing_is_counted_and_said(payload: str, kind: str, said: str) -> None:
-    assembly = Assembly(own())
+    assembly = SampleAssembler(own())
     assert told(assembly, [("home/pack", payload)]) == []
     assert assembly.counters[kind] >= 1
     assert said in (assembly.fault or "")
@@ -276,14 +278,14 @@ def test_a_payload_that_tells_nothing_is_counted_and_said(payload: str, kind: st
 @given(st.binary() | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode))
 def test_no_payload_makes_it_raise(payload: bytes) -> None:
     settings = own(cells="c.{cell}", temperature={"path": "0.1"}, time={"path": "t", "unit": "iso"})
-    assembly = Assembly(settings)
+    assembly = SampleAssembler(settings)
     assembly.take("home/pack", payload, 0.0, retained=False)
     assembly.line(1.0)
     for name, place in settings.places():
-        for way in (one, many):
+        for way in (read_value, read_cells):
             try:
                 way(payload, place, name)
-            except NoNumberError:
+            except InvalidValueError:
                 continue
 
 
@@ -291,7 +293,7 @@ def test_no_payload_makes_it_raise(payload: bytes) -> None:
     ("prefix", "instance", "begin"), [("jk-bms", "", "jk-bms_"), ("jk-bms", "", ""), ("home/bms", "jk-bms", "jk-bms_")]
 )
 def test_a_node_may_have_another_prefix_and_leave_its_name_away(prefix: str, instance: str, begin: str) -> None:
-    assembly = Assembly(source(profile="esphome-jk", prefix=prefix, instance=instance))
+    assembly = SampleAssembler(source(profile="esphome-jk", prefix=prefix, instance=instance))
     values = [("total_voltage", "52.98"), ("current", "-12.34"), ("balancing_current", "1")]
     sample = told(assembly, [(f"{prefix}/sensor/{begin}{name}/state", value) for name, value in values])
     assert sample == [{"voltage_v": 52.98, "current_a": -12.34}]
@@ -299,8 +301,8 @@ def test_a_node_may_have_another_prefix_and_leave_its_name_away(prefix: str, ins
 
 def test_it_subscribes_to_nothing_twice() -> None:
     jk = source(profile="esphome-jk", prefix="jk-bms")
-    assert Assembly(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
-    assert Assembly(own()).topics == ["home/pack"]
+    assert SampleAssembler(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
+    assert SampleAssembler(own()).topics == ["home/pack"]
 
 
 @pytest.mark.parametrize(
@@ -342,9 +344,9 @@ def _merged(*publishers: tuple[float, float, float, float]) -> list[tuple[float,
     return sorted(messages)
 
 
-def _errors(messages: list[tuple[float, float]]) -> tuple[Assembly, list[float]]:
+def _errors(messages: list[tuple[float, float]]) -> tuple[SampleAssembler, list[float]]:
     """Times at which a message was counted as one of two publishers [s]."""
-    assembly, found = Assembly(own()), list[float]()
+    assembly, found = SampleAssembler(own()), list[float]()
     for at_s, current_a in messages:
         before = assembly.counters["publisher_errors"]
         assembly.take("home/pack", json.dumps({"u": 52.0, "i": current_a}).encode(), at_s, retained=False)
@@ -416,11 +418,11 @@ def test_a_publisher_with_a_current_of_its_own_at_random_times_is_a_second_one()
 
 
 def test_cells_that_are_no_longer_measured_do_not_stay_as_they_were() -> None:
-    together = Assembly(own(cells="cells"))
+    together = SampleAssembler(own(cells="cells"))
     payloads = ('{"u": 52.0, "i": 1.0, "cells": [3.3, 3.4]}', '{"u": 52.0, "i": 1.0, "cells": null}')
     first, lost = told(together, [("home/pack", payload) for payload in payloads])
     assert (first["cells_v"], "cells_v" in lost) == ([3.3, 3.4], False)
-    each = Assembly(own(cells={"topic": "home/cell/{cell}"}))
+    each = SampleAssembler(own(cells={"topic": "home/cell/{cell}"}))
     pack = ("home/pack", '{"u": 52.0, "i": 1.0}')
     before, after = told(
         each, [("home/cell/1", "3.3"), ("home/cell/2", "3.4"), pack, ("home/cell/1", "unavailable"), pack]

@@ -15,7 +15,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import port_list
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import LONG_S
 from tests.serial_line import Line, usb_port
 
@@ -30,7 +30,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 @contextlib.asynccontextmanager
-async def taken(source: SerialBoard, blocks: list[SampleBlock]):
+async def taken(source: SerialSource, blocks: list[SampleBlock]):
     """The source at work, its blocks kept."""
 
     async def keep() -> None:
@@ -48,7 +48,7 @@ async def taken(source: SerialBoard, blocks: list[SampleBlock]):
 
 async def test_nothing_is_sent_to_a_device_that_speaks_something_else(line: Line) -> None:
     line.plug()
-    source = SerialBoard(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
+    source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
     async with taken(source, []):
         await until(lambda: source.message and "silent" in source.message)
         assert line.heard() == b""
@@ -59,7 +59,7 @@ async def test_nothing_is_sent_to_a_device_that_speaks_something_else(line: Line
 
 async def test_a_board_that_is_heard_is_asked_for_its_hello(line: Line) -> None:
     line.plug()
-    source = SerialBoard(SensorSettings(port=str(line.path)), first_retry_s=0.05)
+    source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
     async with taken(source, []):
         await until(lambda: source.message and "no frame yet" in source.message)
         line.write(b"\0" + hello_command())  # any frame with a right CRC
@@ -105,7 +105,7 @@ async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
 
 async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -> None:
     blocks = list[SampleBlock]()
-    source = SerialBoard(SensorSettings(port="auto", sample_rate_hz=50), first_retry_s=0.05)
+    source = SerialSource(SensorSettings(port="auto", sample_rate_hz=50), first_retry_s=0.05)
     async with taken(source, blocks):
         async with plugged_in(auto, serial=1):
             await until(lambda: source._door.serial)
@@ -122,7 +122,7 @@ async def test_auto_refuses_another_board_and_goes_on_with_its_own(auto: Path) -
 
 
 async def test_auto_says_what_comes_in_place_of_its_own_board(auto: Path) -> None:
-    source = SerialBoard(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
+    source = SerialSource(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
     async with taken(source, []):
         async with plugged_in(auto, serial=1):
             await until(lambda: source._door.serial)

@@ -13,8 +13,8 @@ from bms_estimator.protocols.firmware.protocol import BoardDialect
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.sources.serial.board_check import HELD_READS, Doorkeeper, OtherBoardError
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.serial.board_check import MAX_PENDING_READS, BoardCheck, OtherBoardError
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.serial_line import Line
 from tests.sources.serial.test_pinned_board import until
 
@@ -98,7 +98,7 @@ def test_a_board_that_tells_nothing_is_taken_after_a_while_and_the_gap_is_told()
 
 async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(line: Line) -> None:
     line.plug()
-    source = SerialBoard(SensorSettings(port=str(line.path)), first_retry_s=0.05)
+    source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
     blocks: list[SampleBlock] = []
     ours, other = Running(1, 6.1), Running(2, 9.0, 50_000, 900.0)
 
@@ -129,9 +129,9 @@ async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(lin
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(np.full(10, PACK_V), abs=0.1)
 
 
-def door_of_ours() -> tuple[Doorkeeper, BoardDialect]:
+def door_of_ours() -> tuple[BoardCheck, BoardDialect]:
     """It knows our board."""
-    dialect, door = BoardDialect(), Doorkeeper(BoardDialect)
+    dialect, door = BoardDialect(), BoardCheck(BoardDialect)
     dialect.feed(BEGIN_S, Running(1, 6.1).hello())
     door.know(dialect.board, 0.0)
     return door, dialect
@@ -153,7 +153,7 @@ def test_nothing_of_a_board_that_was_refused_passes_before_the_port_is_opened_an
 def test_each_byte_of_a_board_that_is_not_known_yet_passes_once_or_is_counted() -> None:
     board = Running(1, 6.1)
     door, dialect = door_of_ours()
-    reads = [(BEGIN_S, frame) for frame in board.frames(HELD_READS + 5)]
+    reads = [(BEGIN_S, frame) for frame in board.frames(MAX_PENDING_READS + 5)]
     door.opened()
     assert not any(door.admit(read, dialect) for read in reads[:7])
     door.opened()  # the port was lost

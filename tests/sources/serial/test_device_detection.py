@@ -13,14 +13,14 @@ from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial import device_detection, port_list
-from bms_estimator.sources.serial.device_detection import Found
+from bms_estimator.sources.serial.device_detection import DetectedDevice
 from tests.device_line import on_a_line
 from tests.patience import LONG_S
 
 
 @pytest.fixture(autouse=True)
 def quick_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_detection, "TURN_S", 0.05)
+    monkeypatch.setattr(device_detection, "QUERY_INTERVAL_S", 0.05)
 
 
 def steady(_: float) -> Reading:
@@ -33,10 +33,10 @@ def bms(name: str) -> SimulatedBms:
 
 @pytest.mark.parametrize("name", [name for name in BMS_ANSWERS if name != "jk-pb"])
 def test_a_bms_is_named_with_its_cells(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_detection, "EACH_S", LONG_S)
+    monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
     with on_a_line(bms(name)) as path:
         found = device_detection.probe(path, 115_200)
-    assert isinstance(found, Found)
+    assert isinstance(found, DetectedDevice)
     assert (found.protocol, found.baud, found.cells) == (name, 115_200, 8)
     assert "8 cells" in str(found)
     assert str(found).endswith(f"; protocol {name}, 115200 baud")
@@ -44,34 +44,34 @@ def test_a_bms_is_named_with_its_cells(name: str, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("name", METERS)
 def test_a_meter_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_detection, "EACH_S", LONG_S)
+    monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
     with on_a_line(METERS[name](steady, 1.0)) as path:
         found = device_detection.probe(path, 115_200)
-    assert isinstance(found, Found)
+    assert isinstance(found, DetectedDevice)
     assert found.protocol == name
 
 
 def test_it_is_found_at_its_own_baud_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_detection, "PATIENCE_S", 0.1)  # for a board, which is not there
-    monkeypatch.setattr(device_detection, "EACH_S", LONG_S)
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)  # for a board, which is not there
+    monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
     with on_a_line(bms("jk")) as path:
         found = device_detection.probe(path)
-    assert isinstance(found, Found)
+    assert isinstance(found, DetectedDevice)
     assert (found.protocol, found.baud) == ("jk", 115_200)
 
 
 def test_the_newer_jk_that_is_only_asked_by_what_others_take_for_a_write_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(device_detection, "EACH_S", 0.1)
-    monkeypatch.setattr(device_detection, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)
     with on_a_line(bms("jk-pb")) as path:
         assert device_detection.probe(path) == "silent"
 
 
 def test_a_silent_device_is_sent_questions_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_detection, "EACH_S", 0.3)
-    monkeypatch.setattr(device_detection, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)
     master, slave = os.openpty()
     tty.setraw(slave)
     try:

@@ -20,14 +20,14 @@ from structlog.testing import capture_logs
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.service.pack_service import serve
+from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import board_check, port_list, serial_source
-from bms_estimator.sources.serial.known_board_file import NO_BOARD, BoardMemory
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.collector import Collector
 from tests.command_line import run
 from tests.patience import LONG_S
@@ -54,11 +54,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.fixture
-def memory(tmp_path: Path) -> BoardMemory:
-    return BoardMemory(tmp_path, "house")
+def memory(tmp_path: Path) -> KnownBoardFile:
+    return KnownBoardFile(tmp_path, "house")
 
 
-class Taken(SerialBoard):
+class Taken(SerialSource):
     """A source at work."""
 
     blocks: list[SampleBlock]
@@ -70,7 +70,7 @@ class Taken(SerialBoard):
 
 
 @contextlib.asynccontextmanager
-async def source(port: Path | str, memory: BoardMemory | None = None, **settings: Any) -> AsyncIterator[Taken]:
+async def source(port: Path | str, memory: KnownBoardFile | None = None, **settings: Any) -> AsyncIterator[Taken]:
     taken = Taken(SensorSettings(port=str(port), **settings), memory=memory, first_retry_s=0.05, silent_s=0.3)
     taken.blocks = []
 
@@ -101,11 +101,11 @@ async def board(path: Path, serial: int = 1, voltage_v: float = OURS_V, **option
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def remembered(memory: BoardMemory, serial: str) -> None:
+async def remembered(memory: KnownBoardFile, serial: str) -> None:
     await until(lambda: memory.load().get("serial") == serial)
 
 
-async def test_another_board_on_the_named_port_is_refused_after_a_restart(folder: Path, memory: BoardMemory) -> None:
+async def test_another_board_on_the_named_port_is_refused_after_a_restart(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory), board(port):
         await remembered(memory, "00000001")
@@ -134,7 +134,9 @@ async def test_another_board_on_the_named_port_is_refused_within_a_run(folder: P
     assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_the_first_board_is_not_taken_when_the_settings_name_another(folder: Path, memory: BoardMemory) -> None:
+async def test_the_first_board_is_not_taken_when_the_settings_name_another(
+    folder: Path, memory: KnownBoardFile
+) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory, serial="0000002a") as taken:
         async with board(port, voltage_v=OTHERS_V):
@@ -146,7 +148,7 @@ async def test_the_first_board_is_not_taken_when_the_settings_name_another(folde
         assert taken.voltage_v == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_a_board_without_a_serial_number_is_none_that_is_known(folder: Path, memory: BoardMemory) -> None:
+async def test_a_board_without_a_serial_number_is_none_that_is_known(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     with capture_logs() as logs:
         async with source(port, memory) as taken, board(port, serial=0):
@@ -169,7 +171,7 @@ async def test_a_board_that_takes_the_place_of_another_behind_the_same_adapter_i
     assert np.concatenate(taken.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_a_board_back_under_another_name_is_found(folder: Path, memory: BoardMemory) -> None:
+async def test_a_board_back_under_another_name_is_found(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory) as taken:
         async with board(port):
@@ -186,7 +188,7 @@ async def test_a_board_back_under_another_name_is_found(folder: Path, memory: Bo
 
 async def test_two_boards_that_were_swapped_are_each_found_by_their_own_pack(folder: Path, tmp_path: Path) -> None:
     one, two = folder / "ttyUSB0", folder / "ttyUSB1"
-    memories = [BoardMemory(tmp_path, name) for name in ("house", "shed")]
+    memories = [KnownBoardFile(tmp_path, name) for name in ("house", "shed")]
     async with (
         source(one, memories[0]),
         source(two, memories[1]),
@@ -235,7 +237,7 @@ async def test_the_search_writes_nothing_to_a_silent_device_and_leaves_it(folder
         os.close(master)
 
 
-async def test_a_changed_calibration_is_taken_and_said(folder: Path, memory: BoardMemory) -> None:
+async def test_a_changed_calibration_is_taken_and_said(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory), board(port):
         await remembered(memory, "00000001")
@@ -251,7 +253,7 @@ async def test_a_changed_calibration_is_taken_and_said(folder: Path, memory: Boa
 async def test_a_service_that_runs_takes_another_board_once_it_is_accepted(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    memory, port = BoardMemory(tmp_path, "house"), folder / "ttyUSB0"
+    memory, port = KnownBoardFile(tmp_path, "house"), folder / "ttyUSB0"
     pack = tmp_path / "pack.toml"
     pack.write_text(f'[pack]\nname = "house"\n[state]\nfolder = "{tmp_path}"\n')
     async with source(port, memory) as taken:
@@ -266,7 +268,7 @@ async def test_a_service_that_runs_takes_another_board_once_it_is_accepted(
             assert taken.voltage_v == pytest.approx(OTHERS_V, abs=0.1)
 
 
-async def test_a_memory_that_was_deleted_lets_no_other_board_in(folder: Path, memory: BoardMemory) -> None:
+async def test_a_memory_that_was_deleted_lets_no_other_board_in(folder: Path, memory: KnownBoardFile) -> None:
     port = folder / "ttyUSB0"
     async with source(port, memory) as taken:
         async with board(port):
@@ -280,7 +282,7 @@ async def test_a_memory_that_was_deleted_lets_no_other_board_in(folder: Path, me
 
 
 async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_health(
-    folder: Path, tmp_path: Path, memory: BoardMemory
+    folder: Path, tmp_path: Path, memory: KnownBoardFile
 ) -> None:
     port = folder / "ttyUSB0"
     settings = Settings(
@@ -290,7 +292,7 @@ async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_
     async def served(until_told: Callable[[Snapshot], bool]) -> Snapshot:
         stop, sink = asyncio.Event(), Collector()
         cell = load_cell("ncr18650").pack(6, 1)
-        running = asyncio.create_task(serve(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
+        running = asyncio.create_task(run_pack_service(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
         try:
             return await sink.until(until_told)
         finally:
@@ -306,7 +308,7 @@ async def test_a_service_refuses_another_board_after_its_restart_and_says_so_in_
 
 
 async def test_a_board_that_prints_text_is_taken_whatever_board_was_remembered(
-    folder: Path, memory: BoardMemory
+    folder: Path, memory: KnownBoardFile
 ) -> None:
     port = folder / "ttyUSB0"
     memory.keep({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
@@ -318,7 +320,7 @@ async def test_a_board_that_the_disk_does_not_take_at_first_is_remembered_once_i
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(board_check, "RETRY_S", 0.05, raising=False)
-    memory, said = BoardMemory(tmp_path / "gone", "house"), "the board cannot be remembered"
+    memory, said = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be remembered"
     memory.path.parent.touch()  # a file where the folder should be
     with capture_logs() as logs:
         async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
@@ -335,7 +337,7 @@ async def test_a_folder_that_is_deleted_comes_back_with_the_board(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(board_check, "RETRY_S", 0.05)
-    memory = BoardMemory(tmp_path / "state", "house")
+    memory = KnownBoardFile(tmp_path / "state", "house")
     async with source(folder / "ttyUSB0", memory), board(folder / "ttyUSB0"):
         await remembered(memory, "00000001")
         shutil.rmtree(memory.path.parent)
@@ -343,7 +345,7 @@ async def test_a_folder_that_is_deleted_comes_back_with_the_board(
 
 
 async def test_a_board_that_is_to_be_forgotten_is_not_written_down_again(
-    folder: Path, memory: BoardMemory, monkeypatch: pytest.MonkeyPatch
+    folder: Path, memory: KnownBoardFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(board_check, "RETRY_S", 0.0)
     async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
@@ -354,7 +356,7 @@ async def test_a_board_that_is_to_be_forgotten_is_not_written_down_again(
         assert memory.load() == NO_BOARD
 
 
-def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memory: BoardMemory) -> None:
+def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memory: KnownBoardFile) -> None:
     kept = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
     stranger = memory.path.with_name("stranger")
     stranger.write_text("theirs")
@@ -363,12 +365,12 @@ def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memo
     assert memory.load() == kept
     assert stat.S_IMODE(memory.path.stat().st_mode) == 0o600
     assert stranger.read_text() == "theirs"
-    linked = BoardMemory(memory.path.parent, "linked")
+    linked = KnownBoardFile(memory.path.parent, "linked")
     linked.path.symlink_to(memory.path)
     assert linked.load() == {}
 
 
-def test_a_memory_that_is_a_pipe_is_none(memory: BoardMemory) -> None:
+def test_a_memory_that_is_a_pipe_is_none(memory: KnownBoardFile) -> None:
     os.mkfifo(memory.path)
     writer = os.open(memory.path, os.O_RDWR)
     try:
@@ -380,7 +382,7 @@ def test_a_memory_that_is_a_pipe_is_none(memory: BoardMemory) -> None:
 @pytest.mark.parametrize(
     "text", ["", "[]", "{", "[" * 4000, '{"serial": 1}', json.dumps({"serial": "x" * 3000}), "\xff", "null"]
 )
-def test_a_memory_that_is_damaged_is_none_and_said(memory: BoardMemory, text: str) -> None:
+def test_a_memory_that_is_damaged_is_none_and_said(memory: KnownBoardFile, text: str) -> None:
     memory.path.write_text(text, encoding="latin-1")
     with capture_logs() as logs:
         assert memory.load() == {}
@@ -405,7 +407,7 @@ def test_a_board_that_the_settings_name_is_accepted_there(tmp_path: Path, capsys
 
 
 def test_a_board_is_accepted_in_the_folder_that_is_named_and_only_where_one_is_known(
-    tmp_path: Path, memory: BoardMemory, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, memory: KnownBoardFile, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "mine"))
     pack = tmp_path / "pack.toml"
@@ -426,7 +428,7 @@ def test_what_root_writes_is_for_the_owner_of_the_folder(tmp_path: Path) -> None
     theirs = tmp_path / "theirs"
     theirs.mkdir(mode=0o700)
     os.chown(theirs, 65534, 65533)
-    memory = BoardMemory(theirs, "house")
+    memory = KnownBoardFile(theirs, "house")
     memory.keep(NO_BOARD)
     found = memory.path.stat()
     assert (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == (65534, 65533, 0o600)

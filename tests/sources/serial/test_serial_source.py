@@ -23,16 +23,16 @@ from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import port_list
 from bms_estimator.sources.serial.device_detection import probe
-from bms_estimator.sources.serial.serial_source import SerialBoard
+from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
 STEADY = Reading(0.5, 22.2, 25.0)
 
 
-def board(line: Line, **options: Any) -> SerialBoard:
+def board(line: Line, **options: Any) -> SerialSource:
     settings = {"port": str(line.path), "protocol": "text", "baud": 115_200} | options.pop("settings", {})
-    return SerialBoard(SensorSettings(**settings), first_retry_s=0.05, silent_s=0.3, **options)
+    return SerialSource(SensorSettings(**settings), first_retry_s=0.05, silent_s=0.3, **options)
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -41,7 +41,7 @@ async def until(condition: Callable[[], object]) -> None:
             await asyncio.sleep(0.01)
 
 
-async def take(source: SerialBoard, samples: int) -> SampleBlock:
+async def take(source: SerialSource, samples: int) -> SampleBlock:
     blocks: list[SampleBlock] = []
     async with asyncio.timeout(LONG_S):
         async for block in source:
@@ -51,7 +51,7 @@ async def take(source: SerialBoard, samples: int) -> SampleBlock:
     return np.concatenate(blocks)
 
 
-async def drain(source: SerialBoard) -> None:
+async def drain(source: SerialSource) -> None:
     async for _ in source:
         pass
 
@@ -68,7 +68,7 @@ async def at_work(*tasks: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
         await asyncio.gather(*running, return_exceptions=True)
 
 
-async def keep(source: SerialBoard, blocks: list[SampleBlock]) -> None:
+async def keep(source: SerialSource, blocks: list[SampleBlock]) -> None:
     async for block in source:
         blocks.append(block.copy())  # noqa: PERF401 - others read the list meanwhile
 
@@ -168,7 +168,7 @@ async def test_ports_that_all_go_while_they_are_listed_are_waited_for(tmp_path: 
         patch.setattr(port_list, "BY_ID", tmp_path / "by-id")
         patch.setattr(Path, "is_dir", lambda _: True)  # it was there a moment ago
         patch.setattr(list_ports, "comports", list)
-        async with SerialBoard(SensorSettings(port="auto")) as source:
+        async with SerialSource(SensorSettings(port="auto")) as source:
             await until(lambda: source.message == "waiting for auto: no USB serial port is there")
 
 
@@ -222,7 +222,7 @@ async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> Non
     blocks: list[SampleBlock] = []
     with VirtualBoard(lambda _: STEADY) as virtual:
         async with (
-            SerialBoard(SensorSettings(port=virtual.path)) as source,
+            SerialSource(SensorSettings(port=virtual.path)) as source,
             at_work(virtual.run(), keep(source, blocks)),
         ):
             await until(lambda: count(blocks) >= 20)
@@ -236,7 +236,7 @@ async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> Non
 async def test_the_rate_is_set_again_after_a_reset_whose_hello_was_damaged() -> None:
     blocks: list[SampleBlock] = []
     with VirtualBoard(lambda _: STEADY) as virtual:
-        source = SerialBoard(SensorSettings(port=virtual.path, sample_rate_hz=250))
+        source = SerialSource(SensorSettings(port=virtual.path, sample_rate_hz=250))
         async with source, at_work(virtual.run(), keep(source, blocks)):
             await until(lambda: source.board.get("sample_rate_hz") == "250" and count(blocks) >= 200)
             virtual.send(b"half a frame, which runs into the hello")
@@ -251,7 +251,7 @@ async def test_the_rate_is_set_again_after_a_reset_whose_hello_was_damaged() -> 
 
 async def test_a_board_that_was_not_heard_from_its_start_tells_of_itself_and_gets_its_rate(tmp_path: Path) -> None:
     path, blocks = tmp_path / "board", list[SampleBlock]()
-    source = SerialBoard(SensorSettings(port=str(path), sample_rate_hz=50), first_retry_s=0.05)
+    source = SerialSource(SensorSettings(port=str(path), sample_rate_hz=50), first_retry_s=0.05)
     async with source, at_work(keep(source, blocks)):
         for _ in range(2):
             with VirtualBoard(lambda _: STEADY) as virtual:
