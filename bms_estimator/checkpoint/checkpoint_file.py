@@ -103,7 +103,7 @@ class CheckpointFile:
         self.disk_free_mib: float | None = None
         """Where the file is, when it was written last [MiB]."""
         self.thread = DiskThread("checkpoint")
-        """Where to call ``save`` and ``mark``: a call that nobody waits for any more still ends before the next one begins."""
+        """Where to call ``save`` and ``update_counters``: a call that nobody waits for any more still ends before the next one begins."""
         self.saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 
@@ -120,7 +120,7 @@ class CheckpointFile:
         content = {"identity": self._identity, "observer": self._observer, "state": state, **asdict(self._now())}
         self._write(content, ledger)
 
-    def mark(self, ledger: RunCounters) -> None:
+    def update_counters(self, ledger: RunCounters) -> None:
         """Change what the file tells of the runs, and nothing else: its state is as old as before. Without a file: nothing.
 
         Raises:
@@ -168,7 +168,7 @@ class CheckpointFile:
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
             return CheckpointContent({}, 0.0, new, f"{REFUSED}damaged, perhaps by a power cut ({type(error).__name__})")
 
-    def set_aside(self) -> str:
+    def quarantine(self) -> str:
         """Keep a file that was refused out of the way of the next save. Returns what was done, for people.
 
         One of a later format is good, and in place of none: who goes back to a version and forth has each of them. It is

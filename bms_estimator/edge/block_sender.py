@@ -180,7 +180,7 @@ class BlockSender:
                 await self._link.closing.wait()
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(self._handover_s):
-                        await self._sending.emptied()
+                        await self._sending.wait_until_empty()
                 for task in others:
                     task.cancel()
         finally:
@@ -194,7 +194,7 @@ class BlockSender:
             except ValidationError:
                 self._lose("unreadable", message.topic)
             else:
-                self.store.heard(awaits)
+                self.store.on_request(awaits)
 
     def _lose(self, kind: str, topic: str) -> None:
         """Something came that a worker does not say."""

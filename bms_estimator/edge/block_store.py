@@ -104,7 +104,7 @@ class BlockStore:
         if self._task is None:
             return
         self._closing = True
-        self._database.hurry()
+        self._database.begin_shutdown()
         self._wanted.set()
         await self._task
 
@@ -119,7 +119,7 @@ class BlockStore:
             self._drop(1, "the disk takes no blocks, and memory is full")
         self._wanted.set()
 
-    def heard(self, awaits: BlockRequest) -> None:
+    def on_request(self, awaits: BlockRequest) -> None:
         """A worker says which block it awaits next."""
         if self._settled is None or awaits.store < (made := self._settled.kept.made_s * NS):
             return

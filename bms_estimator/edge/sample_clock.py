@@ -39,7 +39,7 @@ class SampleClock:
         self._lead_s = math.nan  # our clock less the host's steady one
         self._told_s = math.nan  # the source's clock at the last sample
         self._offset_s = 0.0  # our clock less the source's
-        self._owed_s = 0.0  # by so much the offset is to grow, slowly
+        self._slew_s = 0.0  # by so much the offset is to grow, slowly
         self._least_late_s, self._window_s = math.inf, 0.0  # of the present window, and when it began
 
     def go_on_from(self, time_s: float) -> None:
@@ -78,11 +78,11 @@ class SampleClock:
             self._watch(late_s, now_s)
         placed = told_s + self._offset_s
         span_s = float(told_s[-1]) - self._told_s
-        if self._owed_s and span_s > 0.0:
-            shift_s = min(max(self._owed_s, -SLEW * span_s), SLEW * span_s)
+        if self._slew_s and span_s > 0.0:
+            shift_s = min(max(self._slew_s, -SLEW * span_s), SLEW * span_s)
             placed += shift_s * (told_s - self._told_s) / span_s
             self._offset_s += shift_s
-            self._owed_s -= shift_s
+            self._slew_s -= shift_s
         placed = np.maximum(placed, self._last_s)
         self._told_s, self._last_s = float(told_s[-1]), float(placed[-1])
         return placed
@@ -90,7 +90,7 @@ class SampleClock:
     def _map_anew(self, told_s: Times, now_s: float) -> None:
         """The last one has come just now, unless the first would be before what was placed."""
         offset_s = max(now_s - float(told_s[-1]), self._last_s - float(told_s[0]))
-        self._offset_s, self._owed_s = math.ceil(offset_s * GRID) / GRID, 0.0
+        self._offset_s, self._slew_s = math.ceil(offset_s * GRID) / GRID, 0.0
         self._told_s = float(told_s[0])
         self._least_late_s, self._window_s = math.inf, now_s
         self.steps += 1
@@ -98,17 +98,17 @@ class SampleClock:
     def _watch(self, late_s: float, now_s: float) -> None:
         """Find out whether the source's clock runs ahead, or falls behind."""
         if late_s < -BAND_S:
-            self._owed_s = late_s
+            self._slew_s = late_s
         self._least_late_s = min(self._least_late_s, late_s)
         if now_s - self._window_s < WINDOW_S:
             return
         behind_s, self._least_late_s, self._window_s = self._least_late_s, math.inf, now_s
         if behind_s > STEP_S:
             self._offset_s += math.floor(behind_s * GRID) / GRID
-            self._owed_s = 0.0
+            self._slew_s = 0.0
             self.steps += 1
         elif behind_s > BAND_S:
-            self._owed_s = behind_s
+            self._slew_s = behind_s
 
 
 def _finite(told_s: Times, before_s: float) -> Times:

@@ -77,7 +77,7 @@ class Estimator:
         self.state: NDArray[np.void] = self.record["observer"]
         self._trace: TraceBlock = np.zeros(0, dtype=TRACE)
 
-    def on(self, record: NDArray[np.void]) -> Self:
+    def bound_to_record(self, record: NDArray[np.void]) -> Self:
         """Another of the same settings, which it shares, that works on ``record``, shape (1,), dtype ``ESTIMATOR_STATE``."""
         other = copy(self)
         other.record, other.state = record, record["observer"]

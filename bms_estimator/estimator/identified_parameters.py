@@ -30,7 +30,7 @@ class IdentifiedValue(NamedTuple):
 
     value: float
     std: float
-    unlearned_s: float
+    age_s: float
 
     @property
     def relative_std(self) -> float:

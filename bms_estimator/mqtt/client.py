@@ -95,7 +95,7 @@ class Client(aiomqtt.Client):
             will=aiomqtt.Will(*hello.will) if hello.will else None,
             keepalive=patience.keepalive_s,
             max_queued_incoming_messages=hello.most_waiting,
-            queue_type=partial(ReceiveQueue, hello.lose, hello.most_bytes),  # type: ignore[arg-type]  # it is only called
+            queue_type=partial(ReceiveQueue, hello.on_message_lost, hello.most_bytes),  # type: ignore[arg-type]  # it is only called
             socket_options=[NO_DELAY],
             logger=_logger,
         )
@@ -112,7 +112,9 @@ class Client(aiomqtt.Client):
         """As ``Connection`` has it."""
         if self._most_bytes is not None and HEAD_BYTES + len(message.topic) + len(message.payload) > self._most_bytes:
             # it would end the connection
-            return PublishRejection(f"longer than the {self._most_bytes} bytes that the broker takes", for_now=False)
+            return PublishRejection(
+                f"longer than the {self._most_bytes} bytes that the broker takes", is_retryable=False
+            )
         async with self._in_flight:
             info = self._client.publish(*message)
             if info.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
@@ -159,14 +161,14 @@ class Client(aiomqtt.Client):
         self._abandoned = True
         self._client.disconnect()
 
-    def break_off(self) -> None:
+    def drop_connection(self) -> None:
         """Close the line without a word: once the broker has read what is on it, it publishes the will."""
         line: Any = self._client.socket()  # of a protocol of paho's, which leaves out what all sockets have
         if line is not None:
             with contextlib.suppress(OSError):
                 line.shutdown(socket.SHUT_RDWR)
 
-    async def part(self) -> None:
+    async def end_session(self) -> None:
         """End the connection, in good order where that is possible."""
         with contextlib.suppress(TimeoutError, aiomqtt.MqttError):
             async with asyncio.timeout(PARTING_S):
@@ -253,10 +255,10 @@ async def connected(
     try:
         yield client
     except BaseException:
-        client.break_off()
+        client.drop_connection()
         raise
     finally:
-        await client.part()
+        await client.end_session()
 
 
 def refusal(error: aiomqtt.MqttError) -> str:

@@ -25,7 +25,7 @@ class PublishRejection(NamedTuple):
     """The broker's no to a message."""
 
     why: str
-    for_now: bool
+    is_retryable: bool
     """It may take the same message later."""
 
 
@@ -36,7 +36,7 @@ class ConnectOptions(NamedTuple):
     """The same at each: the broker ends an older one that it still holds, and its will comes first."""
     will: Message | None
     """None of who only reads."""
-    lose: Callable[[str, str], None]
+    on_message_lost: Callable[[str, str], None]
     """Hears kind (``too_long``, ``overflow``) and topic of each message that came and was thrown away."""
     most_waiting: int = MOST_WAITING
     """Messages that wait to be read; more are lost."""

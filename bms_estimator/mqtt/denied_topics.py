@@ -53,9 +53,9 @@ class DeniedTopics:
         self._denied.pop(topic, None)
         self._show()
 
-    def answered(self, message: Message, refusal: PublishRejection | None) -> None:
+    def record_result(self, message: Message, refusal: PublishRejection | None) -> None:
         """The broker has taken a message, or refused it."""
-        if refusal is not None and refusal.for_now:
+        if refusal is not None and refusal.is_retryable:
             self._for_now[message.topic] = None
             self._say("broker refuses a topic for now; it is tried again", message.topic, refusal.why)
             if message.retain and self._again is None:

@@ -76,7 +76,7 @@ class QueueSender:
             self._outbox.connected = False
             self._outbox.rewind()
 
-    async def emptied(self) -> None:
+    async def wait_until_empty(self) -> None:
         """Wait until the broker has all of it."""
         while self._outbox.waiting:
             self._moved.clear()
@@ -87,7 +87,7 @@ class QueueSender:
         room = asyncio.Semaphore(WINDOW)
 
         async def carry(waiting: QueuedMessage) -> None:
-            if not await self._carry(connection, waiting):
+            if not await self._send_one(connection, waiting):
                 feeding.cancel()
             room.release()
 
@@ -106,19 +106,19 @@ class QueueSender:
         while True:
             await asyncio.sleep(self._pauses.next_s())
             for oldest in await self._outbox.take(1):
-                if await self._carry(connection, oldest):
+                if await self._send_one(connection, oldest):
                     self._pauses.reset()
                     return
             self._outbox.rewind()
 
-    async def _carry(self, connection: Connection, waiting: QueuedMessage) -> bool:
+    async def _send_one(self, connection: Connection, waiting: QueuedMessage) -> bool:
         """Send one message; False: to be tried again.
 
         What is refused for good is counted and given up: else it would hold up all the rest.
         """
         refusal = await connection.publish(waiting.message)
-        self._refusals.answered(waiting.message, refusal)
-        if refusal is not None and refusal.for_now:
+        self._refusals.record_result(waiting.message, refusal)
+        if refusal is not None and refusal.is_retryable:
             return False
         self._refused += refusal is not None
         self._outbox.sent(waiting.number)

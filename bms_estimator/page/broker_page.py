@@ -29,7 +29,7 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
         UserError: A setting cannot be used, or the address is taken.
     """
     hub, past = PackTopics(), HistoryQuery()
-    hub.say_link(f"{', '.join(broker.urls)}: not reached yet")
+    hub.set_link_state(f"{', '.join(broker.urls)}: not reached yet")
 
     def heard(message: DeviceMessage) -> None:
         if message.device not in hub.packs:
@@ -44,7 +44,7 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
 
     def linked() -> None:
         lost = subscriber.lost_since is not None
-        hub.say_link(subscriber.trouble or "the broker is lost" if lost else None)
+        hub.set_link_state(subscriber.trouble or "the broker is lost" if lost else None)
 
     async with PageServer(settings, hub, past, patient=False) as server:
         subscriber = Subscriber(broker, heard, linked, left_out=left_out)

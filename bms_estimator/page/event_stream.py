@@ -34,17 +34,17 @@ class LatestValues:
         """Return the newest text of a key; None: there is nothing to send."""
         return self._texts.get(key)
 
-    def say(self, key: str, text: str) -> None:
+    def set_value(self, key: str, text: str) -> None:
         """Keep a text, and hand it on where it is another one."""
         if text != self._texts.get(key):
             self._texts[key] = text
-            self.hand_on(key)
+            self.broadcast(key)
 
-    def say_link(self, trouble: str | None) -> None:
+    def set_link_state(self, trouble: str | None) -> None:
         """Whether what fills this is connected: why not, or None when it is."""
-        self.say(LINK, json.dumps({"up": trouble is None, "reason": trouble}))
+        self.set_value(LINK, json.dumps({"up": trouble is None, "reason": trouble}))
 
-    def hand_on(self, key: str) -> None:
+    def broadcast(self, key: str) -> None:
         """Queue the newest text of a key for all readers."""
         for reader in self._readers:
             reader.put(key)

@@ -73,7 +73,7 @@ class PackTopics(LatestValues):
             self._remember(pack, value)
         if topic == PARAMETERS and isinstance(value, dict):
             self._learn(pack, value)
-        self.hand_on(f"{pack}/{topic}")
+        self.broadcast(f"{pack}/{topic}")
 
     def drop(self, pack: str) -> None:
         """Remove a pack."""
@@ -124,7 +124,7 @@ class PackTopics(LatestValues):
             self.drop(pack)
 
     def _publish_packs(self) -> None:
-        self.say(PACKS, _json({"names": self.packs, "hidden": self._hidden}))
+        self.set_value(PACKS, _json({"names": self.packs, "hidden": self._hidden}))
 
     def _remember(self, pack: str, state: Mapping[str, Any]) -> None:
         """Keep what the curves show, once a second; a state that comes late or is dated far in the future is left out."""

@@ -40,19 +40,19 @@ class PageSink:
         self._hub = await self._stack.enter_async_context(
             self._pages.serving(self._settings, self._pack, self._history)
         )
-        self._put(self._messages.greeting())
+        self._put(self._messages.birth_messages())
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """Say that nothing more will come, and part from the browsers."""
-        self._put(self._messages.farewell())
+        self._put(self._messages.offline_messages())
         await self._stack.aclose()
 
     def publish(self, snapshot: Snapshot) -> None:
         """Take a snapshot; returns at once."""
         now_s = asyncio.get_running_loop().time()
-        messages, self._sent = self._messages.due(self._sent, snapshot, now_s)
-        self._put(self._messages.kept(self._before, snapshot) + messages)
+        messages, self._sent = self._messages.live_messages(self._sent, snapshot, now_s)
+        self._put(self._messages.must_deliver(self._before, snapshot) + messages)
         self._before = snapshot
 
     def _put(self, messages: list[Message]) -> None:

@@ -73,13 +73,13 @@ class AlarmHooks:
             failing=[f"{hook.what}: {hook.trouble}" for hook in self._hooks if hook.trouble],
         )
 
-    def tell(self, change: Change) -> None:
+    def on_alarm_change(self, change: Change) -> None:
         """Pass a change of an alarm to its hooks; returns at once."""
         for hook in self._hooks:
             if hook.covers(change.alarm.name):
-                hook.tell(change)
+                hook.on_alarm_change(change)
 
-    def begin(self, alarms: Sequence[Alarm]) -> None:
+    def restore_active(self, alarms: Sequence[Alarm]) -> None:
         """Take over alarms of an earlier run.
 
         Their jobs have been done, but the relay must be as it was. If a hook had failed, all jobs are done again: one that
@@ -88,12 +88,12 @@ class AlarmHooks:
         raised = {alarm.name for alarm in alarms if _counts_as_raised(alarm)}
         if "hook_failed" not in raised:
             for hook in self._hooks:
-                hook.begin(raised)
+                hook.restore_active(raised)
             return
         for hook in self._hooks:
-            hook.begin({"hook_failed"})
+            hook.restore_active({"hook_failed"})
         for alarm in alarms:
-            self.tell(Change(0.0, alarm))
+            self.on_alarm_change(Change(0.0, alarm))
 
     async def __aenter__(self) -> Self:
         """Start."""
@@ -137,7 +137,7 @@ class _Hook:
         """Return whether an alarm is one of this hook's. ``hook_failed`` must be listed."""
         return name in self._hook.alarms if self._hook.alarms else name != "hook_failed"
 
-    def tell(self, change: Change) -> None:
+    def on_alarm_change(self, change: Change) -> None:
         """Queue the job that follows from a change."""
         job = self._job(change)
         if job is None or job.state not in self._hook.on:
@@ -146,7 +146,7 @@ class _Hook:
             log.warning("an alarm hook is behind: its oldest alarm is left out", hook=self.what)
         self._waiting.append(job)
 
-    def begin(self, raised: Collection[str]) -> None:
+    def restore_active(self, raised: Collection[str]) -> None:
         """Take over alarms of an earlier run."""
         self._raised = {name for name in raised if self.covers(name)}
 
@@ -294,7 +294,7 @@ class _RelayHook(_Hook):
         kept = silent == "keep"
         return Relay(high, None if kept else silent == "high", 0 if kept else self._hook.silent_s)
 
-    def tell(self, change: Change) -> None:
+    def on_alarm_change(self, change: Change) -> None:
         """Follow the alarms, whatever the hook is ``on``: the level depends on whether one of them counts as raised."""
         before = self._wanted
         job = self._job(change)

@@ -70,16 +70,16 @@ class AlarmMonitor:
         self.alarms.add(block, trace, self._source.cells)
         self._heard_s, self._arrival_s = now_s, self._clock.wall()
         if now_s - self._judged_s >= JUDGE_S or self.alarms.rows >= JUDGE_ROWS:
-            self.judge(now_s)
+            self.evaluate(now_s)
 
-    def judge(self, now_s: float) -> None:
+    def evaluate(self, now_s: float) -> None:
         """Look at what has come since the last time, and at that nothing came, at ``now_s`` of the monotonic clock [s]."""
         passed_s, self._judged_s = now_s - self._judged_s, now_s
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
         said = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
-        self.alarms.judge(self._arrival_s, self._counts(), suspects, said)
-        self.alarms.silent(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
+        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, said)
+        self.alarms.on_silence(now_s - self._heard_s, self._clock.wall(), self._source.message or "")
         if (hooks := self._hooks()) is not None:
             self.alarms.judge_hooks(hooks.failing, passed_s, self._clock.wall())
         self._tell()

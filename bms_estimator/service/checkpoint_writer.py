@@ -58,7 +58,7 @@ class CheckpointWriter:
         self._saved: tuple[int, float] | None = None
         """Samples and SOC of the state that was saved last; None: none was by this run."""
 
-    async def save_often(self) -> None:
+    async def run(self) -> None:
         """Save every ``every_s``, and once the SOC has gone by ``SAVED_SOC``, a latching alarm turns or a first sample is there."""
         await self._write(self._mark(clean=False))  # from now on a run that leaves no word has crashed
         loop = asyncio.get_running_loop()
@@ -71,7 +71,7 @@ class CheckpointWriter:
                 failed = not await self._save()
                 saved_s = loop.time()
 
-    async def save_last(self, *, clean: bool) -> None:
+    async def save_final(self, *, clean: bool) -> None:
         """Save as the run ends, by itself where it is ``clean``; a disk that hangs is left alone after ``LAST_S``."""
         try:
             async with asyncio.timeout(LAST_S):
@@ -93,7 +93,7 @@ class CheckpointWriter:
         taught, ledger = self._taught, self._ledger(clean=clean)
         if not taught[0] or taught == self._saved:
             if clean or self._alarms != ledger.alarms:
-                return await self._write_with(ledger, lambda: self._checkpoint.mark(ledger))
+                return await self._write_with(ledger, lambda: self._checkpoint.update_counters(ledger))
             return True
         state = self._estimator.record.copy()
         if not await self._write_with(ledger, lambda: self._checkpoint.save(state, ledger)):
@@ -104,7 +104,7 @@ class CheckpointWriter:
 
     def _mark(self, *, clean: bool) -> Callable[[], None]:
         ledger = self._ledger(clean=clean)
-        return lambda: self._checkpoint.mark(ledger)
+        return lambda: self._checkpoint.update_counters(ledger)
 
     def _ledger(self, *, clean: bool) -> RunCounters:
         return RunCounters(self._restarts, self._tally.total, clean, self._publisher.watch.alarms.kept)

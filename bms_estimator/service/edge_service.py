@@ -71,7 +71,7 @@ async def _keep_alive(
     """Pat the watchdog while somebody looks after the line, and say how it is."""
     said = ""
     while True:
-        if source.pulse().untended_s <= UNTENDED_S:
+        if source.pulse().task_idle_s <= UNTENDED_S:
             notifier.alive(name)
         status = f"no samples: {source.message}" if source.message else f"{edge.store.waiting} blocks not sent"
         if status != said:

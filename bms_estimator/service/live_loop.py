@@ -107,10 +107,10 @@ async def run_estimation_loop(
         recording=recording,
         edge=edge.health if edge else lambda: None,
         hooks=lambda: hooks.health,
-        on_alarm=hooks.tell,
+        on_alarm=hooks.on_alarm_change,
     )
     _restore_alarms(publisher, ledger.alarms)
-    hooks.begin(publisher.watch.alarms.report())
+    hooks.restore_active(publisher.watch.alarms.report())
     if requests is not None:
         _offer(requests, estimator, publisher, current_zero)
     every_s = settings.state.checkpoint_s
@@ -133,7 +133,7 @@ async def run_estimation_loop(
             _measure_lag(publisher),
         ]
         if saving:
-            tasks.append(saving.save_often())
+            tasks.append(saving.run())
         if reload:
             tasks.append(_reload(reload, notifier, name))
         clean = False
@@ -143,7 +143,7 @@ async def run_estimation_loop(
         finally:  # a fault ends the loop, too
             notifier.stopping(name)
             if saving:  # before the sinks part, which may take seconds: who stops us may not wait for them
-                await saving.save_last(clean=clean)
+                await saving.save_final(clean=clean)
         publisher.publish_last()
     return estimator
 
@@ -201,9 +201,9 @@ async def _reload(reload: SettingsReload, notifier: SystemdNotifier, name: str) 
 
 
 def _offer_changes(reload: SettingsReload, publisher: Publisher, saving: CheckpointWriter | None) -> None:
-    reload.offer("publish.rate_hz", publisher.set_rate)
+    reload.on_change("publish.rate_hz", publisher.set_rate)
     if saving:
-        reload.offer("state.checkpoint_s", partial(setattr, saving, "every_s"))
+        reload.on_change("state.checkpoint_s", partial(setattr, saving, "every_s"))
 
 
 async def _measure_lag(publisher: Publisher) -> None:
@@ -225,7 +225,7 @@ def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clo
         wrong = restore_state(estimator, found.state, found.unseen_s)
         outcome = f"{REFUSED}{wrong}" if wrong else f"restored{_soc_text(estimator)}"
     if refused := outcome.startswith(REFUSED):
-        outcome = f"{outcome}; {checkpoint.set_aside()}"
+        outcome = f"{outcome}; {checkpoint.quarantine()}"
     say = log.warning if refused else log.info
     say("checkpoint", file=str(checkpoint.path), outcome=outcome)
     return found.ledger, outcome
@@ -301,8 +301,8 @@ def _offer(
         return {"rate_hz": rate_hz, "before": before}
 
     for handler in (state, parameters, health, set_soc, current_zero, publish_rate):
-        requests.offer(handler.__name__, handler)
-    requests.offer("acknowledge_alarm", partial(_acknowledge_alarm, publisher))
+        requests.register(handler.__name__, handler)
+    requests.register("acknowledge_alarm", partial(_acknowledge_alarm, publisher))
 
 
 async def _acknowledge_alarm(publisher: Publisher, arguments: Mapping[str, Any]) -> Mapping[str, Any]:

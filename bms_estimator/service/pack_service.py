@@ -87,8 +87,8 @@ async def run_pack_service(
     outbox = Outbox(database, most=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     if reload:
-        reload.offer("log.level", partial(set_level, settings.pack.name))
-        reload.offer("mqtt.commands", requests.allow)
+        reload.on_change("log.level", partial(set_level, settings.pack.name))
+        reload.on_change("mqtt.commands", requests.allow)
     say: PublishRaw | None = None
     if settings.mqtt is not None:
         mqtt = MqttSink(
@@ -102,7 +102,7 @@ async def run_pack_service(
             alarms=[each.name for each in watched(settings, cell)],
         )
         all_sinks.append(mqtt)
-        say = mqtt.say
+        say = mqtt.publish_raw
     hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, say, relay_of(settings, source.relay))
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None

@@ -135,7 +135,7 @@ class Publisher:
     def add(self, block: SampleBlock, trace: TraceBlock) -> None:
         """Take a block and what the estimator made of it; publish when it is time."""
         if self._pulse:
-            self._latency.add(self._pulse().late_s)
+            self._latency.add(self._pulse().block_age_s)
         now_s = self._clock.monotonic()
         if trace.size:
             self._window.add(trace, self._clock.wall(), self._source.cells)
@@ -158,13 +158,13 @@ class Publisher:
         self._due_s += self.period_s
         if self._due_s <= now_s:  # behind: do not catch up
             self._due_s = now_s + self.period_s
-        self.watch.judge(now_s)
+        self.watch.evaluate(now_s)
         self.snapshot = self._next_snapshot(now_s)
         if self.snapshot.estimate is not None:
             self.latest = self.snapshot.estimate
             self._rest.add(self.latest, now_s)
         elif not self.snapshot.health.sensor_online:
-            self._rest.forget()
+            self._rest.reset()
         for sink in self._sinks:
             sink.publish(self.snapshot)
 
@@ -177,7 +177,7 @@ class Publisher:
     def alive(self) -> bool:
         """Whether samples flow, or what brings them still tries and says why they do not."""
         fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
-        return fresh or self._pulse is None or self._pulse().untended_s <= UNTENDED_S
+        return fresh or self._pulse is None or self._pulse().task_idle_s <= UNTENDED_S
 
     @property
     def status(self) -> str:
@@ -190,7 +190,7 @@ class Publisher:
     @property
     def disturbed(self) -> str | None:
         """Why the pack is not known to be at rest; None when it is."""
-        return self.snapshot.health.sensor_message or self._rest.disturbed(self._clock.monotonic())
+        return self.snapshot.health.sensor_message or self._rest.not_at_rest_reason(self._clock.monotonic())
 
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_s = self._started_s
@@ -256,7 +256,7 @@ class Publisher:
             latency_p50_s=p50_s,
             latency_p99_s=p99_s,
             latency_max_s=most_s,
-            reads_waiting=self._pulse().waiting if self._pulse else 0,
+            reads_waiting=self._pulse().queued_reads if self._pulse else 0,
             messages_waiting=self._delivery.waiting,
             log_lines_lost=self.log_lines_lost,
             disk_free_mib=self.disk_free_mib,

@@ -34,7 +34,7 @@ class SettingsReload:
         self._thread = DiskThread("settings")
         self.asked = asyncio.Event()
 
-    def offer(self, key: str, take: Callable[[Any], None]) -> None:
+    def on_change(self, key: str, take: Callable[[Any], None]) -> None:
         """Have ``take`` called with another value of a setting, ``section.key``."""
         self._takers[key] = take
 

@@ -19,7 +19,7 @@ class FaultLog:
     def __init__(self) -> None:
         self._logged, self._logged_s = 0, -math.inf
 
-    def see(self, counters: Mapping[str, int], now_s: float) -> None:
+    def check(self, counters: Mapping[str, int], now_s: float) -> None:
         """Look at the counters since start.
 
         Args:

@@ -40,7 +40,7 @@ class LineProducer(ABC):
         """What is read, for people: begins the messages."""
 
     @abstractmethod
-    def bring(self) -> AsyncGenerator[bytes, None]:
+    def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """Connect; then ``CONNECTED``, and lines as ``report_line`` makes them, as they come.
 
         Called again, after a pause, when it has ended or raised. It never blocks the event loop, and is closed at the end.
@@ -183,7 +183,7 @@ class LineSource:
             await self._pause()
             reason = "it ended"
             try:
-                async with contextlib.aclosing(self._bringer.bring()) as lines:
+                async with contextlib.aclosing(self._bringer.iter_lines()) as lines:
                     async for line in lines:
                         self._take(line)
             except (SourceUnavailableError, OSError) as error:
@@ -212,7 +212,7 @@ class LineSource:
             if self._connected and now_s - self._heard_s >= self._silent_s:
                 why = self._bringer.fault or self._dialect.fault or "connected, but silent"
                 self._say(f"{self._bringer.name}: {why}")
-            self._faults.see(self.counters, now_s)
+            self._faults.check(self.counters, now_s)
             await asyncio.sleep(self._look_s)
 
     def _say(self, message: str) -> None:

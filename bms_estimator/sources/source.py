@@ -12,11 +12,11 @@ Chunk = tuple[float, bytes]
 class SourceHealth(NamedTuple):
     """Whether what brings samples lives."""
 
-    untended_s: float
+    task_idle_s: float
     """Since its task last looked after the line, or tried to open it [s]."""
-    late_s: float
+    block_age_s: float
     """Since the bytes of the block that came last were read [s]."""
-    waiting: int
+    queued_reads: int
     """Reads of the line that nobody has taken yet."""
 
 

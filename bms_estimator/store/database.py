@@ -87,10 +87,10 @@ class Database:
 
     async def __aexit__(self, *_error: object) -> None:
         """Close the file, unless the disk hangs."""
-        self.hurry()
+        self.begin_shutdown()
         await self._wait(asyncio.wrap_future(self._thread.submit(self._file.close)))
 
-    def hurry(self) -> None:
+    def begin_shutdown(self) -> None:
         """The end has begun: all that is still written may take ``ENDING_S``, and what is waited for no longer."""
         self._end_s = min(self._end_s, asyncio.get_running_loop().time() + ENDING_S)
         for wait in self._waits:

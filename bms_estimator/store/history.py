@@ -83,7 +83,7 @@ class History:
             return
         self._close_minute()
         self._closing = True
-        self._database.hurry()
+        self._database.begin_shutdown()
         self._due.set()
         await self._task
 

@@ -65,7 +65,7 @@ class Outbox:
         if self._task is None or self._database is None:
             return
         self._closing = True
-        self._database.hurry()
+        self._database.begin_shutdown()
         self._wanted.set()
         await self._task
 
@@ -81,8 +81,8 @@ class Outbox:
         while not (self._opened and self._queue.can_hand_out):
             self._filled.clear()
             await self._filled.wait()
-        taken = self._queue.hand_out(most)
-        if self._queue.hungry:
+        taken = self._queue.take_next(most)
+        if self._queue.needs_page:
             self._wanted.set()
         return taken
 
@@ -135,25 +135,25 @@ class Outbox:
             if work:
                 queue.writing(work.rows)
                 self._done(await self._database.call(work))
-            queue.sure, queue.passing = self._known == self._database.opened, False
+            queue.disk_state_known, queue.skip_disk = self._known == self._database.opened, False
             self._known = self._database.opened
         except StoreError:
-            queue.sure, queue.passing = False, True
+            queue.disk_state_known, queue.skip_disk = False, True
         self._opened = True
         self._tell()
 
     def _due(self, offset: int, *, write: bool) -> OutboxTransaction:
         queue, stored = self._queue, self._queue.stored
-        gaps = queue.gaps() if queue.stale or not queue.sure else []
+        gaps = queue.gaps() if queue.stale or not queue.disk_state_known else []
         queue.stale = False
         return OutboxTransaction(
             offset=offset,
             first=stored.first if stored else queue.next,
             end=stored.end if stored else queue.next,
             gaps=gaps,
-            rows=queue.unwritten() if write or not queue.sure else [],
-            page=PAGE if queue.hungry else 0,
-            recount=not queue.sure,
+            rows=queue.unwritten() if write or not queue.disk_state_known else [],
+            page=PAGE if queue.needs_page else 0,
+            recount=not queue.disk_state_known,
         )
 
     def _done(self, outcome: Outcome) -> None:

@@ -1,6 +1,6 @@
 """The order of what waits for the broker, in memory and on disk. Pure: no disk, no clock, no task.
 
-From the oldest to the newest a message is on its way (``handed``), ready to be handed out, on disk alone
+From the oldest to the newest a message is on its way (``in_flight``), ready to be handed out, on disk alone
 (``stored``), or in the tail of what came last. While the broker takes what comes, nothing goes beyond ready.
 """
 
@@ -30,20 +30,20 @@ class Queue:
         most: So many are kept; of more the oldest that is not on its way is dropped.
         dropped: Messages that found no room.
         next: The number of the next message.
-        handed: On their way, not yet acknowledged.
+        in_flight: On their way, not yet acknowledged.
         stale: Whether something may be on disk that is not kept any more.
-        sure: Whether it is known what is on disk; if not, what is in memory is written again.
+        disk_state_known: Whether it is known what is on disk; if not, what is in memory is written again.
         stored: What is on disk alone.
-        passing: Hand out what came last though older ones are on disk, which cannot be read.
+        skip_disk: Hand out what came last though older ones are on disk, which cannot be read.
     """
 
     most: int
     dropped: int = 0
     next: int = 0
-    handed: dict[int, QueuedMessage] = field(default_factory=dict)
+    in_flight: dict[int, QueuedMessage] = field(default_factory=dict)
     stale: bool = False
-    sure: bool = True
-    passing: bool = False
+    disk_state_known: bool = True
+    skip_disk: bool = False
     stored: NumberRanges = field(default_factory=NumberRanges)
     _ready: deque[QueuedMessage] = field(default_factory=deque)
     _tail: deque[QueuedMessage] = field(default_factory=deque)
@@ -52,22 +52,22 @@ class Queue:
     @property
     def waiting(self) -> int:
         """Messages that are not acknowledged."""
-        return len(self.handed) + len(self._ready) + len(self.stored) + len(self._tail)
+        return len(self.in_flight) + len(self._ready) + len(self.stored) + len(self._tail)
 
     @property
     def oldest(self) -> int | None:
         """The lowest number that waits."""
-        if self.stored and not self.handed and not self._ready:
+        if self.stored and not self.in_flight and not self._ready:
             return self.stored.first
         return next((waiting.number for waiting in self._in_memory()), None)
 
     @property
     def can_hand_out(self) -> bool:
-        """Whether ``hand_out`` gives something."""
-        return bool(self._ready or (self._tail and (self.passing or not self.stored)))
+        """Whether ``take_next`` gives something."""
+        return bool(self._ready or (self._tail and (self.skip_disk or not self.stored)))
 
     @property
-    def hungry(self) -> bool:
+    def needs_page(self) -> bool:
         """Whether it is time to read from disk."""
         return bool(self.stored) and len(self._ready) < PAGE // 2
 
@@ -81,27 +81,29 @@ class Queue:
             self._forget(self._tail.popleft().number)
             self.dropped += 1
 
-    def hand_out(self, most: int) -> list[QueuedMessage]:
+    def take_next(self, most: int) -> list[QueuedMessage]:
         """Up to ``most`` of the oldest."""
         taken: list[QueuedMessage] = []
         while len(taken) < most and self.can_hand_out:
             taken.append((self._ready or self._tail).popleft())
-        self.handed |= {waiting.number: waiting for waiting in taken}
+        self.in_flight |= {waiting.number: waiting for waiting in taken}
         return taken
 
     def sent(self, number: int) -> None:
         """A message is acknowledged."""
-        if self.handed.pop(number, None):
+        if self.in_flight.pop(number, None):
             self._forget(number)
 
     def rewind(self) -> None:
         """Nothing is on its way any more."""
-        self._ready.extendleft(reversed(self.handed.values()))
-        self.handed.clear()
+        self._ready.extendleft(reversed(self.in_flight.values()))
+        self.in_flight.clear()
 
     def unwritten(self) -> list[QueuedMessage]:
         """What is in memory alone."""
-        return [waiting for waiting in self._in_memory() if not self.sure or waiting.number not in self._written]
+        return [
+            waiting for waiting in self._in_memory() if not self.disk_state_known or waiting.number not in self._written
+        ]
 
     def writing(self, rows: Iterable[QueuedMessage]) -> None:
         """From now on these may be on disk."""
@@ -162,7 +164,7 @@ class Queue:
         return [*gaps, (begin, self.next)] if begin < self.next else gaps
 
     def _in_memory(self) -> Iterator[QueuedMessage]:
-        return chain(self.handed.values(), self._ready, self._tail)
+        return chain(self.in_flight.values(), self._ready, self._tail)
 
     def _forget(self, number: int) -> None:
         """What may be on disk need not be any more."""

@@ -34,7 +34,7 @@ class AlarmState:
     Attributes:
         watched: What is watched.
         raising: Of an alarm that is active; None of one that is not.
-        gone: The cause is gone, but it is latched.
+        cause_cleared: The cause is gone, but it is latched.
         acknowledged: Somebody knows: it ends once the cause is gone.
         known: A value has come.
         lost_s: Shorter times without values count toward a delay [s].
@@ -42,7 +42,7 @@ class AlarmState:
 
     watched: AlarmDefinition
     raising: RaisedAlarm | None = None
-    gone: bool = False
+    cause_cleared: bool = False
     acknowledged: bool = False
     known: bool = False
     lost_s: float = 0.0
@@ -89,19 +89,19 @@ class AlarmState:
     def acknowledge(self) -> bool:
         """Somebody knows. Returns whether it has ended by that."""
         self.acknowledged = self.raising is not None
-        if not self.gone:
+        if not self.cause_cleared:
             return False
         self._end()
         return True
 
     def restore(self, raising: RaisedAlarm, *, gone: bool, acknowledged: bool) -> None:
         """Go on from a run before."""
-        self.raising, self.gone, self.acknowledged = raising, gone, acknowledged
+        self.raising, self.cause_cleared, self.acknowledged = raising, gone, acknowledged
         self._held_s = None
 
     def _due(self, signed: float, step_s: float, sign: float) -> bool:
         """Whether what leads to the next state has now held for long enough."""
-        raised = self.raising is not None and not self.gone
+        raised = self.raising is not None and not self.cause_cleared
         holds = signed < sign * self.watched.clear if raised else signed >= sign * self.watched.limit
         if not holds:
             self._held_s = None
@@ -116,14 +116,14 @@ class AlarmState:
         """Go to the next state. Returns what others need to know of it."""
         if self.raising is None:
             return self.raise_at(at_s, RaisedAlarm(at_s + wall_s, value if math.isfinite(value) else None))
-        if self.gone:  # it is back
-            self.gone = False
+        if self.cause_cleared:  # it is back
+            self.cause_cleared = False
             return []
         if self.watched.latch and not self.acknowledged:
-            self.gone = True
+            self.cause_cleared = True
             return []
         self._end()
         return [AlarmTransition(at_s, None)]
 
     def _end(self) -> None:
-        self.raising, self.gone, self.acknowledged, self._held_s = None, False, False, None
+        self.raising, self.cause_cleared, self.acknowledged, self._held_s = None, False, False, None

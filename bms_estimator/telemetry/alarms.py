@@ -119,10 +119,10 @@ class AlarmEvaluator:
         return self._waiting.size
 
     def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock) -> None:
-        """Take a block, what the estimator made of it, and the cells beside it; ``judge`` looks at them."""
+        """Take a block, what the estimator made of it, and the cells beside it; ``evaluate`` looks at them."""
         self._waiting.add(block, trace, cells)
 
-    def judge(self, arrival_s: float, counts: SampleCounts, suspects: InputFault, suspicions: Sequence[str]) -> None:
+    def evaluate(self, arrival_s: float, counts: SampleCounts, suspects: InputFault, suspicions: Sequence[str]) -> None:
         """Judge all that waits.
 
         Args:
@@ -145,7 +145,7 @@ class AlarmEvaluator:
             self._judge_estimates(trace, suspects, arrival_s - float(trace["time_s"][-1]))
         self._keep()
 
-    def silent(self, silent_s: float, now_s: float, reason: str) -> None:
+    def on_silence(self, silent_s: float, now_s: float, reason: str) -> None:
         """No sample has come for so long.
 
         Args:
@@ -161,8 +161,8 @@ class AlarmEvaluator:
         state = self._states.get("link_lost")
         if state is None or silent_s < state.watched.limit:
             return
-        if state.gone:  # it latches, and is back
-            state.gone = False
+        if state.cause_cleared:  # it latches, and is back
+            state.cause_cleared = False
             self._keep()
         if state.raising is None:
             self._reasons["link_lost"] = Reasons(InputFault(0), (reason,) if reason else ())
@@ -359,7 +359,7 @@ class AlarmEvaluator:
     def _alarm(self, state: AlarmState) -> Alarm:
         name = state.watched.name
         told = AlarmMessage(
-            state.raising, gone=state.gone, reasons=self._texts(name), unwatched=self._unwatched.get(name)
+            state.raising, gone=state.cause_cleared, reasons=self._texts(name), unwatched=self._unwatched.get(name)
         )
         return _alarm(state.watched, told)
 
@@ -376,7 +376,7 @@ class AlarmEvaluator:
     def _keep(self) -> None:
         """Save the raised alarms, the lost quantities and the silence: a relay that has cut the load stays so over a restart."""
         kept: dict[str, Any] = {
-            name: {**state.raising._asdict(), "gone": state.gone, "acknowledged": state.acknowledged}
+            name: {**state.raising._asdict(), "gone": state.cause_cleared, "acknowledged": state.acknowledged}
             for name, state in self._states.items()
             if state.raising is not None
         }

@@ -23,7 +23,7 @@ class ChargeEnergy(NamedTuple):
         """The part of ``total`` that has flowed."""
         return cls(*(getattr(total, name) for name in cls._fields))
 
-    def and_net(self, charge_as: float, energy_ws: float) -> "ChargeEnergy":
+    def plus_net(self, charge_as: float, energy_ws: float) -> "ChargeEnergy":
         """And ``charge_as`` [A s] and ``energy_ws`` [W s], positive on discharge, each in the direction in which it went."""
         charge_ah, energy_kwh = charge_as / 3600.0, energy_ws / 3.6e6
         return ChargeEnergy(
@@ -53,9 +53,9 @@ class ChargeEnergyMeter:
     def __init__(self, before: ChargeEnergy, gap_s: float, sums: NDArray[np.void] | None = None) -> None:
         self._gap_s = gap_s
         self._sums: NDArray[np.void] = np.zeros(1, dtype=FLOW_SUMS) if sums is None else sums
-        self.go_on(before)
+        self.continue_from(before)
 
-    def go_on(self, flow: ChargeEnergy) -> None:
+    def continue_from(self, flow: ChargeEnergy) -> None:
         """Count on from ``flow`` and what the sums hold."""
         self._flow = flow
 
@@ -67,6 +67,6 @@ class ChargeEnergyMeter:
     def flow(self) -> ChargeEnergy:
         """All that has flowed."""
         s = self._sums[0]
-        self._flow = self._flow.and_net(float(s["charge_as"]), float(s["energy_ws"]))
+        self._flow = self._flow.plus_net(float(s["charge_as"]), float(s["energy_ws"]))
         s["charge_as"] = s["energy_ws"] = 0.0
         return self._flow

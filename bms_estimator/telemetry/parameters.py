@@ -191,10 +191,10 @@ def _parameter(held: Parameter, fit: IdentifiedValue | None, now_s: float) -> Pa
 
 def _identified(learned: IdentifiedValue, held: Parameter, limit: float, now_s: float) -> Parameter:
     """Learned value if its error is small enough, else the observer's value and how far learning has come."""
-    if math.isinf(learned.unlearned_s):
+    if math.isinf(learned.age_s):
         return held
     if learned.relative_std < limit:
-        updated = iso_utc(max(now_s - learned.unlearned_s, 0.0))
+        updated = iso_utc(max(now_s - learned.age_s, 0.0))
         return Parameter(
             value=finite(learned.value), std=finite(learned.std), valid=True, source="identified", updated=updated
         )

@@ -30,11 +30,11 @@ class RestDetector:
         while len(self._windows) > 1 and now_s - self._windows[1][0] >= WATCHED_S:
             self._windows.popleft()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew: nobody has seen what happened meanwhile."""
         self._windows.clear()
 
-    def disturbed(self, now_s: float) -> str | None:
+    def not_at_rest_reason(self, now_s: float) -> str | None:
         """Why the pack is not known to be at rest; None when it is.
 
         Args:

@@ -80,9 +80,9 @@ PARTS: dict[str, Change] = {
     "no error of the capacity": setting(capacity_std=0.0),
     "offset and capacity do not change": setting(offset_s=1e12, aged_soc=1e9),
     "polarisation from the first current": setting(load_c=0.0, load_level_c=1e-3),
-    "weights not tempered": setting(temper=0.5),
-    "weights by S as it is": setting(least_share=1.0),
-    "weights by innovations alone": setting(strain=0.0),
+    "weights not tempered": setting(half_likelihood_exponent=0.5),
+    "weights by S as it is": setting(min_innovation_scale=1.0),
+    "weights by innovations alone": setting(inconsistency_penalty=0.0),
 }
 ONE_FILTER, NO_TEMPERATURE = "one hypothesis", "temperature not used"
 

@@ -98,12 +98,12 @@ def _frames(_: Path) -> Read:
     def read(data: bytes) -> None:
         dialect = BoardDialect(rate_hz=100)
         dialect.feed(1.0, data[: len(data) // 2])
-        dialect.opened()
-        dialect.serial_in(data[len(data) // 2 :])
+        dialect.on_port_opened()
+        dialect.serial_number_in(data[len(data) // 2 :])
         dialect.feed(2.0, data[len(data) // 2 :])
-        dialect.due(3.0)
+        dialect.next_output(3.0)
         assert dialect.counters["bytes_received"] <= len(data)
-        _ = dialect.fault, dialect.board, dialect.described, dialect.clock_ppm
+        _ = dialect.fault, dialect.board, dialect.description, dialect.clock_ppm
 
     return read
 
@@ -112,7 +112,7 @@ def _text(_: Path) -> Read:
     def read(data: bytes) -> None:
         dialect = TextDialect()
         dialect.feed(1.0, data)
-        _ = dialect.fault, dialect.described, dialect.counters
+        _ = dialect.fault, dialect.description, dialect.counters
 
     return read
 
@@ -123,9 +123,9 @@ def _meter(make: Callable[[], DeviceProtocol]) -> Callable[[Path], Read]:
     def read(data: bytes) -> None:
         dialect = make()
         dialect.feed(1.0, data[: len(data) // 2])
-        dialect.due(1.5)
+        dialect.next_output(1.5)
         dialect.feed(2.0, data[len(data) // 2 :])
-        _ = dialect.fault, dialect.described, dialect.counters
+        _ = dialect.fault, dialect.description, dialect.counters
 
     return lambda _: read
 
@@ -137,12 +137,12 @@ def _asked(protocol: str) -> Callable[[Path], Read]:
         def read(data: bytes) -> None:
             dialect = make_dialect(SensorSettings.model_validate({"protocol": protocol}))
             dialect.feed(1.0, data[: len(data) // 2])
-            dialect.due(1.5)
-            dialect.opened()
+            dialect.next_output(1.5)
+            dialect.on_port_opened()
             dialect.feed(2.0, data[len(data) // 2 :])
-            dialect.due(3.0)
+            dialect.next_output(3.0)
             assert dialect.counters["noise_bytes"] <= dialect.counters["bytes_received"] == len(data)
-            _ = dialect.fault, dialect.described, dialect.quiet_s
+            _ = dialect.fault, dialect.description, dialect.allowed_silence_s
 
         return read
 
@@ -185,10 +185,10 @@ def _requests(_: Path) -> Read:
     async def set_soc(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"soc": number(arguments, "soc", 0.0, 1.0)}
 
-    requests.offer("set_soc", set_soc)
+    requests.register("set_soc", set_soc)
 
     def read(data: bytes) -> None:
-        answering = requests.respond("set_soc", data)
+        answering = requests.handle("set_soc", data)
         try:
             answering.send(None)
         except StopIteration as answered:

@@ -80,7 +80,7 @@ def full() -> Snapshot:
 
 def test_what_it_writes_of_a_state_and_an_alarm_is_what_our_own_sink_writes(full: Snapshot) -> None:
     state, alarm = lines(None, full)
-    [sent] = [m for m in MessageBuilder("bms", "pack").kept(full, full) if m.topic == "bms/pack/state"]
+    [sent] = [m for m in MessageBuilder("bms", "pack").must_deliver(full, full) if m.topic == "bms/pack/state"]
     assert made(STATE, sent.topic, sent.payload) == written(state)
     payload = full.alarms[0].model_dump_json().encode()
     assert made(ALARM, "bms/pack/alarm/soc_low", payload) == written(alarm)

@@ -133,7 +133,7 @@ async def test_a_store_that_must_be_later_than_the_clock_goes_on_at_the_same_pac
         feed.give(2)
         later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
         await until(lambda: feed.edge.store._settled.kept.next == 2)  # on disk
-        feed.edge.store.heard(later)
+        feed.edge.store.on_request(later)
         await until(lambda: feed.edge.store.last_s > WALL_S + 1e8)
         feed.give(4)
         async with asyncio.timeout(LONG_S):

@@ -92,7 +92,7 @@ async def test_a_restart_goes_on_with_store_number_and_time_and_sends_what_is_no
         await written(store, *minutes(6))
         for block in await handed_out(store, 6):
             store.sent(block.number)
-        store.heard(BlockRequest(store=int(WALL_S) * NS, number=4, resend=False))
+        store.on_request(BlockRequest(store=int(WALL_S) * NS, number=4, resend=False))
         assert (store.waiting, store.kept) == (0, 3)
     async with opened(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
         assert store.last_s == WALL_S + 304.0
@@ -136,7 +136,7 @@ async def test_a_worker_that_asks_is_sent_the_rest_again(tmp_path: Path) -> None
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(8))
         await handed_out(store, 8)
-        store.heard(BlockRequest(store=int(WALL_S) * NS, number=3, resend=True))
+        store.on_request(BlockRequest(store=int(WALL_S) * NS, number=3, resend=True))
         blocks = await handed_out(store, 6)
         assert (numbers(blocks), {block.oldest for block in blocks}) == ([3, 4, 5, 6, 7, 8], {3})
 
@@ -147,9 +147,9 @@ async def test_what_was_asked_for_is_not_sent_again_at_once(tmp_path: Path) -> N
         await written(store, *minutes(8))
         await handed_out(store, 8)
         asked = BlockRequest(store=int(WALL_S) * NS, number=3, resend=True)
-        store.heard(asked)
+        store.on_request(asked)
         await handed_out(store, 6)
-        store.heard(asked)
+        store.on_request(asked)
         await written(store, *minutes(1, 8))
         assert numbers(await handed_out(store, 1)) == [9]
 
@@ -166,7 +166,7 @@ async def test_a_disk_that_was_set_back_begins_a_store_that_counts(tmp_path: Pat
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(3))
         await handed_out(store, 3)
-        store.heard(awaits)
+        store.on_request(awaits)
         await until(lambda: store._settled.kept.made_s * NS > awaits.store)
         await written(store, gathered(WALL_S + 1000.0))
         (block,) = await handed_out(store, 1)
@@ -180,7 +180,7 @@ async def test_a_disk_that_was_set_back_begins_a_store_that_counts(tmp_path: Pat
 async def test_a_store_that_cannot_be_is_not_believed(tmp_path: Path, store_ns: int) -> None:
     async with opened(tmp_path / "s.sqlite") as store:
         await written(store, *minutes(3))
-        store.heard(BlockRequest(store=store_ns, number=1 << 63, resend=True))
+        store.on_request(BlockRequest(store=store_ns, number=1 << 63, resend=True))
         await written(store, *minutes(1, 3))
         assert numbers(await handed_out(store, 4)) == [1, 2, 3, 4]
 
@@ -233,9 +233,9 @@ async def test_a_damaged_block_is_given_up_and_those_behind_it_come(tmp_path: Pa
         blocks = await handed_out(store, 3)
         assert numbers(blocks) == [2, 3, 6]
         assert {block.oldest for block in blocks} == {2}  # of those no worker has said that they are safe
-        store.heard(BlockRequest(store=blocks[0].store, number=2, resend=True))
+        store.on_request(BlockRequest(store=blocks[0].store, number=2, resend=True))
         assert numbers(await handed_out(store, 3)) == [2, 3, 6]
-        store.heard(BlockRequest(store=blocks[0].store, number=4, resend=True))
+        store.on_request(BlockRequest(store=blocks[0].store, number=4, resend=True))
         (block,) = await handed_out(store, 1)
         assert (block.number, block.oldest, store.dropped) == (6, 6, 3)
 

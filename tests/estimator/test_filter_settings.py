@@ -28,7 +28,7 @@ def test_a_file_without_a_ladder_has_its_two_branches_in_it() -> None:
     assert elements["r_ts_ohm"].value == pytest.approx(r_ts, rel=0.15)
     assert elements["c_ts_farad"].value == pytest.approx(chen_mora.c_ts(soc, a), rel=0.15)
     assert estimator.settings_record["filter"]["r_std"][0] == BRANCHES_STD
-    assert all(math.isinf(element.unlearned_s) for element in elements.values())
+    assert all(math.isinf(element.age_s) for element in elements.values())
 
 
 def test_the_resistances_of_two_branches_are_kept_over_soc() -> None:

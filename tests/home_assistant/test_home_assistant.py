@@ -144,9 +144,9 @@ def play(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], 
     messages, sent, said = MessageBuilder("bms", device), PublishedState(), list[Message]()
     for now_s, each in stream:
         info = each.info.model_copy(update={"device": device})
-        due, sent = messages.due(sent, each._replace(info=info), now_s)
+        due, sent = messages.live_messages(sent, each._replace(info=info), now_s)
         said += due
-    first = [*messages.greeting(), *(message for message in said if message.retain)]
+    first = [*messages.birth_messages(), *(message for message in said if message.retain)]
     values = [message for message in said if message.topic == f"bms/{device}/home_assistant"]
 
     async def say(what: list[Message]) -> None:

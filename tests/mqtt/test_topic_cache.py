@@ -22,7 +22,11 @@ from tests.sinks.snapshots import NOW, ONE
 def test_all_that_a_pack_publishes_is_kept_by_device_and_topic():
     published = TopicCache("site/bms")
     messages = MessageBuilder("site/bms", "pack")
-    for message in (*messages.greeting(), *messages.kept(None, ONE), *messages.due(PublishedState(), ONE, NOW)[0]):
+    for message in (
+        *messages.birth_messages(),
+        *messages.must_deliver(None, ONE),
+        *messages.live_messages(PublishedState(), ONE, NOW)[0],
+    ):
         published.take(message.topic, message.payload, NOW)
     [(name, device)] = published.devices.items()
     assert name == "pack"

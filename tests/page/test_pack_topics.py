@@ -176,10 +176,10 @@ async def test_a_pack_that_is_dropped_is_named_no_more() -> None:
 
 async def test_the_link_is_said_once_for_each_change():
     hub = PackTopics()
-    hub.say_link("no broker")
+    hub.set_link_state("no broker")
     with hub.reading() as reader:
         assert (await read(reader))["link"] == {"up": False, "reason": "no broker"}
-        hub.say_link("no broker")
+        hub.set_link_state("no broker")
         assert await reader.next(0.0) == ""
-        hub.say_link(None)
+        hub.set_link_state(None)
         assert (await read(reader))["link"] == {"up": True, "reason": None}

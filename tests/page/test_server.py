@@ -118,7 +118,7 @@ async def test_a_stream_too_many_replaces_the_oldest_one_of_the_address_that_has
     hub: PackTopics, past: HistoryQuery, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(of_server, "MAX_STREAMS", 3)
-    hub.say_link(None)
+    hub.set_link_state(None)
     async with browsing(hub, past) as session, contextlib.AsyncExitStack() as streams:
         url = session._base_url.join(URL("/events"))
 

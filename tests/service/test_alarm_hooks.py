@@ -93,7 +93,7 @@ async def test_a_program_gets_the_alarm_on_stdin_and_in_its_environment_one_afte
     )
     async with hooks({"run": [tell, "a b;c"]}) as made:
         for alarm in (RAISED, CLEARED):
-            made.tell(Change(0.0, alarm))
+            made.on_alarm_change(Change(0.0, alarm))
         said = await until(out, 2)
     assert said[0].startswith("a b;c soc_low raised 0.09 pack {")
     assert json.loads(said[0][said[0].index("{") :]) == RAISED.model_dump()
@@ -105,9 +105,9 @@ async def test_a_program_that_could_not_be_started_before_a_restart_is_started_a
     tell = program(tmp_path / "tell", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
     failed = RAISED.model_copy(update={"name": "hook_failed"})
     async with hooks({"run": [tell]}) as made:
-        made.begin([RAISED, failed, CLEARED.model_copy(update={"name": "soc_high"})])
+        made.restore_active([RAISED, failed, CLEARED.model_copy(update={"name": "soc_high"})])
         assert await until(out, 1) == ["soc_low raised"]
-        made.tell(Change(0.0, CLEARED))
+        made.on_alarm_change(Change(0.0, CLEARED))
         assert await until(out, 2) == ["soc_low raised", "soc_low cleared"]
 
 
@@ -115,8 +115,8 @@ async def test_an_alarm_of_a_former_run_is_not_announced_again(tmp_path: Path) -
     out = tmp_path / "out"
     tell = program(tmp_path / "tell", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
     async with hooks({"run": [tell]}) as made:
-        made.begin([RAISED])
-        made.tell(Change(0.0, CLEARED))
+        made.restore_active([RAISED])
+        made.on_alarm_change(Change(0.0, CLEARED))
         assert await until(out, 1) == ["soc_low cleared"]
 
 
@@ -126,7 +126,7 @@ async def test_only_what_is_asked_for_is_done(tmp_path: Path) -> None:
     other = RAISED.model_copy(update={"name": "link_lost"})
     async with hooks({"run": [tell], "alarms": ["soc_low"], "on": ["raised"]}) as made:
         for alarm in (other, CLEARED, RAISED):
-            made.tell(Change(0.0, alarm))
+            made.on_alarm_change(Change(0.0, alarm))
         assert await until(out, 1) == ["soc_low raised"]
 
 
@@ -136,7 +136,7 @@ async def test_after_a_program_that_hangs_the_next_alarm_is_told(tmp_path: Path)
     with capture_logs() as lines:
         async with hooks({"run": [hang], "timeout_s": 2.0}) as made:
             for alarm in (RAISED, CLEARED):
-                made.tell(Change(0.0, alarm))
+                made.on_alarm_change(Change(0.0, alarm))
             assert await until(out, 1) == ["cleared"]
     assert [line["event"] for line in lines] == ["alarm hook: the program takes too long and is killed"]
 
@@ -163,7 +163,7 @@ async def test_all_that_a_program_has_started_is_killed_after_the_time_limit(
     lines += [f"until [ $(wc -l < {started}) = {len(ways)} ]; do :; done", then]
     tell = program(tmp_path / "tell", "\n".join(lines))
     async with hooks({"run": [tell], "timeout_s": 30.0}) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         failed = await until_health(made, lambda health: health.failures == 1)
     assert failed.failing == [f"run {tell}: took longer than 30 s"]
     assert [_runs(int(line)) for line in _lines(started)] == [False] * len(ways)
@@ -173,7 +173,7 @@ async def test_a_child_that_outlives_its_program_has_until_the_time_limit(tmp_pa
     out, go = tmp_path / "out", tmp_path / "go"
     child = program(tmp_path / "child", f"until [ -e {go} ]; do sleep 0.01; done; echo sent > {out}")
     async with hooks({"run": [program(tmp_path / "tell", f"{child} & : > {go}")], "timeout_s": LONG_S}) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         assert (await until_health(made, lambda health: health.done == 1)).failing == []
     assert _lines(out) == ["sent"]
 
@@ -181,9 +181,9 @@ async def test_a_child_that_outlives_its_program_has_until_the_time_limit(tmp_pa
 async def test_a_program_that_cannot_be_started_is_tried_again_until_its_alarm_has_ended(tmp_path: Path) -> None:
     out, path = tmp_path / "out", tmp_path / "tell"
     async with hooks({"run": [str(path)]}) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         await until_health(made, lambda health: health.failures >= 2)
-        made.tell(Change(0.0, CLEARED))
+        made.on_alarm_change(Change(0.0, CLEARED))
         program(path, f"echo $BMS_STATE >> {out}")
         assert await until(out, 1) == ["cleared"]
         assert (await until_health(made, lambda health: health.done == 1)).failing == []
@@ -192,10 +192,10 @@ async def test_a_program_that_cannot_be_started_is_tried_again_until_its_alarm_h
 async def test_another_alarm_does_not_hasten_the_next_attempt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alarm_hooks, "FIRST_RETRY_S", LONG_S)
     async with hooks({"run": [str(tmp_path / "none")]}) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         await until_health(made, lambda health: health.failures == 1)
-        made.tell(Change(0.0, RAISED.model_copy(update={"name": "link_lost"})))
-        made.tell(Change(0.0, CLEARED.model_copy(update={"name": "link_lost"})))
+        made.on_alarm_change(Change(0.0, RAISED.model_copy(update={"name": "link_lost"})))
+        made.on_alarm_change(Change(0.0, CLEARED.model_copy(update={"name": "link_lost"})))
         for _ in range(100):  # each pass of the loop would let the hook try
             await asyncio.sleep(0)
         assert made.health is not None
@@ -209,7 +209,7 @@ async def test_a_program_that_finds_no_descriptor_is_started_once_there_are_some
     async with hooks({"run": [tell]}) as made:
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, most[1]))
         try:
-            made.tell(Change(0.0, RAISED))
+            made.on_alarm_change(Change(0.0, RAISED))
             failed = await until_health(made, lambda health: health.failures >= 2)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, most)
@@ -222,7 +222,7 @@ async def test_descriptors_that_run_out_while_a_program_runs_neither_save_it_nor
     tell = program(tmp_path / "tell", f"sleep 1000 & echo $! >> {child}; echo $$ >> {child}; exec sleep 1000")
     most = resource.getrlimit(resource.RLIMIT_NOFILE)
     async with hooks({"run": [tell], "timeout_s": 30.0}) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         await until(child, 2)
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, most[1]))
         try:
@@ -247,7 +247,7 @@ async def test_a_program_for_which_no_thread_or_memory_is_free_is_tried_again(
 
     monkeypatch.setattr(asyncio, "create_subprocess_exec", fail_first)
     async with hooks({"run": [program(tmp_path / "tell", f"echo $BMS_STATE >> {out}")]}) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         assert await until(out, 1) == ["raised"]
         assert (await until_health(made, lambda health: health.done == 1)).failures == 1
 
@@ -257,7 +257,7 @@ async def test_a_text_from_outside_cannot_keep_a_program_from_its_start(tmp_path
     out = tmp_path / "out"
     tell = program(tmp_path / "tell", f'echo "$BMS_TEXT" > {out}')
     async with hooks({"run": [tell]}) as made:
-        made.tell(Change(0.0, RAISED.model_copy(update={"text": "the publisher says offline\0"})))
+        made.on_alarm_change(Change(0.0, RAISED.model_copy(update={"text": "the publisher says offline\0"})))
         assert await until(out, 1) == ["the publisher says offline "]
 
 
@@ -270,10 +270,10 @@ async def test_an_internal_error_does_not_end_a_hook() -> None:
         said.append(payload)
 
     async with hooks({"topic": "load/set", "payload": "$state"}, say=say) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         failed = await until_health(made, lambda health: health.failures == 1)
         assert failed.failing == ["publish on load/set: internal error: RuntimeError('a fault of ours')"]
-        made.tell(Change(0.0, CLEARED))
+        made.on_alarm_change(Change(0.0, CLEARED))
         await until_health(made, lambda health: health.done == 1)
     assert said == [b"cleared"]
 
@@ -286,7 +286,7 @@ async def test_a_program_gets_the_variables_on_the_list_and_those_that_are_named
     out = tmp_path / "out"
     show = program(tmp_path / "show", f"env > {out}.part; mv {out}.part {out}")
     async with hooks({"run": [show], "pass_environment": ["GATEWAY", "NOT_SET"]}) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         names = {line.partition("=")[0] for line in await until(out, 1)}
     assert {"PATH", "LC_TIME", "GATEWAY", "BMS_NAME"} <= names
     assert names.isdisjoint({"MQTT_PASSWORD", "NOTIFY_SOCKET", "NOT_SET", "PYTHONPATH"})
@@ -308,8 +308,8 @@ async def test_a_critical_alarm_that_cannot_be_watched_counts_as_raised() -> Non
             cold.model_copy(update=blind | {"severity": "warning"}),
             cold.model_copy(update={"severity": "warning"}),
         ):
-            made.tell(Change(0.0, alarm))
-        made.tell(Change(0.0, RAISED))
+            made.on_alarm_change(Change(0.0, alarm))
+        made.on_alarm_change(Change(0.0, RAISED))
         await until_health(made, lambda health: health.done == 3)
     assert said == [
         b"over_temperature raised no temperature",
@@ -326,9 +326,9 @@ async def test_a_failed_hook_is_told_to_hooks_that_list_it_and_works_again_once_
     said: list[bytes] = []
     told = {"run": [tell], "alarms": ["soc_low", "hook_failed"]}, {"topic": "all", "payload": "$name"}
     async with hooks(*told, say=lambda _, payload: said.append(payload)) as made:
-        made.tell(Change(0.0, RAISED))
+        made.on_alarm_change(Change(0.0, RAISED))
         await until_health(made, lambda health: health.failing == [f"run {tell}: exit code 1"])
-        made.tell(Change(0.0, failed))
+        made.on_alarm_change(Change(0.0, failed))
         await until_health(made, lambda health: health.failing == [])
     assert said == [b"soc_low"]
 
@@ -336,7 +336,7 @@ async def test_a_failed_hook_is_told_to_hooks_that_list_it_and_works_again_once_
 async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_path: Path) -> None:
     with capture_logs() as lines:
         async with hooks({"run": [str(tmp_path / "none"), "token=secret"]}) as made:
-            made.tell(Change(0.0, RAISED))
+            made.on_alarm_change(Change(0.0, RAISED))
             await until_health(made, lambda health: health.failures >= 1)
             assert "secret" not in str(made.health)
     assert "secret" not in str(lines)
@@ -361,7 +361,7 @@ async def test_a_program_that_is_not_there_or_fails_is_logged_and_ends_nothing(t
     told = {"run": [str(tmp_path / "none")]}, {"run": [program(tmp_path / "fail", "exit 3")]}
     with capture_logs() as lines:
         async with hooks(*told) as made:
-            made.tell(Change(0.0, RAISED))
+            made.on_alarm_change(Change(0.0, RAISED))
     said = {line["event"]: line for line in lines}
     assert set(said) == {
         "alarm hook: the program cannot be started",
@@ -378,7 +378,7 @@ async def test_a_dry_run_says_what_would_be_done_and_does_nothing(tmp_path: Path
     told: tuple[dict[str, Any], ...] = {"run": [tell]}, {"topic": "load/set", "payload": "OFF"}, {"relay": "high"}
     with capture_logs() as lines:
         async with hooks(*({**each, "dry_run": True} for each in told), say=said.append, switch=said.append) as made:
-            made.tell(Change(0.0, RAISED))
+            made.on_alarm_change(Change(0.0, RAISED))
     assert [line.get("would") or line.get("hook") for line in lines] == [
         "relay pin high",
         f"run {tell}",

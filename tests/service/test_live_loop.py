@@ -44,7 +44,7 @@ class Run:
 
     async def ask(self, name: str, **arguments: Any) -> Any:
         """The data of the response; UserError where there is an error."""
-        response = await self.requests.respond(name, json.dumps(arguments).encode())
+        response = await self.requests.handle(name, json.dumps(arguments).encode())
         assert response
         answer = json.loads(response)
         if answer["error"]:

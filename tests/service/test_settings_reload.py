@@ -34,7 +34,7 @@ async def test_what_cannot_be_changed_is_said_each_time_and_what_can_is_changed_
     now = edited("publish", rate_hz=2.0).model_copy(update={"log": SETTINGS.log.model_copy(update={"level": "error"})})
     now = now.model_copy(update={"pack": now.pack.model_copy(update={"series": 2})})
     reload, taken = SettingsReload(SETTINGS, lambda: now), []
-    reload.offer("publish.rate_hz", taken.append)
+    reload.on_change("publish.rate_hz", taken.append)
     with capture_logs() as lines:
         assert await reload.reload() == ["pack.series", "log.level"]
         assert await reload.reload() == ["pack.series", "log.level"]
@@ -80,7 +80,7 @@ async def test_a_file_that_hangs_ends_no_reload_after_it(tmp_path: Path, monkeyp
 def test_commands_that_are_allowed_may_change() -> None:
     requests = RequestDispatcher(DeliveryStats(), ["set_soc"])
     requests.allow([])
-    assert b"not allowed" in (asyncio.run(requests.respond("set_soc", b"")) or b"")
+    assert b"not allowed" in (asyncio.run(requests.handle("set_soc", b"")) or b"")
 
 
 async def test_a_running_service_takes_another_rate_at_a_signal_and_tells_systemd(tmp_path: Path) -> None:

@@ -92,13 +92,13 @@ async def test_the_task_of_a_board_tells_whether_it_hangs(monkeypatch: pytest.Mo
         for _ in range(3):
             now_s += 10.0
             async with asyncio.timeout(LONG_S):
-                while board.pulse().untended_s > 0.0:  # noqa: ASYNC110 - the board tells nobody
+                while board.pulse().task_idle_s > 0.0:  # noqa: ASYNC110 - the board tells nobody
                     await asyncio.sleep(0.001)
     monkeypatch.setattr(SerialPort, "open", hang)
     async with SerialSource(sensor, monotonic=lambda: now_s) as board:
         await asyncio.wait_for(opened.wait(), LONG_S)
         now_s += 100.0
-        assert board.pulse().untended_s == 100.0
+        assert board.pulse().task_idle_s == 100.0
 
 
 async def test_systemctl_status_shows_the_soc_and_why_samples_do_not_come(systemd: Systemd) -> None:

@@ -28,7 +28,7 @@ class Sink:
         self.requests = RequestDispatcher(self.delivery, ["set_soc", "current_zero"])
         self.asked: list[str] = []
         for name in NAMES:
-            self.requests.offer(name, self._handler(name))
+            self.requests.register(name, self._handler(name))
         options = {"first_delay_s": 0.1, "birth_delay_s": 0.1} | options
         outbox = Outbox(None, most=most_kept)
         self.mqtt = MqttSink(MqttSettings(url=url), "pack", self.requests, self.delivery, outbox, **options)

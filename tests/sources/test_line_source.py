@@ -30,7 +30,7 @@ class Scripted(LineProducer):
         self._scripts = list(scripts)
         self.begun = 0
 
-    async def bring(self) -> AsyncGenerator[bytes, None]:
+    async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         self.begun += 1
         for line in self._scripts.pop(0) if self._scripts else ():
             if isinstance(line, Exception):

@@ -94,7 +94,7 @@ class Promises(RuleBasedStateMachine):
     def hand_out(self, most: int) -> None:
         if not self.outbox._queue.can_hand_out:
             return
-        taken = self.outbox._queue.hand_out(most)
+        taken = self.outbox._queue.take_next(most)
         numbers = [int(waiting.message.payload) for waiting in taken]
         ahead = [number for number in self.pending if number not in self.out]
         assert numbers
@@ -191,7 +191,7 @@ class Promises(RuleBasedStateMachine):
             rounds = self.outbox.waiting + 10
             while self.outbox.waiting and (rounds := rounds - 1):
                 self.settle(write=False)
-                for waiting in self.outbox._queue.hand_out(PAGE):
+                for waiting in self.outbox._queue.take_next(PAGE):
                     got.append(int(waiting.message.payload))
                     self.outbox.sent(waiting.number)
             assert sorted(got) == sorted(self.pending)

@@ -15,7 +15,7 @@ def filled(count: int) -> Queue:
 
 
 def numbers(queue: Queue, most: int) -> list[int]:
-    return [int(waiting.message.payload) for waiting in queue.hand_out(most)]
+    return [int(waiting.message.payload) for waiting in queue.take_next(most)]
 
 
 def test_after_a_lost_connection_what_was_on_its_way_goes_before_what_was_ready():
@@ -31,15 +31,15 @@ def test_memory_keeps_a_page_of_what_is_written_and_nothing_newer_passes_what_is
     queue.put(Message("t", b"9999", 1, retain=False))
     assert numbers(queue, 2 * PAGE) == list(range(PAGE))
     assert not queue.can_hand_out
-    assert queue.hungry
-    queue.passing = True
+    assert queue.needs_page
+    queue.skip_disk = True
     assert numbers(queue, 5) == [9999]
 
 
 def test_what_is_acknowledged_is_removed_from_disk_if_it_ever_was_there():
     queue = filled(2)
     queue.put(Message("t", b"2", 1, retain=False))
-    _, second, third = queue.hand_out(3)
+    _, second, third = queue.take_next(3)
     queue.sent(third.number)
     assert not queue.stale, "it never was there"
     queue.sent(second.number)

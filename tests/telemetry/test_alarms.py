@@ -184,9 +184,9 @@ def test_no_delay_and_no_hysteresis_are_one_turn_for_each_side() -> None:
 def test_one_that_latches_waits_until_somebody_knows_and_comes_again_unless_it_is_known() -> None:
     state = _state(latch=True, delay_s=0.0, clear_delay_s=0.0)
     assert _values(state, 11.0, 7.0) == [(0.0, True)]
-    assert state.gone
+    assert state.cause_cleared
     assert _values(state, 11.0) == []  # it never ended
-    assert not state.gone
+    assert not state.cause_cleared
     assert not state.acknowledge(), "the cause is there"
     assert _values(state, 7.0) == [(0.0, False)]
     assert not state.acknowledge()
@@ -242,7 +242,7 @@ async def test_a_current_at_the_end_of_the_range_is_beyond_any_limit() -> None:
     block["time_s"], block["current_a"], block["voltage_v"] = [0.0, 0.1], 25.0, 7.4
     block["status"] = [0, int(SampleStatus.CURRENT_SATURATED)]
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    alarms.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     (change,) = alarms.changes()
     assert (change.alarm.name, change.at_s, change.alarm.value) == ("discharge_over_current", 0.1, None)
     assert change.alarm.since == iso_utc(WALL_S)
@@ -252,9 +252,9 @@ def test_silence_that_is_back_is_the_cause_of_a_latched_link_lost_again() -> Non
     alarms = AlarmEvaluator(watched(settings({"link_lost": {"latch": True}}), PACK), 0.2, 5.0, Inputs(10.0, 2), 10.0)
     kept = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
     alarms.restore(json.dumps({"link_lost": kept}))
-    alarms.silent(1.0, WALL_S, "")
+    alarms.on_silence(1.0, WALL_S, "")
     assert json.loads(alarms.kept)["link_lost"]["gone"]
-    alarms.silent(1000.0, WALL_S, "")
+    alarms.on_silence(1000.0, WALL_S, "")
     assert json.loads(alarms.kept)["link_lost"] == kept | {"gone": False}
     assert alarms.acknowledge(None) == ["link_lost"]
     assert alarms.active == ("link_lost",), "the cause is there"
@@ -365,10 +365,10 @@ def test_without_samples_alarms_are_unwatched_until_some_come() -> None:
     block = np.zeros(1, dtype=SAMPLE)
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    alarms.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     seen = [(9.9, True, None), (10.0, False, "no cable"), (0.1, True, None)]
     for silent_s, is_watched, reason in seen:
-        alarms.silent(silent_s, WALL_S, "no cable")
+        alarms.on_silence(silent_s, WALL_S, "no cable")
         shown = {alarm.name: alarm for alarm in alarms.report()}
         assert (shown["pack_over_voltage"].watched, shown["pack_over_voltage"].unwatched_reason) == (is_watched, reason)
         assert shown["link_lost"].watched
@@ -380,14 +380,14 @@ def test_an_alarm_that_silence_kept_from_being_watched_is_so_over_a_restart_unti
     block = np.zeros(1, dtype=SAMPLE)
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     before.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    before.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
-    before.silent(10.0, WALL_S, "no cable")
+    before.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    before.on_silence(10.0, WALL_S, "no cable")
     after.restore(before.kept)
-    after.silent(0.0, WALL_S, "")
+    after.on_silence(0.0, WALL_S, "")
     assert "pack_over_voltage" in after.unwatched, "no sample has come since the restart"
     after.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    after.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
-    after.silent(0.0, WALL_S, "")
+    after.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    after.on_silence(0.0, WALL_S, "")
     changed = {change.alarm.name: change for change in after.changes()}
     assert (changed["pack_over_voltage"].turn, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
     assert after.unwatched == ()
@@ -409,7 +409,7 @@ def test_a_delay_counts_the_time_between_bursts_of_samples(spacing_s: float) -> 
         block = np.zeros(2, dtype=SAMPLE)
         block["time_s"], block["voltage_v"] = 30.0 * burst + np.array([0.0, spacing_s]), 8.6 if burst >= 4 else 7.4
         alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-        alarms.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+        alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
     assert turns == [150.0], "the first burst after which it has been over the limit for 10 s"
 
@@ -422,7 +422,7 @@ def test_a_gap_that_does_not_come_again_soon_counts_for_no_delay() -> None:
     block["time_s"] = times_s
     block["voltage_v"] = np.where((block["time_s"] < 180.0) & (block["time_s"] > 10.0), 7.4, 8.6)
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    alarms.judge(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
     turns = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
     assert turns == [226.0]  # 180 to 199 s, nothing for 20 s, then 6 s
 

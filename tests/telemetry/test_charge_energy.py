@@ -38,7 +38,7 @@ def test_it_is_the_same_in_blocks_of_any_size() -> None:
     time_s = np.cumsum(rng.uniform(0.001, 4.0, 3000))
     whole = trace(time_s, rng.normal(3.0, 1.0, time_s.size), rng.uniform(3.0, 4.2, time_s.size))
     current_a, power_w = whole["current_a"], whole["current_a"] * whole["voltage_v"]
-    wanted = ChargeEnergy().and_net(np.trapezoid(current_a, time_s), np.trapezoid(power_w, time_s))
+    wanted = ChargeEnergy().plus_net(np.trapezoid(current_a, time_s), np.trapezoid(power_w, time_s))
     for size in (1, 7, 1000, time_s.size):
         assert after(*(whole[i : i + size] for i in range(0, time_s.size, size))) == pytest.approx(wanted)
 

@@ -458,7 +458,7 @@ class World:
 
     def _reopened(self, process: Process, door: BoardCheck, opened: Callable[[], None]) -> None:
         """A port that was lost before its board was known: what it said is nobody's."""
-        if door.stranger is not None:
+        if door.pending_protocol is not None:
             nobodys = Reference()
             nobodys.feed(b"".join(data for _, data in door._held))
             process.reference.samples -= nobodys.samples

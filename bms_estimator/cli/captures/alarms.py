@@ -120,7 +120,7 @@ async def _found(settings: Settings, cell: PackModel, source: Replay) -> Found:
     async for block in source:
         now_s = max(now_s, float(block["time_s"][-1]))
         watch.add(block, estimator.run(block), now_s)
-    watch.judge(now_s)
+    watch.evaluate(now_s)
     shown = watch.alarms.report()
     raised, latched = _paired(changes), {alarm.name for alarm in shown if alarm.latched}
     for each in raised:

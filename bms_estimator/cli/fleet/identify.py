@@ -181,7 +181,7 @@ def _table(found: Sequence["ReidentificationResult"]) -> Table:
             _change(one.capacity_before_ah, one.capacity_ah, one.capacity_std_ah, 1.0),
             _change(one.r_s_before_ohm, one.r_s_ohm, math.nan, 1e3),
             _change(one.rms_before_v, one.rms_v, math.nan, 1e3),
-            one.way if one.cell_file else "",
+            one.method if one.cell_file else "",
             one.reason,
         )
     return table

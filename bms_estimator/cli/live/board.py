@@ -128,7 +128,7 @@ def _accept_next(settings: Settings, folder: Path) -> None:
             "(the installed unit's is /var/lib/bms-estimator, for root alone)"
         )
     try:
-        memory.keep(NO_BOARD)
+        memory.save(NO_BOARD)
     except OSError as error:
         raise UserError(f"{memory.path}: cannot be written: {error.strerror}") from error
     forgotten = f"board {known['serial']} is forgotten" if known["serial"] else "no board was known"

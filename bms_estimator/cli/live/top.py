@@ -54,7 +54,7 @@ async def _watch(settings: MqttSettings, log: deque[str], first: str) -> None:
     stop = stop_on_signal()
 
     def hear(heard: DeviceMessage) -> None:
-        view.hear(heard)
+        view.on_message(heard)
         fresh.set()
 
     def lost() -> BrokerOutage | None:

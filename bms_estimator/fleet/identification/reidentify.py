@@ -66,7 +66,7 @@ class ReidentificationResult:
     Attributes:
         pack: Its name.
         reason: Why it has no new cell; empty where it has one.
-        way: ``learned`` or ``fitted``: how the best new cell was found; empty without any.
+        method: ``learned`` or ``fitted``: how the best new cell was found; empty without any.
         cell_file: The text of the new cell's file; empty without one that is better.
         hours: From its first to its last sample.
         capacity_ah, capacity_std_ah: Of the best new cell, one object of its file; NaN without any.
@@ -79,7 +79,7 @@ class ReidentificationResult:
 
     pack: str
     reason: str = ""
-    way: str = ""
+    method: str = ""
     cell_file: str = ""
     hours: float = math.nan
     capacity_ah: float = math.nan
@@ -158,7 +158,7 @@ class _Pack:
         cell, rms_v = ways[best], judged[best].rms_v
         outcome = replace(
             self._outcome,
-            way=best,
+            method=best,
             capacity_ah=cell.cell.capacity_ah,
             capacity_std_ah=cell.cell.capacity_ah * (cell.cell.capacity_std or math.nan),
             r_s_ohm=_r_s(cell),

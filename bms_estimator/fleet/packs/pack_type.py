@@ -28,7 +28,7 @@ class PackType:
     Attributes:
         settings: Of the packs, but for the name.
         made_of: Digest of all that the estimator is made of.
-        meaning: Digest of what gives a state its meaning; under another it begins anew.
+        state_digest: Digest of what gives a state its meaning; under another it begins anew.
         estimator: Works on the record of the partition.
         meter: Counts for one pack after the other.
         capacity_ah: Of the pack, rated; None of a fuel cell.
@@ -36,7 +36,7 @@ class PackType:
 
     settings: PackSettings
     made_of: Digest
-    meaning: Digest
+    state_digest: Digest
     estimator: Estimator
     meter: ChargeEnergyMeter
     capacity_ah: float | None
@@ -94,11 +94,11 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
         record: What its estimator and meter work on, shape (1,), dtype PACK_STATE.
     """
     made = config_digest(settings, cell)
-    estimator = type_estimator(settings, cell).on(record["estimator"])
+    estimator = type_estimator(settings, cell).bound_to_record(record["estimator"])
     return PackType(
         settings=settings.pack,
         made_of=made,
-        meaning=_digest(bytes.fromhex(pack_identity(settings, cell))),
+        state_digest=_digest(bytes.fromhex(pack_identity(settings, cell))),
         estimator=estimator,
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,

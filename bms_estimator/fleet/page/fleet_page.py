@@ -69,7 +69,7 @@ async def fleet_page(
 
     async with (
         WebServer(settings, FILES, newest, {"/packs": packs, "/pack": pack}, patient=False) as page,
-        FleetFeed(server, view, newest.say_link),
+        FleetFeed(server, view, newest.set_link_state),
     ):
         tasks = [asyncio.create_task(_draw(view, newest, step_s), name="fleet page")]
         if hours is not None:
@@ -86,7 +86,7 @@ async def _draw(view: FleetView, newest: LatestValues, step_s: float) -> None:
     """A picture now and then; while the server is lost the last one stays."""
     while True:
         if view.listening:
-            newest.say(FLEET, view.text(time.monotonic(), time.time()))
+            newest.set_value(FLEET, view.text(time.monotonic(), time.time()))
         await asyncio.sleep(step_s)
 
 
@@ -96,7 +96,7 @@ async def _ask(hours: Path, newest: LatestValues) -> None:
 
     while True:
         found = {name: await asyncio.to_thread(answer, hours, name) for name in ASKED}
-        newest.say(ANSWERS, json.dumps(found, allow_nan=False, separators=(",", ":")))
+        newest.set_value(ANSWERS, json.dumps(found, allow_nan=False, separators=(",", ":")))
         await asyncio.sleep(ASK_S)
 
 

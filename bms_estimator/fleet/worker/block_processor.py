@@ -80,7 +80,7 @@ class BlockProcessor:
         if same and former is None:
             return
         known = bool(self._hour["store"])
-        if _digest(d["meaning"]) == of_type.meaning and known:
+        if _digest(d["meaning"]) == of_type.state_digest and known:
             saved = former if former is not None else {name: v.copy() for name, v in fields(self._record["estimator"])}
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
             wrong = restore_state(of_type.estimator, saved if same else without_observer(saved), self._unseen_s(block))
@@ -91,7 +91,7 @@ class BlockProcessor:
                 record[name] = np.zeros((), PACK_STATE[name])
             d["clock"] = d["hour"] = 0
             self._counters["begun_anew"] += known
-        d["made_of"], d["meaning"] = of_type.made_of, of_type.meaning
+        d["made_of"], d["meaning"] = of_type.made_of, of_type.state_digest
 
     def _follow_clock(self, estimator: Estimator, block: Block) -> None:
         """Time stamps of another store have nothing to do with those before."""
@@ -107,7 +107,7 @@ class BlockProcessor:
         """Take the samples to the estimator, and what it makes of them to hour, meter and window."""
         observer, counters = self._observer, self._counters
         accepted, steps_back = int(observer["samples"]), int(observer["time_steps_back"])
-        of_type.meter.go_on(ChargeEnergy(*(float(self._flows[name]) for name in ChargeEnergy._fields)))
+        of_type.meter.continue_from(ChargeEnergy(*(float(self._flows[name]) for name in ChargeEnergy._fields)))
         for part in _parts(block):
             trace = of_type.estimator.run(part.samples)
             hour_summary.add(self._record["hour"], trace, part, of_type.estimator)

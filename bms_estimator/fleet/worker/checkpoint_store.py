@@ -107,7 +107,7 @@ class CheckpointStore:
             await self._remove(before.next)
         return claim
 
-    async def present(self, claim: Claim) -> Claim:
+    async def confirm_claim(self, claim: Claim) -> Claim:
         """The claim as it stands: the last write may have been done though no answer came.
 
         Raises:
@@ -148,7 +148,7 @@ class CheckpointStore:
         Raises:
             FencedError: Another worker has taken the partition over; nothing was changed.
         """
-        claim = await self.present(claim)
+        claim = await self.confirm_claim(claim)
         pointer = claim.pointer
         size = await self._put(pointer.next, chunks)
         made = CheckpointInfo(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())

@@ -167,7 +167,7 @@ def _identified(estimator: Estimator) -> dict[str, object]:
         "current_offset_std_a": offset.std,
         "r_s_ratio": r_s.value,
         "r_s_ratio_std": r_s.std,
-        "r_s_unlearned_s": r_s.unlearned_s,
+        "r_s_unlearned_s": r_s.age_s,
     }
     covariance = f["covariance"][f["best"]]
     for name, (j, k) in _CORRELATIONS.items():

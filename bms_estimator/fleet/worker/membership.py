@@ -44,7 +44,7 @@ class Membership:
         self._alive: list[str] = []
         self._share: set[int] = set()
 
-    def hear(self, worker: str, now_s: float, *, leaving: bool = False) -> bool:
+    def on_heartbeat(self, worker: str, now_s: float, *, leaving: bool = False) -> bool:
         """Take a heartbeat, at ``now_s`` of a monotonic clock. Whether the worker is new."""
         if leaving:
             self._heard.pop(worker, None)
@@ -53,7 +53,7 @@ class Membership:
         self._heard[worker] = now_s
         return new and worker != self.me
 
-    def forgive(self, now_s: float) -> None:
+    def extend_all(self, now_s: float) -> None:
         """None could be heard until now: their silence says nothing."""
         self._heard = dict.fromkeys(self._heard, now_s)
 

@@ -102,12 +102,12 @@ class PartitionLease:
         self._sending = asyncio.Lock()
 
     @property
-    def kept(self) -> CheckpointInfo | None:
+    def last_checkpoint(self) -> CheckpointInfo | None:
         """The last checkpoint."""
         return self.claim.pointer.kept[0] if self.claim and self.claim.pointer.kept else None
 
     @property
-    def held(self) -> bool:
+    def is_owned(self) -> bool:
         """Whether we have it, as far as we have heard."""
         return self.partition is not None and self.claim is not None
 
@@ -117,7 +117,7 @@ class PartitionLease:
             self._lost, self._ask_s = True, time.monotonic() + SILENCE_S
         self._news.set()
 
-    def remind(self) -> None:
+    def check_silence(self) -> None:
         """Look into silence, if there was enough of it; to be called now and then."""
         if time.monotonic() >= self._ask_s:
             self._silent = True
@@ -139,7 +139,7 @@ class PartitionLease:
                 self._ask_s = time.monotonic() + SILENCE_S
             elif self._silent:
                 self._silent, self._ask_s = False, time.monotonic() + SILENCE_S
-                await self._try(self._break_silence)
+                await self._try(self._read_unseen_messages)
             else:
                 await self._news.wait()
 
@@ -153,7 +153,11 @@ class PartitionLease:
             partition, claim = self.partition, self.claim
             if partition is None or claim is None:
                 return
-            if self.kept and self.kept.sequence == partition.sequence and partition.deferred.is_saved:
+            if (
+                self.last_checkpoint
+                and self.last_checkpoint.sequence == partition.sequence
+                and partition.deferred.is_saved
+            ):
                 return
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
             try:
@@ -184,7 +188,7 @@ class PartitionLease:
                     if self.hours and self.hours[0] is row:
                         self.hours.popleft()
 
-    async def give_back(self) -> None:
+    async def release(self) -> None:
         """Write a checkpoint and let somebody else have the partition; ``run`` has ended."""
         try:
             await self.save()
@@ -260,7 +264,7 @@ class PartitionLease:
             await self._catch_up(partition, given.sequence)
             self._whole = True
 
-    async def _break_silence(self) -> None:
+    async def _read_unseen_messages(self) -> None:
         """Have the state of all messages that the stream has, without being given any."""
         if not self.consumer.pinned and await self.consumer.is_pinned():
             await self._look()
@@ -387,7 +391,7 @@ class PartitionLease:
         """See whether our claim still stands; ``_changing`` is held."""
         if self.claim:
             try:
-                self.claim = await self._keeping.present(self.claim)
+                self.claim = await self._keeping.confirm_claim(self.claim)
             except FencedError as error:
                 self._fenced(error)
 

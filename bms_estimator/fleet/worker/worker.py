@@ -200,7 +200,7 @@ class Worker:
         if heard.id == self._options.name and heard.started_s != self._started_s and not heard.leaving:
             log.warning("another worker has the same name: give each its own with --name", worker=heard.id)
         now_s = time.monotonic()
-        if self._members.hear(heard.id, now_s, leaving=heard.leaving):
+        if self._members.on_heartbeat(heard.id, now_s, leaving=heard.leaving):
             log.info("another worker", worker=heard.id)
             await self._beat()
 
@@ -233,7 +233,7 @@ class Worker:
         _check(self._nc, self._options)
         now_s = time.monotonic()
         if not self._nc.is_connected or now_s > self._renewed_s + DEAD_S / 2.0:
-            self._members.forgive(now_s)  # nobody could be heard
+            self._members.extend_all(now_s)  # nobody could be heard
         self._renewed_s = now_s
         share = self._members.share(self._partitions, now_s)
         for number in self._held.keys() - share:
@@ -246,7 +246,7 @@ class Worker:
         await self._ask_all()
         if self._nc.is_connected:
             for holding in self._holdings:
-                holding.remind()
+                holding.check_silence()
 
     async def _ask_all(self) -> None:
         if self._nc.is_connected:
@@ -275,7 +275,7 @@ class Worker:
         await end(task)
         async with self._few:
             if self._nc.is_connected:
-                await holding.give_back()
+                await holding.release()
         self._blocks, self._samples = self._blocks + holding.blocks, self._samples + holding.samples
         self._faults += holding.faults
         del self._held[holding.number], self._returning[holding.number]
@@ -308,7 +308,7 @@ class Worker:
                     held[0].settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
-        holdings = [holding for holding in self._holdings if holding.held]
+        holdings = [holding for holding in self._holdings if holding.is_owned]
         counters, unknown = Counter[str](), list[str]()
         for holding in holdings:
             if holding.partition:
@@ -318,7 +318,7 @@ class Worker:
         for holding in holdings:
             holding.lag_s = None
         usage = resource.getrusage(resource.RUSAGE_SELF)
-        ages = [time.time() - kept.made_s for holding in holdings if (kept := holding.kept)]
+        ages = [time.time() - kept.made_s for holding in holdings if (kept := holding.last_checkpoint)]
         return Heartbeat(
             id=self._options.name,
             started_s=self._started_s,

@@ -179,9 +179,11 @@ def update_hypotheses(s: Record, p: Record) -> None:
         innovation_v, total_v2, straight_v2 = update(s, p, q, variance_v2)
         u = innovation_v / math.sqrt(total_v2)
         # a bend's part of S stays while nothing moves: counted each second, it would tell against the knee at full rest
-        s.ln_weight[q] -= p.temper * (innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2))
+        s.ln_weight[q] -= p.half_likelihood_exponent * (
+            innovation_v * innovation_v / (share * straight_v2) + math.log(straight_v2)
+        )
         if s.count > 1:
-            s.ln_weight[q] -= p.strain * max(normalized_bias_squared(s, p, q) - STRAINED_STDS**2, 0.0)
+            s.ln_weight[q] -= p.inconsistency_penalty * max(normalized_bias_squared(s, p, q) - STRAINED_STDS**2, 0.0)
         if dt_s > 0.0 and not w.gap:  # one innovation is no error that stays, however long the gap
             adapt_bias_inflation(s, q, dt_s, u)
         if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
@@ -204,7 +206,10 @@ def innovation_scale(s: Record, p: Record) -> float:
     is forgotten: innovations far within S would leave it to ln S to judge, and the hypothesis of the smallest S would win.
     Outside the temperatures of the cell file less of the kind is known, ``OUTSIDE_K`` away nothing.
     """
-    return min(max(math.exp(-s.seeded_s / KNOWN_S), p.least_share * extrapolation_factor(p, s.temperature_c) ** 2), 1.0)
+    return min(
+        max(math.exp(-s.seeded_s / KNOWN_S), p.min_innovation_scale * extrapolation_factor(p, s.temperature_c) ** 2),
+        1.0,
+    )
 
 
 @njit(cache=True)

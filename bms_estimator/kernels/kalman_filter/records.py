@@ -81,11 +81,11 @@ class Noise:
     """... the std of that, constant for hours, ..."""
     load_s: float = 20.0
     """... and for how long it stays the same [s]."""
-    temper: float = 0.17
+    half_likelihood_exponent: float = 0.17
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
-    least_share: float = 0.25
+    min_innovation_scale: float = 0.25
     """For weights S shrinks to this part of what R and B, which allow for the worst, make of it."""
-    strain: float = 0.1
+    inconsistency_penalty: float = 0.1
     """A hypothesis that holds the model for wrong by more than two std loses this part of their square from its ln weight, with each
     update."""
     hysteresis_soc: float = 0.04

@@ -32,7 +32,7 @@ class DeviceClock:
         self._least_late_s = math.inf
         self._lag_s, self._lags, self._slow = 0.0, 0, False
 
-    def place(self, arrival_s: float, told_s: float) -> float:
+    def sample_time(self, arrival_s: float, told_s: float) -> float:
         """Time of a sample [s].
 
         Args:

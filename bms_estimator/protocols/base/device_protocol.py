@@ -31,7 +31,7 @@ class DeviceProtocol(ABC):
     cells: CellBlock = NO_CELLS
     """Beside the samples that ``feed`` or ``feed_reads`` returned last."""
     probing: bool = False
-    """Set where nobody knows who is there: ``due`` then sends only what changes nothing in any device."""
+    """Set where nobody knows who is there: ``next_output`` then sends only what changes nothing in any device."""
 
     @property
     @abstractmethod
@@ -45,7 +45,7 @@ class DeviceProtocol(ABC):
 
     @property
     @abstractmethod
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """Who is there, for people; None until that is known."""
 
     @property
@@ -59,7 +59,7 @@ class DeviceProtocol(ABC):
         return None
 
     @property
-    def quiet_s(self) -> float:
+    def allowed_silence_s(self) -> float:
         """So long it may say nothing while all is well [s]."""
         return 0.0
 
@@ -88,14 +88,14 @@ class DeviceProtocol(ABC):
         self.cells = cell_block(cells)
         return np.concatenate(blocks)
 
-    def serial_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for those that tell one
+    def serial_number_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for those that tell one
         """Serial number that the device would have told by the end of ``data``, which is not fed; None: it would tell none there."""
         return None
 
-    def opened(self) -> None:  # noqa: B027 - most have nothing to forget
+    def on_port_opened(self) -> None:  # noqa: B027 - most have nothing to forget
         """The port was opened anew: what comes next may be another device's, or the same one's after a reset."""
 
-    def due(self, now_s: float) -> bytes:  # noqa: ARG002 - for those that ask
+    def next_output(self, now_s: float) -> bytes:  # noqa: ARG002 - for those that ask
         """What is to be sent now. A device that speaks by itself is sent nothing before it was understood.
 
         Args:
@@ -104,7 +104,7 @@ class DeviceProtocol(ABC):
         return b""
 
     def command(self, name: str) -> Command:
-        """Have ``due`` send what makes the device do ``name``, such as ``current_zero``.
+        """Have ``next_output`` send what makes the device do ``name``, such as ``current_zero``.
 
         Raises:
             UserError: It takes no such command.
@@ -112,7 +112,7 @@ class DeviceProtocol(ABC):
         raise UserError(f"this board takes no commands, nor {name}")
 
     def relay(self, relay: Relay) -> Command:  # noqa: ARG002 - for those that have one
-        """Have ``due`` send what sets the level of the relay pin.
+        """Have ``next_output`` send what sets the level of the relay pin.
 
         Raises:
             UserError: There is none.

@@ -68,11 +68,11 @@ class PolledProtocol(ReadingProtocol):
         return self._wrong
 
     @abstractmethod
-    def _ways(self) -> Sequence[Sequence[bytes]]:
+    def _query_variants(self) -> Sequence[Sequence[bytes]]:
         """Ways of asking, each the questions of one round: the first that is answered is kept to."""
 
     @abstractmethod
-    def _look(self, data: bytes, at: int) -> int | ParseResult:
+    def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
         """Length of the frame that begins at ``at`` with ``start``, checksum and all [bytes]."""
 
     @abstractmethod
@@ -80,15 +80,15 @@ class PolledProtocol(ReadingProtocol):
         """Whether its checksum is right."""
 
     @abstractmethod
-    def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
+    def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
         """What a whole frame says; None where that is no sample."""
 
-    def opened(self) -> None:
+    def on_port_opened(self) -> None:
         """Ask at once, first in the first way. What was decoded stays: a recording does not tell of openings."""
         self._due, self._way, self._unanswered, self._answers_before = [], 0, 0, -1
         self._round_s = self._asked_s = -math.inf
 
-    def due(self, now_s: float) -> bytes:
+    def next_output(self, now_s: float) -> bytes:
         """The next question of the round, or nothing while the device has time to answer."""
         if now_s - self._asked_s < GAP_S:
             return b""
@@ -106,14 +106,14 @@ class PolledProtocol(ReadingProtocol):
         self._answers_before = self._answers
         if self._unanswered > UNANSWERED_ROUNDS:
             self._way, self._unanswered = self._way + 1, 0
-        ways = self._ways()
+        ways = self._query_variants()
         self._due = list(ways[self._way % len(ways)])
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
         for frame in self._frames(data):
             self._answers += 1
             self._noise = 0
-            if (reading := self._take(arrival_s, frame)) is not None:
+            if (reading := self._decode_frame(arrival_s, frame)) is not None:
                 yield reading
 
     def _frames(self, data: bytes) -> list[bytes]:
@@ -122,12 +122,14 @@ class PolledProtocol(ReadingProtocol):
         frames, done, waiting = list[bytes](), 0, -1  # all before ``done`` is over, at ``waiting`` a frame has begun
         at = self._next(rest, 0)
         while at >= 0:
-            look = self._look(rest, at)
+            look = self._frame_length(rest, at)
             if isinstance(look, int) and at + look > len(rest):
                 look = ParseResult.MORE
             if isinstance(look, int) and self._is_whole(rest[at : at + look]):
                 if waiting >= 0:
-                    self._blame("short_frames", "an answer broke off: interference, or a second master on the line?")
+                    self._count_fault(
+                        "short_frames", "an answer broke off: interference, or a second master on the line?"
+                    )
                 self._skip(at - done)
                 done, waiting = at + look, -1
                 frames.append(rest[at:done])
@@ -137,11 +139,11 @@ class PolledProtocol(ReadingProtocol):
                 if look is ParseResult.MORE:
                     waiting = at
                 elif look is ParseResult.LENGTH:
-                    self._blame(
+                    self._count_fault(
                         "length_errors", "answers come with impossible lengths: interference, or a wrong baud rate?"
                     )
                 elif look is not ParseResult.NOISE:
-                    self._blame(
+                    self._count_fault(
                         "crc_errors", "answers come with wrong checksums: interference, or a second master on the line?"
                     )
             at = self._next(rest, at + 1)
@@ -166,7 +168,9 @@ class PolledProtocol(ReadingProtocol):
             self._address = address
         if address == self._address:
             return False
-        self._blame("other_packs", f"pack {address} answers, and pack {self._address} is wanted: see sensor.address")
+        self._count_fault(
+            "other_packs", f"pack {address} answers, and pack {self._address} is wanted: see sensor.address"
+        )
         return True
 
     def _mean_c(self, probes_c: Sequence[float]) -> float:

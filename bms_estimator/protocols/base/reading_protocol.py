@@ -70,9 +70,9 @@ class ReadingProtocol(DeviceProtocol):
 
     @abstractmethod
     def _read(self, arrival_s: float, data: bytes) -> Iterable[Reading]:
-        """What a read of the line says; what is wrong with it goes to ``_blame``."""
+        """What a read of the line says; what is wrong with it goes to ``_count_fault``."""
 
-    def _blame(self, counter: str, wrong: str) -> None:
+    def _count_fault(self, counter: str, wrong: str) -> None:
         """Count a fault; the first since the last good reading is told to people."""
         self._counts[counter] += 1
         self._wrong = self._wrong or wrong

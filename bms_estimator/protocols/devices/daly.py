@@ -57,22 +57,22 @@ class DalyDialect(PolledProtocol):
         self._cells_s = self._probes_s = -math.inf
 
     @property
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """How many cells it has, once that and a sample have come."""
         return f"Daly BMS, {self._cells} cells" if self._told and self._cells is not None else None
 
-    def opened(self) -> None:
+    def on_port_opened(self) -> None:
         """As all; it may be another pack's, with more cells."""
-        super().opened()
+        super().on_port_opened()
         self._known = False
 
-    def _ways(self) -> Sequence[Sequence[bytes]]:
+    def _query_variants(self) -> Sequence[Sequence[bytes]]:
         if self.probing:
             return [[question(host, command) for host in HOSTS for command in (STATUS, CELLS, PACK)]]
         commands = (CELLS, PROBES, PACK) if self._known else (STATUS, CELLS, PROBES, PACK)
         return [[question(host, command) for command in commands] for host in HOSTS]
 
-    def _look(self, data: bytes, at: int) -> int | ParseResult:
+    def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
         head = data[at + 1 : at + 4]
         if any(byte not in allowed for byte, allowed in zip(head, (PACKS, COMMANDS), strict=False)):
             return ParseResult.NOISE
@@ -83,7 +83,7 @@ class DalyDialect(PolledProtocol):
     def _is_whole(self, frame: bytes) -> bool:
         return sealed(frame[:-1]) == frame
 
-    def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
+    def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
         if self._is_other(frame[1]):
             return None
         command, data = frame[2], frame[4:-1]
@@ -92,7 +92,9 @@ class DalyDialect(PolledProtocol):
         if command == STATUS:
             self._cells, self._probes, self._known = data[0] or None, data[1], True
         elif command in (CELLS, PROBES) and data[0] > MOST_FRAMES:
-            self._blame("length_errors", f"a frame with number {data[0]} comes, and there are at most {MOST_FRAMES}")
+            self._count_fault(
+                "length_errors", f"a frame with number {data[0]} comes, and there are at most {MOST_FRAMES}"
+            )
         elif command == CELLS:
             self._first = 0 if data[0] == 0 else self._first
             self._cells_v[data[0]], self._cells_s = [mv / 1000 for mv in struct.unpack_from(">3H", data, 1)], arrival_s

@@ -50,15 +50,15 @@ class JbdDialect(PolledProtocol):
         self._cells: int | None = None
 
     @property
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """Name and number of cells, once its basic information has come."""
         return None if self._cells is None else f"JBD BMS {self._model}".rstrip() + f", {self._cells} cells"
 
-    def _ways(self) -> Sequence[Sequence[bytes]]:
+    def _query_variants(self) -> Sequence[Sequence[bytes]]:
         registers = (CELLS, BASIC) if self._model else (NAME, CELLS, BASIC)
         return ([question(register) for register in registers],)
 
-    def _look(self, data: bytes, at: int) -> int | ParseResult:
+    def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
         if len(data) < at + HEAD:
             return ParseResult.MORE if len(data) < at + 2 or data[at + 1] in (BASIC, CELLS, NAME) else ParseResult.NOISE
         _, register, status, length = data[at : at + HEAD]
@@ -69,16 +69,16 @@ class JbdDialect(PolledProtocol):
     def _is_whole(self, frame: bytes) -> bool:
         return frame[-1] == END and checksum(frame[2:-TAIL]) == frame[-TAIL:-1]
 
-    def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
+    def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
         register, status, data = frame[1], frame[2], frame[HEAD:-TAIL]
         if status == REFUSED:
-            self._blame("refused", f"the BMS refuses to tell register 0x{register:02x}")
+            self._count_fault("refused", f"the BMS refuses to tell register 0x{register:02x}")
         elif register == NAME:
             self._model = data.decode("ascii", "replace").strip("\0 ")
         elif register == CELLS:
             self._beside.keep(arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])])
         elif len(data) < LEAST_BASIC:
-            self._blame("length_errors", "its basic information is too short")
+            self._count_fault("length_errors", "its basic information is too short")
         else:
             return self._basic(arrival_s, data)
         return None

@@ -85,12 +85,12 @@ class JkDialect(PolledProtocol):
         self._overheard_s = -math.inf  # when a newer frame came that was not asked for
 
     @property
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """Number of cells, and what else the frame tells."""
         return self._told
 
     @property
-    def quiet_s(self) -> float:
+    def allowed_silence_s(self) -> float:
         """Where another asks, its answers come at its pace [s]."""
         return LISTEN_S if math.isfinite(self._overheard_s) else 0.0
 
@@ -99,20 +99,20 @@ class JkDialect(PolledProtocol):
         """Those that are asked in the newer way, in turns."""
         return (1, 0) if self._address is None else (self._address,)
 
-    def _ways(self) -> Sequence[Sequence[bytes]]:
+    def _query_variants(self) -> Sequence[Sequence[bytes]]:
         newer = [] if self.probing else [[question(address)] for address in self._asked_packs]
         return [[OLD_QUESTION], *newer]
 
-    def opened(self) -> None:
+    def on_port_opened(self) -> None:
         """As all; who else asks is not known any more."""
-        super().opened()
+        super().on_port_opened()
         self._overheard_s = -math.inf
 
-    def due(self, now_s: float) -> bytes:
+    def next_output(self, now_s: float) -> bytes:
         """The question, unless another asks and its answers are heard."""
-        return b"" if now_s - self._overheard_s < LISTEN_S else super().due(now_s)
+        return b"" if now_s - self._overheard_s < LISTEN_S else super().next_output(now_s)
 
-    def _look(self, data: bytes, at: int) -> int | ParseResult:
+    def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
         return self._look_old(data, at) if data[at] == OLD_START[0] else self._look_newer(data, at)
 
     def _look_old(self, data: bytes, at: int) -> int | ParseResult:
@@ -138,7 +138,7 @@ class JkDialect(PolledProtocol):
             return frame[-5] == OLD_END and old_sealed(frame[:-4]) == frame
         return sum(frame[: FRAME_BYTES - 1]) & 0xFF == frame[FRAME_BYTES - 1]
 
-    def _take(self, arrival_s: float, frame: bytes) -> Reading | None:
+    def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
         return self._old(frame) if frame.startswith(OLD_START) else self._newer(arrival_s, frame)
 
     def _old(self, frame: bytes) -> Reading | None:
@@ -146,7 +146,7 @@ class JkDialect(PolledProtocol):
             return None
         registers = dict(_registers(frame[OLD_HEAD:-OLD_TAIL]))
         if not {VOLTAGE, CURRENT} <= registers.keys():
-            self._blame("length_errors", "its answer tells no voltage or no current")
+            self._count_fault("length_errors", "its answer tells no voltage or no current")
             return None
         cells_v = [mv / 1000 for _, mv in struct.iter_unpack(">BH", registers.get(CELLS, b""))]
         self._told = f"JK-BMS, {len(cells_v)} cells"

@@ -43,17 +43,17 @@ class JunctekDialect(ReadingProtocol):
         self._asked_s = -math.inf
 
     @property
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """The last values."""
         if self._good is None:
             return None
         return f"Junctek battery monitor, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
-    def opened(self) -> None:
+    def on_port_opened(self) -> None:
         """Ask at once. What was decoded stays: a recording does not tell of openings."""
         self._asked_s = -math.inf
 
-    def due(self, now_s: float) -> bytes:
+    def next_output(self, now_s: float) -> bytes:
         """The question, once a second."""
         if now_s - self._asked_s < ASK_S:
             return b""
@@ -66,11 +66,11 @@ class JunctekDialect(ReadingProtocol):
             skipped, self._overlong = self._overlong, False
             counted, self._in_step = self._in_step, True
             if len(line) > LINE_BYTES:
-                self._blame("length_errors", TOO_LONG)
+                self._count_fault("length_errors", TOO_LONG)
             elif not skipped and (reading := self._of(line.strip(b"\r\0"), counted)) is not None:
                 yield reading
         if len(self._rest) > LINE_BYTES:
-            self._blame("length_errors", TOO_LONG)
+            self._count_fault("length_errors", TOO_LONG)
             self._overlong = True
         if self._overlong:
             self._rest = b""
@@ -86,22 +86,24 @@ class JunctekDialect(ReadingProtocol):
             if counted:
                 text = not line.translate(None, PRINTABLE)
                 shown = repr(line[:40])[1:]
-                self._blame("text_errors", f"{'a line' if text else 'noise'} that is no answer of a Junctek: {shown}")
+                self._count_fault(
+                    "text_errors", f"{'a line' if text else 'noise'} that is no answer of a Junctek: {shown}"
+                )
             return None
         values = line[at + 5 :].strip().split(b",")
         if not values[-1]:
             values.pop()
         if not all(0 < len(v) <= VALUE_DIGITS and v.isdigit() for v in values) or len(values) < DIRECTION + 3:
-            self._blame("length_errors", "an answer that is cut off, or has no numbers")
+            self._count_fault("length_errors", "an answer that is cut off, or has no numbers")
             return None
         address, checksum, *told = map(int, values)
         if checksum != sum(told) % 255 + 1:
-            self._blame(
+            self._count_fault(
                 "checksum_errors", "answers come whose checksum is wrong: are A and B of the RS-485 line twisted?"
             )
             return None
         if address != ADDRESS:
-            self._blame("other_address", f"a monitor at address {address} answers: set its address to {ADDRESS}")
+            self._count_fault("other_address", f"a monitor at address {address} answers: set its address to {ADDRESS}")
             return None
         current_a = 0.01 * told[CURRENT]
         return Reading(

@@ -52,7 +52,7 @@ class PylontechDialect(ReadingProtocol):
         self._turn = 0  # whose cells are next
 
     @property
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """How many batteries, and the last values."""
         if self._good is None:
             return None
@@ -60,12 +60,12 @@ class PylontechDialect(ReadingProtocol):
         batteries = "1 battery" if n == 1 else f"{n} batteries"
         return f"Pylontech, {batteries}, {self._good.voltage_v:g} V, {self._good.current_a:g} A"
 
-    def opened(self) -> None:
+    def on_port_opened(self) -> None:
         """Ask at once. What was decoded stays: a recording does not tell of openings."""
         self._round_s = self._asked_s = -math.inf
         self._asked = b""
 
-    def due(self, now_s: float) -> bytes:
+    def next_output(self, now_s: float) -> bytes:
         """``pwr`` each round, and when that is answered ``bat N``, each battery in its turn."""
         waits = self._asked and self._answers == self._asked_at
         if waits and now_s - self._asked_s < ANSWER_S:
@@ -94,7 +94,7 @@ class PylontechDialect(ReadingProtocol):
                 yield reading
         if len(self._rest) > ANSWER_BYTES:
             self._rest = b""
-            self._blame("length_errors", "bytes come, but no prompt of a Pylontech console: it has 115200 baud")
+            self._count_fault("length_errors", "bytes come, but no prompt of a Pylontech console: it has 115200 baud")
 
     def _of(self, arrival_s: float, answer: str) -> Reading | None:
         """What the answer to ``pwr`` says; that to ``bat`` is kept for the next."""
@@ -102,11 +102,13 @@ class PylontechDialect(ReadingProtocol):
         header = next((n for n, line in enumerate(lines) if line[:2] in (["Power", "Volt"], ["Battery", "Volt"])), None)
         if header is None:
             if "Unknown command" in answer or "Invalid" in answer:
-                self._blame("text_errors", "the console does not know the command: is it that of a Pylontech master?")
+                self._count_fault(
+                    "text_errors", "the console does not know the command: is it that of a Pylontech master?"
+                )
             return None
         rows = [line for line in lines[header + 1 :] if line[0].isdigit()]
         if SUCCESS not in answer or not rows:
-            self._blame("length_errors", "a table that is cut off")
+            self._count_fault("length_errors", "a table that is cut off")
             return None
         try:
             if lines[header][0] == "Battery":
@@ -114,7 +116,7 @@ class PylontechDialect(ReadingProtocol):
                 return None
             return self._stack(arrival_s, lines[header], rows)
         except (ValueError, LookupError):
-            self._blame("text_errors", "a table with a row that cannot be read")
+            self._count_fault("text_errors", "a table with a row that cannot be read")
             return None
 
     def _keep_cells(self, arrival_s: float, answer: str, rows: Sequence[Sequence[str]]) -> None:
@@ -135,7 +137,7 @@ class PylontechDialect(ReadingProtocol):
         volt, amp, warm, low, high = (names.index(name) for name in ("Volt", "Curr", "Tempr", "Tlow", "Thigh"))
         present = [row for row in rows if row[volt] != ABSENT]
         if not present:
-            self._blame("text_errors", "the console knows no battery that is present")
+            self._count_fault("text_errors", "the console knows no battery that is present")
             return None
         voltages_v = [1e-3 * _whole(row[volt]) for row in present]
         currents_a = [1e-3 * _whole(row[amp]) for row in present]

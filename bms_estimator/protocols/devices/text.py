@@ -71,7 +71,7 @@ class TextDialect(DeviceProtocol):
         return f"lines come that do not tell voltage and current; the first: {shown}"
 
     @property
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """The last line's values, once it was a whole one."""
         if self._good is None:
             return None
@@ -105,7 +105,7 @@ class TextDialect(DeviceProtocol):
         before_s, self._last_s = (arrival_s if math.isnan(self._last_s) else self._last_s), arrival_s
         steps = np.arange(1, len(readings) + 1) / len(readings)
         arrivals = (before_s + (arrival_s - before_s) * steps).tolist()
-        return [self._clock.place(at_s, reading.time_s) for at_s, reading in zip(arrivals, readings, strict=True)]
+        return [self._clock.sample_time(at_s, reading.time_s) for at_s, reading in zip(arrivals, readings, strict=True)]
 
     def _end_line(self, line: bytes) -> Reading | None:
         """What a line says. Half a line at the start is no fault."""

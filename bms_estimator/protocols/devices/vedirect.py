@@ -35,7 +35,7 @@ class VeDirectDialect(ReadingProtocol):
         self._product = ""
 
     @property
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """Product and the last values."""
         if self._good is None:
             return None
@@ -49,15 +49,17 @@ class VeDirectDialect(ReadingProtocol):
             counted, self._in_step = self._in_step, True
             head = HEX.sub(b"", block[:at])
             if len(head) > BLOCK_BYTES:
-                self._blame("length_errors", "blocks come that are too long for VE.Direct text")
+                self._count_fault("length_errors", "blocks come that are too long for VE.Direct text")
             elif sum(head) + sum(block[at:]) & 0xFF:
                 if counted:
-                    self._blame("checksum_errors", "VE.Direct blocks come whose checksum is wrong: is the cable long?")
+                    self._count_fault(
+                        "checksum_errors", "VE.Direct blocks come whose checksum is wrong: is the cable long?"
+                    )
             elif (reading := self._of(head)) is not None:
                 yield reading
         if len(self._rest) > BLOCK_BYTES and at < 0:
             self._rest = self._rest[-len(END) :]
-            self._blame("length_errors", "bytes come that are no VE.Direct text: it has 19200 baud, 8N1")
+            self._count_fault("length_errors", "bytes come that are no VE.Direct text: it has 19200 baud, 8N1")
 
     def _of(self, head: bytes) -> Reading | None:
         """What a whole block says; None of history, and of a device that is no battery monitor."""
@@ -68,7 +70,9 @@ class VeDirectDialect(ReadingProtocol):
         self._product = fields.get("BMV") or fields.get("PID", "")
         if "I" not in fields or not fields.keys() & {"SOC", "CE", "TTG"}:
             named = f"product {fields['PID']}" if "PID" in fields else "the device"
-            self._blame("text_errors", f"{named} is no battery monitor: the current that it tells is not the battery's")
+            self._count_fault(
+                "text_errors", f"{named} is no battery monitor: the current that it tells is not the battery's"
+            )
             return None
         return self._measured(fields)
 
@@ -81,5 +85,5 @@ class VeDirectDialect(ReadingProtocol):
                 nan if temperature == "---" else number(temperature),
             )
         except ValueError as error:
-            self._blame("text_errors", f"a VE.Direct block without a voltage or a current: {error}")
+            self._count_fault("text_errors", f"a VE.Direct block without a voltage or a current: {error}")
             return None

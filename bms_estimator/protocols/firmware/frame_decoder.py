@@ -153,7 +153,7 @@ class FrameDecoder:
             return FrameFault.NO_HELLO
         return None
 
-    def serial_in(self, data: bytes) -> str | None:
+    def serial_number_in(self, data: bytes) -> str | None:
         """Serial number of the last hello that ends in ``data``, which is not fed; empty of a board that has none."""
         state, found = self._state[0], None
         begun = state["buffer"][: state["length"]].tobytes()

@@ -79,7 +79,7 @@ class BoardDialect(DeviceProtocol):
         return self._decoder.clock_ppm
 
     @property
-    def described(self) -> str | None:
+    def description(self) -> str | None:
         """Firmware, serial number and rate."""
         if self.hello is None:
             return None
@@ -91,11 +91,11 @@ class BoardDialect(DeviceProtocol):
         """Full range of the board's converter [V]; NaN before it is known."""
         return self._decoder.reference_v
 
-    def serial_in(self, data: bytes) -> str | None:
+    def serial_number_in(self, data: bytes) -> str | None:
         """Of the last hello that ends in ``data``."""
-        return self._decoder.serial_in(data)
+        return self._decoder.serial_number_in(data)
 
-    def opened(self) -> None:
+    def on_port_opened(self) -> None:
         """There is no hello until the next comes, nor is a command given again; samples keep the scaling of the last."""
         self._decoder.forget_hello()
         self._unheard_at = self._decoder.heard_at
@@ -116,7 +116,7 @@ class BoardDialect(DeviceProtocol):
         """Decode many reads of the line at once."""
         return self._decoder.feed_reads(arrivals_s, ends, data)
 
-    def due(self, now_s: float) -> bytes:
+    def next_output(self, now_s: float) -> bytes:
         """Ask for the hello, then give the command, then set the rate: each again until it is answered."""
         wanted, again_s = self._wanted()
         if wanted == self._asked and now_s - self._asked_s < again_s:
@@ -141,7 +141,7 @@ class BoardDialect(DeviceProtocol):
         return self._tell(set_relay_command(relay), hint=hint, changes_hello=False)
 
     def tell(self, frame: bytes) -> Command:
-        """Have ``due`` send a command that may be given twice."""
+        """Have ``next_output`` send a command that may be given twice."""
         return self._tell(frame)
 
     def _tell(

@@ -156,7 +156,7 @@ def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
         "device_class": entity.device_class,
         "state_class": entity.state_class,
         "suggested_display_precision": entity.decimals,
-        "entity_category": None if entity.main else "diagnostic",
+        "entity_category": None if entity.is_primary else "diagnostic",
         "enabled_by_default": None if entity.enabled else False,
         "expire_after": expiry_s,
     }

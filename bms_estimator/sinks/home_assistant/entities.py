@@ -26,16 +26,16 @@ class Entity(NamedTuple):
     step: float
     """It is shown anew when it has changed by so much, in its unit: what noise moves is less."""
     device_class: str | None = None
-    pace_s: float = SLOW_S
+    min_interval_s: float = SLOW_S
     """Nor more often than this [s]."""
-    main: bool = False
+    is_primary: bool = False
     """Else Home Assistant lists it among the diagnostics."""
     enabled: bool = True
     """Else the user enables it."""
     state_class: str | None = "measurement"
     signed: bool = False
     """Its sign is that of the current."""
-    jump: float = math.inf
+    immediate_step: float = math.inf
     """A change by so much is shown at once: somebody has set it."""
 
 
@@ -47,7 +47,7 @@ def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = 
 def _total(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
     """Total over all runs."""
     step = 10.0**-decimals
-    return Entity(name, unit, decimals, step, device_class, main=True, state_class="total_increasing")
+    return Entity(name, unit, decimals, step, device_class, is_primary=True, state_class="total_increasing")
 
 
 def _count(name: str) -> Entity:
@@ -56,10 +56,10 @@ def _count(name: str) -> Entity:
 
 
 ESTIMATE = {
-    "voltage_v": Entity(None, "V", 2, 0.02, "voltage", QUICK_S, main=True),
-    "current_a": Entity(None, "A", 2, 0.05, "current", QUICK_S, main=True, signed=True),
-    "power_w": Entity(None, "W", 1, 0.5, "power", QUICK_S, main=True, signed=True),
-    "temperature_c": Entity(None, "°C", 1, 0.3, "temperature", main=True),
+    "voltage_v": Entity(None, "V", 2, 0.02, "voltage", QUICK_S, is_primary=True),
+    "current_a": Entity(None, "A", 2, 0.05, "current", QUICK_S, is_primary=True, signed=True),
+    "power_w": Entity(None, "W", 1, 0.5, "power", QUICK_S, is_primary=True, signed=True),
+    "temperature_c": Entity(None, "°C", 1, 0.3, "temperature", is_primary=True),
     "energy_out_kwh": _total("Energy out", "kWh", 3, "energy"),
     "energy_in_kwh": _total("Energy in", "kWh", 3, "energy"),
     "charge_out_ah": _total("Charge out", "Ah", 2)._replace(enabled=False),
@@ -73,12 +73,12 @@ ESTIMATE = {
     "sample_rate_hz": _raw("Sample rate", "Hz", 1, "frequency"),
 }
 OF_CHARGE = {
-    "soc_percent": Entity(None, "%", 1, 0.2, "battery", main=True, jump=2.0),
-    "soc_std_percent": Entity("State of charge, standard deviation", "%", 1, 0.2, main=True),
-    "remaining_capacity_ah": Entity("Remaining capacity", "Ah", 2, 0.02, main=True),
-    "remaining_energy_wh": Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", main=True),
-    "time_to_empty_h": Entity("Time to empty", "h", 2, 0.05, "duration", main=True),
-    "time_to_full_h": Entity("Time to full", "h", 2, 0.05, "duration", main=True),
+    "soc_percent": Entity(None, "%", 1, 0.2, "battery", is_primary=True, immediate_step=2.0),
+    "soc_std_percent": Entity("State of charge, standard deviation", "%", 1, 0.2, is_primary=True),
+    "remaining_capacity_ah": Entity("Remaining capacity", "Ah", 2, 0.02, is_primary=True),
+    "remaining_energy_wh": Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", is_primary=True),
+    "time_to_empty_h": Entity("Time to empty", "h", 2, 0.05, "duration", is_primary=True),
+    "time_to_full_h": Entity("Time to full", "h", 2, 0.05, "duration", is_primary=True),
     "equivalent_cycles": _total("Equivalent cycles", None, 2),
     "soh_percent": Entity("State of health", "%", 1, 0.2),
     "soh_std_percent": Entity("State of health, standard deviation", "%", 1, 0.2),

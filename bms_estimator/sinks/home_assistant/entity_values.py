@@ -98,7 +98,7 @@ def _moved(shown: EntityStates, key: str, value: float | None, entity: Entity, n
     """Whether a value is to be shown anew."""
     if key not in shown.values:
         return True
-    before, rested = shown.values[key], now_s - shown.changed_s[key] >= entity.pace_s
+    before, rested = shown.values[key], now_s - shown.changed_s[key] >= entity.min_interval_s
     if value is None or before is None:
         return rested and value is not before
-    return round(abs(value - before), entity.decimals) >= (entity.step if rested else entity.jump)
+    return round(abs(value - before), entity.decimals) >= (entity.step if rested else entity.immediate_step)

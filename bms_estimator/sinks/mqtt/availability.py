@@ -50,11 +50,11 @@ class AvailabilityMonitor:
         self._echoed.clear()
         self._forged = False
 
-    def told(self) -> None:
+    def record_published(self) -> None:
         """All has been said just now."""
         self._forged = False
 
-    def heard(self, topic: str, payload: bytes) -> None:
+    def on_message(self, topic: str, payload: bytes) -> None:
         """An availability has come: given back, or somebody else's."""
         right = {own.topic: own.payload for own in self._own()}
         if right.get(topic, payload) == payload:

@@ -67,12 +67,12 @@ class MessageBuilder:
         self._device, self._sample_period_s = device, sample_period_s
         self._schema = _schema()  # takes milliseconds, and here nothing waits yet
 
-    def greeting(self) -> list[Message]:
+    def birth_messages(self) -> list[Message]:
         """What a broker is told first."""
         removed = [self._retained(f"alarm/{name}", b"") for name in self._unwatched]
         return [self._retained(AVAILABILITY, b"online"), self._retained("schema", self._schema), *removed]
 
-    def farewell(self) -> list[Message]:
+    def offline_messages(self) -> list[Message]:
         """What it is told last; the last of these is the will, too."""
         return [self._retained(SENSOR_AVAILABILITY, b"offline"), self._retained(AVAILABILITY, b"offline")]
 
@@ -81,7 +81,7 @@ class MessageBuilder:
         sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
         return [self._retained(AVAILABILITY, b"online"), *sensor]
 
-    def kept(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
+    def must_deliver(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
         """What a snapshot brings that must reach the broker, late if need be: each has its own time.
 
         Args:
@@ -91,8 +91,10 @@ class MessageBuilder:
         happened = [self._kept("event", event) for event in events(before, snapshot)]
         return happened + ([self._kept("state", snapshot.estimate)] if snapshot.estimate else [])
 
-    def due(self, sent: PublishedState, snapshot: Snapshot, now_s: float) -> tuple[list[Message], PublishedState]:
-        """What a snapshot brings that the broker has not got yet, beside what is ``kept``.
+    def live_messages(
+        self, sent: PublishedState, snapshot: Snapshot, now_s: float
+    ) -> tuple[list[Message], PublishedState]:
+        """What a snapshot brings that the broker has not got yet, beside what is ``must_deliver``.
 
         Args:
             sent: What it got.

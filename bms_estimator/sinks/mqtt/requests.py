@@ -56,7 +56,7 @@ class RequestDispatcher:
         self._reads, self._commands = RateLimiter(READS_PER_MIN, monotonic), RateLimiter(COMMANDS_PER_MIN, monotonic)
         self._logged_s: dict[str, float] = {}
 
-    def offer(self, name: str, handler: Handler) -> None:
+    def register(self, name: str, handler: Handler) -> None:
         """Make a request of ``NAMES`` answerable."""
         self._handlers[name] = handler
 
@@ -69,17 +69,17 @@ class RequestDispatcher:
         """Allow these commands from now on, and no others."""
         self._allowed = commands
 
-    async def respond(self, name: str, payload: bytes) -> bytes | None:
+    async def handle(self, name: str, payload: bytes) -> bytes | None:
         """The response to one request: JSON of status, data, error, transaction.
 
         Returns:
             None where no response is due: to a name that does not exist, and beyond the rate.
         """
         if name not in NAMES:
-            self.refuse("unknown", name[:MOST_SHOWN])
+            self.count_refusal("unknown", name[:MOST_SHOWN])
             return None
         if not (self._commands if name in COMMANDS else self._reads).take():
-            self.refuse("too_many", name)
+            self.count_refusal("too_many", name)
             return None
         transaction = None
         try:
@@ -87,15 +87,15 @@ class RequestDispatcher:
             transaction = _transaction(arguments)
             response = _response("ok", await self._handler(name)(arguments), None, transaction)
         except UserError as error:
-            self.refuse("refused", name, reason=str(error))
+            self.count_refusal("refused", name, reason=str(error))
             return _response("error", None, str(error), transaction)
         except Exception as error:  # noqa: BLE001  counted and logged: who asks must not be able to end the service
-            self.refuse("failed", name, exc_info=error)
+            self.count_refusal("failed", name, exc_info=error)
             return _response("error", None, "a fault of the service's own, which its log describes", transaction)
         self._counts["granted"] += 1
         return response
 
-    def refuse(self, kind: str, name: str, **why: Any) -> None:
+    def count_refusal(self, kind: str, name: str, **why: Any) -> None:
         """Count a request that is not granted; log the first of a burst.
 
         Args:

@@ -84,8 +84,8 @@ class MqttSink:
         self._birth_delay_s = birth_delay_s
         self._messages = MessageBuilder(settings.base_topic, device, sample_period_s, home_assistant, alarms)
         self._birth_topic = (home_assistant or HomeAssistantSettings()).status_topic
-        identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.farewell()[-1]
-        hello = ConnectOptions(identifier, will, lambda kind, topic: requests.refuse(kind, topic[:MOST_SHOWN]))
+        identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.offline_messages()[-1]
+        hello = ConnectOptions(identifier, will, lambda kind, topic: requests.count_refusal(kind, topic[:MOST_SHOWN]))
         for warning in check(settings):
             log.warning("a secret that is none", reason=warning)
         self._link = ReconnectLoop(
@@ -105,11 +105,11 @@ class MqttSink:
         """Take a snapshot; returns at once."""
         if self._task is not None and self._task.done():
             self._task.result()  # only a fault of ours ends it: let it be seen
-        self._backlog.put(self._messages.kept(self._before, snapshot))
+        self._backlog.put(self._messages.must_deliver(self._before, snapshot))
         self._slot = self._before = snapshot
         self._wake.set()
 
-    def say(self, topic: str, payload: bytes) -> None:
+    def publish_raw(self, topic: str, payload: bytes) -> None:
         """Publish a message of somebody else at QoS 1; it waits for a broker that is away, as states do."""
         self._backlog.put([Message(topic, payload, 1, retain=False)])
 
@@ -162,7 +162,7 @@ class MqttSink:
     async def _publish(self, connection: Connection, messages: Sequence[Message]) -> None:
         """Publish one after the other."""
         for message in messages:
-            self._refusals.answered(message, await connection.publish(message))
+            self._refusals.record_result(message, await connection.publish(message))
 
     async def _send(self, connection: Connection) -> None:
         """Send what is live until the sink closes, then say goodbye."""
@@ -172,20 +172,20 @@ class MqttSink:
             self._wake.clear()
             if self._again:
                 self._again, self._sent = False, PublishedState()
-                self._availability.told()
-                await self._publish(connection, self._messages.greeting())
+                self._availability.record_published()
+                await self._publish(connection, self._messages.birth_messages())
             await self._availability.correct(lambda messages: self._publish(connection, messages))
             snapshot, self._slot = self._slot, None
             if snapshot is not None:
                 now_s = asyncio.get_running_loop().time()
                 self._messages.commands = self._requests.allowed
-                messages, self._sent = self._messages.due(self._sent, snapshot, now_s)
+                messages, self._sent = self._messages.live_messages(self._sent, snapshot, now_s)
                 await self._publish(connection, messages)
             if self._link.closing.is_set():
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(HANDOVER_S):
-                        await self._backlog.emptied()
-                await self._publish(connection, self._messages.farewell())
+                        await self._backlog.wait_until_empty()
+                await self._publish(connection, self._messages.offline_messages())
                 return
 
     async def _receive(self, connection: Connection) -> None:
@@ -197,16 +197,16 @@ class MqttSink:
                     asyncio.get_running_loop().call_later(self._birth_delay_s, self._say_again)
             elif message.topic in (self._topic(AVAILABILITY), self._topic(SENSOR_AVAILABILITY)):
                 if not message.retain:  # what the broker kept from earlier is not news
-                    self._availability.heard(message.topic, message.payload)
+                    self._availability.on_message(message.topic, message.payload)
             else:
                 await self._answer(connection, message)
 
     async def _answer(self, connection: Connection, message: ReceivedMessage) -> None:
         name = message.topic.rsplit("/", 1)[-1]
         if message.retain:  # it would be granted again with each connection
-            self._requests.refuse("retained", name[:MOST_SHOWN])
+            self._requests.count_refusal("retained", name[:MOST_SHOWN])
             return
-        response = await self._requests.respond(name, message.payload)
+        response = await self._requests.handle(name, message.payload)
         if response is not None:  # so the name is one of ours
             # not at QoS 1: in a flood the broker's word that it has it comes late, and who waits for that reads nothing
             await connection.publish(Message(self._topic(f"response/{name}"), response, 0, retain=False))

@@ -91,7 +91,7 @@ class LiveView:
         self._due.set()
         await asyncio.to_thread(self._thread.join, CLOSE_S)
 
-    def hear(self, heard: DeviceMessage) -> None:
+    def on_message(self, heard: DeviceMessage) -> None:
         """Take a message of a pack, which ``devices`` holds already; without a screen it may be a line."""
         if heard.device not in self._devices:
             self._curves.pop(heard.device, None)

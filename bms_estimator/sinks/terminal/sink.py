@@ -57,7 +57,7 @@ class TerminalSink:
         for message in self._said(snapshot):
             heard = self._published.take(message.topic, message.payload, self._clock.wall())
             if heard is not None:
-                self._view.hear(heard)
+                self._view.on_message(heard)
         self._view.show()
 
     def _said(self, snapshot: Snapshot) -> list[Message]:
@@ -65,8 +65,8 @@ class TerminalSink:
         greeting: list[Message] = []
         if self._messages is None:
             self._messages = MessageBuilder(BASE_TOPIC, snapshot.info.device)
-            greeting = self._messages.greeting()
-        kept = self._messages.kept(self._before, snapshot)
-        due, self._sent = self._messages.due(self._sent, snapshot, self._clock.monotonic())
+            greeting = self._messages.birth_messages()
+        kept = self._messages.must_deliver(self._before, snapshot)
+        due, self._sent = self._messages.live_messages(self._sent, snapshot, self._clock.monotonic())
         self._before = snapshot
         return [*greeting, *kept, *due]

@@ -56,7 +56,7 @@ class BleBringer(LineProducer):
         """That it answers, but measures nothing."""
         return self._fault
 
-    async def bring(self) -> AsyncGenerator[bytes, None]:
+    async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """One line for each poll."""
         try:
             device, kind = await self._find()

@@ -65,7 +65,7 @@ class CanBringer(LineProducer):
         missing = self._map.missing
         return missing and f"connected, but nothing comes of {missing}: are identifiers, bitrate and wiring right?"
 
-    async def bring(self) -> AsyncGenerator[bytes, None]:
+    async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """One line for each voltage and current."""
         loop, stop = asyncio.get_running_loop(), threading.Event()
         heard: asyncio.Queue[bytes | Exception] = asyncio.Queue()

@@ -76,7 +76,7 @@ class ModbusBringer(LineProducer):
         """That the device answers, but measures nothing."""
         return self._fault
 
-    async def bring(self) -> AsyncGenerator[bytes, None]:
+    async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """One line for each poll. After a late or missing answer the line is opened anew: no answer is taken for another's."""
         self._requests = plan(self._values)
         client = _client(self._settings)

@@ -65,7 +65,7 @@ class LinuxSensor(LineProducer):
         """What was wrong with the last reading."""
         return self._fault
 
-    async def bring(self) -> AsyncGenerator[bytes, None]:
+    async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """A line each interval.
 
         Raises:

@@ -75,7 +75,7 @@ class MqttReports(LineProducer):
         """As the assembly has it."""
         return self._assembly.fault
 
-    async def bring(self) -> AsyncGenerator[bytes, None]:
+    async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """Lines as samples are complete; each time the next broker is tried.
 
         Raises:

@@ -44,7 +44,7 @@ class BoardCheck:
         self._kept = self._known  # on disk
         self._nameless = self._looking = self._keeping = self._failed = self._refused = False
         self._tried_s = -math.inf
-        self.stranger: DeviceProtocol | None = None
+        self.pending_protocol: DeviceProtocol | None = None
         """What hears a board that is not known yet."""
         self._held = deque[Chunk]()
         self.unadmitted_bytes = 0
@@ -57,12 +57,12 @@ class BoardCheck:
 
     def opened(self) -> None:
         """The port was opened anew."""
-        self.stranger = self._make() if self.serial else None
+        self.pending_protocol = self._make() if self.serial else None
         self._refused = False
         self._drop(self._held)
         self._held.clear()
 
-    def look_again(self) -> None:
+    def reload_known_board(self) -> None:
         """Soon take note when somebody has accepted another board. A file that is gone tells nothing of the kind."""
         if self._memory and not self._looking:
             self._looking = True
@@ -76,7 +76,7 @@ class BoardCheck:
         finally:
             self._looking = False
 
-    def admit(self, read: Chunk, dialect: DeviceProtocol) -> Sequence[Chunk]:
+    def accept(self, read: Chunk, dialect: DeviceProtocol) -> Sequence[Chunk]:
         """The reads that ``dialect``, which hears the pack's board, may be fed now.
 
         Raises:
@@ -85,23 +85,23 @@ class BoardCheck:
         if self._refused:
             self._drop((read,))
             return ()
-        if self.stranger is None:
-            if self.serial and (swapped := dialect.serial_in(read[1])) is not None:
+        if self.pending_protocol is None:
+            if self.serial and (swapped := dialect.serial_number_in(read[1])) is not None:
                 self._check(swapped, (read,))
             return (read,)
         if len(self._held) == MAX_PENDING_READS:
             self._drop((self._held.popleft(),))
         self._held.append(read)
-        self.stranger.feed(*read)
-        if not self.stranger.board:
+        self.pending_protocol.feed(*read)
+        if not self.pending_protocol.board:
             return ()
         held = list(self._held)
         self._held.clear()
-        self._check(self.stranger.board.get("serial", ""), held)
-        self.stranger = None
+        self._check(self.pending_protocol.board.get("serial", ""), held)
+        self.pending_protocol = None
         return held
 
-    def know(self, board: Mapping[str, str], now_s: float) -> None:
+    def remember_board(self, board: Mapping[str, str], now_s: float) -> None:
         """Samples of ``board`` are taken: it is the pack's from now on. What has changed is said, and remembered.
 
         Args:
@@ -140,7 +140,7 @@ class BoardCheck:
         """In a thread of its own."""
         try:
             if board != self._kept or memory.is_gone():
-                memory.keep(board)
+                memory.save(board)
             self._kept, self._failed = board, False
         except OSError as error:
             if not self._failed:

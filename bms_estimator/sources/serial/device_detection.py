@@ -113,21 +113,21 @@ def _ask_in_turns(line: "serial.Serial", dialects: Mapping[str, DeviceProtocol],
     end_s = time.monotonic() + patience_s
     while (now_s := time.monotonic()) < end_s:
         if now_s >= next_s:
-            questions = (dialect.due(now_s) for dialect in itertools.islice(turns, len(dialects)))
+            questions = (dialect.next_output(now_s) for dialect in itertools.islice(turns, len(dialects)))
             if question := next(filter(None, questions), b""):
                 line.write(question)
                 next_s = now_s + QUERY_INTERVAL_S
         data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
         for name, dialect in dialects.items():
             dialect.feed(now_s, data)
-            if dialect.described:
+            if dialect.description:
                 return name
     return None
 
 
 def _described(dialect: DeviceProtocol) -> tuple[str, int | None]:
     """What it is, and its cells."""
-    return dialect.described or "", dialect.cells.shape[1] or None
+    return dialect.description or "", dialect.cells.shape[1] or None
 
 
 class BoardClient:
@@ -200,7 +200,7 @@ class BoardClient:
         """
 
         def answer_or_text() -> Answer | None:
-            if self._text.described:
+            if self._text.description:
                 raise UserError(f"{self._port}: {FrameFault.TEXT.value}; it takes no commands")
             return answer()
 
@@ -229,7 +229,7 @@ def _converse(
         if (answered := answer()) is not None:
             return answered
         for dialect in dialects:
-            line.write(dialect.due(now_s))
+            line.write(dialect.next_output(now_s))
         data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
         for dialect in dialects:
             dialect.feed(now_s, data)

@@ -61,7 +61,7 @@ class KnownBoardFile:
             return True
         return False
 
-    def keep(self, board: Mapping[str, str]) -> None:
+    def save(self, board: Mapping[str, str]) -> None:
         """Write atomically. A folder that is gone is made anew.
 
         Raises:

@@ -21,14 +21,14 @@ class PortDiscovery:
         monotonic: Monotonic clock [s].
 
     Attributes:
-        may_stay: Whether a device that tells nothing is waited for on the port that was chosen last. Else it may be
+        is_preferred: Whether a device that tells nothing is waited for on the port that was chosen last. Else it may be
             somebody else's: it is left soon.
     """
 
     def __init__(self, port: str, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._port, self._monotonic = port, monotonic
         self._left: dict[str, tuple[float, float]] = {}  # path: when it was left, until when it is
-        self.may_stay = True
+        self.is_preferred = True
 
     def next(self, serial: str) -> str:
         """Device path to open now.
@@ -40,7 +40,7 @@ class PortDiscovery:
             NoPortError: There is none.
         """
         if not serial:
-            self.may_stay = True
+            self.is_preferred = True
             return resolve_port(self._port)
         there = board_ports()
         if self._port == "auto":
@@ -57,10 +57,10 @@ class PortDiscovery:
         if not fresh:
             raise NoPortError(f"{self._port}: board {serial} is not there, nor on {', '.join(places)}")
         chosen = min(fresh, key=lambda path: self._left.get(path, never)[0])  # each has its turn
-        self.may_stay = chosen in home
+        self.is_preferred = chosen in home
         return chosen
 
-    def leave(self, path: str, seconds: float) -> None:
+    def skip_port(self, path: str, seconds: float) -> None:
         """Try the other ports first for so long."""
         now_s = self._monotonic()
         self._left[path] = now_s, now_s + seconds

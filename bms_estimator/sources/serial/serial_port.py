@@ -75,7 +75,7 @@ class SerialPort:
         return self._reads.qsize()
 
     async def open(self) -> str:
-        """Path of the port as soon as it can be opened; each attempt waits longer until one was ``good``."""
+        """Path of the port as soon as it can be opened; each attempt waits longer until one was ``confirm``."""
         while True:
             await asyncio.sleep(self._retry_s)
             self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), LONGEST_RETRY_S)
@@ -94,7 +94,7 @@ class SerialPort:
         asyncio.get_running_loop().add_reader(self._port.fileno(), self._read, self._port.fileno())
         return path
 
-    def good(self) -> None:
+    def confirm(self) -> None:
         """What is on the line is what was looked for: when it is lost it is looked for at once."""
         self._retry_s = self._first_retry_s
 
@@ -105,7 +105,7 @@ class SerialPort:
             self._port.close()
             self._port = None
 
-    def end(self) -> None:
+    def finish(self) -> None:
         """Let who reads come to an end."""
         self._reads.put_nowait(None)
 

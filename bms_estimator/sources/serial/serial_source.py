@@ -134,7 +134,7 @@ class SerialSource:
     async def __aenter__(self) -> Self:
         """Begin to open the port; it need not be there yet."""
         self._task = asyncio.create_task(self._stay_open(), name="serial board")
-        self._task.add_done_callback(lambda _: self._line.end())
+        self._task.add_done_callback(lambda _: self._line.finish())
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -155,7 +155,7 @@ class SerialSource:
                     self._arrived_s = arrival_s
                     if self._message is not None:
                         self._message, self._refused = None, False
-                        self._line.good()
+                        self._line.confirm()
                     yield block
         if self._task is not None and not self._task.cancelled():
             self._task.result()
@@ -164,11 +164,11 @@ class SerialSource:
         """The reads that are decoded now."""
         if not read[1]:
             self._openings += 1
-            self._dialect.opened()
+            self._dialect.on_port_opened()
             self._door.opened()
             return ()
         try:
-            return self._door.admit(read, self._dialect)
+            return self._door.accept(read, self._dialect)
         except OtherBoardError as error:
             self._leave(f"{self._path}: refused: {error}")
             return ()
@@ -177,18 +177,18 @@ class SerialSource:
         """What is on the port is not taken: look elsewhere."""
         self._say(message)
         self._refused = True
-        self._where.leave(self._path, WRONG_PORT_RETRY_S)
+        self._where.skip_port(self._path, WRONG_PORT_RETRY_S)
         self._line.lost.set()
 
     @property
     def _listener(self) -> DeviceProtocol:
         """Who hears the device that has been heard last."""
-        return self._door.stranger or self._dialect
+        return self._door.pending_protocol or self._dialect
 
     def _send_due(self) -> None:
         """Send what is due to the device that has been heard last, if it is the one on the port now."""
         if self._openings == self._line.openings and not self._line.lost.is_set():
-            self._line.send(self._listener.due(self._line.now_s))
+            self._line.send(self._listener.next_output(self._line.now_s))
 
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         if self._tap is not None:
@@ -255,14 +255,14 @@ class SerialSource:
         try:
             return path, open_port(path, self._settings.baud)
         except NoPortError:
-            self._where.leave(path, BUSY_PORT_RETRY_S)
+            self._where.skip_port(path, BUSY_PORT_RETRY_S)
             raise
 
     async def _stay_open(self) -> None:
         """Open, attend until lost, and again."""
         while True:
             if self._refused:
-                self._door.look_again()
+                self._door.reload_known_board()
             path = self._path = await self._line.open()
             try:
                 await self._attend(path)
@@ -283,18 +283,18 @@ class SerialSource:
             counters = self._dialect.counters
             if counters["frames_received"] != frames:
                 heard_s, frames = now_s, counters["frames_received"]
-                self._door.know(self.board, now_s)
+                self._door.remember_board(self.board, now_s)
             elif self._refused:
                 continue
             elif fault := self._listener.fault:
                 self._say_or_leave(f"{path} at {self._settings.baud} baud: {fault}")
-            elif now_s - heard_s >= max(self._silent_s, self._listener.quiet_s):
+            elif now_s - heard_s >= max(self._silent_s, self._listener.allowed_silence_s):
                 self._say_or_leave(f"{path}: open, but silent")
-            self._faults.see(counters, now_s)
+            self._faults.check(counters, now_s)
 
     def _say_or_leave(self, message: str) -> None:
         """Say why no samples come, and look elsewhere where the board only might be."""
-        if self._where.may_stay:
+        if self._where.is_preferred:
             self._say(message)
         else:
             self._leave(message)

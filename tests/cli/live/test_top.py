@@ -25,9 +25,9 @@ def of(device: str, voltage_v: float) -> Snapshot:
 async def publish(client: Listener, device: str, voltage_v: float) -> None:
     messages, snapshot = MessageBuilder("bms", device), of(device, voltage_v)
     for message in (
-        *messages.greeting(),
-        *messages.due(PublishedState(), snapshot, NOW)[0],
-        *messages.kept(None, snapshot),
+        *messages.birth_messages(),
+        *messages.live_messages(PublishedState(), snapshot, NOW)[0],
+        *messages.must_deliver(None, snapshot),
     ):
         await client.publish(message.topic, message.payload, qos=1, retain=message.retain)
 

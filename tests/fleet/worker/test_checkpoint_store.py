@@ -86,9 +86,9 @@ async def test_who_lost_the_partition_cannot_write_and_leaves_nothing_behind(nc)
     slow, quick = await _keeping(nc, "slow"), await _keeping(nc, "quick")
     claim = await slow.write(await slow.claim(8), 1, iter([b"1"]))
     theirs = await quick.claim(8)
-    assert await quick.present(theirs) == theirs
+    assert await quick.confirm_claim(theirs) == theirs
     with pytest.raises(FencedError, match="quick"):
-        await slow.present(claim)
+        await slow.confirm_claim(claim)
     with pytest.raises(FencedError, match="quick"):
         await slow.write(claim, 2, iter([b"2"]))
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}

@@ -85,7 +85,7 @@ async def test_who_was_fenced_out_and_is_given_the_partition_again_says_so_and_b
         await (await _keeping(nc, "other")).claim(0)  # and dies: its pin has lapsed when we ask for more
 
         def said() -> object:
-            holding.remind()
+            holding.check_silence()
             return any(line["event"].startswith("fenced out") and line["worker"] == "other" for line in logs)
 
         with capture_logs() as logs:

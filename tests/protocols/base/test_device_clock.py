@@ -24,13 +24,13 @@ from bms_estimator.protocols.devices.text import TextDialect
 )
 def test_times(stamps: list[tuple[float, float]], placed: list[float], jumps: int):
     clock = DeviceClock()
-    assert [clock.place(*stamp) for stamp in stamps] == placed
+    assert [clock.sample_time(*stamp) for stamp in stamps] == placed
     assert clock.jumps == jumps
 
 
 def test_a_clock_that_is_slow_loses_no_time():
     clock = DeviceClock()
-    placed = [clock.place(float(second), 1e-3 * second) for second in range(200)]
+    placed = [clock.sample_time(float(second), 1e-3 * second) for second in range(200)]
     assert placed[-1] == pytest.approx(199.0)
     assert max(b - a for a, b in itertools.pairwise(placed)) <= LAG_S + 2.0
     assert clock.jumps == 1
@@ -38,7 +38,7 @@ def test_a_clock_that_is_slow_loses_no_time():
 
 def test_samples_that_came_in_bursts_are_no_slow_clock():
     clock = DeviceClock()
-    placed = [clock.place(100.0 * (second // 100 + 1), float(second)) for second in range(1000)]
+    placed = [clock.sample_time(100.0 * (second // 100 + 1), float(second)) for second in range(1000)]
     assert placed == [float(second) for second in range(1000)]
     assert clock.jumps == 0
 
@@ -48,7 +48,7 @@ def test_it_never_runs_back_and_never_far_ahead_of_the_arrivals(stamps: list[tup
     clock, arrival_s, last_s = DeviceClock(), 0.0, 0.0
     for step_s, told_s in stamps:
         arrival_s += step_s
-        placed_s = clock.place(arrival_s, told_s)
+        placed_s = clock.sample_time(arrival_s, told_s)
         assert placed_s >= last_s
         last_s = placed_s
 

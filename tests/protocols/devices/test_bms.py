@@ -65,7 +65,7 @@ def test_a_published_answer_is_read_as_its_publisher_reads_it(published: Publish
     assert sample["current_a"] == published.current_a
     assert sample["temperature_c"] == pytest.approx(published.temperature_c, abs=1e-3)
     assert cells == [published.cells_v]
-    assert device.described == published.described
+    assert device.description == published.described
     assert (device.fault, faults(device)) == (None, {})
     assert device.counters["bytes_received"] == len(published.frames)
 
@@ -83,8 +83,8 @@ def test_no_bytes_make_it_raise_and_cutting_them_changes_no_value(protocol: str,
     assert whole.counters["frames_received"] == block.size
     for device in (whole, cut):
         assert 0 <= device.counters["noise_bytes"] <= len(data)
-        device.due(2.0)
-        _ = device.described, device.fault
+        device.next_output(2.0)
+        _ = device.description, device.fault
 
 
 @pytest.mark.parametrize("name", A_ROUND)
@@ -153,9 +153,9 @@ def test_bytes_of_another_device_are_said_to_be_that(protocol: str) -> None:
 def test_its_own_questions_come_back_on_some_adapters_and_are_no_answers(protocol: str) -> None:
     device = dialect(protocol)
     for tick in range(100):
-        block = device.feed(0.1 * tick, device.due(0.1 * tick))
+        block = device.feed(0.1 * tick, device.next_output(0.1 * tick))
         assert block.size == 0
-    assert device.described is None
+    assert device.description is None
     assert device.counters["crc_errors"] == 0
 
 
@@ -271,7 +271,7 @@ def questions(device: PolledProtocol, seconds: float, answer: bytes = b"") -> li
     asked = []
     for tick in range(round(20 * seconds)):
         now_s = tick / 20.0
-        if question := device.due(now_s):
+        if question := device.next_output(now_s):
             asked.append((now_s, question))
             device.feed(now_s, answer)
     return asked
@@ -295,7 +295,7 @@ def test_what_may_be_another_pack_is_asked_anew_how_many_cells_it_has() -> None:
     device = dialect("daly")
     status = daly.question(daly.HOSTS[0], daly.STATUS)
     assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
-    device.opened()
+    device.on_port_opened()
     assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
 
 
@@ -313,7 +313,7 @@ def test_silence_makes_it_try_the_other_ways_of_asking() -> None:
 def test_the_way_that_is_answered_is_kept_to() -> None:
     device = dialect("jk")
     questions(device, (UNANSWERED_ROUNDS + 1.5) * PACE_S)
-    answered = [device.due(100.0 + tick) for tick in range(20) if device.feed(100.0 + tick, newer(1)).size]
+    answered = [device.next_output(100.0 + tick) for tick in range(20) if device.feed(100.0 + tick, newer(1)).size]
     assert set(answered) == {jk.question(1)}
 
 
@@ -332,12 +332,12 @@ def test_a_line_on_which_another_asks_is_only_listened_to() -> None:
     asked = []
     for tick in range(300):  # the other has its answer every 6 s
         now_s = tick / 10.0
-        asked.append(device.due(now_s))
+        asked.append(device.next_output(now_s))
         if tick % 60 == 0:
             assert device.feed(now_s, newer(0)).size == 1
     assert not any(asked)
-    assert device.quiet_s > 6.0
-    assert device.due(60.0) == jk.OLD_QUESTION
+    assert device.allowed_silence_s > 6.0
+    assert device.next_output(60.0) == jk.OLD_QUESTION
 
 
 def test_many_reads_at_once_are_the_same_samples_and_cells() -> None:

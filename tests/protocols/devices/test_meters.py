@@ -122,7 +122,7 @@ def test_real_frames_say_what_is_known_of_them(name: str, sent: bytes, told: tup
         told, nan_ok=True
     )
     assert dialect.fault is None
-    assert dialect.described is not None
+    assert dialect.description is not None
 
 
 def test_a_shunt_wired_the_other_way_is_turned_by_the_setting() -> None:
@@ -198,19 +198,19 @@ def test_cells_of_all_batteries_stand_beside_the_stack_once_all_have_told_them()
 
 def test_a_console_is_asked_for_the_stack_and_then_for_the_cells_of_each_in_turn() -> None:
     dialect = PylontechDialect()
-    assert [dialect.due(now) for now in (0.0, 0.25)] == [b"pwr\n", b""]
+    assert [dialect.next_output(now) for now in (0.0, 0.25)] == [b"pwr\n", b""]
     dialect.feed(0.3, US2000_PWR)
-    assert dialect.due(0.5) == b"bat 2\n"
+    assert dialect.next_output(0.5) == b"bat 2\n"
     dialect.feed(0.6, bat(2, US2000_CELLS))
-    assert [dialect.due(now) for now in (0.75, 2.0)] == [b"", b"pwr\n"]
-    assert [dialect.due(now) for now in (6.0, 7.0)] == [b"", b"pwr\n"]  # no answer: again
+    assert [dialect.next_output(now) for now in (0.75, 2.0)] == [b"", b"pwr\n"]
+    assert [dialect.next_output(now) for now in (6.0, 7.0)] == [b"", b"pwr\n"]  # no answer: again
 
 
 def test_a_junctek_is_asked_once_a_second_and_after_the_port_was_opened_anew() -> None:
     dialect = JunctekDialect()
-    assert [dialect.due(now) for now in (0.0, 0.5, 1.0)] == [ASK, b"", ASK]
-    dialect.opened()
-    assert dialect.due(1.1) == ASK
+    assert [dialect.next_output(now) for now in (0.0, 0.5, 1.0)] == [ASK, b"", ASK]
+    dialect.on_port_opened()
+    assert dialect.next_output(1.1) == ASK
 
 
 def test_cells_that_a_console_has_not_told_for_long_stand_beside_no_sample() -> None:
@@ -236,7 +236,7 @@ def test_a_port_that_was_opened_anew_changes_no_sample_since_no_recording_tells_
     sensor = SensorSettings.model_validate({"protocol": name})
     live, replayed = make_dialect(sensor), make_dialect(sensor)
     for arrival_s, read in reads:
-        live.opened()
+        live.on_port_opened()
         blocks = live.feed(arrival_s, read), replayed.feed(arrival_s, read)
         assert repr(blocks[0].tolist()) == repr(blocks[1].tolist())  # NaN is no number, and equals none
         assert live.cells.tolist() == replayed.cells.tolist()
@@ -276,7 +276,7 @@ def test_no_bytes_make_a_dialect_raise_and_cutting_them_changes_no_value(
     for n, (a, b) in enumerate(itertools.pairwise(edges)):
         blocks.append(cut.feed(1.0 + n, bytes(damaged[a:b])))
         rows += cut.cells.shape[0]
-        cut.due(1.0 + n)
+        cut.next_output(1.0 + n)
     assert values(np.concatenate(blocks)) == values(block)
     assert rows <= cells.shape[0]
     assert whole.counters["frames_received"] == block.size
@@ -304,4 +304,4 @@ def test_silence_is_no_fault_of_the_dialect() -> None:
     for make in DIALECTS.values():
         dialect = make()
         assert dialect.feed(1.0, b"").size == 0
-        assert (dialect.fault, dialect.described) == (None, None)
+        assert (dialect.fault, dialect.description) == (None, None)

@@ -34,36 +34,36 @@ def talking(hello: Hello = HELLO, rate_hz: int = 100) -> BoardDialect:
 
 def test_nothing_is_due_before_a_whole_frame_was_heard() -> None:
     dialect = BoardDialect(rate_hz=100)
-    assert dialect.due(0.0) == b""
+    assert dialect.next_output(0.0) == b""
     dialect.feed(1.0, b"\x1a\xc1\x02\x0b\x0a\x52\x7e" + sample(0).encode()[:-4])
-    assert dialect.due(1.0) == b""
+    assert dialect.next_output(1.0) == b""
     dialect.feed(2.0, b"\0" + sample(1).encode())
-    assert dialect.due(2.0) == hello_command()
+    assert dialect.next_output(2.0) == hello_command()
 
 
 def test_what_is_not_answered_is_asked_again_and_no_sooner() -> None:
     dialect = BoardDialect(rate_hz=100)
     dialect.feed(0.0, b"\0" + sample(0).encode())
-    assert dialect.due(0.0) == hello_command()
-    assert dialect.due(0.9 * ASK_AGAIN_S) == b""
-    assert dialect.due(1.1 * ASK_AGAIN_S) == hello_command()
+    assert dialect.next_output(0.0) == hello_command()
+    assert dialect.next_output(0.9 * ASK_AGAIN_S) == b""
+    assert dialect.next_output(1.1 * ASK_AGAIN_S) == hello_command()
 
 
 def test_the_rate_is_set_where_the_board_has_another() -> None:
-    assert talking(rate_hz=100).due(0.0) == b""
+    assert talking(rate_hz=100).next_output(0.0) == b""
     dialect = talking(rate_hz=250)
-    assert dialect.due(0.0) == set_rate_command(250) + hello_command()
+    assert dialect.next_output(0.0) == set_rate_command(250) + hello_command()
     dialect.feed(0.1, replace(HELLO, rate_hz=250).encode())
-    assert dialect.due(10.0) == b""
+    assert dialect.next_output(10.0) == b""
 
 
 def test_after_the_port_was_opened_anew_the_board_has_to_be_heard_first() -> None:
     dialect = talking()
-    dialect.opened()
-    assert dialect.due(1.0) == b""
+    dialect.on_port_opened()
+    assert dialect.next_output(1.0) == b""
     assert dialect.board == {}
     dialect.feed(2.0, sample(0).encode())
-    assert dialect.due(2.0) == hello_command()
+    assert dialect.next_output(2.0) == hello_command()
     dialect.feed(2.1, replace(HELLO, serial=7).encode())
     assert dialect.board["serial"] == "00000007"
 
@@ -71,10 +71,10 @@ def test_after_the_port_was_opened_anew_the_board_has_to_be_heard_first() -> Non
 def test_a_command_is_done_with_the_hello_that_follows_it() -> None:
     dialect = talking()
     command = dialect.command("current_zero")
-    assert dialect.due(0.0) == zero_current_command()
-    assert dialect.due(3.0) == b""  # the board measures; asked twice it would be busy
+    assert dialect.next_output(0.0) == zero_current_command()
+    assert dialect.next_output(3.0) == b""  # the board measures; asked twice it would be busy
     dialect.feed(3.0, Ack(ZERO, AckResult.OK, 510_000).encode())
-    assert (command.done, dialect.due(3.0)) == (False, hello_command())
+    assert (command.done, dialect.next_output(3.0)) == (False, hello_command())
     dialect.feed(3.1, replace(HELLO, current_zero_ppm=510_000).encode())
     assert (command.done, command.refusal) == (True, None)
 
@@ -92,16 +92,16 @@ def test_a_command_that_was_given_up_is_not_sent() -> None:
     command = dialect.command("current_zero")
     command.done = True
     dialect.feed(0.0, b"\0" + HELLO.encode())
-    assert dialect.due(0.0) == b""
+    assert dialect.next_output(0.0) == b""
 
 
 def test_a_command_is_not_given_to_a_board_that_comes_after_the_line_was_lost() -> None:
     dialect = talking()
     command = dialect.command("current_zero")
-    dialect.due(0.0)
-    dialect.opened()
+    dialect.next_output(0.0)
+    dialect.on_port_opened()
     dialect.feed(1.0, b"\0" + HELLO.encode())
-    assert dialect.due(1.0) == b""
+    assert dialect.next_output(1.0) == b""
     assert (command.done, "the line was lost" in (command.refusal or "")) == (True, True)
 
 
@@ -125,18 +125,18 @@ def test_no_bytes_make_it_raise_whatever_was_asked(reads: list[bytes]) -> None:
         if at % 5 == 2:
             dialect.command("current_zero")
         dialect.feed(float(at), data)
-        dialect.due(float(at))
+        dialect.next_output(float(at))
     assert dialect.counters["bytes_received"] <= sum(map(len, reads))
 
 
 def test_the_relay_is_told_until_it_is_acknowledged_and_no_hello_is_asked_for() -> None:
     dialect, relay = talking(), Relay(high=True, high_when_silent=False, silent_s=30)
     command = dialect.relay(relay)
-    assert dialect.due(0.0) == set_relay_command(relay)
-    assert dialect.due(1.1 * ASK_AGAIN_S) == set_relay_command(relay)
+    assert dialect.next_output(0.0) == set_relay_command(relay)
+    assert dialect.next_output(1.1 * ASK_AGAIN_S) == set_relay_command(relay)
     dialect.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
     assert (command.done, command.refusal) == (True, None)
-    assert dialect.due(2.0) == b""
+    assert dialect.next_output(2.0) == b""
     assert dialect.hello == HELLO
 
 

@@ -86,7 +86,7 @@ def told(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str,
     """When Home Assistant is told what on which of its topics."""
     messages, sent = MessageBuilder("bms", "pack"), PublishedState()
     for now_s, each in stream:
-        due, sent = messages.due(sent, each, now_s)
+        due, sent = messages.live_messages(sent, each, now_s)
         for message in due:
             if message.topic.startswith(f"{ROOT}/home_assistant"):
                 yield now_s, message.topic, json.loads(message.payload)
@@ -234,7 +234,7 @@ def discoveries(*snapshots: Snapshot, commands: tuple[str, ...] = (), **settings
     messages.commands = commands
     found = []
     for i, each in enumerate(snapshots):
-        due, sent = messages.due(sent, each, 10.0 * i)
+        due, sent = messages.live_messages(sent, each, 10.0 * i)
         found += [json.loads(m.payload or "null") for m in due if m.topic.endswith("/device/bms_pack/config")]
     return found
 
@@ -270,7 +270,7 @@ def test_commands_are_there_where_they_are_allowed() -> None:
 def test_what_is_not_there_any_more_is_removed() -> None:
     messages = MessageBuilder("bms", "pack", alarms=[name for name in ALARMS if name != "soc_low"])
     messages.commands = ("set_soc",)
-    due, _ = messages.due(PublishedState(), ONE, 0.0)
+    due, _ = messages.live_messages(PublishedState(), ONE, 0.0)
     [found] = [json.loads(m.payload) for m in due if m.topic.endswith("/device/bms_pack/config")]
     removed = {key: c["platform"] for key, c in found["components"].items() if key not in described(found)}
     assert removed == {
@@ -334,13 +334,13 @@ def test_an_unknown_name_is_refused_with_what_there_is() -> None:
 
 def test_charging_may_be_positive() -> None:
     messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(current_sign="charge_positive"))
-    due, _ = messages.due(PublishedState(), with_values(current_a=2.0, power_w=8.0, voltage_v=4.0), 0.0)
+    due, _ = messages.live_messages(PublishedState(), with_values(current_a=2.0, power_w=8.0, voltage_v=4.0), 0.0)
     values = next(json.loads(m.payload) for m in due if m.topic == f"{ROOT}/home_assistant")
     assert (values["current_a"], values["power_w"], values["voltage_v"]) == (-2.0, -8.0, 4.0)
 
 
 def test_of_a_pack_that_it_is_not_to_know_home_assistant_is_told_nothing_but_that() -> None:
     messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(enabled=False, discovery_prefix="ha"))
-    due, _ = messages.due(PublishedState(), ONE, 0.0)
+    due, _ = messages.live_messages(PublishedState(), ONE, 0.0)
     told = [m for m in due if "home_assistant" in m.topic or not m.topic.startswith("bms/")]
     assert [(m.topic, m.payload, m.retain) for m in told] == [("ha/device/bms_pack/config", b"", True)]

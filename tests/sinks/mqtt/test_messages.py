@@ -23,7 +23,7 @@ def topics(messages: list[Message]) -> list[str]:
 
 
 def test_a_broker_that_got_nothing_gets_everything_that_is_not_kept():
-    messages, sent = MESSAGES.due(PublishedState(), ONE, NOW)
+    messages, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     assert topics(messages) == [
         "parameters",
         "sensor/availability",
@@ -36,22 +36,22 @@ def test_a_broker_that_got_nothing_gets_everything_that_is_not_kept():
 
 
 def test_what_is_retained_has_qos_1_and_what_is_live_is_neither():
-    messages, _ = MESSAGES.due(PublishedState(), ONE, NOW)
+    messages, _ = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     live = {"parameters", "home_assistant"}
     for message, topic in zip(messages, topics(messages), strict=True):
         assert (message.qos, message.retain) == ((0, False) if topic in live else (1, True))
-    assert all((m.qos, m.retain) == (1, True) for m in (*MESSAGES.greeting(), *MESSAGES.farewell()))
+    assert all((m.qos, m.retain) == (1, True) for m in (*MESSAGES.birth_messages(), *MESSAGES.offline_messages()))
 
 
 def test_a_state_is_kept_until_the_broker_has_it_and_there_is_none_without_samples():
-    [state] = MESSAGES.kept(ONE, ONE)
+    [state] = MESSAGES.must_deliver(ONE, ONE)
     assert (state.topic, state.qos, state.retain) == ("bms/pack/state", 1, False)
-    assert topics(MESSAGES.kept(ONE, ONE)) == ["state"]
-    assert MESSAGES.kept(ONE, NOTHING_YET) == []
+    assert topics(MESSAGES.must_deliver(ONE, ONE)) == ["state"]
+    assert MESSAGES.must_deliver(ONE, NOTHING_YET) == []
 
 
 def test_an_event_is_kept_as_a_state_is_and_comes_before_it():
-    event, *_, state = MESSAGES.kept(None, ONE)
+    event, *_, state = MESSAGES.must_deliver(None, ONE)
     assert (event.topic, event.qos, event.retain) == ("bms/pack/event", 1, False)
     told = json.loads(event.payload)
     assert (told["name"], told["time"]) == ("start", ONE.health.publish_time)
@@ -60,43 +60,43 @@ def test_an_event_is_kept_as_a_state_is_and_comes_before_it():
 
 
 def test_what_has_not_changed_is_not_said_again():
-    _, sent = MESSAGES.due(PublishedState(), ONE, NOW)
-    messages, _ = MESSAGES.due(sent, ONE, NOW + 1.0)
+    _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
+    messages, _ = MESSAGES.live_messages(sent, ONE, NOW + 1.0)
     assert topics(messages) == []
 
 
 def test_health_is_said_whenever_it_was_made_anew():
-    _, sent = MESSAGES.due(PublishedState(), ONE, NOW)
-    messages, _ = MESSAGES.due(sent, snapshot(), NOW + 1.0)
+    _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
+    messages, _ = MESSAGES.live_messages(sent, snapshot(), NOW + 1.0)
     assert topics(messages) == ["parameters", "health"]
 
 
 def test_another_setting_of_the_board_changes_info_and_only_another_board_the_discovery():
-    _, sent = MESSAGES.due(PublishedState(), ONE, NOW)
+    _, sent = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     faster = ONE.info.model_copy(update={"board": {**ONE.info.board, "sample_rate_hz": "50"}})
-    messages, sent = MESSAGES.due(sent, ONE._replace(info=faster), NOW + 1.0)
+    messages, sent = MESSAGES.live_messages(sent, ONE._replace(info=faster), NOW + 1.0)
     assert topics(messages) == ["info"]
     swapped = ONE.info.model_copy(update={"board": {**ONE.info.board, "serial": "B2"}})
-    messages, _ = MESSAGES.due(sent, ONE._replace(info=swapped), NOW + 2.0)
+    messages, _ = MESSAGES.live_messages(sent, ONE._replace(info=swapped), NOW + 2.0)
     assert topics(messages) == ["info", DISCOVERY]
 
 
 def test_parameters_come_not_before_the_first_sample():
-    messages, sent = MESSAGES.due(PublishedState(), NOTHING_YET, NOW)
+    messages, sent = MESSAGES.live_messages(PublishedState(), NOTHING_YET, NOW)
     assert not {"parameters", "home_assistant"} & set(topics(messages))
-    messages, _ = MESSAGES.due(sent, ONE, NOW + 1.0)
+    messages, _ = MESSAGES.live_messages(sent, ONE, NOW + 1.0)
     assert topics(messages)[0] == "parameters"
 
 
 def test_the_availabilities_that_are_right_are_those_last_said():
-    _, silent = MESSAGES.due(PublishedState(), snapshot("no board"), NOW)
+    _, silent = MESSAGES.live_messages(PublishedState(), snapshot("no board"), NOW)
     right = {m.topic: m.payload for m in MESSAGES.availability(silent)}
     assert right == {"bms/pack/availability": b"online", "bms/pack/sensor/availability": b"offline"}
     assert topics(MESSAGES.availability(PublishedState())) == ["availability"]
 
 
 def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missing():
-    state = json.loads(MESSAGES.kept(ONE, ONE)[0].payload)
+    state = json.loads(MESSAGES.must_deliver(ONE, ONE)[0].payload)
     described = schema()["state"]["properties"]
     assert set(state) == set(described) == set(schema()["state"]["required"])
     assert all("description" in field for field in described.values())
@@ -106,8 +106,8 @@ def test_state_has_the_fields_of_the_published_schema_and_null_for_what_is_missi
 
 
 def test_every_payload_is_json_without_nan():
-    messages, _ = MESSAGES.due(PublishedState(), ONE, NOW)
-    for message in (*messages, *MESSAGES.kept(None, ONE)):
+    messages, _ = MESSAGES.live_messages(PublishedState(), ONE, NOW)
+    for message in (*messages, *MESSAGES.must_deliver(None, ONE)):
         if message.topic != "bms/pack/sensor/availability":
             json.loads(message.payload, parse_constant=pytest.fail)
 
@@ -115,9 +115,10 @@ def test_every_payload_is_json_without_nan():
 def test_no_message_comes_near_the_limit_of_the_broker_s_example():
     limit = re.search(r"^message_size_limit (\d+)$", BROKER.read_text(), re.MULTILINE)
     assert limit
-    messages, _ = MESSAGES.due(PublishedState(), ONE, NOW)
+    messages, _ = MESSAGES.live_messages(PublishedState(), ONE, NOW)
     assert (
-        max(len(m.payload) for m in (*messages, *MESSAGES.kept(None, ONE), *MESSAGES.greeting())) < int(limit[1]) / 10
+        max(len(m.payload) for m in (*messages, *MESSAGES.must_deliver(None, ONE), *MESSAGES.birth_messages()))
+        < int(limit[1]) / 10
     )
 
 
@@ -136,23 +137,23 @@ def test_an_alarm_is_said_when_it_changes_and_all_of_them_to_a_broker_that_got_n
     other = quiet.model_copy(update={"name": "link_lost", "unit": "s", "limit": 10.0})
     raised = quiet.model_copy(update={"active": True, "since": ONE.info.started, "value": 0.09, "text": "charge"})
     before, after = ONE._replace(alarms=(quiet, other)), ONE._replace(alarms=(raised, other))
-    messages, sent = MESSAGES.due(PublishedState(), before, NOW)
+    messages, sent = MESSAGES.live_messages(PublishedState(), before, NOW)
     assert {"alarm/soc_low", "alarm/link_lost"} <= set(topics(messages))
-    assert MESSAGES.due(sent, before, NOW)[0] == []
-    [message], sent = MESSAGES.due(sent, after, NOW)
+    assert MESSAGES.live_messages(sent, before, NOW)[0] == []
+    [message], sent = MESSAGES.live_messages(sent, after, NOW)
     assert (message.topic, message.qos, message.retain) == ("bms/pack/alarm/soc_low", 1, True)
     told = json.loads(message.payload)
     assert told == raised.model_dump()
     assert set(told) == set(schema()["alarm"]["properties"])
-    assert [json.loads(m.payload)["name"] for m in MESSAGES.kept(before, after)[:-1]] == ["alarm_raised"]
-    assert [json.loads(m.payload)["name"] for m in MESSAGES.kept(after, before)[:-1]] == ["alarm_cleared"]
+    assert [json.loads(m.payload)["name"] for m in MESSAGES.must_deliver(before, after)[:-1]] == ["alarm_raised"]
+    assert [json.loads(m.payload)["name"] for m in MESSAGES.must_deliver(after, before)[:-1]] == ["alarm_cleared"]
 
 
 def test_what_a_broker_keeps_of_an_alarm_that_is_not_watched_any_more_is_removed():
-    assert not [m for m in MESSAGES.greeting() if "alarm" in m.topic]
+    assert not [m for m in MESSAGES.birth_messages() if "alarm" in m.topic]
     [message] = [
         m
-        for m in MessageBuilder("bms", "pack", alarms=[a for a in ALARMS if a != "soc_low"]).greeting()
+        for m in MessageBuilder("bms", "pack", alarms=[a for a in ALARMS if a != "soc_low"]).birth_messages()
         if not m.payload
     ]
     assert (message.topic, message.qos, message.retain) == ("bms/pack/alarm/soc_low", 1, True)

@@ -45,7 +45,7 @@ def test_the_version_is_published() -> None:
     messages = MessageBuilder("bms", "pack")
     said = {
         m.topic.removeprefix("bms/pack/"): m.payload
-        for m in (*messages.greeting(), *messages.due(PublishedState(), ONE, NOW)[0])
+        for m in (*messages.birth_messages(), *messages.live_messages(PublishedState(), ONE, NOW)[0])
     }
     assert json.loads(said["info"])["payload_version"] == PAYLOAD_VERSION
     assert json.loads(said["schema"])["payload_version"] == PAYLOAD_VERSION
@@ -55,7 +55,7 @@ def test_every_message_goes_out_as_the_table_of_topics_says() -> None:
     messages, told = MessageBuilder("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
     sent = {
         m.topic.removeprefix("bms/pack/"): m
-        for m in (*messages.kept(None, told), *messages.due(PublishedState(), told, NOW)[0])
+        for m in (*messages.must_deliver(None, told), *messages.live_messages(PublishedState(), told, NOW)[0])
     }
     assert sent["alarm/soc_low"].qos == TOPICS["alarm"].qos
     assert sent["alarm/soc_low"].retain

@@ -28,7 +28,7 @@ class Asked:
         self.delivery, self.now_s, self.granted = DeliveryStats(), 0.0, list[str]()
         self.requests = RequestDispatcher(self.delivery, commands, monotonic=lambda: self.now_s)
         for name in NAMES:
-            self.requests.offer(name, self._handler(name))
+            self.requests.register(name, self._handler(name))
 
     def _handler(self, name: str) -> Any:
         async def echo(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -42,7 +42,7 @@ class Asked:
         return echo
 
     async def __call__(self, name: str, payload: bytes = b"") -> Any:
-        response = await self.requests.respond(name, payload)
+        response = await self.requests.handle(name, payload)
         return None if response is None else json.loads(response, parse_constant=pytest.fail)
 
 
@@ -86,7 +86,7 @@ async def test_data_that_is_no_json_is_a_fault_of_the_handler() -> None:
     async def broken(_: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"soc": float("nan")}
 
-    asked.requests.offer("state", broken)
+    asked.requests.register("state", broken)
     assert (await asked("state"))["status"] == "error"
 
 

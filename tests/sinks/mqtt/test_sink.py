@@ -255,7 +255,7 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
         return {}
 
     async with Listener(broker, "bms/pack/response/#") as live, Sink(url) as sink:
-        sink.requests.offer("current_zero", slow)
+        sink.requests.register("current_zero", slow)
         async with Listener(broker, "bms/pack/availability") as started:
             await started.wait("bms/pack/availability")
         with structlog.testing.capture_logs() as logs:
@@ -275,7 +275,7 @@ async def test_a_flood_is_counted_and_outlived(broker: Broker, url: str) -> None
 
 def test_what_waits_to_be_read_is_bounded_in_bytes() -> None:
     delivery = DeliveryStats()
-    inbox = ReceiveQueue(RequestDispatcher(delivery).refuse, MOST_BYTES, MOST_WAITING)
+    inbox = ReceiveQueue(RequestDispatcher(delivery).count_refusal, MOST_BYTES, MOST_WAITING)
     for length in (MOST_BYTES - 1, 200_000_000) * (2 * MOST_WAITING):
         payload = bytes(1) * min(length, 2 * MOST_BYTES)
         inbox.put_nowait(aiomqtt.Message("t", payload, 1, retain=False, mid=1, properties=None))

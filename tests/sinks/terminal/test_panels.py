@@ -52,9 +52,9 @@ def scene(snapshot: Snapshot, topics: dict[str, Any] | None = None, **told: Any)
     device, published = snapshot.info.device, TopicCache("bms")
     messages = MessageBuilder("bms", device)
     for message in (
-        *messages.greeting(),
-        *messages.kept(None, snapshot),
-        *messages.due(PublishedState(), snapshot, NOW)[0],
+        *messages.birth_messages(),
+        *messages.must_deliver(None, snapshot),
+        *messages.live_messages(PublishedState(), snapshot, NOW)[0],
     ):
         published.take(message.topic, message.payload, NOW)
     return ScreenState(device, published.devices[device].topics | (topics or {}), NOW, told.pop("now_s", NOW), **told)

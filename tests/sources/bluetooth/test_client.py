@@ -40,7 +40,7 @@ async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeyp
         stack = bluez.BlueZ(bus)
         await bus.request_name("org.bluez")
         asked = bringer(address=bluez.ADDRESS.lower())
-        async with aclosing(asked.bring()) as brought:
+        async with aclosing(asked.iter_lines()) as brought:
             assert await anext(brought) == CONNECTED
             assert [json.loads(await anext(brought)) for _ in range(2)] == 2 * [TOLD]
             stack.leave()
@@ -48,10 +48,10 @@ async def test_a_bms_is_found_asked_lost_and_found_again(tmp_path: Path, monkeyp
                 await to_the_end(brought)
         monkeypatch.setattr(ble_bms, "SCAN_S", 0.2)
         with pytest.raises(SourceUnavailableError, match="does not advertise"):
-            await to_the_end(asked.bring())
+            await to_the_end(asked.iter_lines())
         monkeypatch.undo()
         stack.near = True
-        async with aclosing(bringer(name=bluez.NAME, bms="jbd").bring()) as brought:
+        async with aclosing(bringer(name=bluez.NAME, bms="jbd").iter_lines()) as brought:
             assert await anext(brought) == CONNECTED
             assert json.loads(await anext(brought)) == TOLD
 

@@ -55,7 +55,7 @@ def sender(channel: str) -> Iterator[can.BusABC]:
 
 async def test_frames_of_a_bus_become_lines(channel: str, sender: can.BusABC) -> None:
     bringer = CanBringer(source(interface="virtual", channel=channel))
-    async with aclosing(bringer.bring()) as brought:
+    async with aclosing(bringer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         assert bringer.fault is not None
         assert "source.voltage (frame 0x356)" in bringer.fault
@@ -73,7 +73,7 @@ async def test_frames_of_a_bus_become_lines(channel: str, sender: can.BusABC) ->
 
 async def test_a_controller_that_is_bus_off_is_said_until_it_is_back(channel: str, sender: can.BusABC) -> None:
     bringer = CanBringer(source(interface="virtual", channel=channel))
-    async with aclosing(bringer.bring()) as brought:
+    async with aclosing(bringer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         assert PYLONTECH.arbitration_id & BUS_OFF  # the virtual bus filters error frames, too
         sender.send(can.Message(arbitration_id=0x356, is_extended_id=False, is_error_frame=True))
@@ -89,11 +89,11 @@ async def test_a_controller_that_is_bus_off_is_said_until_it_is_back(channel: st
 async def test_an_adapter_that_is_unplugged_and_plugged_in_again(line: Line) -> None:
     bringer = CanBringer(slcan(line))
     with pytest.raises(SourceUnavailableError, match=r"cannot be opened: .*No such file"):
-        async with aclosing(bringer.bring()) as brought:
+        async with aclosing(bringer.iter_lines()) as brought:
             await next_of(brought)
     for _ in range(2):
         line.plug()
-        async with aclosing(bringer.bring()) as brought:
+        async with aclosing(bringer.iter_lines()) as brought:
             assert await next_of(brought) == CONNECTED
             line.write(SLCAN)
             assert json.loads(await next_of(brought)) == TOLD
@@ -105,7 +105,7 @@ async def test_an_adapter_that_is_unplugged_and_plugged_in_again(line: Line) -> 
 async def test_junk_of_an_adapter_is_no_frame(line: Line) -> None:
     line.plug()
     bringer = CanBringer(slcan(line))
-    async with aclosing(bringer.bring()) as brought:
+    async with aclosing(bringer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         line.write(b"t35z6zz\r\a" + b"t3568721485FF\r" + SLCAN)  # of the second, bytes are missing
         assert json.loads(await next_of(brought)) == TOLD
@@ -113,7 +113,7 @@ async def test_junk_of_an_adapter_is_no_frame(line: Line) -> None:
         line.write(b"\xff\xfe\r")
         with pytest.raises(SourceUnavailableError, match="lost: "):
             await next_of(brought)
-    async with aclosing(bringer.bring()) as brought:
+    async with aclosing(bringer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         line.write(SLCAN)
         assert json.loads(await next_of(brought)) == TOLD
@@ -137,7 +137,7 @@ async def test_samples_are_positive_on_discharge(channel: str, sender: can.BusAB
 async def test_an_option_that_the_interface_does_not_have() -> None:
     bringer = CanBringer(source(interface="socketcand", channel="can0", options={"hots": "127.0.0.1"}))
     with pytest.raises(SourceUnavailableError, match=r"cannot be opened: .*host"):
-        async with aclosing(bringer.bring()) as brought:
+        async with aclosing(bringer.iter_lines()) as brought:
             await next_of(brought)
 
 
@@ -162,7 +162,7 @@ def vcan() -> Iterator[str]:
 
 async def test_an_interface_of_the_kernel_that_goes_down(vcan: str) -> None:
     bringer = CanBringer(source(channel=vcan))
-    async with aclosing(bringer.bring()) as brought:
+    async with aclosing(bringer.iter_lines()) as brought:
         assert await next_of(brought) == CONNECTED
         with can.Bus(interface="socketcan", channel=vcan, ignore_config=True) as bus:
             bus.send(PYLONTECH)

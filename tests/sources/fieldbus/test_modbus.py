@@ -34,7 +34,7 @@ def victron() -> Registers:
 
 async def lines(bringer: ModbusBringer, count: int) -> list[dict[str, object]]:
     """The first lines that it brings, after it has said that it is connected."""
-    async with asyncio.timeout(LONG_S), aclosing(bringer.bring()) as brought:
+    async with asyncio.timeout(LONG_S), aclosing(bringer.iter_lines()) as brought:
         assert await anext(brought) == CONNECTED
         return [json.loads(await anext(brought)) for _ in range(count)]
 
@@ -154,7 +154,7 @@ async def until(brought: AsyncGenerator[bytes, None], condition: Callable[[], bo
 async def test_a_device_that_goes_and_comes_back() -> None:
     registers, port = victron(), free_port()
     bringer = ModbusBringer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
-    async with aclosing(bringer.bring()) as brought:
+    async with aclosing(bringer.iter_lines()) as brought:
         async with tcp_device(registers, UNIT, port):
             await until(brought, lambda: len(registers.asked) > 2)
         with pytest.raises(SourceUnavailableError):
@@ -179,7 +179,7 @@ async def test_floats_that_are_no_numbers_are_no_samples_until_they_are() -> Non
     current = {"address": 2, "type": "float32"}
     given = source(voltage={"address": 0, "type": "float32"}, current=current, host="127.0.0.1", tcp_port=port)
     bringer = ModbusBringer(given)
-    async with tcp_device(registers, UNIT, port), aclosing(bringer.bring()) as brought, asyncio.timeout(LONG_S):
+    async with tcp_device(registers, UNIT, port), aclosing(bringer.iter_lines()) as brought, asyncio.timeout(LONG_S):
         assert await anext(brought) == CONNECTED
         coming = asyncio.ensure_future(anext(brought))
         await registers.was_asked(4)

@@ -47,7 +47,7 @@ def _reading(line: bytes) -> Reading:
 async def test_an_ina226_is_found_by_its_name_or_place(chip: str, tmp_path: Path):
     hwmon(tmp_path, "cpu_thermal", "thermal", number=0, temp1_input=48312)
     hwmon(tmp_path, **INA226)
-    reading = await first(sensor(tmp_path, chip=chip).bring())
+    reading = await first(sensor(tmp_path, chip=chip).iter_lines())
     assert (reading.voltage_v, reading.current_a) == (13.28, -2.51)
 
 
@@ -62,7 +62,7 @@ async def test_an_ina226_is_found_by_its_name_or_place(chip: str, tmp_path: Path
 )
 async def test_divider_and_shunt(settings: dict[str, Any], voltage_v: float, current_a: float, tmp_path: Path):
     hwmon(tmp_path, **INA226)
-    reading = await first(sensor(tmp_path, **settings).bring())
+    reading = await first(sensor(tmp_path, **settings).iter_lines())
     assert (reading.voltage_v, reading.current_a) == (voltage_v, current_a)
 
 
@@ -79,7 +79,7 @@ async def test_an_ads1115_over_a_divider_and_a_shunt_and_another_chip_for_the_te
             temperature="lm75/temp1_input",
             voltage_scale=16.0,
             shunt_ohm=0.00075,
-        ).bring()
+        ).iter_lines()
     )
     assert reading == Reading(53.12, -6.666667, 21.5)
 
@@ -103,7 +103,7 @@ async def test_what_is_not_there_is_said_with_what_to_do(settings: dict[str, Any
     for number, place in ((4, "1-0041"), (5, "1-0042")):
         hwmon(tmp_path, "ina219", place, number, in1_input=1, curr1_input=1)
     with pytest.raises(SourceUnavailableError) as caught:
-        await first(sensor(tmp_path, **settings).bring())
+        await first(sensor(tmp_path, **settings).iter_lines())
     assert str(caught.value).endswith(said)
 
 
@@ -118,7 +118,7 @@ async def test_a_file_that_fails_or_holds_junk_costs_a_sample_and_is_counted_and
         "curr1_input: Input/output error": lambda: (current.unlink(), current.symlink_to(EIO)),
         "curr1_input: Is a directory": lambda: (current.unlink(), current.mkdir()),
     }
-    async with aclosing(ina.bring()) as lines:
+    async with aclosing(ina.iter_lines()) as lines:
         assert await anext(lines) == CONNECTED
         await anext(lines)
         for said, spoil in spoilt.items():
@@ -147,20 +147,20 @@ async def test_a_bus_that_hangs_holds_up_nothing_and_is_left_until_it_answers(tm
     before = set(threading.enumerate())
     for _ in range(3):
         with pytest.raises(SourceUnavailableError, match=r"the bus has not answered for 0.05 s"):
-            await first(ina.bring())
+            await first(ina.iter_lines())
     assert len(set(threading.enumerate()) - before) == 1
     writer = os.open(folder / "curr1_input", os.O_RDWR | os.O_NONBLOCK)
     (folder / "curr1_input").unlink()
     (folder / "curr1_input").write_text("1500\n")
     os.close(writer)  # lets go who waits
     ina._hung_s = LONG_S
-    assert (await first(ina.bring())).current_a == 1.5
+    assert (await first(ina.iter_lines())).current_a == 1.5
 
 
 async def test_a_temperature_that_fails_costs_no_sample(tmp_path: Path):
     hwmon(tmp_path, **INA226, temp1_input="nonsense")
     ina = sensor(tmp_path, temperature="temp1_input")
-    reading = await first(ina.bring())
+    reading = await first(ina.iter_lines())
     assert reading.temperature_c != reading.temperature_c
     assert ina.counters == {"read_errors": 0, "value_errors": 1}
 
@@ -176,5 +176,5 @@ def test_it_is_polled_as_fast_as_the_chip_is_set_but_not_faster_than_anybody_nee
 async def test_a_chip_slower_than_it_is_taken_for_says_what_to_set(tmp_path: Path):
     hwmon(tmp_path, **INA226 | {"update_interval": "17000"})
     with pytest.raises(SourceUnavailableError, match=r"measures each 17 s only; .*source\.interval_s = 17$"):
-        await first(sensor(tmp_path, interval_s=None).bring())
-    assert await first(sensor(tmp_path, interval_s=17.0).bring())
+        await first(sensor(tmp_path, interval_s=None).iter_lines())
+    assert await first(sensor(tmp_path, interval_s=17.0).iter_lines())

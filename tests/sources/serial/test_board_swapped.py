@@ -133,7 +133,7 @@ def door_of_ours() -> tuple[BoardCheck, BoardDialect]:
     """It knows our board."""
     dialect, door = BoardDialect(), BoardCheck(BoardDialect)
     dialect.feed(BEGIN_S, Running(1, 6.1).hello())
-    door.know(dialect.board, 0.0)
+    door.remember_board(dialect.board, 0.0)
     return door, dialect
 
 
@@ -142,12 +142,12 @@ def test_nothing_of_a_board_that_was_refused_passes_before_the_port_is_opened_an
     own, other = Running(1, 6.1), Running(2, 9.0)
     door, dialect = door_of_ours()
     with pytest.raises(OtherBoardError):
-        door.admit((BEGIN_S, other.hello()), dialect)
+        door.accept((BEGIN_S, other.hello()), dialect)
     frame = other.frames(1)[0]
-    assert door.admit((BEGIN_S, frame), dialect) == ()
+    assert door.accept((BEGIN_S, frame), dialect) == ()
     assert door.unadmitted_bytes == len(other.hello() + frame)
     door.opened()
-    assert len(door.admit((BEGIN_S, own.hello()), dialect)) == 1
+    assert len(door.accept((BEGIN_S, own.hello()), dialect)) == 1
 
 
 def test_each_byte_of_a_board_that_is_not_known_yet_passes_once_or_is_counted() -> None:
@@ -155,11 +155,11 @@ def test_each_byte_of_a_board_that_is_not_known_yet_passes_once_or_is_counted() 
     door, dialect = door_of_ours()
     reads = [(BEGIN_S, frame) for frame in board.frames(MAX_PENDING_READS + 5)]
     door.opened()
-    assert not any(door.admit(read, dialect) for read in reads[:7])
+    assert not any(door.accept(read, dialect) for read in reads[:7])
     door.opened()  # the port was lost
     assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7])
-    assert not any(door.admit(read, dialect) for read in reads)
+    assert not any(door.accept(read, dialect) for read in reads)
     hello = BEGIN_S, board.hello()
-    assert door.admit(hello, dialect) == [*reads[6:], hello]
+    assert door.accept(hello, dialect) == [*reads[6:], hello]
     door.opened()
     assert door.unadmitted_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])

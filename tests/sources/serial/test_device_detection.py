@@ -84,7 +84,7 @@ def test_a_silent_device_is_sent_questions_alone(monkeypatch: pytest.MonkeyPatch
     questions = [
         jk.OLD_QUESTION,
         junctek.ASK,
-        PylontechDialect().due(0.0),
+        PylontechDialect().next_output(0.0),
         *(jbd.question(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
         *(daly.question(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
     ]

@@ -311,7 +311,7 @@ async def test_a_board_that_prints_text_is_taken_whatever_board_was_remembered(
     folder: Path, memory: KnownBoardFile
 ) -> None:
     port = folder / "ttyUSB0"
-    memory.keep({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
+    memory.save({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
     async with source(port, memory, protocol="text") as taken, board(port, mode="text"):
         await until(lambda: taken.blocks)
 
@@ -350,7 +350,7 @@ async def test_a_board_that_is_to_be_forgotten_is_not_written_down_again(
     monkeypatch.setattr(board_check, "RETRY_S", 0.0)
     async with source(folder / "ttyUSB0", memory) as taken, board(folder / "ttyUSB0"):
         await remembered(memory, "00000001")
-        memory.keep(NO_BOARD)
+        memory.save(NO_BOARD)
         seen = len(taken.blocks)
         await until(lambda: len(taken.blocks) > seen + 30)
         assert memory.load() == NO_BOARD
@@ -361,7 +361,7 @@ def test_what_is_remembered_is_for_its_owner_alone_and_goes_through_no_link(memo
     stranger = memory.path.with_name("stranger")
     stranger.write_text("theirs")
     memory.path.with_suffix(".new").symlink_to(stranger)
-    memory.keep(kept)
+    memory.save(kept)
     assert memory.load() == kept
     assert stat.S_IMODE(memory.path.stat().st_mode) == 0o600
     assert stranger.read_text() == "theirs"
@@ -412,7 +412,7 @@ def test_a_board_is_accepted_in_the_folder_that_is_named_and_only_where_one_is_k
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "mine"))
     pack = tmp_path / "pack.toml"
     pack.write_text('[pack]\nname = "house"\n')
-    memory.keep({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
+    memory.save({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
     code, _, err = run(capsys, "board", "--accept", pack)
     assert code == 2
     assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is known there" in err
@@ -429,6 +429,6 @@ def test_what_root_writes_is_for_the_owner_of_the_folder(tmp_path: Path) -> None
     theirs.mkdir(mode=0o700)
     os.chown(theirs, 65534, 65533)
     memory = KnownBoardFile(theirs, "house")
-    memory.keep(NO_BOARD)
+    memory.save(NO_BOARD)
     found = memory.path.stat()
     assert (found.st_uid, found.st_gid, stat.S_IMODE(found.st_mode)) == (65534, 65533, 0o600)
