@@ -17,9 +17,9 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.device_resolution import BOARD, Sampling
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sampling import BOARD, Sampling
 
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""

@@ -10,8 +10,8 @@ from bms_estimator.kernels.cell_model.current_interpolation import PERIODS, UNME
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANCES, TAU_S, weak_share
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, Noise
 from bms_estimator.model.cell import CellModel, TableOcv
-from bms_estimator.settings.device_resolution import BOARD, Sampling
 from bms_estimator.settings.observer import IdentifierSettings
+from bms_estimator.settings.sampling import BOARD, Sampling
 
 CURVE_ERROR_V, CURVE_ERROR_SOC = 0.004, 0.007
 """Where the cell file does not say how wrong its OCV is: std of one cell [V], and std along SOC."""

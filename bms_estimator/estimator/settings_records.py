@@ -14,8 +14,8 @@ from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
-from bms_estimator.settings.device_resolution import BOARD, Sampling
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.sampling import BOARD, Sampling
 
 SETTLED_STEPS = 2.0
 """Width of the dead zone in steps of the converter: half a step of rounding, half of noise, and as much again."""

@@ -1,38 +1,61 @@
-"""Which dialect ``sensor.protocol`` asks for."""
+"""All device protocols by their names.
 
-from collections.abc import Callable, Mapping
+Every module of ``protocols.devices`` is found by itself: a new device is one new file.
+"""
 
+import importlib
+import pkgutil
+from collections.abc import Mapping
+from typing import Protocol
+
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols import devices
+from bms_estimator.protocols.base.device import Device
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
-from bms_estimator.protocols.devices.daly import DalyDialect
-from bms_estimator.protocols.devices.jbd import JbdDialect
-from bms_estimator.protocols.devices.jk import JkDialect
-from bms_estimator.protocols.devices.junctek import JunctekDialect
-from bms_estimator.protocols.devices.pylontech import PylontechDialect
-from bms_estimator.protocols.devices.text import TextDialect
-from bms_estimator.protocols.devices.vedirect import VeDirectDialect
-from bms_estimator.settings.sensor import SensorSettings
+
+BOARD = "binary"
+"""Name of the firmware's own protocol. It is not a ``Device``, because its decoder would load numba for a text meter."""
 
 
-def _board(sensor: SensorSettings) -> DeviceProtocol:
-    """Of the firmware, whose frames a kernel decodes: who has another device need not load any."""
-    from bms_estimator.protocols.firmware.protocol import BoardDialect  # noqa: PLC0415 - as said above
-
-    return BoardDialect(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz)
-
-
-DIALECTS: Mapping[str, Callable[[SensorSettings], DeviceProtocol]] = {
-    "binary": _board,
-    "text": lambda sensor: TextDialect(current_sign=sensor.current_sign),
-    "vedirect": lambda sensor: VeDirectDialect(current_sign=sensor.current_sign),
-    "junctek": lambda sensor: JunctekDialect(current_sign=sensor.current_sign),
-    "pylontech": lambda sensor: PylontechDialect(current_sign=sensor.current_sign),
-    "jbd": lambda sensor: JbdDialect(current_sign=sensor.current_sign),
-    "daly": lambda sensor: DalyDialect(current_sign=sensor.current_sign, address=sensor.address),
-    "jk": lambda sensor: JkDialect(current_sign=sensor.current_sign, address=sensor.address),
-}
-"""By the protocol's name in the settings and in the header of a capture."""
+def _find_devices() -> dict[str, Device]:
+    """Import every module of ``protocols.devices``; return its ``DEVICE`` by name."""
+    modules = (
+        importlib.import_module(f"{devices.__name__}.{each.name}") for each in pkgutil.iter_modules(devices.__path__)
+    )
+    found: list[Device] = [module.DEVICE for module in modules]
+    return {device.name: device for device in found}
 
 
-def make_dialect(sensor: SensorSettings) -> DeviceProtocol:
-    """What ``[sensor]`` asks for; it turns the sign of the current."""
-    return DIALECTS[sensor.protocol](sensor)
+DEVICES: Mapping[str, Device] = _find_devices()
+"""Devices by their names in ``sensor.protocol``."""
+PROTOCOLS = (BOARD, *DEVICES)
+"""Values of ``sensor.protocol``."""
+
+
+class Sensor(Protocol):
+    """Part of ``[sensor]`` that a protocol depends on."""
+
+    @property
+    def protocol(self) -> str:
+        """One of ``PROTOCOLS``."""
+
+    @property
+    def current_sign(self) -> CurrentSign:
+        """Direction that the device reports as positive."""
+
+    @property
+    def address(self) -> int | None:
+        """Address of the device on its bus; None: the first that answers."""
+
+    @property
+    def sample_rate_hz(self) -> int:
+        """Sample rate that a board of the firmware is set to [Hz]."""
+
+
+def make_protocol(sensor: Sensor) -> DeviceProtocol:
+    """Make the protocol of a device; its samples have the sign of current that the estimator expects."""
+    if sensor.protocol == BOARD:
+        from bms_estimator.protocols.firmware.protocol import BoardDialect  # noqa: PLC0415 - it loads numba
+
+        return BoardDialect(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz)
+    return DEVICES[sensor.protocol].make(sensor.current_sign, sensor.address)

@@ -9,7 +9,6 @@ from bms_estimator.model.config_file import Fraction, Positive, Strict, read_tom
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.settings.can_source import CanSource
-from bms_estimator.settings.device_resolution import Sampling
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings, PrometheusSettings
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
@@ -19,6 +18,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.page import PageSettings
+from bms_estimator.settings.sampling import Sampling
 from bms_estimator.settings.sensor import NO_DEVICE, SensorSettings
 
 SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]

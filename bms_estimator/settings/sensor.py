@@ -5,18 +5,19 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
 from bms_estimator.model.config_file import NotNegative, Positive, Strict
-from bms_estimator.settings.device_resolution import RESOLUTIONS
+from bms_estimator.model.one_of import OneOf
+from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
 
 NO_DEVICE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
 """What ``[sensor]`` may say of a device on a serial line beside ``[source]``: no more than a file with all defaults does."""
 
 
 def _filled(sensor: dict[str, object]) -> dict[str, object]:
-    """The table ``[sensor]`` with what it leaves out, as ``RESOLUTIONS`` has it of the device."""
+    """Fill in the device's resolution where the table ``[sensor]`` leaves it out."""
     protocol = sensor.get("protocol")
-    if not isinstance(protocol, str) or protocol not in RESOLUTIONS:
+    if not isinstance(protocol, str) or protocol not in DEVICES:
         return sensor
-    declared = vars(RESOLUTIONS[protocol])
+    declared = vars(DEVICES[protocol].resolution)
     return {name: value for name, value in declared.items() if value is not None} | sensor
 
 
@@ -31,8 +32,8 @@ class SensorSettings(Strict):
         description='the only board that is taken, as `bms-estimator board` shows its number, such as "0000002a"; '
         "the first that came, which is remembered, when left out",
     )
-    protocol: Literal["binary", "text", "jbd", "daly", "jk", "vedirect", "junctek", "pylontech"] = Field(
-        default="binary", description="frames of the firmware, text lines, or a BMS or meter by its name"
+    protocol: Annotated[str, OneOf(PROTOCOLS)] = Field(
+        default=BOARD, description="frames of the firmware, text lines, or a BMS or meter by its name"
     )
     address: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,

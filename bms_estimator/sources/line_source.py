@@ -14,7 +14,7 @@ from bms_estimator.model.clock import since_boot
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S, LONGEST_RETRY_S
 from bms_estimator.protocols.base.reading import CONNECTED
-from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
@@ -93,7 +93,7 @@ class LineSource:
         first_retry_s: float = FIRST_RETRY_S,
         look_s: float = LOOK_S,
     ) -> None:
-        self._bringer, self._dialect, self._tap = bringer, make_dialect(sensor), tap
+        self._bringer, self._dialect, self._tap = bringer, make_protocol(sensor), tap
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
         self._look_s, self._silent_s = look_s, SILENT_PERIODS * max(period_s, look_s)
         self._first_retry_s, self._retry_s = first_retry_s, 0.0

@@ -48,7 +48,7 @@ from bms_estimator.protocols.devices.text import TextDialect
 from bms_estimator.protocols.devices.vedirect import VeDirectDialect
 from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
 from bms_estimator.protocols.firmware.protocol import BoardDialect
-from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
@@ -135,7 +135,7 @@ def _asked(protocol: str) -> Callable[[Path], Read]:
 
     def make(_: Path) -> Read:
         def read(data: bytes) -> None:
-            dialect = make_dialect(SensorSettings.model_validate({"protocol": protocol}))
+            dialect = make_protocol(SensorSettings.model_validate({"protocol": protocol}))
             dialect.feed(1.0, data[: len(data) // 2])
             dialect.next_output(1.5)
             dialect.on_port_opened()

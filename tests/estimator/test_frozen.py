@@ -12,7 +12,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.settings.device_resolution import Sampling
+from bms_estimator.settings.sampling import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
 
 HOUR = 3600

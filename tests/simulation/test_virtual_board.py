@@ -30,7 +30,7 @@ from bms_estimator.protocols.firmware.messages import (
     unseal,
     zero_current_command,
 )
-from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading, window_of
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
@@ -233,7 +233,7 @@ async def test_a_host_that_does_not_read_loses_samples_and_is_told() -> None:
 
 async def test_text_mode_prints_what_a_hobby_sketch_prints() -> None:
     data = await received(board(mode="text"), 50)
-    decoder = make_dialect(SensorSettings(port="x", protocol="text", baud=115_200))
+    decoder = make_protocol(SensorSettings(port="x", protocol="text", baud=115_200))
     block = decoder.feed(0.0, data)
     assert block.size == 50
     assert block["voltage_v"] == pytest.approx(22.2, abs=0.03)

@@ -23,7 +23,7 @@ from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.device_resolution import Sampling
+from bms_estimator.settings.sampling import Sampling
 
 TRAINING = 2.0 / 3.0
 """Part of the time whose samples identify; the others judge."""

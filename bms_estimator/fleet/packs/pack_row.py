@@ -4,7 +4,7 @@ On the server a row stands under its pack's name as JSON without that name, so t
 """
 
 import tomllib
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, ValidationError
 
@@ -18,10 +18,11 @@ from bms_estimator.model.cell import (
 from bms_estimator.model.config_file import Fraction, NotNegative, Positive, Strict, parse_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
+from bms_estimator.model.one_of import OneOf
+from bms_estimator.protocols.registry import DEVICES
 from bms_estimator.settings.pack import DeviceName, PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 
-Protocol = Literal["text", "jbd", "daly", "jk", "vedirect", "junctek", "pylontech"]
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
 """Of a cell; one of a pack has more in it than the pack's."""
 _COUNT = Field(ge=1, le=10_000)
@@ -40,7 +41,7 @@ class PackSpec(Strict):
     series: Annotated[int, _COUNT] = Field(default=1, description="cell-file objects in series")
     parallel: Annotated[int, _COUNT] = Field(default=1, description="cell-file objects in parallel")
     initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; from the OCV when left out")
-    protocol: Protocol = Field(
+    protocol: Annotated[str, OneOf(DEVICES)] = Field(
         default="text", description="the BMS or meter that measures: what it resolves, where no column says otherwise"
     )
     voltage_resolution_v: Positive | None = Field(default=None, description="one step of the pack's voltage")

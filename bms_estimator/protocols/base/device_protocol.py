@@ -1,4 +1,4 @@
-"""What a device says and wants to hear, apart from the line: a device is one file here and a row in ``table``."""
+"""Base class of device protocols: bytes from a device to samples, and bytes that it is sent. It knows no port."""
 
 import math
 from abc import ABC, abstractmethod

@@ -13,6 +13,7 @@ import struct
 from collections.abc import Mapping, Sequence
 
 from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.polled_protocol import FRESH_S, ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
 
@@ -128,3 +129,12 @@ class DalyDialect(PolledProtocol):
         while values and not values[-1] > 0.0:
             values.pop()
         return values
+
+
+DEVICE = Device(
+    "daly",
+    lambda sign, address: DalyDialect(current_sign=sign, address=address),
+    Resolution(9600, None, 1.0, 0.1, 0.1, 2.5),
+)
+"""One frame has voltage and current in steps of 0.1 V and 0.1 A. Users found its parameter DfilterCur at 2 A and at 2.5 A
+(github.com/softwarecrash/Daly2MQTT, issue 171; github.com/fl4p/batmon-ha, issue 144)."""

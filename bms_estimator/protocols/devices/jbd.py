@@ -10,6 +10,7 @@ import struct
 from collections.abc import Sequence
 
 from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.polled_protocol import FRESH_S, ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import RecentCellVoltages
@@ -93,3 +94,12 @@ class JbdDialect(PolledProtocol):
             self._mean_c([(step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", told[: len(told) & ~1])]),
             self._beside.at(arrival_s)[: self._cells],
         )
+
+
+DEVICE = Device(
+    "jbd",
+    lambda sign, _: JbdDialect(current_sign=sign),
+    Resolution(9600, "charge_positive", 1.0, 0.01, 0.01, 0.5),
+)
+"""One frame has voltage and current in steps of 10 mV and 10 mA. Users saw nothing below 0.2 A, and nothing below 0.5 A on one of
+120 A (github.com/smagicld/xiaoxiangBMS, issues 115 and 39)."""

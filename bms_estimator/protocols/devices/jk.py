@@ -16,6 +16,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 
 from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.polled_protocol import ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
 
@@ -196,3 +197,12 @@ def _registers(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _number(content: bytes) -> int:
     return int.from_bytes(content, "big")
+
+
+DEVICE = Device(
+    "jk",
+    lambda sign, address: JkDialect(current_sign=sign, address=address),
+    Resolution(115_200, "charge_positive", 1.0, 0.01, 0.01, 0.7),
+)
+"""One frame has voltage and current in steps of 10 mV and 10 mA. One board showed nothing below 0.7 A
+(github.com/syssi/esphome-jk-bms, issue 243)."""

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
@@ -109,3 +110,11 @@ class JunctekDialect(ReadingProtocol):
         return Reading(
             0.01 * told[VOLTAGE], current_a if told[DIRECTION] == 1 else -current_a, float(told[TEMPERATURE] - ZERO_C)
         )
+
+
+DEVICE = Device(
+    "junctek",
+    lambda sign, _: JunctekDialect(current_sign=sign),
+    Resolution(115_200, "charge_positive", 1.0, 0.01, 0.1),
+)
+"""The protocol has steps of 10 mV and 10 mA; the makers specify 0.1 A."""

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol, RecentCellVoltages
 
@@ -162,3 +163,11 @@ def _whole(text: str) -> int:
 
 def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
+
+
+DEVICE = Device(
+    "pylontech",
+    lambda sign, _: PylontechDialect(current_sign=sign),
+    Resolution(115_200, "charge_positive", 2.0, 0.001, 0.01, 0.1),
+)
+"""The table has steps of 1 mV and 1 mA. In public captures the smallest current that is not 0 is 149 mA, beside many of 0."""

@@ -16,6 +16,7 @@ from bms_estimator.model.sample import (
     SampleBlock,
     forget_beyond,
 )
+from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.device_clock import DeviceClock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
 from bms_estimator.protocols.base.reading import Reading, read_line
@@ -128,3 +129,11 @@ class TextDialect(DeviceProtocol):
     def _begin_overlong(self, line: bytes) -> None:
         self._too_long += 1
         self._bad = self._bad or line[:LINE_BYTES]
+
+
+DEVICE = Device(
+    "text",
+    lambda sign, _: TextDialect(current_sign=sign),
+    Resolution(period_s=1.0),
+)
+"""Boards print at their own pace, usually once a second."""

@@ -12,6 +12,7 @@ from math import nan
 
 from bms_estimator.model.decimal_text import number
 from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.device import Device, Resolution
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
@@ -87,3 +88,11 @@ class VeDirectDialect(ReadingProtocol):
         except ValueError as error:
             self._count_fault("text_errors", f"a VE.Direct block without a voltage or a current: {error}")
             return None
+
+
+DEVICE = Device(
+    "vedirect",
+    lambda sign, _: VeDirectDialect(current_sign=sign),
+    Resolution(19_200, "charge_positive", 1.0, 0.01, 0.01),
+)
+"""The text has steps of 1 mV and 1 mA; the data sheets of BMV and SmartShunt specify 10 mV and 10 mA."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, CurrentSign, SampleBlock
-from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, sensor_of
@@ -70,7 +70,7 @@ class RawCapture:
                 f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {told.protocol!r}: "
                 "give settings with that protocol, or none"
             )
-        self.decoder = make_dialect(told.model_copy(update={"current_sign": current_sign or told.current_sign}))
+        self.decoder = make_protocol(told.model_copy(update={"current_sign": current_sign or told.current_sign}))
         self.damaged, self.unread_bytes = False, 0
         self._path = path
         self._read, self._size = 0, path.stat().st_size

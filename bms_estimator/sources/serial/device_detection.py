@@ -12,7 +12,7 @@ from bms_estimator.protocols.devices.text import TextDialect
 from bms_estimator.protocols.firmware.frame_decoder import FrameFault
 from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command
 from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardDialect
-from bms_estimator.protocols.registry import DIALECTS
+from bms_estimator.protocols.registry import PROTOCOLS, make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
 
@@ -65,7 +65,7 @@ def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
         port: Device path; opened for ourselves alone.
         baud: Try everything at this rate [1/s]; None: each at its own.
     """
-    rates = _rates() if baud is None else {baud: list(DIALECTS)}
+    rates = _rates() if baud is None else {baud: list(PROTOCOLS)}
     silence = "silent"
     BoardDialect().feed(0.0, b"\0\n")  # loads its kernel: nothing compiles while an answer is waited for
     try:
@@ -89,7 +89,7 @@ def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
 def _rates() -> Mapping[int, Sequence[str]]:
     """Protocols by baud rate, the firmware's first, then from the fastest down; text is read at any."""
     rates: dict[int, list[str]] = {BAUD: []}
-    for name in DIALECTS:
+    for name in PROTOCOLS:
         rates.setdefault(SensorSettings.model_validate({"protocol": name}).baud, []).append(name)
     for protocols in rates.values():
         if "text" not in protocols:
@@ -98,7 +98,7 @@ def _rates() -> Mapping[int, Sequence[str]]:
 
 
 def _prober(protocol: str) -> DeviceProtocol:
-    dialect = DIALECTS[protocol](SensorSettings.model_validate({"protocol": protocol}))
+    dialect = make_protocol(SensorSettings.model_validate({"protocol": protocol}))
     dialect.probing = True
     return dialect
 

@@ -15,7 +15,7 @@ from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S
 from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
-from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.serial.board_check import BoardCheck, OtherBoardError
@@ -73,10 +73,12 @@ class SerialSource:
         slow_s = settings.period_s or 0.0
         self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
         self._monotonic = monotonic
-        make_dialect(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
-        self._dialect = make_dialect(settings)
+        make_protocol(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
+        self._dialect = make_protocol(settings)
         tells_serial = settings.protocol == "binary"  # what prints text could never be told from another
-        self._door = BoardCheck(lambda: make_dialect(settings), settings.serial or "", memory if tells_serial else None)
+        self._door = BoardCheck(
+            lambda: make_protocol(settings), settings.serial or "", memory if tells_serial else None
+        )
         self._where = PortDiscovery(settings.port, monotonic)
         self._line = SerialPort(
             self._open_next,

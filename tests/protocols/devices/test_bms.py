@@ -12,7 +12,7 @@ from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.protocols.base.polled_protocol import GAP_S, PACE_S, UNANSWERED_ROUNDS, PolledProtocol
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.daly import sealed
-from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from tests.protocols import bms_frames as frames
 from tests.protocols.bms_frames import PUBLISHED, Published
@@ -41,7 +41,7 @@ streams = st.lists(
 
 
 def dialect(protocol: str, **options: object) -> PolledProtocol:
-    return cast("PolledProtocol", make_dialect(SensorSettings.model_validate({"protocol": protocol, **options})))
+    return cast("PolledProtocol", make_protocol(SensorSettings.model_validate({"protocol": protocol, **options})))
 
 
 def fed(dialect: PolledProtocol, *reads: bytes, arrival_s: float = 1.0) -> tuple[SampleBlock, list[list[float]]]:

@@ -15,7 +15,7 @@ from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices.junctek import ASK, JunctekDialect
 from bms_estimator.protocols.devices.pylontech import PylontechDialect
 from bms_estimator.protocols.devices.vedirect import VeDirectDialect
-from bms_estimator.protocols.registry import make_dialect
+from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_adc import Reading
@@ -116,7 +116,7 @@ def values(block: SampleBlock) -> list[tuple[float, float]]:
     ],
 )
 def test_real_frames_say_what_is_known_of_them(name: str, sent: bytes, told: tuple[float, float, float]) -> None:
-    dialect = make_dialect(SensorSettings.model_validate({"protocol": name}))
+    dialect = make_protocol(SensorSettings.model_validate({"protocol": name}))
     block = dialect.feed(1.0, sent)
     assert [block[name].item() for name in ("voltage_v", "current_a", "temperature_c")] == pytest.approx(
         told, nan_ok=True
@@ -127,7 +127,7 @@ def test_real_frames_say_what_is_known_of_them(name: str, sent: bytes, told: tup
 
 def test_a_shunt_wired_the_other_way_is_turned_by_the_setting() -> None:
     sensor = SensorSettings.model_validate({"protocol": "vedirect", "current_sign": "discharge_positive"})
-    assert make_dialect(sensor).feed(1.0, BMV_NOW)["current_a"].item() == pytest.approx(-7.625)
+    assert make_protocol(sensor).feed(1.0, BMV_NOW)["current_a"].item() == pytest.approx(-7.625)
 
 
 def test_a_protocol_brings_its_baud_rate_sign_and_resolution_which_the_file_may_change() -> None:
@@ -234,7 +234,7 @@ def test_cells_that_a_console_has_not_told_for_long_stand_beside_no_sample() -> 
 def test_a_port_that_was_opened_anew_changes_no_sample_since_no_recording_tells_of_it(name: str, data: bytes) -> None:
     reads = [(0.01 * n, data[n : n + 7]) for n in range(0, len(data), 7)]
     sensor = SensorSettings.model_validate({"protocol": name})
-    live, replayed = make_dialect(sensor), make_dialect(sensor)
+    live, replayed = make_protocol(sensor), make_protocol(sensor)
     for arrival_s, read in reads:
         live.on_port_opened()
         blocks = live.feed(arrival_s, read), replayed.feed(arrival_s, read)

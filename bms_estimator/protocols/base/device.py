@@ -1,0 +1,42 @@
+"""Description of a BMS or meter: its name in the settings, its resolution and its protocol."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Defaults of ``[sensor]`` for one kind of device. None: the default of a board of the firmware holds."""
+
+    baud: int | None = None
+    """Baud rate of its serial port."""
+    current_sign: CurrentSign | None = None
+    """Direction that it reports as positive."""
+    period_s: float | None = None
+    """Time between two samples [s]."""
+    voltage_resolution_v: float | None = None
+    """One step of the pack's voltage [V]."""
+    current_resolution_a: float | None = None
+    """One step of the current [A]."""
+    current_dead_band_a: float | None = None
+    """Currents below this are reported as 0 [A]."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """A kind of device.
+
+    Each module of ``protocols.devices`` has one as ``DEVICE``. Nothing else needs to know of it.
+
+    Attributes:
+        name: Value of ``sensor.protocol``.
+        make: Makes the protocol from the sign of the current and the address (None: the first device that answers).
+        resolution: Defaults of ``[sensor]``.
+    """
+
+    name: str
+    make: Callable[[CurrentSign, int | None], DeviceProtocol]
+    resolution: Resolution

@@ -1,0 +1,53 @@
+"""A device is one file: everything that depends on its name follows."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from bms_estimator.fleet.packs.pack_row import PackSpec
+from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
+from bms_estimator.settings.sensor import SensorSettings
+from tests.patience import LONG_S
+
+NEW_DEVICE = """
+from bms_estimator.protocols.base.device import Device, Resolution
+from bms_estimator.protocols.devices.text import TextDialect
+
+DEVICE = Device(
+    "shunt", lambda sign, _: TextDialect(current_sign=sign), Resolution(2400, "charge_positive", 5.0, 0.05, 0.02, 0.3)
+)
+"""
+USE_IT = """
+import sys
+from bms_estimator.protocols import devices
+devices.__path__.append(sys.argv[1])
+from bms_estimator.fleet.packs.pack_row import PackSpec
+from bms_estimator.protocols.registry import make_protocol
+from bms_estimator.settings.sensor import SensorSettings
+sensor = SensorSettings.model_validate({"protocol": "shunt", "baud": 9600})
+samples = make_protocol(sensor).feed(1.0, b"V=3.7 I=0.2\\n")
+spec = PackSpec.model_validate({"cell": "leaf", "protocol": "shunt"})
+print(sensor.baud, sensor.period_s, sensor.current_dead_band_a, samples["current_a"].tolist(), spec.protocol)
+"""
+
+
+def test_file_in_the_folder_of_devices_is_a_protocol(tmp_path: Path) -> None:
+    (tmp_path / "shunt.py").write_text(NEW_DEVICE)
+    done = subprocess.run(
+        [sys.executable, "-c", USE_IT, tmp_path], capture_output=True, text=True, timeout=LONG_S, check=False
+    )
+    assert done.stdout == "9600 5.0 0.3 [-0.2] shunt\n", done.stderr
+
+
+def test_settings_list_all_protocols() -> None:
+    assert SensorSettings.model_json_schema()["properties"]["protocol"]["enum"] == list(PROTOCOLS)
+    assert PackSpec.model_json_schema()["properties"]["protocol"]["enum"] == list(DEVICES)
+    assert set(PROTOCOLS) == {BOARD, "daly", "jbd", "jk", "junctek", "pylontech", "text", "vedirect"}
+
+
+def test_unknown_protocol_is_refused_with_the_list() -> None:
+    with pytest.raises(ValidationError, match="must be one of binary, daly, jbd, "):
+        SensorSettings.model_validate({"protocol": "x"})
