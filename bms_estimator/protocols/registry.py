@@ -55,7 +55,7 @@ class Sensor(Protocol):
 def make_protocol(sensor: Sensor) -> DeviceProtocol:
     """Make the protocol of a device; its samples have the sign of current that the estimator expects."""
     if sensor.protocol == BOARD:
-        from bms_estimator.protocols.firmware.protocol import BoardDialect  # noqa: PLC0415 - it loads numba
+        from bms_estimator.protocols.firmware.protocol import BoardProtocol  # noqa: PLC0415 - it loads numba
 
-        return BoardDialect(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz)
+        return BoardProtocol(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz)
     return DEVICES[sensor.protocol].make(sensor.current_sign, sensor.address)

@@ -68,13 +68,13 @@ class LineProducer(ABC):
 class LineSource:
     """Async source of SAMPLE blocks from a bringer, which is begun anew whenever it ends.
 
-    All that makes a sample passes ``dialect.feed(arrival_s, line)``: a capture of these calls replays to the same bits.
+    All that makes a sample passes ``decoder.feed(arrival_s, line)``: a capture of these calls replays to the same bits.
 
     Args:
         bringer: What brings lines.
         sensor: Sign of the current; ``protocol`` must be ``text``.
         period_s: Between two samples, as expected [s].
-        tap: Gets the same (arrival time, line) as the dialect.
+        tap: Gets the same (arrival time, line) as the decoder.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Before what is missing or lost is tried again; doubles with each attempt [s].
@@ -93,7 +93,7 @@ class LineSource:
         first_retry_s: float = FIRST_RETRY_S,
         look_s: float = LOOK_S,
     ) -> None:
-        self._bringer, self._dialect, self._tap = bringer, make_protocol(sensor), tap
+        self._bringer, self._decoder, self._tap = bringer, make_protocol(sensor), tap
         self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
         self._look_s, self._silent_s = look_s, SILENT_PERIODS * max(period_s, look_s)
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
@@ -109,8 +109,8 @@ class LineSource:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The dialect's and the bringer's, ``reconnects``, and of a tap ``missed_reads``."""
-        counters = {**self._dialect.counters, **self._bringer.counters, "reconnects": max(self._openings - 1, 0)}
+        """The decoder's and the bringer's, ``reconnects``, and of a tap ``missed_reads``."""
+        counters = {**self._decoder.counters, **self._bringer.counters, "reconnects": max(self._openings - 1, 0)}
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
 
     @property
@@ -126,12 +126,12 @@ class LineSource:
     @property
     def cells(self) -> CellBlock:
         """Beside the samples of the last block."""
-        return self._dialect.cells
+        return self._decoder.cells
 
     @property
     def clock_ppm(self) -> float | None:
         """Nobody knows."""
-        return self._dialect.clock_ppm
+        return self._decoder.clock_ppm
 
     current_zero: None = None
     """There is no zero to be set."""
@@ -172,7 +172,7 @@ class LineSource:
     def _decode(self, arrival_s: float, line: bytes) -> SampleBlock:
         if self._tap is not None:
             self._tap.write(arrival_s, line)
-        block = self._dialect.feed(arrival_s, line)
+        block = self._decoder.feed(arrival_s, line)
         if block.size:
             self._heard_s = self._monotonic()
         return block
@@ -210,7 +210,7 @@ class LineSource:
         while True:
             self._tended_s = now_s = self._monotonic()
             if self._connected and now_s - self._heard_s >= self._silent_s:
-                why = self._bringer.fault or self._dialect.fault or "connected, but silent"
+                why = self._bringer.fault or self._decoder.fault or "connected, but silent"
                 self._say(f"{self._bringer.name}: {why}")
             self._faults.check(self.counters, now_s)
             await asyncio.sleep(self._look_s)

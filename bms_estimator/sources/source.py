@@ -21,7 +21,7 @@ class SourceHealth(NamedTuple):
 
 
 class ReadTap(Protocol):
-    """Takes all that the dialect is fed, as ``Recording`` does. Does not wait, and raises nothing."""
+    """Takes all that the decoder is fed, as ``Recording`` does. Does not wait, and raises nothing."""
 
     @property
     def missed_reads(self) -> int:

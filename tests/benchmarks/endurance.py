@@ -27,7 +27,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.protocols.firmware.protocol import BoardDialect
+from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from tests.benchmarks import edge_token, lost_sensor
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
 from tests.benchmarks.table import Row, show
@@ -189,9 +189,9 @@ def _send_over(master: "mp.reduction.DupFd", *arguments: object) -> None:
     send(master.detach(), *arguments)  # type: ignore[arg-type]
 
 
-def fed(rate_hz: int, seconds: float) -> tuple[BoardDialect, Estimator, float, list[float]]:
+def fed(rate_hz: int, seconds: float) -> tuple[BoardProtocol, Estimator, float, list[float]]:
     """All bytes through decoder and estimator in reads of ``READ_BYTES``: both, seconds that took, RSS each hour [MiB]."""
-    dialect, estimator, process = BoardDialect(), Estimator(load_cell(CELL)), psutil.Process()
+    dialect, estimator, process = BoardProtocol(), Estimator(load_cell(CELL)), psutil.Process()
     dialect.feed(0.0, hello(rate_hz))
     rss, took_s, bytes_fed = list[float](), 0.0, 0
     bytes_per_s = rate_hz * len(next(chunks(rate_hz, 1.0 / rate_hz, 1.0)))

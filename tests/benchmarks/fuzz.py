@@ -42,12 +42,12 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.topic_cache import TopicCache
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices import daly, jbd, jk
-from bms_estimator.protocols.devices.junctek import JunctekDialect
-from bms_estimator.protocols.devices.pylontech import PylontechDialect
-from bms_estimator.protocols.devices.text import TextDialect
-from bms_estimator.protocols.devices.vedirect import VeDirectDialect
+from bms_estimator.protocols.devices.junctek import JunctekProtocol
+from bms_estimator.protocols.devices.pylontech import PylontechProtocol
+from bms_estimator.protocols.devices.text import TextProtocol
+from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
 from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
-from bms_estimator.protocols.firmware.protocol import BoardDialect
+from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings
@@ -96,7 +96,7 @@ class Target:
 
 def _frames(_: Path) -> Read:
     def read(data: bytes) -> None:
-        dialect = BoardDialect(rate_hz=100)
+        dialect = BoardProtocol(rate_hz=100)
         dialect.feed(1.0, data[: len(data) // 2])
         dialect.on_port_opened()
         dialect.serial_number_in(data[len(data) // 2 :])
@@ -110,7 +110,7 @@ def _frames(_: Path) -> Read:
 
 def _text(_: Path) -> Read:
     def read(data: bytes) -> None:
-        dialect = TextDialect()
+        dialect = TextProtocol()
         dialect.feed(1.0, data)
         _ = dialect.fault, dialect.description, dialect.counters
 
@@ -386,9 +386,9 @@ _JSON = (b"null", b'"version"', b": [", b'{"a":', b"\\ud800", b'"soc"', b'"trans
 TARGETS: Mapping[str, Target] = {
     "frames": Target(_frames, (DELIMITER, b"\x01\x01", b"\x01\x02", b"\xff\xff\xff\xff"), _sealed, decoder=True),
     "text": Target(_text, (b"V=", b"I=", b"T=", b"cells=", b'{"voltage":', b";", b" mA", b"kV"), decoder=True),
-    "vedirect": Target(_meter(VeDirectDialect), (b"\r\nV\t", b"\r\nI\t", b"\r\nChecksum\t", b":7F0"), _summed),
-    "junctek": Target(_meter(JunctekDialect), (b":r50=1,", b",", b":R50=1,2,1,\r\n"), _counted),
-    "pylontech": Target(_meter(PylontechDialect), (b"pylon>", b"Power Volt", b"Absent", b"bat 2", b" - ")),
+    "vedirect": Target(_meter(VeDirectProtocol), (b"\r\nV\t", b"\r\nI\t", b"\r\nChecksum\t", b":7F0"), _summed),
+    "junctek": Target(_meter(JunctekProtocol), (b":r50=1,", b",", b":R50=1,2,1,\r\n"), _counted),
+    "pylontech": Target(_meter(PylontechProtocol), (b"pylon>", b"Power Volt", b"Absent", b"bat 2", b" - ")),
     "jbd": Target(_asked("jbd"), (b"\xdd\x03\0", b"\xdd\x04\0", b"\x77"), _jbd_summed, decoder=True),
     "daly": Target(_asked("daly"), (b"\xa5\x01\x90\x08", b"\xa5\x01\x95\x08"), _daly_summed, decoder=True),
     "jk": Target(

@@ -8,9 +8,9 @@ from tests.mosquitto import Broker
 
 
 def test_ten_minutes_of_serial_bytes_are_all_estimated() -> None:
-    dialect, estimator, _, _ = fed(100, 600.0)
-    assert dialect.counters["frames_received"] == estimator.state["samples"][0] == 60_000
-    assert dialect.counters["frames_lost"] == dialect.counters["clock_jumps"] == 0
+    decoder, estimator, _, _ = fed(100, 600.0)
+    assert decoder.counters["frames_received"] == estimator.state["samples"][0] == 60_000
+    assert decoder.counters["frames_lost"] == decoder.counters["clock_jumps"] == 0
 
 
 async def test_a_lost_sensor_raises_sensor_fault_and_runs_the_hook_of_an_alarm_that_needs_it(

@@ -393,7 +393,7 @@ async def test_a_kill_costs_little_however_seldom_is_saved(tmp_path: Path, monke
             return await super()._save(clean=clean)
 
     looked = asyncio.Event()
-    monkeypatch.setattr(live_loop, "Saving", Looking)
+    monkeypatch.setattr(live_loop, "CheckpointWriter", Looking)
     tables = {"state": {"checkpoint_s": 1e6}, "identifier": {"enabled": False}}
     settings = Settings.model_validate(SETTINGS.model_dump(by_alias=True, exclude_none=True) | tables)
     source = ScriptedSource()

@@ -19,7 +19,7 @@ def test_each_kernel_is_told_once_with_its_number_and_what_is_compiled_already_i
         kernel(0.5, 1.0, 2.0)
         kernel(1, 1, 2)  # for other types
     [(name, number, most)] = told
-    assert (name, number) == ("margins: crossing", 1)
+    assert (name, number) == ("chen mora: crossing", 1)
     assert most >= 2
     with report_compilation(lambda *what: told.append(what)):
         kernel(0.6, 1.0, 2.0)
@@ -49,4 +49,4 @@ def test_where_stderr_is_no_terminal_lines_come_now_and_then() -> None:
         njit(chen_mora.delta.py_func)(0.5, 1.0, 2.0)
     [line] = lines
     assert line.startswith("compiling kernels, once: 1/")
-    assert line.endswith(" margins: crossing")
+    assert line.endswith(" chen mora: crossing")

@@ -11,10 +11,10 @@ import aiohttp
 import pytest
 import structlog
 
-from bms_estimator.page import listener as of_listener
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer
+from bms_estimator.process import listener as of_listener
 from bms_estimator.process.listener import CONNECTIONS, Connections, Listener
 from bms_estimator.settings.page import PageSettings
 from tests.idle_connections import DESCRIPTORS, attacked, few_descriptors

@@ -118,7 +118,7 @@ def test_a_hangup_before_samples_are_taken_is_not_lost(tmp_path: Path, monkeypat
         asked.append(reload.asked.is_set())
 
     monkeypatch.setattr("bms_estimator.cli.live.run.load_kernels", lambda: os.kill(os.getpid(), signal.SIGHUP))
-    monkeypatch.setattr("bms_estimator.cli.live.run.serve", serve)
+    monkeypatch.setattr("bms_estimator.cli.live.run.run_pack_service", serve)
     monkeypatch.setattr("bms_estimator.cli.live.run.configure_logs", lambda *_: None)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     (tmp_path / "pack.toml").write_text('[pack]\ncell = "chen_mora"\n')

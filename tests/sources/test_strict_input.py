@@ -12,9 +12,9 @@ import pytest
 
 from bms_estimator.model.decimal_text import measured, number
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.devices.text import TextDialect
+from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.protocols.firmware.messages import Hello, SampleMessage, unseal
-from bms_estimator.protocols.firmware.protocol import BoardDialect
+from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.raw_capture import MAGIC, CaptureHeader, CaptureWriter, read_capture, read_header
 from bms_estimator.sources.captures.replay import Replay, load_capture, open_capture
@@ -130,17 +130,17 @@ def test_a_packed_capture_whose_end_is_damaged_ends_there(tmp_path: Path) -> Non
 
 
 def test_a_text_line_s_temperature_and_cells_beyond_reason_are_dropped_and_counted() -> None:
-    dialect = TextDialect()
-    block = dialect.feed(0.0, b"\nV=7.2 I=1 T=1e308 cells=3.6,1e308\nV=7.2 I=1 T=25 cells=3.6,3.6\n")
+    decoder = TextProtocol()
+    block = decoder.feed(0.0, b"\nV=7.2 I=1 T=1e308 cells=3.6,1e308\nV=7.2 I=1 T=25 cells=3.6,3.6\n")
     assert block["temperature_c"].tolist() == pytest.approx([math.nan, 25.0], nan_ok=True)
-    assert dialect.cells[0].tolist() == pytest.approx([3.6, math.nan], nan_ok=True)
-    assert dialect.counters["implausible"] == 2
+    assert decoder.cells[0].tolist() == pytest.approx([3.6, math.nan], nan_ok=True)
+    assert decoder.counters["implausible"] == 2
 
 
 def test_a_board_s_temperature_beyond_reason_is_dropped_and_counted() -> None:
-    dialect = BoardDialect()
+    decoder = BoardProtocol()
     odd = replace(Hello.decode(unseal(HELLO)), ntc_beta_k=200)
     ntc = [SampleMessage(i, 10_000 * (i + 1), 34_571, 21_405, 38, 60, 1, 0x18).encode() for i in range(3)]
-    block = dialect.feed(0.0, odd.encode() + b"".join(ntc))
+    block = decoder.feed(0.0, odd.encode() + b"".join(ntc))
     assert np.isnan(block["temperature_c"]).all()
-    assert dialect.counters["implausible"] == 3
+    assert decoder.counters["implausible"] == 3

@@ -589,7 +589,7 @@ class World:
     @contextlib.contextmanager
     def _board_seen(self) -> Iterator[None]:
         """The counters of the service's source are read."""
-        made = service.SerialBoard
+        made = service.SerialSource
 
         def make(*arguments: Any, **named: Any) -> Any:
             board = made(*arguments, **named)
@@ -598,11 +598,11 @@ class World:
                 board._door.opened = partial(self._reopened, self.process, board._door, board._door.opened)
             return board
 
-        service.SerialBoard = make
+        service.SerialSource = make
         try:
             yield
         finally:
-            service.SerialBoard = made
+            service.SerialSource = made
 
 
 KILL_S = 6.0

@@ -8,7 +8,7 @@ A stack of n cells as one two-terminal object under the current i, positive when
     v_inf(I) = a + A ln I - B ln(1 - I / i_L)                                    Larminie and Dicks (2003), 3.4 to 3.7
 
 T in K, pressures in atm, I in A: a is the loss at 1 A, and e^(-a / A) A the exchange current. v is the activation and
-concentration overpotential of the whole stack. r, A and a are of the file's temperature and follow the stack's (``give_file``).
+concentration overpotential of the whole stack. r, A and a are of the file's temperature and follow the stack's (``load_file_constants``).
 Over a sample whose current is held, e^(-v / A) is a first-order lag of time constant A C / I: the step is exact for every length.
 
 Correa et al. take v / v_inf(I) in place of the exponential. Both end at v_inf; theirs does so v_inf / A (6 to 9) times more
@@ -60,14 +60,14 @@ def nernst(temperature_k: float, hydrogen_atm: float, oxygen_atm: float) -> floa
 
 
 @njit(cache=True)
-def give(given: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - a cell's needs the SOC
+def load_constants(given: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - a cell's needs the SOC
     """The file's parameters, and E at ``temperature_c`` [C], into ``given``; ``p`` is a record of ESTIMATOR_SETTINGS."""
-    give_file(given, p.learning.file, temperature_c)
+    load_file_constants(given, p.learning.file, temperature_c)
 
 
 @njit(cache=True)
-def give_file(given: Floats, file: Floats, temperature_c: float) -> None:
-    """As ``give``, of what the file gives, shape (16,); without a temperature (NaN) at the file's."""
+def load_file_constants(given: Floats, file: Floats, temperature_c: float) -> None:
+    """As ``load_constants``, of what the file gives, shape (16,); without a temperature (NaN) at the file's."""
     for j in range(len(NAMES)):
         given[j] = file[1 + j]
     of_file = 273.15 + file[TEMPERATURE]
@@ -155,7 +155,7 @@ def output(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float
 
 
 @njit(cache=True)
-def settle(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
+def steady_state(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
     """The state that ``current_a`` leads to, and its sensitivities, whatever they were; arguments as of ``advance``."""
     dx[1] = 0.0
     x[0], x[1] = settled(theta, given, current_a, dx[0]), 0.0

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bms_estimator.kernels.cell_model.current_interpolation import interpolated_current
-from bms_estimator.kernels.cell_model.fuel_cell import advance, give_file, output, settle
+from bms_estimator.kernels.cell_model.fuel_cell import advance, load_file_constants, output, steady_state
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
@@ -28,9 +28,9 @@ def open_loop(
     voltage_v, psi = np.empty(n), np.zeros((n, theta.size))
     x, dx, given = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)
     for j in range(n):
-        give_file(given, file, temperature_c[j])
+        load_file_constants(given, file, temperature_c[j])
         if j == 0:
-            settle(x, dx, theta, given, current_a[0])
+            steady_state(x, dx, theta, given, current_a[0])
         else:
             dt_s = time_s[j] - time_s[j - 1]
             advance(x, dx, theta, given, interpolated_current(dt_s, current_a[j - 1], current_a[j]), dt_s)
@@ -45,7 +45,7 @@ def polarisation(file: Floats, theta: Floats, current_a: Floats, temperature_c: 
     voltage_v, psi = np.empty(n), np.zeros((n, theta.size))
     x, dx, given = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)
     for j in range(n):
-        give_file(given, file, temperature_c[j])
-        settle(x, dx, theta, given, current_a[j])
+        load_file_constants(given, file, temperature_c[j])
+        steady_state(x, dx, theta, given, current_a[j])
         voltage_v[j] = output(x, dx, theta, given, current_a[j], psi[j])
     return voltage_v, psi

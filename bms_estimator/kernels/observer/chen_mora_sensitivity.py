@@ -32,7 +32,7 @@ def load_constants(given: Floats, p: Record, soc: float, temperature_c: float) -
 
 
 @njit(cache=True)
-def settle(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:  # noqa: ARG001
+def steady_state(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:  # noqa: ARG001
     """The states of a cell at rest: its branches are empty."""
     x[:] = 0.0
     dx[:] = 0.0

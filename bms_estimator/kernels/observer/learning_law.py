@@ -7,7 +7,7 @@ the observer's.
 import math
 
 from bms_estimator.kernels.cell_model.current_interpolation import interpolated_current
-from bms_estimator.kernels.observer.learning_model import advance, give, output, steady_state, write
+from bms_estimator.kernels.observer.learning_model import advance, load_constants, output, steady_state, write
 from bms_estimator.kernels.observer.observer import lock_transition, update_margins
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
@@ -50,7 +50,7 @@ def initialize_states_at_rest(s: Record, p: Record, voltage_v: float) -> None:
     Nothing is learned until the states would have forgotten that they were otherwise.
     """
     m, q, o = s.learning, p.learning, s.observer
-    give(q.model, m.given, p, o.soc, m.temperature_c)
+    load_constants(q.model, m.given, p, o.soc, m.temperature_c)
     steady_state(q.model, m.x, m.dx, m.theta, m.given, o.current_a)
     injects = math.isfinite(q.offset_s)
     m.offset_v = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) if injects else 0.0
@@ -65,7 +65,7 @@ def initialize_states_at_rest(s: Record, p: Record, voltage_v: float) -> None:
 def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v: float) -> None:
     """Advance by one sample at the SOC that the observer has; the current was ``before_a`` [A] at the sample before."""
     m, q, o = s.learning, p.learning, s.observer
-    give(q.model, m.given, p, o.soc, m.temperature_c)
+    load_constants(q.model, m.given, p, o.soc, m.temperature_c)
     unmeasured_s = p.observer.unmeasured_s
     held_a = interpolated_current(dt_s, before_a, o.current_a, unmeasured_s)
     advance(q.model, m.x, m.dx, m.theta, m.given, held_a, dt_s)

@@ -26,21 +26,21 @@ NAMES = {Model.CHEN_MORA: chen_mora_sensitivity.NAMES, Model.FUEL_CELL: fuel_cel
 
 
 @njit(cache=True)
-def give(model: int, given: Floats, p: Record, soc: float, temperature_c: float) -> None:
+def load_constants(model: int, given: Floats, p: Record, soc: float, temperature_c: float) -> None:
     """What is not learned, at this sample; ``p`` is a record of ESTIMATOR_SETTINGS."""
     if model == _CHEN_MORA:
         chen_mora_sensitivity.load_constants(given, p, soc, temperature_c)
     elif model == _FUEL_CELL:
-        fuel_cell.give(given, p, soc, temperature_c)
+        fuel_cell.load_constants(given, p, soc, temperature_c)
 
 
 @njit(cache=True)
 def steady_state(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
     """The states and their derivatives at a first sample, when nobody knows what was before; in place."""
     if model == _CHEN_MORA:
-        chen_mora_sensitivity.settle(x, dx, theta, given, current_a)
+        chen_mora_sensitivity.steady_state(x, dx, theta, given, current_a)
     elif model == _FUEL_CELL:
-        fuel_cell.settle(x, dx, theta, given, current_a)
+        fuel_cell.steady_state(x, dx, theta, given, current_a)
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""Devices that tell of the pack reading by reading: what their dialects have in common."""
+"""Devices that tell of the pack reading by reading: what their decoders have in common."""
 
 import math
 from abc import abstractmethod

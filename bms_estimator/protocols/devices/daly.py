@@ -39,7 +39,7 @@ def question(host: int, command: int) -> bytes:
     return sealed(bytes((START, host, command, DATA_BYTES)) + bytes(DATA_BYTES))
 
 
-class DalyDialect(PolledProtocol):
+class DalyProtocol(PolledProtocol):
     """The conversation with a Daly BMS: how many cells it has until that is known, then cells, probes, pack in each round.
 
     Args:
@@ -133,7 +133,7 @@ class DalyDialect(PolledProtocol):
 
 DEVICE = Device(
     "daly",
-    lambda sign, address: DalyDialect(current_sign=sign, address=address),
+    lambda sign, address: DalyProtocol(current_sign=sign, address=address),
     Resolution(9600, None, 1.0, 0.1, 0.1, 2.5),
 )
 """One frame has voltage and current in steps of 0.1 V and 0.1 A. Users found its parameter DfilterCur at 2 A and at 2.5 A

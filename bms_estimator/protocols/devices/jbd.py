@@ -37,7 +37,7 @@ def question(register: int) -> bytes:
     return bytes((START, READ, register, 0)) + checksum(bytes((register, 0))) + bytes((END,))
 
 
-class JbdDialect(PolledProtocol):
+class JbdProtocol(PolledProtocol):
     """The conversation with a JBD BMS: name until it is known, then cells and basic information in each round.
 
     Args:
@@ -98,7 +98,7 @@ class JbdDialect(PolledProtocol):
 
 DEVICE = Device(
     "jbd",
-    lambda sign, _: JbdDialect(current_sign=sign),
+    lambda sign, _: JbdProtocol(current_sign=sign),
     Resolution(9600, "charge_positive", 1.0, 0.01, 0.01, 0.5),
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. Users saw nothing below 0.2 A, and nothing below 0.5 A on one of

@@ -72,7 +72,7 @@ def question(address: int) -> bytes:
     return frame + crc16(frame)
 
 
-class JkDialect(PolledProtocol):
+class JkProtocol(PolledProtocol):
     """The conversation with a JK-BMS.
 
     Args:
@@ -201,7 +201,7 @@ def _number(content: bytes) -> int:
 
 DEVICE = Device(
     "jk",
-    lambda sign, address: JkDialect(current_sign=sign, address=address),
+    lambda sign, address: JkProtocol(current_sign=sign, address=address),
     Resolution(115_200, "charge_positive", 1.0, 0.01, 0.01, 0.7),
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. One board showed nothing below 0.7 A

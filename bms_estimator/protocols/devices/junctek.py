@@ -29,7 +29,7 @@ VALUE_DIGITS = 12
 TOO_LONG = "bytes come that are no lines of a Junctek monitor: it has 115200 baud"
 
 
-class JunctekDialect(ReadingProtocol):
+class JunctekProtocol(ReadingProtocol):
     """Lines of a battery monitor to samples. It is asked once a second.
 
     Args:
@@ -114,7 +114,7 @@ class JunctekDialect(ReadingProtocol):
 
 DEVICE = Device(
     "junctek",
-    lambda sign, _: JunctekDialect(current_sign=sign),
+    lambda sign, _: JunctekProtocol(current_sign=sign),
     Resolution(115_200, "charge_positive", 1.0, 0.01, 0.1),
 )
 """The protocol has steps of 10 mV and 10 mA; the makers specify 0.1 A."""

@@ -32,7 +32,7 @@ DIGITS = 9
 ABSENT = "-"
 
 
-class PylontechDialect(ReadingProtocol):
+class PylontechProtocol(ReadingProtocol):
     """The tables of a console to samples: mean voltage, sum of the currents, mean temperature of the cells.
 
     Cells are those of all batteries one after the other, each battery's as it told them last, if that was of late.
@@ -167,7 +167,7 @@ def _mean(values: Sequence[float]) -> float:
 
 DEVICE = Device(
     "pylontech",
-    lambda sign, _: PylontechDialect(current_sign=sign),
+    lambda sign, _: PylontechProtocol(current_sign=sign),
     Resolution(115_200, "charge_positive", 2.0, 0.001, 0.01, 0.1),
 )
 """The table has steps of 1 mV and 1 mA. In public captures the smallest current that is not 0 is 149 mA, beside many of 0."""

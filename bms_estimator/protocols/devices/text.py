@@ -27,7 +27,7 @@ SHOWN_BYTES = 60
 """So much of a line that says nothing is shown."""
 
 
-class TextDialect(DeviceProtocol):
+class TextProtocol(DeviceProtocol):
     """Lines of a board to samples. It takes no commands.
 
     Lines that say nothing are counted and skipped. Lines that tell no ``time_s`` share the time since the read before
@@ -133,7 +133,7 @@ class TextDialect(DeviceProtocol):
 
 DEVICE = Device(
     "text",
-    lambda sign, _: TextDialect(current_sign=sign),
+    lambda sign, _: TextProtocol(current_sign=sign),
     Resolution(period_s=1.0),
 )
 """Boards print at their own pace, usually once a second."""

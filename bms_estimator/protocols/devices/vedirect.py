@@ -22,7 +22,7 @@ HEX = re.compile(rb":[0-9A-Fa-f]*\r?\n")
 END = b"Checksum\t"
 
 
-class VeDirectDialect(ReadingProtocol):
+class VeDirectProtocol(ReadingProtocol):
     """Blocks of a battery monitor to samples. It speaks by itself and is sent nothing.
 
     Args:
@@ -92,7 +92,7 @@ class VeDirectDialect(ReadingProtocol):
 
 DEVICE = Device(
     "vedirect",
-    lambda sign, _: VeDirectDialect(current_sign=sign),
+    lambda sign, _: VeDirectProtocol(current_sign=sign),
     Resolution(19_200, "charge_positive", 1.0, 0.01, 0.01),
 )
 """The text has steps of 1 mV and 1 mA; the data sheets of BMV and SmartShunt specify 10 mV and 10 mA."""

@@ -38,7 +38,7 @@ class _Told(Command):
     acknowledged: bool = False
 
 
-class BoardDialect(DeviceProtocol):
+class BoardProtocol(DeviceProtocol):
     """The conversation with a board. It samples by itself: before a whole frame has come it is sent nothing.
 
     Args:

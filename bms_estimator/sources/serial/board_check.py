@@ -31,7 +31,7 @@ class BoardCheck:
     """Lets the reads of one board pass; those of a port opened anew wait until its serial number is known.
 
     Args:
-        make: A dialect that hears them meanwhile.
+        make: A decoder that hears them meanwhile.
         serial: Of the pack's board, as the settings have it; empty: as remembered, else of the first board that comes.
         memory: What outlives a restart; None: nothing does.
     """
@@ -76,8 +76,8 @@ class BoardCheck:
         finally:
             self._looking = False
 
-    def accept(self, read: Chunk, dialect: DeviceProtocol) -> Sequence[Chunk]:
-        """The reads that ``dialect``, which hears the pack's board, may be fed now.
+    def accept(self, read: Chunk, decoder: DeviceProtocol) -> Sequence[Chunk]:
+        """The reads that ``decoder``, which hears the pack's board, may be fed now.
 
         Raises:
             OtherBoardError: Neither this one nor those after it, until the port is opened anew.
@@ -86,7 +86,7 @@ class BoardCheck:
             self._drop((read,))
             return ()
         if self.pending_protocol is None:
-            if self.serial and (swapped := dialect.serial_number_in(read[1])) is not None:
+            if self.serial and (swapped := decoder.serial_number_in(read[1])) is not None:
                 self._check(swapped, (read,))
             return (read,)
         if len(self._held) == MAX_PENDING_READS:

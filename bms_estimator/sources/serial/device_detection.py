@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Self, TypeVar
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
-from bms_estimator.protocols.devices.text import TextDialect
+from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.protocols.firmware.frame_decoder import FrameFault
 from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command
-from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardDialect
+from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardProtocol
 from bms_estimator.protocols.registry import PROTOCOLS, make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
@@ -67,18 +67,18 @@ def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
     """
     rates = _rates() if baud is None else {baud: list(PROTOCOLS)}
     silence = "silent"
-    BoardDialect().feed(0.0, b"\0\n")  # loads its kernel: nothing compiles while an answer is waited for
+    BoardProtocol().feed(0.0, b"\0\n")  # loads its kernel: nothing compiles while an answer is waited for
     try:
         with open_port(port, next(iter(rates)), READ_S) as line:
             for rate, protocols in rates.items():
                 line.baudrate = rate
                 line.reset_input_buffer()
-                dialects = {name: _prober(name) for name in protocols}
-                patience_s = BOOT_TIMEOUT_S if rate == BAUD and baud is None else PROTOCOL_TIMEOUT_S * len(dialects)
-                if (found := _ask_in_turns(line, dialects, patience_s)) is not None:
-                    return DetectedDevice(found, rate, *_described(dialects[found]))
+                decoders = {name: _prober(name) for name in protocols}
+                patience_s = BOOT_TIMEOUT_S if rate == BAUD and baud is None else PROTOCOL_TIMEOUT_S * len(decoders)
+                if (found := _ask_in_turns(line, decoders, patience_s)) is not None:
+                    return DetectedDevice(found, rate, *_described(decoders[found]))
                 if silence == "silent":
-                    silence = _silence(list(dialects.values()))
+                    silence = _silence(list(decoders.values()))
     except NoPortError as error:
         return str(error).removeprefix(f"{port}: ")
     except OSError as error:
@@ -98,36 +98,36 @@ def _rates() -> Mapping[int, Sequence[str]]:
 
 
 def _prober(protocol: str) -> DeviceProtocol:
-    dialect = make_protocol(SensorSettings.model_validate({"protocol": protocol}))
-    dialect.probing = True
-    return dialect
+    decoder = make_protocol(SensorSettings.model_validate({"protocol": protocol}))
+    decoder.probing = True
+    return decoder
 
 
-def _ask_in_turns(line: "serial.Serial", dialects: Mapping[str, DeviceProtocol], patience_s: float) -> str | None:
+def _ask_in_turns(line: "serial.Serial", decoders: Mapping[str, DeviceProtocol], patience_s: float) -> str | None:
     """Have all hear, and one of them ask at a time. Returns the protocol of the first that knows who is there.
 
     Raises:
         OSError: The port is lost.
     """
-    turns, next_s = itertools.cycle(dialects.values()), 0.0
+    turns, next_s = itertools.cycle(decoders.values()), 0.0
     end_s = time.monotonic() + patience_s
     while (now_s := time.monotonic()) < end_s:
         if now_s >= next_s:
-            questions = (dialect.next_output(now_s) for dialect in itertools.islice(turns, len(dialects)))
+            questions = (decoder.next_output(now_s) for decoder in itertools.islice(turns, len(decoders)))
             if question := next(filter(None, questions), b""):
                 line.write(question)
                 next_s = now_s + QUERY_INTERVAL_S
         data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
-        for name, dialect in dialects.items():
-            dialect.feed(now_s, data)
-            if dialect.description:
+        for name, decoder in decoders.items():
+            decoder.feed(now_s, data)
+            if decoder.description:
                 return name
     return None
 
 
-def _described(dialect: DeviceProtocol) -> tuple[str, int | None]:
+def _described(decoder: DeviceProtocol) -> tuple[str, int | None]:
     """What it is, and its cells."""
-    return dialect.description or "", dialect.cells.shape[1] or None
+    return decoder.description or "", decoder.cells.shape[1] or None
 
 
 class BoardClient:
@@ -143,7 +143,7 @@ class BoardClient:
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
         self._port, self._line = port, open_port(port, baud, ASK_AGAIN_S)
-        self._board, self._text = BoardDialect(), TextDialect()
+        self._board, self._text = BoardProtocol(), TextProtocol()
 
     def __enter__(self) -> Self:
         """The board."""
@@ -182,7 +182,7 @@ class BoardClient:
             UserError: As ``tell``.
         """
         hello = self.tell(set_rate_command(REFERENCE_RATE_HZ))
-        now = BoardDialect()
+        now = BoardProtocol()
         now.feed(0.0, replace(hello, bandgap_sum=0, bandgap_count=0).encode())
 
         def measured() -> float | None:
@@ -191,7 +191,7 @@ class BoardClient:
         return self._ask([now], measured, REFERENCE_S)
 
     def _ask(
-        self, dialects: Sequence[DeviceProtocol], answer: Callable[[], Answer | None], patience_s: float | None = None
+        self, decoders: Sequence[DeviceProtocol], answer: Callable[[], Answer | None], patience_s: float | None = None
     ) -> Answer:
         """The answer.
 
@@ -205,21 +205,21 @@ class BoardClient:
             return answer()
 
         try:
-            answered = _converse(self._line, dialects, answer_or_text, patience_s)
+            answered = _converse(self._line, decoders, answer_or_text, patience_s)
         except OSError as error:
             raise UserError(f"{self._port}: lost: {error}") from None
         if answered is None:
-            raise UserError(f"{self._port}: {_silence(dialects)}")
+            raise UserError(f"{self._port}: {_silence(decoders)}")
         return answered
 
 
 def _converse(
     line: "serial.Serial",
-    dialects: Sequence[DeviceProtocol],
+    decoders: Sequence[DeviceProtocol],
     answer: Callable[[], Answer | None],
     patience_s: float | None = None,
 ) -> Answer | None:
-    """Have dialects hear and talk until there is an answer; None where none comes.
+    """Have decoders hear and talk until there is an answer; None where none comes.
 
     Raises:
         OSError: The port is lost.
@@ -228,16 +228,16 @@ def _converse(
     while (now_s := time.monotonic()) < end_s:
         if (answered := answer()) is not None:
             return answered
-        for dialect in dialects:
-            line.write(dialect.next_output(now_s))
+        for decoder in decoders:
+            line.write(decoder.next_output(now_s))
         data = line.read(max(1, min(line.in_waiting, READ_BYTES)))
-        for dialect in dialects:
-            dialect.feed(now_s, data)
+        for decoder in decoders:
+            decoder.feed(now_s, data)
     return answer()
 
 
-def _silence(dialects: Sequence[DeviceProtocol]) -> str:
+def _silence(decoders: Sequence[DeviceProtocol]) -> str:
     """Why none of them knows who is there."""
-    if not dialects[0].counters["bytes_received"]:
+    if not decoders[0].counters["bytes_received"]:
         return "silent"
-    return next((dialect.fault for dialect in dialects if dialect.fault), "no board answers")
+    return next((decoder.fault for decoder in decoders if decoder.fault), "no board answers")

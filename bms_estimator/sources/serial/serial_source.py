@@ -1,4 +1,4 @@
-"""The board on a serial port, whatever it speaks: line and dialect tied together."""
+"""The board on a serial port, whatever it speaks: line and decoder tied together."""
 
 import asyncio
 import contextlib
@@ -45,13 +45,13 @@ log = structlog.get_logger(__name__)
 class SerialSource:
     """Async source of SAMPLE blocks from a board.
 
-    All that makes a sample passes ``dialect.feed(arrival_s, data)``: a capture of these calls replays to the same bits.
+    All that makes a sample passes ``decoder.feed(arrival_s, data)``: a capture of these calls replays to the same bits.
     It stays with the pack's board, and looks for it on other ports, as ``BoardCheck`` and ``PortDiscovery`` say.
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
         memory: Remembers the pack's board, if it can tell its serial number; None: it is known for this run only.
-        tap: Gets the same (arrival time, bytes) as the dialect.
+        tap: Gets the same (arrival time, bytes) as the decoder.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Before a missing or lost port is tried again [s].
@@ -74,7 +74,7 @@ class SerialSource:
         self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
         self._monotonic = monotonic
         make_protocol(settings).feed(0.0, b"\0\n")  # loads its kernel: nothing compiles once bytes come
-        self._dialect = make_protocol(settings)
+        self._decoder = make_protocol(settings)
         tells_serial = settings.protocol == "binary"  # what prints text could never be told from another
         self._door = BoardCheck(
             lambda: make_protocol(settings), settings.serial or "", memory if tells_serial else None
@@ -100,9 +100,9 @@ class SerialSource:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The dialect's, ``unadmitted_bytes`` of the doorkeeper, ``reconnects``, and of a tap ``missed_reads``."""
+        """The decoder's, ``unadmitted_bytes`` of the doorkeeper, ``reconnects``, and of a tap ``missed_reads``."""
         counters = {
-            **self._dialect.counters,
+            **self._decoder.counters,
             "unadmitted_bytes": self._door.unadmitted_bytes,
             "reconnects": max(self._line.openings - 1, 0),
         }
@@ -116,17 +116,17 @@ class SerialSource:
     @property
     def board(self) -> Mapping[str, str]:
         """What the board said of itself."""
-        return self._dialect.board
+        return self._decoder.board
 
     @property
     def cells(self) -> CellBlock:
         """Beside the samples of the last block."""
-        return self._dialect.cells
+        return self._decoder.cells
 
     @property
     def clock_ppm(self) -> float | None:
         """How much faster the board's clock runs than the monotonic one."""
-        return self._dialect.clock_ppm
+        return self._decoder.clock_ppm
 
     def pulse(self) -> SourceHealth:
         """Whether line and task live."""
@@ -166,11 +166,11 @@ class SerialSource:
         """The reads that are decoded now."""
         if not read[1]:
             self._openings += 1
-            self._dialect.on_port_opened()
+            self._decoder.on_port_opened()
             self._door.opened()
             return ()
         try:
-            return self._door.accept(read, self._dialect)
+            return self._door.accept(read, self._decoder)
         except OtherBoardError as error:
             self._leave(f"{self._path}: refused: {error}")
             return ()
@@ -185,7 +185,7 @@ class SerialSource:
     @property
     def _listener(self) -> DeviceProtocol:
         """Who hears the device that has been heard last."""
-        return self._door.pending_protocol or self._dialect
+        return self._door.pending_protocol or self._decoder
 
     def _send_due(self) -> None:
         """Send what is due to the device that has been heard last, if it is the one on the port now."""
@@ -195,7 +195,7 @@ class SerialSource:
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         if self._tap is not None:
             self._tap.write(arrival_s, data)
-        block = self._dialect.feed(arrival_s, data)
+        block = self._decoder.feed(arrival_s, data)
         self._decoded.set()
         return block
 
@@ -207,7 +207,7 @@ class SerialSource:
         Raises:
             UserError: The board is not connected, takes no commands, does not answer, or refuses.
         """
-        await self._ask(lambda: self._dialect.command("current_zero"))
+        await self._ask(lambda: self._decoder.command("current_zero"))
 
     async def relay(self, relay: Relay) -> None:
         """Have the board set its relay pin; somebody must iterate over the blocks meanwhile.
@@ -215,7 +215,7 @@ class SerialSource:
         Raises:
             UserError: As ``current_zero``.
         """
-        await self._ask(lambda: self._dialect.relay(relay))
+        await self._ask(lambda: self._decoder.relay(relay))
 
     async def _ask(self, ask: Callable[[], Command]) -> None:
         """Have a command given, after those before it, and wait for its answer.
@@ -278,11 +278,11 @@ class SerialSource:
         if not self._refused:
             self._message = f"{path}: open, no frame yet"
             log.info("port opened", port=path, baud=self._settings.baud)
-        heard_s, frames = self._monotonic(), self._dialect.counters["frames_received"]
+        heard_s, frames = self._monotonic(), self._decoder.counters["frames_received"]
         while not self._line.lost.is_set():
             await self._talk()
             now_s = self._monotonic()
-            counters = self._dialect.counters
+            counters = self._decoder.counters
             if counters["frames_received"] != frames:
                 heard_s, frames = now_s, counters["frames_received"]
                 self._door.remember_board(self.board, now_s)

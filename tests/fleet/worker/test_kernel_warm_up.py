@@ -11,7 +11,7 @@ from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.kernels import packed_record
 from bms_estimator.kernels.accumulators import charge_energy, hour, publish_window
 load_fleet_kernels()
-kernels = packed_record.pack, packed_record.unpack, charge_energy.add_flow, hour.add_rows, publish_window.add_window
+kernels = packed_record.pack, packed_record.unpack, charge_energy.accumulate_charge_energy, hour.accumulate_hour, publish_window.accumulate_window
 print([len(kernel.signatures) for kernel in kernels])
 """
 

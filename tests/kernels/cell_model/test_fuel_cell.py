@@ -26,13 +26,13 @@ lengths = st.floats(1e-4, 10.0)
 
 def given_by_file() -> np.ndarray:
     values = np.zeros(8)
-    fuel_cell.give_file(values, PEM.a, np.nan)
+    fuel_cell.load_file_constants(values, PEM.a, np.nan)
     return values
 
 
 def settled(current_a: float, theta: np.ndarray = THETA) -> tuple[np.ndarray, np.ndarray]:
     x, dx = np.zeros(2), np.zeros((2, 8))
-    fuel_cell.settle(x, dx, theta, given_by_file(), current_a)
+    fuel_cell.steady_state(x, dx, theta, given_by_file(), current_a)
     return x, dx
 
 
@@ -98,7 +98,7 @@ def test_a_small_step_settles_with_the_resistance_of_tafel_s_slope(current_a: fl
     reaction_a = current_a + values[fuel_cell.INTERNAL]
     tau_s = values[fuel_cell.C_DL] * values[fuel_cell.TAFEL] / reaction_a
     x, dx = np.zeros(2), np.zeros((2, 8))
-    fuel_cell.settle(x, dx, np.zeros(8), values, current_a)
+    fuel_cell.steady_state(x, dx, np.zeros(8), values, current_a)
     start_v = x[0]
     fuel_cell.advance(x, dx, np.zeros(8), values, 1.001 * current_a, tau_s)
     reached = (x[0] - start_v) / (values[fuel_cell.TAFEL] / reaction_a * 0.001 * current_a)
@@ -124,7 +124,7 @@ def test_a_settled_record_lies_on_the_polarisation_curve() -> None:
 @pytest.mark.parametrize("celsius", [20.0, 60.0])
 def test_losses_follow_the_temperature_as_mann_s_coefficients_do(celsius: float) -> None:
     values, kelvin = np.zeros(8), 273.15 + celsius
-    fuel_cell.give_file(values, PEM.a, celsius)
+    fuel_cell.load_file_constants(values, PEM.a, celsius)
     cells = mann_stack.CELLS
     assert values[fuel_cell.TAFEL] == pytest.approx(-mann_stack.XI_4 * kelvin * cells, rel=1e-3)
     assert values[fuel_cell.ACTIVATION] == pytest.approx(cells * mann_stack._activation_v(kelvin), rel=0.01)
@@ -140,7 +140,7 @@ def test_charge_and_overload_leave_the_model_finite() -> None:
 
 
 def test_the_cell_and_the_fuel_cell_are_two_files_of_one_shape() -> None:
-    for function in ("give", "settle", "advance", "output", "write"):
+    for function in ("load_constants", "steady_state", "advance", "output", "write"):
         shapes = [
             tuple(inspect.signature(getattr(m, function).py_func).parameters)
             for m in (chen_mora_sensitivity, fuel_cell)

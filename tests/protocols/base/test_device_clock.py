@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.protocols.base.device_clock import LAG_S, DeviceClock
-from bms_estimator.protocols.devices.text import TextDialect
+from bms_estimator.protocols.devices.text import TextProtocol
 
 
 @pytest.mark.parametrize(
@@ -54,9 +54,9 @@ def test_it_never_runs_back_and_never_far_ahead_of_the_arrivals(stamps: list[tup
 
 
 def test_a_line_tells_its_time_in_seconds():
-    dialect = TextDialect()
+    decoder = TextProtocol()
     times = [
-        dialect.feed(at, b'{"voltage":1,"current":0,"time_s":%.1f}\n' % told)["time_s"][0]
+        decoder.feed(at, b'{"voltage":1,"current":0,"time_s":%.1f}\n' % told)["time_s"][0]
         for at, told in [(1, 5), (9, 6.5)]
     ]
     assert times == [0.0, 1.5]

@@ -40,26 +40,26 @@ streams = st.lists(
 ).map(b"".join)
 
 
-def dialect(protocol: str, **options: object) -> PolledProtocol:
+def decoder(protocol: str, **options: object) -> PolledProtocol:
     return cast("PolledProtocol", make_protocol(SensorSettings.model_validate({"protocol": protocol, **options})))
 
 
-def fed(dialect: PolledProtocol, *reads: bytes, arrival_s: float = 1.0) -> tuple[SampleBlock, list[list[float]]]:
+def fed(decoder: PolledProtocol, *reads: bytes, arrival_s: float = 1.0) -> tuple[SampleBlock, list[list[float]]]:
     """Samples of reads that come at once, and their cells."""
     blocks, cells = [], []
     for read in reads:
-        blocks.append(dialect.feed(arrival_s, read))
-        cells += [[v for v in row if v == v] for row in dialect.cells.tolist()] or [[]] * blocks[-1].size
+        blocks.append(decoder.feed(arrival_s, read))
+        cells += [[v for v in row if v == v] for row in decoder.cells.tolist()] or [[]] * blocks[-1].size
     return np.concatenate(blocks), cells
 
 
-def faults(dialect: PolledProtocol) -> dict[str, int]:
-    return {name: count for name in FAULTS if (count := dialect.counters[name])}
+def faults(decoder: PolledProtocol) -> dict[str, int]:
+    return {name: count for name in FAULTS if (count := decoder.counters[name])}
 
 
 @pytest.mark.parametrize("published", PUBLISHED.values(), ids=list(PUBLISHED))
 def test_a_published_answer_is_read_as_its_publisher_reads_it(published: Published) -> None:
-    device = dialect(published.protocol)
+    device = decoder(published.protocol)
     (sample,), cells = fed(device, published.frames)
     assert sample["voltage_v"] == published.voltage_v
     assert sample["current_a"] == published.current_a
@@ -74,7 +74,7 @@ def test_a_published_answer_is_read_as_its_publisher_reads_it(published: Publish
 @given(st.sampled_from(PROTOCOLS), streams, st.lists(st.integers(0, 3000), max_size=8))
 def test_no_bytes_make_it_raise_and_cutting_them_changes_no_value(protocol: str, data: bytes, cuts: list[int]) -> None:
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
-    whole, cut = dialect(protocol), dialect(protocol)
+    whole, cut = decoder(protocol), decoder(protocol)
     block, cells = fed(whole, data)
     cut_block, cut_cells = fed(cut, *(data[a:b] for a, b in itertools.pairwise(edges)))
     for name in ("voltage_v", "current_a", "temperature_c"):
@@ -92,7 +92,7 @@ def test_an_answer_with_one_wrong_byte_is_no_sample_and_the_next_one_is(name: st
     good = A_ROUND[name]
     last = 300 if name == "jk_newer" else 12  # of the answer that makes the sample
     for back in range(2, last):
-        device = dialect(OF[name])
+        device = decoder(OF[name])
         bad = bytearray(good)
         bad[len(good) - back - 8 * (name == "jk_newer")] ^= 0x55
         assert fed(device, bytes(bad))[0].size == 0
@@ -102,7 +102,7 @@ def test_an_answer_with_one_wrong_byte_is_no_sample_and_the_next_one_is(name: st
 
 
 def test_a_wrong_checksum_is_counted_and_said() -> None:
-    device = dialect("jbd")
+    device = decoder("jbd")
     fed(device, frames.JBD_BASIC[:-3] + b"\0\0\x77")
     assert device.counters["crc_errors"] == 1
     assert "wrong checksums" in (device.fault or "")
@@ -113,7 +113,7 @@ def test_a_wrong_checksum_is_counted_and_said() -> None:
 @pytest.mark.parametrize("name", A_ROUND)
 def test_of_an_answer_that_broke_off_nothing_is_left_when_the_next_one_comes(name: str) -> None:
     good = A_ROUND[name]
-    device = dialect(OF[name])
+    device = decoder(OF[name])
     assert fed(device, good[: len(good) - 20])[0].size == 0
     block, _ = fed(device, good)
     assert block["voltage_v"].tolist() == [PUBLISHED[name].voltage_v]
@@ -127,7 +127,7 @@ def test_an_answer_that_claims_to_be_longer_than_any_holds_up_nothing() -> None:
         ("daly", b"\xa5\x01\x90\x09"),
         ("jk", b"NW\x7f\xff" + bytes(8)),
     ):
-        device = dialect(protocol)
+        device = decoder(protocol)
         fed(device, long)
         assert device.counters["length_errors"] == 1
         assert "impossible lengths" in (device.fault or "")
@@ -137,21 +137,21 @@ def test_an_answer_that_claims_to_be_longer_than_any_holds_up_nothing() -> None:
 @pytest.mark.parametrize("name", A_ROUND)
 def test_noise_between_answers_is_skipped_and_counted(name: str) -> None:
     noise = bytes(range(1, 60))
-    device = dialect(OF[name])
+    device = decoder(OF[name])
     assert fed(device, noise, A_ROUND[name], noise[:40], A_ROUND[name])[0].size == 2
     assert faults(device) == {"noise_bytes": 99}
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_bytes_of_another_device_are_said_to_be_that(protocol: str) -> None:
-    device = dialect(protocol)
+    device = decoder(protocol)
     fed(device, 20 * b"V=13.2 I=4.1\r\n")
     assert "wrong baud rate, or another sensor.protocol?" in (device.fault or "")
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_its_own_questions_come_back_on_some_adapters_and_are_no_answers(protocol: str) -> None:
-    device = dialect(protocol)
+    device = decoder(protocol)
     for tick in range(100):
         block = device.feed(0.1 * tick, device.next_output(0.1 * tick))
         assert block.size == 0
@@ -160,27 +160,27 @@ def test_its_own_questions_come_back_on_some_adapters_and_are_no_answers(protoco
 
 
 def test_cells_whose_answer_did_not_come_stand_beside_no_later_sample() -> None:
-    device = dialect("jbd")
+    device = decoder("jbd")
     assert fed(device, frames.JBD_CELLS, frames.JBD_BASIC)[1] == [frames.JBD.cells_v]
     device.feed(10.0, frames.JBD_BASIC)
     assert device.cells is NO_CELLS or np.isnan(device.cells).all()
 
 
 def test_jbd_refuses_and_says_so() -> None:
-    device = dialect("jbd")
+    device = decoder("jbd")
     fed(device, bytes((0xDD, 0x03, 0x80, 0)) + jbd.checksum(b"\x80\0") + b"\x77")
     assert device.counters["refused"] == 1
     assert "refuses to tell register 0x03" in (device.fault or "")
 
 
 def test_jbd_without_a_probe_has_no_temperature() -> None:
-    (sample,), _ = fed(dialect("jbd"), frames.JBD_UNWIRED)
+    (sample,), _ = fed(decoder("jbd"), frames.JBD_UNWIRED)
     assert np.isnan(sample["temperature_c"])
     assert sample["voltage_v"] == 0.0
 
 
 def test_daly_loses_three_cells_with_a_frame_and_keeps_the_others_in_their_places() -> None:
-    device = dialect("daly")
+    device = decoder("daly")
     lost = frames.DALY_CELLS[:13] + frames.DALY_CELLS[26:]
     device.feed(1.0, frames.DALY_STATUS + lost + frames.DALY_PACK)
     np.testing.assert_equal(device.cells[0, :7], [3.383, 3.382, 3.380, np.nan, np.nan, np.nan, 3.380])
@@ -188,7 +188,7 @@ def test_daly_loses_three_cells_with_a_frame_and_keeps_the_others_in_their_place
 
 
 def test_daly_that_numbers_its_frames_from_zero_is_understood() -> None:
-    device = dialect("daly")
+    device = decoder("daly")
     cells = b"".join(
         sealed(frames.DALY_CELLS[i : i + 4] + bytes((i // 13,)) + frames.DALY_CELLS[i + 5 : i + 12])
         for i in range(0, len(frames.DALY_CELLS), 13)
@@ -198,7 +198,7 @@ def test_daly_that_numbers_its_frames_from_zero_is_understood() -> None:
 
 
 def test_daly_that_does_not_tell_how_many_cells_it_has_tells_them_all_the_same() -> None:
-    assert fed(dialect("daly"), frames.DALY_CELLS + frames.DALY_PACK)[1] == [frames.DALY.cells_v]
+    assert fed(decoder("daly"), frames.DALY_CELLS + frames.DALY_PACK)[1] == [frames.DALY.cells_v]
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_the_older_jk_tells_its_current_in_two_ways(version: int, raw: int, curr
     """The four examples of JK's document."""
     frame = frames.JK_OLD.frames[:-4].replace(b"\x84\x80\xd0", b"\x84" + raw.to_bytes(2, "big"))
     frame = frame.replace(b"\xc0\x01", bytes((0xC0, version)))
-    (sample,), _ = fed(dialect("jk"), jk.old_sealed(frame))
+    (sample,), _ = fed(decoder("jk"), jk.old_sealed(frame))
     assert sample["current_a"] == current_a
 
 
@@ -218,7 +218,7 @@ def test_the_older_jk_tells_temperatures_below_zero_above_a_hundred() -> None:
     frame = (
         frames.JK_OLD.frames[:-4].replace(b"\x81\x00\x1e", b"\x81\x00\x69").replace(b"\x82\x00\x1c", b"\x82\x00\x8c")
     )
-    (sample,), _ = fed(dialect("jk"), jk.old_sealed(frame))
+    (sample,), _ = fed(decoder("jk"), jk.old_sealed(frame))
     assert sample["temperature_c"] == -5.0  # the other probe is not there
 
 
@@ -234,17 +234,17 @@ def newer(address: int, **values: int) -> bytes:
 
 
 def test_the_newer_jk_is_positive_on_charge() -> None:
-    (sample,), _ = fed(dialect("jk"), newer(0, milliamperes=-9241))
+    (sample,), _ = fed(decoder("jk"), newer(0, milliamperes=-9241))
     assert sample["current_a"] == 9.241
 
 
 def test_of_several_packs_on_a_line_the_first_or_the_one_that_was_told_is_taken() -> None:
     two = newer(0, millivolts=51_000) + newer(2, millivolts=52_000)
-    first, told = dialect("jk"), dialect("jk", address=2)
+    first, told = decoder("jk"), decoder("jk", address=2)
     assert fed(first, two, two)[0]["voltage_v"].tolist() == [51.0, 51.0]
     assert fed(told, two, two)[0]["voltage_v"].tolist() == [52.0, 52.0]
     assert first.counters["other_packs"] == told.counters["other_packs"] == 2
-    only = dialect("jk", address=5)
+    only = decoder("jk", address=5)
     fed(only, two)
     assert only.fault == "pack 0 answers, and pack 5 is wanted: see sensor.address"
 
@@ -254,8 +254,8 @@ def test_the_sign_of_the_current_is_as_the_settings_say(protocol: str) -> None:
     device = SensorSettings(protocol=protocol)
     other = {"discharge_positive": "charge_positive", "charge_positive": "discharge_positive"}[device.current_sign]
     published = {"jbd": frames.JBD_DISCHARGING, "daly": frames.DALY, "jk": frames.JK_OLD}[protocol]
-    assert fed(dialect(protocol), published.frames)[0]["current_a"].tolist() == [published.current_a]
-    assert fed(dialect(protocol, current_sign=other), published.frames)[0]["current_a"].tolist() == [
+    assert fed(decoder(protocol), published.frames)[0]["current_a"].tolist() == [published.current_a]
+    assert fed(decoder(protocol, current_sign=other), published.frames)[0]["current_a"].tolist() == [
         -published.current_a
     ]
 
@@ -279,20 +279,20 @@ def questions(device: PolledProtocol, seconds: float, answer: bytes = b"") -> li
 
 @pytest.mark.parametrize("name", ["jbd", "daly", "jk_old"])
 def test_a_device_that_answers_is_asked_once_a_second_and_one_that_is_silent_again_and_again(name: str) -> None:
-    asked = questions(dialect(OF[name]), 20.0, A_ROUND[name])
+    asked = questions(decoder(OF[name]), 20.0, A_ROUND[name])
     assert min(np.diff([at_s for at_s, _ in asked])) >= GAP_S
     assert [question for _, question in asked].count(asked[-1][1]) == 20
-    assert len(questions(dialect(OF[name]), 20.0)) >= 20
+    assert len(questions(decoder(OF[name]), 20.0)) >= 20
 
 
 def test_what_is_known_is_not_asked_again() -> None:
-    asked = [question for _, question in questions(dialect("jbd"), 10.0, A_ROUND["jbd"])]
+    asked = [question for _, question in questions(decoder("jbd"), 10.0, A_ROUND["jbd"])]
     assert asked.count(jbd.question(jbd.NAME)) == 1
     assert asked.count(jbd.question(jbd.BASIC)) == 10
 
 
 def test_what_may_be_another_pack_is_asked_anew_how_many_cells_it_has() -> None:
-    device = dialect("daly")
+    device = decoder("daly")
     status = daly.question(daly.HOSTS[0], daly.STATUS)
     assert [question for _, question in questions(device, 5.0, A_ROUND["daly"])].count(status) == 1
     device.on_port_opened()
@@ -300,18 +300,18 @@ def test_what_may_be_another_pack_is_asked_anew_how_many_cells_it_has() -> None:
 
 
 def test_silence_makes_it_try_the_other_ways_of_asking() -> None:
-    asked = [question for _, question in questions(dialect("jk"), 20.0)]
+    asked = [question for _, question in questions(decoder("jk"), 20.0)]
     assert asked[: UNANSWERED_ROUNDS + 1] == [jk.OLD_QUESTION] * (UNANSWERED_ROUNDS + 1)
     assert {jk.question(1), jk.question(0)} < set(asked)
-    assert {question for _, question in questions(dialect("jk", address=7), 20.0)} == {
+    assert {question for _, question in questions(decoder("jk", address=7), 20.0)} == {
         jk.OLD_QUESTION,
         jk.question(7),
     }
-    assert {question[1] for _, question in questions(dialect("daly"), 20.0)} == {0x40, 0x80}
+    assert {question[1] for _, question in questions(decoder("daly"), 20.0)} == {0x40, 0x80}
 
 
 def test_the_way_that_is_answered_is_kept_to() -> None:
-    device = dialect("jk")
+    device = decoder("jk")
     questions(device, (UNANSWERED_ROUNDS + 1.5) * PACE_S)
     answered = [device.next_output(100.0 + tick) for tick in range(20) if device.feed(100.0 + tick, newer(1)).size]
     assert set(answered) == {jk.question(1)}
@@ -319,7 +319,7 @@ def test_the_way_that_is_answered_is_kept_to() -> None:
 
 def test_who_only_probes_sends_nothing_that_another_device_could_take_for_a_change() -> None:
     for protocol in PROTOCOLS:
-        device = dialect(protocol)
+        device = decoder(protocol)
         device.probing = True
         for _, question in questions(device, 60.0):
             assert question[:2] in (b"\xdd\xa5", b"\xa5\x40", b"\xa5\x80", b"NW")
@@ -327,7 +327,7 @@ def test_who_only_probes_sends_nothing_that_another_device_could_take_for_a_chan
 
 
 def test_a_line_on_which_another_asks_is_only_listened_to() -> None:
-    device = dialect("jk")
+    device = decoder("jk")
     device.feed(0.0, newer(0))
     asked = []
     for tick in range(300):  # the other has its answer every 6 s
@@ -343,7 +343,7 @@ def test_a_line_on_which_another_asks_is_only_listened_to() -> None:
 def test_many_reads_at_once_are_the_same_samples_and_cells() -> None:
     for name, data in A_ROUND.items():
         reads = [data[i : i + 50] for i in range(0, len(data), 50)] * 2
-        one, many = dialect(OF[name]), dialect(OF[name])
+        one, many = decoder(OF[name]), decoder(OF[name])
         blocks = [one.feed(float(i), read) for i, read in enumerate(reads)]
         ends = np.cumsum([len(read) for read in reads])
         block = many.feed_reads(np.arange(float(len(reads))), ends, np.frombuffer(2 * data, dtype=np.uint8))

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
-from bms_estimator.protocols.devices.junctek import ASK, JunctekDialect
-from bms_estimator.protocols.devices.pylontech import PylontechDialect
-from bms_estimator.protocols.devices.vedirect import VeDirectDialect
+from bms_estimator.protocols.devices.junctek import ASK, JunctekProtocol
+from bms_estimator.protocols.devices.pylontech import PylontechProtocol
+from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_meter import METERS
@@ -92,9 +92,9 @@ def bat(battery: int, cells_mv: list[int]) -> bytes:
 US2000_CELLS = [3379, 3379, 3379, 3379, 3381, 3378, 3378, 3378, 3380, 3379, 3380, 3380, 3378, 3380, 3380]
 
 DIALECTS: Mapping[str, Callable[[], DeviceProtocol]] = {
-    "vedirect": VeDirectDialect,
-    "junctek": JunctekDialect,
-    "pylontech": PylontechDialect,
+    "vedirect": VeDirectProtocol,
+    "junctek": JunctekProtocol,
+    "pylontech": PylontechProtocol,
 }
 
 
@@ -116,13 +116,13 @@ def values(block: SampleBlock) -> list[tuple[float, float]]:
     ],
 )
 def test_real_frames_say_what_is_known_of_them(name: str, sent: bytes, told: tuple[float, float, float]) -> None:
-    dialect = make_protocol(SensorSettings.model_validate({"protocol": name}))
-    block = dialect.feed(1.0, sent)
+    decoder = make_protocol(SensorSettings.model_validate({"protocol": name}))
+    block = decoder.feed(1.0, sent)
     assert [block[name].item() for name in ("voltage_v", "current_a", "temperature_c")] == pytest.approx(
         told, nan_ok=True
     )
-    assert dialect.fault is None
-    assert dialect.description is not None
+    assert decoder.fault is None
+    assert decoder.description is not None
 
 
 def test_a_shunt_wired_the_other_way_is_turned_by_the_setting() -> None:
@@ -138,11 +138,11 @@ def test_a_protocol_brings_its_baud_rate_sign_and_resolution_which_the_file_may_
 
 
 def test_history_and_hex_messages_between_blocks_disturb_none() -> None:
-    dialect = VeDirectDialect()
+    decoder = VeDirectProtocol()
     cut_in_two = BMV_NEXT.replace(b"\r\nSOC", HEX + b"\r\nSOC")
-    block = dialect.feed(1.0, BMV_NOW[9:] + BMV_HISTORY + HEX + BMV_NEXT + BMV_HISTORY + cut_in_two)
+    block = decoder.feed(1.0, BMV_NOW[9:] + BMV_HISTORY + HEX + BMV_NEXT + BMV_HISTORY + cut_in_two)
     assert values(block) == [(12.065, 7.626)] * 2
-    assert dialect.counters["checksum_errors"] == 0  # the half block at the start is no fault
+    assert decoder.counters["checksum_errors"] == 0  # the half block at the start is no fault
 
 
 @pytest.mark.parametrize(
@@ -170,57 +170,57 @@ def test_history_and_hex_messages_between_blocks_disturb_none() -> None:
 def test_a_damaged_frame_is_counted_and_said_until_a_good_one_comes(
     name: str, good: bytes, damaged: bytes, counter: str, said: str
 ) -> None:
-    dialect = DIALECTS[name]()
-    assert dialect.feed(1.0, good).size == 1
-    assert dialect.feed(2.0, damaged).size == 0
-    assert dialect.counters[counter] == 1
-    assert said in (dialect.fault or "")
-    assert dialect.feed(3.0, b"\n" + good + good).size >= 1
-    assert dialect.fault is None
+    decoder = DIALECTS[name]()
+    assert decoder.feed(1.0, good).size == 1
+    assert decoder.feed(2.0, damaged).size == 0
+    assert decoder.counters[counter] == 1
+    assert said in (decoder.fault or "")
+    assert decoder.feed(3.0, b"\n" + good + good).size >= 1
+    assert decoder.fault is None
 
 
 def test_a_charger_is_no_battery_monitor() -> None:
     body = lines("\nPID 0xA042\nV 12740\nI 800\nVPV 0\nPPV 0\nCS 0\nERR 0\nLOAD ON\nChecksum ")
-    dialect = VeDirectDialect()
-    assert dialect.feed(1.0, body + bytes((-sum(body) & 0xFF,))).size == 0
-    assert "product 0xA042 is no battery monitor" in (dialect.fault or "")
+    decoder = VeDirectProtocol()
+    assert decoder.feed(1.0, body + bytes((-sum(body) & 0xFF,))).size == 0
+    assert "product 0xA042 is no battery monitor" in (decoder.fault or "")
 
 
 def test_cells_of_all_batteries_stand_beside_the_stack_once_all_have_told_them() -> None:
-    dialect = PylontechDialect()
-    dialect.feed(1.0, bat(1, US2000_CELLS) + US2000_PWR)
-    assert dialect.cells.size == 0
-    block = dialect.feed(2.0, bat(2, [mv - 1 for mv in US2000_CELLS]) + US2000_PWR)
+    decoder = PylontechProtocol()
+    decoder.feed(1.0, bat(1, US2000_CELLS) + US2000_PWR)
+    assert decoder.cells.size == 0
+    block = decoder.feed(2.0, bat(2, [mv - 1 for mv in US2000_CELLS]) + US2000_PWR)
     assert block.size == 1
-    assert dialect.cells.shape == (1, 30)
-    assert dialect.cells[0, [0, 4, 15]].tolist() == pytest.approx([3.379, 3.381, 3.378])
+    assert decoder.cells.shape == (1, 30)
+    assert decoder.cells[0, [0, 4, 15]].tolist() == pytest.approx([3.379, 3.381, 3.378])
 
 
 def test_a_console_is_asked_for_the_stack_and_then_for_the_cells_of_each_in_turn() -> None:
-    dialect = PylontechDialect()
-    assert [dialect.next_output(now) for now in (0.0, 0.25)] == [b"pwr\n", b""]
-    dialect.feed(0.3, US2000_PWR)
-    assert dialect.next_output(0.5) == b"bat 2\n"
-    dialect.feed(0.6, bat(2, US2000_CELLS))
-    assert [dialect.next_output(now) for now in (0.75, 2.0)] == [b"", b"pwr\n"]
-    assert [dialect.next_output(now) for now in (6.0, 7.0)] == [b"", b"pwr\n"]  # no answer: again
+    decoder = PylontechProtocol()
+    assert [decoder.next_output(now) for now in (0.0, 0.25)] == [b"pwr\n", b""]
+    decoder.feed(0.3, US2000_PWR)
+    assert decoder.next_output(0.5) == b"bat 2\n"
+    decoder.feed(0.6, bat(2, US2000_CELLS))
+    assert [decoder.next_output(now) for now in (0.75, 2.0)] == [b"", b"pwr\n"]
+    assert [decoder.next_output(now) for now in (6.0, 7.0)] == [b"", b"pwr\n"]  # no answer: again
 
 
 def test_a_junctek_is_asked_once_a_second_and_after_the_port_was_opened_anew() -> None:
-    dialect = JunctekDialect()
-    assert [dialect.next_output(now) for now in (0.0, 0.5, 1.0)] == [ASK, b"", ASK]
-    dialect.on_port_opened()
-    assert dialect.next_output(1.1) == ASK
+    decoder = JunctekProtocol()
+    assert [decoder.next_output(now) for now in (0.0, 0.5, 1.0)] == [ASK, b"", ASK]
+    decoder.on_port_opened()
+    assert decoder.next_output(1.1) == ASK
 
 
 def test_cells_that_a_console_has_not_told_for_long_stand_beside_no_sample() -> None:
-    dialect = PylontechDialect()
-    dialect.feed(1.0, bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + US2000_PWR)
-    assert dialect.cells.shape == (1, 30)
-    dialect.feed(60.0, bat(1, US2000_CELLS) + US2000_PWR)
-    assert dialect.cells.shape == (1, 30)
-    assert dialect.feed(100.0, US2000_PWR).size == 1
-    assert dialect.cells.size == 0
+    decoder = PylontechProtocol()
+    decoder.feed(1.0, bat(1, US2000_CELLS) + bat(2, US2000_CELLS) + US2000_PWR)
+    assert decoder.cells.shape == (1, 30)
+    decoder.feed(60.0, bat(1, US2000_CELLS) + US2000_PWR)
+    assert decoder.cells.shape == (1, 30)
+    assert decoder.feed(100.0, US2000_PWR).size == 1
+    assert decoder.cells.size == 0
 
 
 @pytest.mark.parametrize(
@@ -302,6 +302,6 @@ async def test_a_device_on_a_line_is_heard_and_asked_as_it_wants(name: str, cell
 
 def test_silence_is_no_fault_of_the_dialect() -> None:
     for make in DIALECTS.values():
-        dialect = make()
-        assert dialect.feed(1.0, b"").size == 0
-        assert (dialect.fault, dialect.description) == (None, None)
+        decoder = make()
+        assert decoder.feed(1.0, b"").size == 0
+        assert (decoder.fault, decoder.description) == (None, None)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
-from bms_estimator.protocols.devices.text import LINE_BYTES, TextDialect
+from bms_estimator.protocols.devices.text import LINE_BYTES, TextProtocol
 
 lines = (
     st.binary(max_size=40)
@@ -21,27 +21,27 @@ streams = st.lists(lines, max_size=12).map(b"\n".join)
 cuttings = st.lists(st.integers(0, 8 * LINE_BYTES), max_size=12)
 
 
-def fed(data: bytes, cuts: list[int]) -> tuple[TextDialect, SampleBlock, list[list[float]]]:
-    """The dialect after ``data`` in pieces; its samples; their cells."""
-    dialect = TextDialect()
+def fed(data: bytes, cuts: list[int]) -> tuple[TextProtocol, SampleBlock, list[list[float]]]:
+    """The decoder after ``data`` in pieces; its samples; their cells."""
+    decoder = TextProtocol()
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     blocks, cells = [], []
     for a, b in itertools.pairwise(edges):
-        blocks.append(dialect.feed(1.0, data[a:b]))
-        cells += [[v for v in row if v == v] for row in dialect.cells.tolist()] or [[]] * blocks[-1].size
-    return dialect, np.concatenate(blocks), cells
+        blocks.append(decoder.feed(1.0, data[a:b]))
+        cells += [[v for v in row if v == v] for row in decoder.cells.tolist()] or [[]] * blocks[-1].size
+    return decoder, np.concatenate(blocks), cells
 
 
 @settings(max_examples=300)
 @given(streams, cuttings)
 def test_no_bytes_make_it_raise_and_cutting_them_changes_no_value(data: bytes, cuts: list[int]) -> None:
-    dialect, whole, cells = fed(data, [])
-    cut_dialect, cut, cut_cells = fed(data, cuts)
+    decoder, whole, cells = fed(data, [])
+    cut_decoder, cut, cut_cells = fed(data, cuts)
     for name in ("voltage_v", "current_a", "temperature_c"):
         assert whole[name].tobytes() == cut[name].tobytes()
     assert cells == cut_cells
-    assert (dialect.counters, dialect.fault) == (cut_dialect.counters, cut_dialect.fault)
-    assert dialect.counters["frames_received"] == whole.size
+    assert (decoder.counters, decoder.fault) == (cut_decoder.counters, cut_decoder.fault)
+    assert decoder.counters["frames_received"] == whole.size
 
 
 def test_the_end_of_a_line_that_is_too_long_is_no_line_of_its_own() -> None:
@@ -60,32 +60,32 @@ def test_the_end_of_a_line_that_is_too_long_is_no_line_of_its_own() -> None:
     ],
 )
 def test_the_first_line_that_says_nothing_is_shown_as_it_came(sent: bytes, shown: str) -> None:
-    dialect, _, _ = fed(b"half\n" + sent, [])
-    assert dialect.fault is not None
-    assert shown in dialect.fault
-    assert "baud" not in dialect.fault
-    dialect.feed(2.0, b"3.3,0.1\n")
-    assert dialect.fault is None
+    decoder, _, _ = fed(b"half\n" + sent, [])
+    assert decoder.fault is not None
+    assert shown in decoder.fault
+    assert "baud" not in decoder.fault
+    decoder.feed(2.0, b"3.3,0.1\n")
+    assert decoder.fault is None
 
 
 def test_bytes_that_are_no_text_are_called_a_wrong_baud_rate() -> None:
-    dialect, _, _ = fed(bytes(range(128, 256)) * (LINE_BYTES // 100), [])
-    assert "wrong baud rate" in (dialect.fault or "")
+    decoder, _, _ = fed(bytes(range(128, 256)) * (LINE_BYTES // 100), [])
+    assert "wrong baud rate" in (decoder.fault or "")
 
 
 def test_cells_stand_beside_their_samples() -> None:
-    dialect = TextDialect()
-    block = dialect.feed(1.0, b"V=6.6 I=2 cells=3.31,3.29\n6.6,2\nV=6.6 I=2 cells=3.3\n")
+    decoder = TextProtocol()
+    block = decoder.feed(1.0, b"V=6.6 I=2 cells=3.31,3.29\n6.6,2\nV=6.6 I=2 cells=3.3\n")
     assert block.size == 3
-    assert dialect.cells.dtype == np.float64
-    np.testing.assert_equal(dialect.cells, [[3.31, 3.29], [np.nan, np.nan], [3.3, np.nan]])
-    assert dialect.feed(2.0, b"6.6,2\n").size == 1
-    assert dialect.cells is NO_CELLS
+    assert decoder.cells.dtype == np.float64
+    np.testing.assert_equal(decoder.cells, [[3.31, 3.29], [np.nan, np.nan], [3.3, np.nan]])
+    assert decoder.feed(2.0, b"6.6,2\n").size == 1
+    assert decoder.cells is NO_CELLS
 
 
 def test_many_reads_at_once_are_the_same_samples_and_cells() -> None:
     reads = [b"6.6,2,25\nV=6.6 I=2 T=25 ce", b"lls=3.31,3.29\n", b"6.7,2,25\n"]
-    one, many = TextDialect(), TextDialect()
+    one, many = TextProtocol(), TextProtocol()
     blocks = [one.feed(float(i), read) for i, read in enumerate(reads)]
     data = np.frombuffer(b"".join(reads), dtype=np.uint8)
     ends = np.cumsum([len(read) for read in reads])

@@ -19,95 +19,95 @@ from bms_estimator.protocols.firmware.messages import (
     set_relay_command,
     zero_current_command,
 )
-from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardDialect
+from bms_estimator.protocols.firmware.protocol import ASK_AGAIN_S, BoardProtocol
 from tests.service.test_bad_line import HELLO, frames, sample
 
 ZERO = MessageType.COMMAND_ZERO_CURRENT
 
 
-def talking(hello: Hello = HELLO, rate_hz: int = 100) -> BoardDialect:
+def talking(hello: Hello = HELLO, rate_hz: int = 100) -> BoardProtocol:
     """After the board's hello."""
-    dialect = BoardDialect(rate_hz=rate_hz)
-    dialect.feed(0.0, b"\0" + hello.encode())
-    return dialect
+    decoder = BoardProtocol(rate_hz=rate_hz)
+    decoder.feed(0.0, b"\0" + hello.encode())
+    return decoder
 
 
 def test_nothing_is_due_before_a_whole_frame_was_heard() -> None:
-    dialect = BoardDialect(rate_hz=100)
-    assert dialect.next_output(0.0) == b""
-    dialect.feed(1.0, b"\x1a\xc1\x02\x0b\x0a\x52\x7e" + sample(0).encode()[:-4])
-    assert dialect.next_output(1.0) == b""
-    dialect.feed(2.0, b"\0" + sample(1).encode())
-    assert dialect.next_output(2.0) == hello_command()
+    decoder = BoardProtocol(rate_hz=100)
+    assert decoder.next_output(0.0) == b""
+    decoder.feed(1.0, b"\x1a\xc1\x02\x0b\x0a\x52\x7e" + sample(0).encode()[:-4])
+    assert decoder.next_output(1.0) == b""
+    decoder.feed(2.0, b"\0" + sample(1).encode())
+    assert decoder.next_output(2.0) == hello_command()
 
 
 def test_what_is_not_answered_is_asked_again_and_no_sooner() -> None:
-    dialect = BoardDialect(rate_hz=100)
-    dialect.feed(0.0, b"\0" + sample(0).encode())
-    assert dialect.next_output(0.0) == hello_command()
-    assert dialect.next_output(0.9 * ASK_AGAIN_S) == b""
-    assert dialect.next_output(1.1 * ASK_AGAIN_S) == hello_command()
+    decoder = BoardProtocol(rate_hz=100)
+    decoder.feed(0.0, b"\0" + sample(0).encode())
+    assert decoder.next_output(0.0) == hello_command()
+    assert decoder.next_output(0.9 * ASK_AGAIN_S) == b""
+    assert decoder.next_output(1.1 * ASK_AGAIN_S) == hello_command()
 
 
 def test_the_rate_is_set_where_the_board_has_another() -> None:
     assert talking(rate_hz=100).next_output(0.0) == b""
-    dialect = talking(rate_hz=250)
-    assert dialect.next_output(0.0) == set_rate_command(250) + hello_command()
-    dialect.feed(0.1, replace(HELLO, rate_hz=250).encode())
-    assert dialect.next_output(10.0) == b""
+    decoder = talking(rate_hz=250)
+    assert decoder.next_output(0.0) == set_rate_command(250) + hello_command()
+    decoder.feed(0.1, replace(HELLO, rate_hz=250).encode())
+    assert decoder.next_output(10.0) == b""
 
 
 def test_after_the_port_was_opened_anew_the_board_has_to_be_heard_first() -> None:
-    dialect = talking()
-    dialect.on_port_opened()
-    assert dialect.next_output(1.0) == b""
-    assert dialect.board == {}
-    dialect.feed(2.0, sample(0).encode())
-    assert dialect.next_output(2.0) == hello_command()
-    dialect.feed(2.1, replace(HELLO, serial=7).encode())
-    assert dialect.board["serial"] == "00000007"
+    decoder = talking()
+    decoder.on_port_opened()
+    assert decoder.next_output(1.0) == b""
+    assert decoder.board == {}
+    decoder.feed(2.0, sample(0).encode())
+    assert decoder.next_output(2.0) == hello_command()
+    decoder.feed(2.1, replace(HELLO, serial=7).encode())
+    assert decoder.board["serial"] == "00000007"
 
 
 def test_a_command_is_done_with_the_hello_that_follows_it() -> None:
-    dialect = talking()
-    command = dialect.command("current_zero")
-    assert dialect.next_output(0.0) == zero_current_command()
-    assert dialect.next_output(3.0) == b""  # the board measures; asked twice it would be busy
-    dialect.feed(3.0, Ack(ZERO, AckResult.OK, 510_000).encode())
-    assert (command.done, dialect.next_output(3.0)) == (False, hello_command())
-    dialect.feed(3.1, replace(HELLO, current_zero_ppm=510_000).encode())
+    decoder = talking()
+    command = decoder.command("current_zero")
+    assert decoder.next_output(0.0) == zero_current_command()
+    assert decoder.next_output(3.0) == b""  # the board measures; asked twice it would be busy
+    decoder.feed(3.0, Ack(ZERO, AckResult.OK, 510_000).encode())
+    assert (command.done, decoder.next_output(3.0)) == (False, hello_command())
+    decoder.feed(3.1, replace(HELLO, current_zero_ppm=510_000).encode())
     assert (command.done, command.refusal) == (True, None)
 
 
 def test_a_refusal_says_why() -> None:
-    dialect = talking()
-    command = dialect.command("current_zero")
-    dialect.feed(1.0, Ack(ZERO, AckResult.BAD_VALUE, 0).encode())
+    decoder = talking()
+    command = decoder.command("current_zero")
+    decoder.feed(1.0, Ack(ZERO, AckResult.BAD_VALUE, 0).encode())
     assert command.done
     assert command.refusal == "the board refuses: bad value; is the sensor connected, and no current flowing?"
 
 
 def test_a_command_that_was_given_up_is_not_sent() -> None:
-    dialect = BoardDialect()
-    command = dialect.command("current_zero")
+    decoder = BoardProtocol()
+    command = decoder.command("current_zero")
     command.done = True
-    dialect.feed(0.0, b"\0" + HELLO.encode())
-    assert dialect.next_output(0.0) == b""
+    decoder.feed(0.0, b"\0" + HELLO.encode())
+    assert decoder.next_output(0.0) == b""
 
 
 def test_a_command_is_not_given_to_a_board_that_comes_after_the_line_was_lost() -> None:
-    dialect = talking()
-    command = dialect.command("current_zero")
-    dialect.next_output(0.0)
-    dialect.on_port_opened()
-    dialect.feed(1.0, b"\0" + HELLO.encode())
-    assert dialect.next_output(1.0) == b""
+    decoder = talking()
+    command = decoder.command("current_zero")
+    decoder.next_output(0.0)
+    decoder.on_port_opened()
+    decoder.feed(1.0, b"\0" + HELLO.encode())
+    assert decoder.next_output(1.0) == b""
     assert (command.done, "the line was lost" in (command.refusal or "")) == (True, True)
 
 
 def test_another_command_there_is_not() -> None:
     with pytest.raises(UserError, match="no command fly"):
-        BoardDialect().command("fly")
+        BoardProtocol().command("fly")
 
 
 messages = (
@@ -120,29 +120,29 @@ messages = (
 
 @given(st.lists(messages, max_size=20))
 def test_no_bytes_make_it_raise_whatever_was_asked(reads: list[bytes]) -> None:
-    dialect = BoardDialect(rate_hz=250)
+    decoder = BoardProtocol(rate_hz=250)
     for at, data in enumerate(reads):
         if at % 5 == 2:
-            dialect.command("current_zero")
-        dialect.feed(float(at), data)
-        dialect.next_output(float(at))
-    assert dialect.counters["bytes_received"] <= sum(map(len, reads))
+            decoder.command("current_zero")
+        decoder.feed(float(at), data)
+        decoder.next_output(float(at))
+    assert decoder.counters["bytes_received"] <= sum(map(len, reads))
 
 
 def test_the_relay_is_told_until_it_is_acknowledged_and_no_hello_is_asked_for() -> None:
-    dialect, relay = talking(), Relay(high=True, high_when_silent=False, silent_s=30)
-    command = dialect.relay(relay)
-    assert dialect.next_output(0.0) == set_relay_command(relay)
-    assert dialect.next_output(1.1 * ASK_AGAIN_S) == set_relay_command(relay)
-    dialect.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
+    decoder, relay = talking(), Relay(high=True, high_when_silent=False, silent_s=30)
+    command = decoder.relay(relay)
+    assert decoder.next_output(0.0) == set_relay_command(relay)
+    assert decoder.next_output(1.1 * ASK_AGAIN_S) == set_relay_command(relay)
+    decoder.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
     assert (command.done, command.refusal) == (True, None)
-    assert dialect.next_output(2.0) == b""
-    assert dialect.hello == HELLO
+    assert decoder.next_output(2.0) == b""
+    assert decoder.hello == HELLO
 
 
 def test_firmware_of_before_the_relay_refuses_it_and_the_reason_says_so() -> None:
-    dialect = talking()
-    command = dialect.relay(Relay(high=True, high_when_silent=None))
-    dialect.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.UNKNOWN_COMMAND, 0).encode())
+    decoder = talking()
+    command = decoder.relay(Relay(high=True, high_when_silent=None))
+    decoder.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.UNKNOWN_COMMAND, 0).encode())
     assert command.done
     assert command.refusal == "the board refuses: unknown command; firmware before 0.2.0 has no relay pin"

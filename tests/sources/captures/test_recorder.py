@@ -134,7 +134,7 @@ from bms_estimator.sources.captures import raw_capture, recorder
 
 recorder.END_S = 0.01
 raw_capture.CaptureWriter.write = lambda *_: threading.Event().wait()
-with recorder.Recording(Path(sys.argv[1]), raw_capture.CaptureHeader()) as recorded:
+with recorder.CaptureRecorder(Path(sys.argv[1]), raw_capture.CaptureHeader()) as recorded:
     recorded.write(0.0, b"3.7,0.1\\n")
 print(recorded.fault)
 """

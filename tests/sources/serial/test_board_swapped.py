@@ -9,7 +9,7 @@ from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.framing import LONGEST_DOUBT_S
 from bms_estimator.protocols.firmware.messages import Hello, hello_command
-from bms_estimator.protocols.firmware.protocol import BoardDialect
+from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
@@ -129,9 +129,9 @@ async def test_another_board_on_the_open_port_is_asked_who_it_is_and_refused(lin
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(np.full(10, PACK_V), abs=0.1)
 
 
-def door_of_ours() -> tuple[BoardCheck, BoardDialect]:
+def door_of_ours() -> tuple[BoardCheck, BoardProtocol]:
     """It knows our board."""
-    dialect, door = BoardDialect(), BoardCheck(BoardDialect)
+    dialect, door = BoardProtocol(), BoardCheck(BoardProtocol)
     dialect.feed(BEGIN_S, Running(1, 6.1).hello())
     door.remember_board(dialect.board, 0.0)
     return door, dialect

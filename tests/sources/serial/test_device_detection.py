@@ -7,7 +7,7 @@ import tty
 import pytest
 
 from bms_estimator.protocols.devices import daly, jbd, jk, junctek
-from bms_estimator.protocols.devices.pylontech import PylontechDialect
+from bms_estimator.protocols.devices.pylontech import PylontechProtocol
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS
@@ -84,7 +84,7 @@ def test_a_silent_device_is_sent_questions_alone(monkeypatch: pytest.MonkeyPatch
     questions = [
         jk.OLD_QUESTION,
         junctek.ASK,
-        PylontechDialect().next_output(0.0),
+        PylontechProtocol().next_output(0.0),
         *(jbd.question(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
         *(daly.question(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
     ]
