@@ -445,7 +445,7 @@ class World:
         if process.board is None:
             return
         door, counters = process.board._door, process.board.counters
-        held = door.stranger is not None
+        held = door.pending_protocol is not None
         if self.timeline.now_s - process.delivered_s <= 0.05 or self._reads(process):
             return
         given = counters["bytes_received"] + counters["unadmitted_bytes"] + sum(len(data) for _, data in door._held)
