@@ -3,7 +3,6 @@
 import sys
 from itertools import chain
 
-import callbacks
 import capture
 import kernel
 import live
@@ -17,7 +16,6 @@ GROUPS = {
     "live": live.rows,
     "packs": packs.rows,
     "partition": partition.rows,
-    "callbacks": callbacks.rows,
 }
 
 
