@@ -62,7 +62,6 @@ EXTRAS = {
     "bleak": "ble",
     "nats": "fleet",
     "duckdb": "fleet",
-    "dask": "fleet",
     "nkeys": "fleet",
 }
 """Optional package -> the extra that brings it."""

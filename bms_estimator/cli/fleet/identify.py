@@ -48,9 +48,6 @@ def identify(
     processes: Annotated[
         int | None, typer.Option(parser=whole(1), help="on this machine; else one for each CPU", show_default=False)
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="tcp://host:port of a Dask cluster's scheduler", show_default=False)
-    ] = None,
     server: Server = SERVER,
     creds: Creds = None,
     ca: Ca = None,
@@ -68,9 +65,7 @@ def identify(
     known = asyncio.run(known_packs(where))
     refuse_unknown(names, known)
     found = list["ReidentificationResult"]()
-    for outcome in _outcomes(
-        names, known, (epoch_s(since, -math.inf), epoch_s(until, math.inf)), where, scheduler, processes
-    ):
+    for outcome in _outcomes(names, known, (epoch_s(since, -math.inf), epoch_s(until, math.inf)), where, processes):
         found.append(outcome)
         if outcome.cell_file:
             write_text(out / f"{outcome.pack}.toml", outcome.cell_file, make_folder=True)
@@ -93,10 +88,9 @@ def _outcomes(
     known: PackRegistry,
     span_s: tuple[float, float],
     where: ServerAddress,
-    scheduler: str | None,
     processes: int | None,
 ) -> Iterator["ReidentificationResult"]:
-    from bms_estimator.fleet.identification.batch import Task, reidentify_all  # noqa: PLC0415 - needs Dask and NATS
+    from bms_estimator.fleet.identification.batch import Task, reidentify_all  # noqa: PLC0415 - needs NATS
     from bms_estimator.fleet.identification.reidentify import ReidentificationResult  # noqa: PLC0415 - slow to import
 
     tasks, (server, creds, ca) = [], where
@@ -106,7 +100,7 @@ def _outcomes(
             tasks.append(Task(name, kind, known.cell_file(kind.cell), *span_s, server, creds, ca))
         else:
             yield ReidentificationResult(name, reason=known.reason(name))
-    yield from reidentify_all(tasks, scheduler=scheduler, processes=processes or os.cpu_count() or 1)
+    yield from reidentify_all(tasks, processes or os.cpu_count() or 1)
 
 
 def _names(packs: Sequence[str], from_file: Path | None) -> list[str]:

@@ -88,9 +88,3 @@ def test_packs_are_identified_and_the_better_cells_put(url, tmp_path, capsys):
 def test_what_cannot_be_asked_is_said(url, tmp_path, capsys, arguments, said):
     code, _, err = run(capsys, "fleet", "identify", *arguments, "--out", tmp_path / "out", "--server", url)
     assert (code, said in err) == (2, True)
-
-
-def test_a_cluster_that_cannot_be_used_is_said(url, tmp_path, capsys):
-    asked = ["fleet", "identify", "house", "--scheduler", "tcp://127.0.0.1:1", "--out", tmp_path / "out"]
-    code, _, err = run(capsys, *asked, "--server", url)
-    assert (code, err.startswith("error: --scheduler tcp://127.0.0.1:1: ")) == (2, True)
