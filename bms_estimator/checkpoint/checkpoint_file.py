@@ -31,7 +31,7 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import new_totals
 
 FORMAT = 7
-"""Raise it when a field of an old name gets another meaning, and tell ``_MIGRATIONS`` how to read those before."""
+"""Version of the file's layout. Raise it when a field changes its meaning, and migrate files of the version before."""
 DAY_S = 86400.0
 LONGEST_FILE = 1 << 20
 """A checkpoint has some kilobytes; a longer file is none [bytes]."""
@@ -95,7 +95,6 @@ class CheckpointFile:
     ) -> None:
         self._name, self._now = settings.pack.name, now
         self._identity, self._observer = pack_identity(settings, cell), observer_identity(settings, cell)
-        self._range_v = cell.cell.voltage_min_v, cell.cell.voltage_max_v
         self._longest_days = settings.state.longest_days
         self._content: dict[str, Any] = {}  # of the file, as far as it is no ledger
         self._later = False  # the file is of a later format
@@ -147,16 +146,9 @@ class CheckpointFile:
         self._remove_oldest()
 
     def load(self) -> CheckpointContent:
-        """Read; what is wrong is a reason, not an exception.
-
-        The file of a format before names is taken over by its name: it is of the settings that were used last. What it
-        hashed, whole sections of the settings, cannot be made again by a version that knows others.
-        """
-        before = self.path.with_name(f"{self._name}.npz")
+        """Read the file. An error becomes the result's reason, not an exception."""
         new = RunCounters(0, new_totals(self._now().wall_s))
         try:
-            if not self.path.exists() and before.exists():
-                before.replace(self.path)
             with np.load(io.BytesIO(read_private(self.path, LONGEST_FILE)), allow_pickle=False) as file:
                 return self._checked(file)
         except FileNotFoundError:
@@ -191,18 +183,15 @@ class CheckpointFile:
 
     def _checked(self, found: Mapping[str, NDArray[Any]]) -> CheckpointContent:
         now_s, version = self._now().wall_s, int(found["format"])
+        ours = str(found.get("identity", "")) == self._identity
         self._later = version > FORMAT
-        if self._later:
-            ours = str(found.get("identity", "")) == self._identity
-            raise _RefusedError(_unknown(version), _ledger(found, now_s) if ours else None)
-        file = _migrated(dict(found))
-        state = dict(fields(file["state"]))
-        if not str(file["identity"]):  # a format that had another one: what its voltage tells
-            low, high = self._range_v
-            if not low <= state["observer.voltage_estimate_v"][0] <= high:
-                raise _RefusedError("its voltage is none of this pack")
-        elif str(file["identity"]) != self._identity:
+        if version != FORMAT:
+            ledger = _ledger(found, now_s) if ours and self._later else None
+            raise _RefusedError(f"format {version}, this version reads {FORMAT}", ledger)
+        if not ours:
             raise _RefusedError("it belongs to another pack or cell")
+        file = dict(found)
+        state = dict(fields(file["state"]))
         saved = BootTimestamp(
             float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"])
         )
@@ -258,50 +247,3 @@ def _believable(file: Mapping[str, NDArray[Any]]) -> RunCounters:
     if wrong:
         raise ValueError(", ".join(wrong))
     return RunCounters(restarts, total.model_copy(update={"crashes": crashes}), alarms=str(file.get("alarms", "")))
-
-
-File = dict[str, Any]
-"""Arrays by their names."""
-
-
-def _named(file: File) -> File:
-    """From format 4, that of 0.1.0: one record with the layout of its version, one file for each pack, hashed settings."""
-    state = {f"state.{name}": field for name, field in fields(file.pop("state"))}
-    return file | state | {"identity": "", "observer": ""}
-
-
-def _counted(file: File) -> File:
-    """From format 5: nothing was counted over restarts, and nobody knows how its run ended."""
-    total = new_totals(float(file["wall_s"]))
-    return file | {"total": total.model_dump_json(), "clean": True}
-
-
-def _in_one(file: File) -> File:
-    """From format 6: each field of the state was an array of its own, and a file took five times as long to write."""
-    named = {name.removeprefix("state."): file.pop(name) for name in list(file) if name.startswith("state.")}
-    state = np.zeros((), [(name, field.dtype, field.shape) for name, field in named.items()])
-    for name, field in named.items():
-        state[name] = field
-    return file | {"state": state}
-
-
-_MIGRATIONS = {4: _named, 5: _counted, 6: _in_one}
-"""By format: how to make a file of it one of the next format."""
-
-
-def _migrated(file: File) -> File:
-    """A file of any format that is known, as one of ``FORMAT``.
-
-    Raises:
-        _RefusedError: Its format is not known.
-    """
-    version = int(file["format"])
-    if version != FORMAT and version not in _MIGRATIONS:
-        raise _RefusedError(_unknown(version))
-    for step in range(version, FORMAT):
-        file = _MIGRATIONS[step](file)
-    return file
-
-
-def _unknown(version: int) -> str:
-    return f"format {version}, this version reads {min(_MIGRATIONS)} to {FORMAT}"

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field
 
 from bms_estimator.model.config_file import Strict
 
@@ -61,11 +61,3 @@ class MqttSettings(Strict):
     def urls(self) -> tuple[str, ...]:
         """The addresses of all brokers."""
         return (self.url,) if isinstance(self.url, str) else self.url
-
-    @model_validator(mode="before")
-    @classmethod
-    def _no_publish_rate(cls, table: object) -> object:
-        """The rate stood here once."""
-        if isinstance(table, dict) and "publish_rate_hz" in table:
-            raise ValueError("publish_rate_hz is now called rate_hz and stands in the section [publish]")
-        return table

@@ -136,7 +136,7 @@ def make_root(root: Path) -> None:
     state = root / "var/lib/private/bms-estimator"
     for folder in (state.parent, state):
         folder.mkdir(mode=0o700, parents=True)  # as systemd wants it
-    shutil.copy(PROJECT / "tests/checkpoint/checkpoint_format_4.npz", state / "pack.npz")
+    shutil.copy(PROJECT / "tests/checkpoint/checkpoint_format_7.npz", state / "pack-5613cbc0.npz")
     private = root / "var/cache/private"
     private.mkdir(mode=0o700, parents=True)  # as systemd wants it
     kernel_cache.fill(private / "bms-estimator", Path("/opt/project/bms_estimator"))

@@ -65,7 +65,7 @@ def test_kernels_are_compiled_into_the_cache_folder(report):
 
 
 def test_what_the_version_before_has_learned_is_taken_over(report):
-    assert '"outcome": "restored: SOC 0.5762"' in report["journal"], report
+    assert '"outcome": "restored: SOC 0.3710"' in report["journal"], report
 
 
 def test_the_password_of_a_credential_is_read_and_shown_nowhere(report):

@@ -25,9 +25,6 @@ from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 
-OLD_FILES = {4: 0.5762, 5: 0.4149, 6: 0.4132}
-"""SOC by format: 4 is that of 0.1.0."""
-
 
 def at(hours: float) -> BootTimestamp:
     return BootTimestamp(1.7e9 + 3600.0 * hours, synchronised=True, boot_s=5000.0 + 3600.0 * hours, boot="one")
@@ -132,20 +129,6 @@ async def test_starts_after_a_run_that_left_no_word_are_counted_as_crashes(tmp_p
     assert counted == [0, 1, 2, 2]
 
 
-@pytest.mark.parametrize("version", OLD_FILES)
-async def test_checkpoints_of_all_formats_since_0_1_0_are_taken_up(tmp_path: Path, version: int) -> None:
-    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
-    name = "pack.npz" if version == 4 else checkpoint.path.name
-    shutil.copy(Path(__file__).parents[1] / f"checkpoint/checkpoint_format_{version}.npz", tmp_path / name)
-    run = await ran(tmp_path, samples=1)
-    assert run.health.checkpoint == f"restored: SOC {OLD_FILES[version]}"
-    assert (run.health.restarts, run.health.total.crashes) == (4, 0)
-    assert run.health.total.since.startswith("2023-11-14T22:13:20")
-    with np.load(checkpoint.path) as now:
-        assert now["format"] == FORMAT
-    assert (await ran(tmp_path, samples=1)).health.restarts == 5
-
-
 async def test_a_checkpoint_that_is_older_than_configured_is_refused_and_without_that_none_is(tmp_path: Path) -> None:
     CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(a_used_pack().record, NEW)
     for hours, settings, reason in (
@@ -180,7 +163,7 @@ async def test_checkpoints_of_later_versions_are_each_kept_and_what_they_have_co
         inodes.append(file.path.stat().st_ino)
         health = (await ran(tmp_path, samples=1)).health
         kept = min(attempt + 1, LATER)
-        assert f"reads 4 to {FORMAT}; set aside as pack.later-{kept}.npz; once the version" in health.checkpoint
+        assert f"reads {FORMAT}; set aside as pack.later-{kept}.npz; once the version" in health.checkpoint
         assert (health.restarts, health.total.crashes, health.total.unseen_s) == (7 + attempt, 2, 30.0)
     kept_inodes = [(tmp_path / f"pack.later-{n}.npz").stat().st_ino for n in range(1, LATER + 1)]
     assert kept_inodes == [*inodes[: LATER - 1], inodes[LATER]]

@@ -25,14 +25,6 @@ ALARM_CLASSES = {
 """Where it is not "problem"."""
 _SEES = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
 """An alarm that is raised stays on: what it needs may be lost after it was raised."""
-FORMER = {
-    "soc_std": "sensor",
-    "time_to_empty_s": "sensor",
-    "sensor_silent": "binary_sensor",
-    "suspicion": "binary_sensor",
-    "lock_lost": "binary_sensor",
-}
-"""What versions before this one have told of, and on which platform."""
 NAMED = {*BATTERY, *FUEL_CELL, *OF_CELLS, CELL, *ALARMS, *get_args(Command)}
 """All that ``[home_assistant.names]`` may name."""
 
@@ -120,7 +112,7 @@ def discovery(
 
 def _removed(described: DiscoveryInputs) -> dict[str, dict[str, str]]:
     """What it may know from before: by its platform alone it goes, what is left out stays."""
-    platforms = FORMER | {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
+    platforms = {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
     platforms |= {name: made("")["platform"] for name, made in _COMMANDS.items() if name not in described.commands}
     return {key: {"platform": platform} for key, platform in platforms.items()}
 

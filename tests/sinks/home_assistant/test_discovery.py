@@ -278,12 +278,6 @@ def test_what_is_not_there_any_more_is_removed() -> None:
         "current_zero": "button",
         "acknowledge_alarm": "button",
         "publish_rate": "number",
-        # of versions before
-        "soc_std": "sensor",
-        "time_to_empty_s": "sensor",
-        "sensor_silent": "binary_sensor",
-        "suspicion": "binary_sensor",
-        "lock_lost": "binary_sensor",
     }
 
 
