@@ -1,12 +1,11 @@
-"""How what runs long ends: by a signal, or by the first of their tasks."""
+"""Clean end of a long-running process by a signal."""
 
 import asyncio
 import contextlib
 import os
 import signal
 import threading
-from collections.abc import Callable, Coroutine, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import structlog
 
@@ -16,27 +15,25 @@ log = structlog.get_logger(__name__)
 
 
 def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
-    """An event, ``stop`` where it is given, that SIGINT and SIGTERM set in place of ending the process.
+    """Return an event, ``stop`` if given, that SIGINT, SIGTERM and SIGHUP set instead of killing the process.
 
-    SIGHUP, too, as when the terminal is closed, unless somebody handles or ignores it.
+    An ignored SIGHUP stays ignored, as under nohup.
     """
     stop = stop or asyncio.Event()
-    unheard = [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL else []
-    for number in (signal.SIGINT, signal.SIGTERM, *unheard):
+    hangup = [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
+    for number in (signal.SIGINT, signal.SIGTERM, *hangup):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     return stop
 
 
 @contextlib.contextmanager
-def startup_signals(reload: Callable[[], None] | None) -> Iterator[None]:
-    """What signals do until an event loop takes them: SIGTERM ends the process with exit code 0, there is nothing to save.
+def startup_signals() -> Iterator[None]:
+    """Exit with code 0 on SIGTERM or SIGHUP until an event loop handles them: there is nothing to save yet.
 
-    Args:
-        reload: What SIGHUP asks for; None: it ends the process, as when a terminal is closed.
+    An ignored SIGHUP stays ignored, as under nohup.
     """
-    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, _end)}
-    if reload:
-        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, lambda *_: reload())
+    unignored = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
+    before = {number: signal.signal(number, _end) for number in unignored}
     try:
         yield
     finally:
@@ -53,17 +50,3 @@ def _end(*_: object) -> None:
         os._exit(0)
 
     threading.Thread(target=end, daemon=True).start()
-
-
-async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:
-    """Run all until one ends, end the others, raise what one raised."""
-    tasks = [asyncio.ensure_future(coroutine) for coroutine in coroutines]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in tasks:
-            task.cancel()
-        results = await asyncio.gather(*tasks, return_exceptions=True)
-    for result in results:
-        if isinstance(result, Exception):
-            raise result

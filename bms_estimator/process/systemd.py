@@ -2,7 +2,6 @@
 
 import os
 import socket
-import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -42,11 +41,6 @@ class SystemdNotifier:
         """How the pack is, for ``systemctl status``."""
         self._texts[pack] = text
         self._send(self._status)
-
-    def reloading(self, pack: str) -> None:
-        """The pack's settings are read anew; ``ready`` ends that."""
-        self._awaited.setdefault("READY=1", set()).add(pack)
-        self._send(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def alive(self, pack: str) -> None:
         """The pack's loop turns."""

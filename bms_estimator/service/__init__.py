@@ -1,1 +1,1 @@
-"""One pack as a process: live loop, publisher, alarm monitor and hooks, requests, reload."""
+"""One pack as a process: live loop, publisher, alarm monitor and hooks, requests."""

@@ -9,8 +9,9 @@ from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.process.log_setup import set_level
-from bms_estimator.process.signals import stop_on_signal, until_first_ends
+from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.line_source import LineSource

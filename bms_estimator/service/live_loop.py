@@ -22,13 +22,12 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.process.signals import until_first_ends
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import CheckpointWriter
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.service.settings_reload import SettingsReload
 from bms_estimator.settings.pack import LEAST_RATE_HZ, MOST_RATE_HZ, Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
 from bms_estimator.sinks.sink import Sink
@@ -56,7 +55,6 @@ async def run_estimation_loop(
     current_zero: Callable[[], Awaitable[None]] | None = None,
     notifier: SystemdNotifier | None = None,
     clock: Clock | None = None,
-    reload: SettingsReload | None = None,
     pulse: Callable[[], SourceHealth] | None = None,
     recording: Callable[[], RecordingHealth | None] = lambda: None,
     hooks: AlarmHooks | None = None,
@@ -76,7 +74,6 @@ async def run_estimation_loop(
         current_zero: Has the board take the present current as zero; None: it cannot.
         notifier: Who hears that the loop is ready and alive.
         clock: The clocks.
-        reload: Where this loop offers what it can change while it runs; None: nothing is read anew.
         pulse: Whether the source lives; None: it does not say.
         recording: State of a recording; None where nothing is recorded.
         hooks: What is done of alarms; opened and closed here.
@@ -119,8 +116,6 @@ async def run_estimation_loop(
         if checkpoint
         else None
     )
-    if reload:
-        _offer_changes(reload, publisher, saving)
     async with contextlib.AsyncExitStack() as stack:
         for sink in sinks:
             await stack.enter_async_context(sink)
@@ -134,8 +129,6 @@ async def run_estimation_loop(
         ]
         if saving:
             tasks.append(saving.run())
-        if reload:
-            tasks.append(_reload(reload, notifier, name))
         clean = False
         try:
             await until_first_ends(*tasks, stop.wait())
@@ -188,22 +181,6 @@ async def _keep_alive(publisher: Publisher, notifier: SystemdNotifier, name: str
         await asyncio.sleep(min(max(publisher.wait_s, 0.01), longest_s))
         if publisher.wait_s == 0.0:
             publisher.publish()
-
-
-async def _reload(reload: SettingsReload, notifier: SystemdNotifier, name: str) -> None:
-    """Read the settings anew whenever somebody asks."""
-    while True:
-        await reload.asked.wait()
-        reload.asked.clear()
-        notifier.reloading(name)
-        await reload.reload()
-        notifier.ready(name)
-
-
-def _offer_changes(reload: SettingsReload, publisher: Publisher, saving: CheckpointWriter | None) -> None:
-    reload.on_change("publish.rate_hz", publisher.set_rate)
-    if saving:
-        reload.on_change("state.checkpoint_s", partial(setattr, saving, "every_s"))
 
 
 async def _measure_lag(publisher: Publisher) -> None:

@@ -12,16 +12,14 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.pack_service import run_pack_service
-from bms_estimator.service.settings_reload import SettingsReload
 from bms_estimator.settings.pack import Settings
 
 
-async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[SettingsReload]) -> None:
-    """Serve packs until SIGINT or SIGTERM. When one ends, all end in good order: who starts us starts all again.
+async def serve_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
+    """Serve packs until SIGINT, SIGTERM or SIGHUP. When one service ends, all end, so that systemd restarts all of them.
 
     Args:
         packs: The settings of each pack, and the pack as one object.
-        reloads: Of each pack.
 
     Raises:
         UserError: A setting that cannot be used, with the pack's name before it; or two packs share a name or a port.
@@ -34,21 +32,17 @@ async def serve_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Se
     _differ("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
     stop, notifier, pages = stop_on_signal(), SystemdNotifier(names), Pages()
 
-    async def serve_one(settings: Settings, cell: PackModel, reload: SettingsReload) -> None:
+    async def serve_one(settings: Settings, cell: PackModel) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
             folder = state_folder(settings)
-            await run_pack_service(
-                settings, cell, stop=stop, folder=folder, notifier=notifier, reload=reload, pages=pages
-            )
+            await run_pack_service(settings, cell, stop=stop, folder=folder, notifier=notifier, pages=pages)
         except UserError as error:
             raise UserError(f"{settings.pack.name}: {error}") from error
         finally:
             stop.set()
 
-    results = await asyncio.gather(
-        *(serve_one(*pack, reload) for pack, reload in zip(packs, reloads, strict=True)), return_exceptions=True
-    )
+    results = await asyncio.gather(*(serve_one(*pack) for pack in packs), return_exceptions=True)
     for result in results:
         if isinstance(result, BaseException):
             raise result

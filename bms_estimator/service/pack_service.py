@@ -22,7 +22,6 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks, PublishRaw, relay_of
 from bms_estimator.service.live_loop import run_estimation_loop
-from bms_estimator.service.settings_reload import SettingsReload
 from bms_estimator.settings.alarm_limits import out_of_range, watched
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.exports.influx import InfluxSink
@@ -50,10 +49,9 @@ async def run_pack_service(
     stop: asyncio.Event | None = None,
     folder: Path | None = None,
     notifier: SystemdNotifier | None = None,
-    reload: SettingsReload | None = None,
     pages: Pages | None = None,
 ) -> Estimator:
-    """Run until SIGINT or SIGTERM.
+    """Run until SIGINT, SIGTERM or SIGHUP.
 
     Args:
         settings: The pack's settings; with ``[mqtt]`` a broker is served.
@@ -63,7 +61,6 @@ async def run_pack_service(
         stop: Set by someone else to end as a signal does.
         folder: Where the state outlives a restart, as ``state_folder`` has it; None: it does not.
         notifier: Who hears that the loop is ready and alive.
-        reload: Where is offered what can be changed while it runs.
         pages: The live pages of this process.
 
     Returns:
@@ -86,9 +83,6 @@ async def run_pack_service(
         all_sinks.append(History(database, days=settings.store.history_days))
     outbox = Outbox(database, most=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
-    if reload:
-        reload.on_change("log.level", partial(set_level, settings.pack.name))
-        reload.on_change("mqtt.commands", requests.allow)
     say: PublishRaw | None = None
     if settings.mqtt is not None:
         mqtt = MqttSink(
@@ -127,7 +121,6 @@ async def run_pack_service(
             delivery=delivery,
             current_zero=source.current_zero,
             notifier=notifier,
-            reload=reload,
             pulse=source.pulse,
             recording=partial(recording_health, tap),
             hooks=hooks,

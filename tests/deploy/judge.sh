@@ -40,13 +40,6 @@ tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep -c "$secret"
 ps -eo args | grep -v grep | grep -c "$secret"
 timeout 5 mosquitto_sub -C 2 -u dashboard -P two -t bms/pack/health -t bms/pack/info | grep -c "$secret"
 
-part reload
-before=$(main_pid)
-systemctl reload bms-estimator
-until_true 'lines | grep -q "settings reloaded"'
-timeout 5 mosquitto_sub -C 2 -u dashboard -P two -t bms/pack/state | wc -l
-test "$before" = "$(main_pid)" && show
-
 part watchdog
 for name in $(find $cache -name "*.nbi" | sort | tail -n 1); do : >"$name"; done # as a power cut leaves them
 for name in $(find $cache -name "*.nbc" | sort | head -n 1); do : >"$name"; done

@@ -73,11 +73,6 @@ def test_the_password_of_a_credential_is_read_and_shown_nowhere(report):
     assert report["secret"].split() == ["0"] * 4  # journal, environment, ps, health and info
 
 
-def test_a_reload_goes_on_in_the_same_process(report):
-    assert "never true" not in report["reload"], report
-    assert "NRestarts=0" in report["reload"]
-
-
 def test_the_watchdog_starts_a_service_that_hangs_and_a_kernel_that_was_cut_is_compiled_again(report):
     assert "never true" not in report["watchdog"], report
     assert "NRestarts=1" in report["watchdog"]

@@ -12,7 +12,6 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.multi_pack_service import serve_several
 from bms_estimator.service.pack_service import run_pack_service
-from bms_estimator.service.settings_reload import SettingsReload
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from tests.patience import LONG_S
@@ -50,9 +49,8 @@ async def test_one_of_several_packs_that_cannot_be_served_is_named(
     for name, port in zip(names, ports, strict=True):
         tables = {"pack": {"name": name}, "sensor": {"port": port}} | ({"mqtt": mqtt} if mqtt and name == "b" else {})
         packs.append((Settings.model_validate(tables), cell))
-    reloads = [SettingsReload(settings, lambda settings=settings: settings) for settings, _ in packs]
     with pytest.raises(UserError, match=f"^{re.escape(said)}"):
-        await asyncio.wait_for(serve_several(packs, reloads), LONG_S)
+        await asyncio.wait_for(serve_several(packs), LONG_S)
 
 
 async def test_packs_without_a_serial_line_need_no_port_of_their_own(state_home: Path) -> None:
@@ -60,9 +58,8 @@ async def test_packs_without_a_serial_line_need_no_port_of_their_own(state_home:
     sources = {"a": source, "b": source | {"password_file": "/none"}}
     tables = [{"pack": {"name": name}, "source": table} for name, table in sources.items()]
     packs = [(Settings.model_validate(table), load_cell("chen_mora")) for table in tables]
-    reloads = [SettingsReload(settings, lambda settings=settings: settings) for settings, _ in packs]
     with pytest.raises(UserError, match=r"^b: source.password_file = /none: cannot be read"):
-        await asyncio.wait_for(serve_several(packs, reloads), LONG_S)
+        await asyncio.wait_for(serve_several(packs), LONG_S)
 
 
 def test_a_user_without_a_home_is_served_and_told_that_the_state_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,7 +37,7 @@ def worker(
     """
     options = Options(server, _named(name), creds, ca, checkpoint_s)
     configure_logs()
-    with startup_signals(None), flush_logs():
+    with startup_signals(), flush_logs():
         with show_compile_progress(structlog.get_logger(__name__).info):
             load_fleet_kernels()
         asyncio.run(_work(options))

@@ -24,5 +24,5 @@ def edge(
     """
     settings = with_sensor(load_settings(pack), port=port)
     configure_logs()
-    with startup_signals(None), flush_logs():
+    with startup_signals(), flush_logs():
         asyncio.run(serve_edge(settings, state_folder(settings)))

@@ -16,7 +16,8 @@ from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.pack_options import load_pack, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs, flush_logs
-from bms_estimator.process.signals import stop_on_signal, until_first_ends
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import header_of
 from bms_estimator.sources.captures.recorder import CaptureRecorder

@@ -4,10 +4,10 @@ import asyncio
 import contextlib
 import sys
 from collections import deque
-from collections.abc import Coroutine, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import structlog
 import typer
@@ -22,8 +22,7 @@ from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.service.multi_pack_service import serve_several
 from bms_estimator.service.pack_service import run_pack_service
-from bms_estimator.service.settings_reload import SettingsReload, ask_all, reload_on_hangup
-from bms_estimator.settings.pack import Settings, load_settings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.terminal.panels import LOG_LINES
 from bms_estimator.sinks.terminal.sink import TerminalSink
 from bms_estimator.sources.captures.raw_capture import header_of
@@ -50,15 +49,13 @@ def run(
     paths = packs or [Path("pack.toml")]
     told = partial(_told, port=port, mqtt=mqtt)
     loaded = [(told(settings), cell) for settings, cell in map(load_pack, paths)]
-    reads = [lambda path=path: told(load_settings(path)) for path in paths]
-    reloads = [SettingsReload(settings, read) for (settings, _), read in zip(loaded, reads, strict=True)]
-    with startup_signals(None if _on_terminal() else partial(ask_all, reloads)):
+    with startup_signals():
         if len(loaded) == 1:
-            _run_one(*loaded[0], reloads[0], record, view=sys.stdout.isatty() if view is None else view)
+            _run_one(*loaded[0], record, view=sys.stdout.isatty() if view is None else view)
         else:
             if port or record or view:
                 raise UserError("--port, --record and --view are for one pack")
-            _run_several(loaded, reloads)
+            _run_several(loaded)
 
 
 def _told(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
@@ -68,25 +65,14 @@ def _told(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
     return with_sensor(settings, port=port)
 
 
-def _on_terminal() -> bool:
-    return bool(sys.stdin and sys.stdin.isatty())
-
-
-async def _reloading(service: Coroutine[Any, Any, object], reloads: Sequence[SettingsReload]) -> None:
-    """Serve, and read the settings anew on SIGHUP; where there is a terminal it says that this is gone, and ends us."""
-    if not _on_terminal():
-        reload_on_hangup(reloads)
-    await service
-
-
-def _run_several(packs: Sequence[tuple[Settings, PackModel]], reloads: Sequence[SettingsReload]) -> None:
+def _run_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
     configure_logs()
     with flush_logs():
         _load_kernels()
-        asyncio.run(_reloading(serve_several(packs, reloads), reloads))
+        asyncio.run(serve_several(packs))
 
 
-def _run_one(settings: Settings, cell: PackModel, reload: SettingsReload, record: Path | None, *, view: bool) -> None:
+def _run_one(settings: Settings, cell: PackModel, record: Path | None, *, view: bool) -> None:
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if view and sys.stdout.isatty() else None)
     recorder = (
@@ -95,8 +81,8 @@ def _run_one(settings: Settings, cell: PackModel, reload: SettingsReload, record
     sinks = [TerminalSink(log=log)] if view else []
     with flush_logs(), recorder as tap:
         _load_kernels()
-        service = run_pack_service(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings), reload=reload)
-        asyncio.run(_reloading(service, [reload]))
+        service = run_pack_service(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings))
+        asyncio.run(service)
 
 
 def _load_kernels() -> None:

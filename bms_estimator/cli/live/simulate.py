@@ -12,7 +12,8 @@ from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.model.cell import Cell, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs
-from bms_estimator.process.signals import stop_on_signal, until_first_ends
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS

@@ -65,10 +65,6 @@ class RequestDispatcher:
         """Commands that are allowed, in the order in which all stand."""
         return tuple(command for command in COMMANDS if command in self._allowed)
 
-    def allow(self, commands: Collection[Command]) -> None:
-        """Allow these commands from now on, and no others."""
-        self._allowed = commands
-
     async def handle(self, name: str, payload: bytes) -> bytes | None:
         """The response to one request: JSON of status, data, error, transaction.
 
