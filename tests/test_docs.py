@@ -72,9 +72,12 @@ def test_relative_links_lead_to_files(document: Path) -> None:
     assert [link for link in relative if not (document.parent / link).exists()] == []
 
 
-def test_every_command_has_its_section() -> None:
-    headings = re.findall(r"^## (.+)$", (ROOT / "docs" / "cli.md").read_text(encoding="utf-8"), re.MULTILINE)
-    described = {name for heading in headings for name in heading.split(", ")}
+def test_every_command_is_documented() -> None:
+    text = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+    described = {
+        *re.findall(r"^## (.+)$", text, re.MULTILINE),
+        *re.findall(r"^\| `(fleet \w+)` \|", text, re.MULTILINE),
+    }
     commands = {*COMMANDS, *(f"fleet {name}" for name in OF_A_FLEET)} - {"fleet"}
     assert commands - described == set()
 
