@@ -91,11 +91,6 @@ def model_itself(a: Floats, duration_s: float, *, seed: int = 0, noise_v: float 
     return Record(time_s, current_a, voltage_v, nobody, nobody).every(5)
 
 
-def settled_r_ohm(current_a: float, temperature_c: float) -> float:
-    """Resistance of the stack once the water has settled [ohm]."""
-    return CELLS * _cell_ohm(current_a, temperature_c + 273.15, DRY + PER_AMPERE * current_a)
-
-
 @njit
 def _cell_ohm(current_a: float, kelvin: float, water: float) -> float:
     density = current_a / AREA_CM2

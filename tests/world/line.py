@@ -45,8 +45,6 @@ NOISE_STEPS = 0.5
 LATE_S = 0.004
 """So long a read may be late on USB."""
 ARDUINO = 0x2341, 0x0043
-ZERO_S = 1.0
-"""A board measures so long before it answers."""
 
 
 class Board:
@@ -69,13 +67,11 @@ class Board:
         self.stamps_off_us = deque[int]()
         """By so much the stamps of the next samples are wrong."""
         self._boot_id = dice.randrange(1 << 16)
-        self.boots = 0
         self.reset(ResetCause.POWER_ON)
 
     def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> bytes:
         """It begins anew. Returns its hello."""
         self._boot_id = (self._boot_id + 1) % (1 << 16)
-        self.boots += 1
         self._cause, self._sequence, self._ns, self._ntc_next, self._inbox = cause, 0, 0, False, b""
         self.stamps_off_us.clear()
         self._window_ns = 0

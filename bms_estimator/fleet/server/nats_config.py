@@ -12,8 +12,6 @@ from bms_estimator.fleet.nats.connection import LET_IN_S
 
 NATS_PORT, MQTT_PORT, MONITOR_PORT, CLUSTER_PORT = 4222, 1883, 8222, 6222
 """As NATS has them; the monitor, which asks nobody for a name, stays on the loopback."""
-TLS_MQTT_PORT = 8883
-"""Of MQTT with TLS."""
 LONGEST_BLOCK_BYTES = 1 << 20
 """Of a message: a block of 60 samples takes 700 bytes, one of a whole day at 1 Hz less than this."""
 MOST_CONNECTIONS = 200_000
