@@ -83,13 +83,13 @@ def _go_on(cache: Any) -> Iterator[None]:
 
 
 def _sealed(file: Any, kernel: Any) -> bytes:
-    """What is kept of a kernel, or of the list of them: numba's content, which tells its own end, and its digest."""
+    """Append the digest to a cached kernel, or to the list of them."""
     content: bytes = _DUMP(file, kernel)
     return content + hashlib.sha256(content).digest()
 
 
 def _opened(file: Any, name: str) -> Any:
-    """A kernel that was kept.
+    """Read a cached kernel and verify its digest.
 
     Raises:
         ValueError: The file is not as it was written.

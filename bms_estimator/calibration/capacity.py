@@ -168,7 +168,7 @@ def continuous(good: SampleBlock, capacity_ah: float) -> list[tuple[int, int]]:
 
 
 def of_part(name: str, part: int, good: SampleBlock, p: np.void, anchors: list[Anchor], rejected: list[str]) -> None:
-    """The anchors of a continuous part, and why its other rests are none, into the lists."""
+    """Append the anchors of a continuous part, and the reasons why its other rests are rejected."""
     capacity_ah, series = p["capacity_as"] / 3600.0, int(p["series"])
     step_ah = good["current_a"][:-1] * np.diff(good["time_s"]) / 3600.0
     counted_ah, moved_ah = np.r_[0.0, np.cumsum(step_ah)], np.r_[0.0, np.cumsum(np.abs(step_ah))]

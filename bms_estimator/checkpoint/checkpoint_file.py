@@ -223,7 +223,7 @@ class _RefusedError(Exception):
 
 
 def _ledger(file: Mapping[str, NDArray[Any]], now_s: float) -> RunCounters:
-    """What a file tells of its runs, with this start. What cannot be is not believed: counting begins anew at ``now_s``."""
+    """Return a file's run counters with this start added. Invalid counters restart from zero at ``now_s``."""
     try:
         return _believable(file)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
@@ -232,7 +232,7 @@ def _ledger(file: Mapping[str, NDArray[Any]], now_s: float) -> RunCounters:
 
 
 def _believable(file: Mapping[str, NDArray[Any]]) -> RunCounters:
-    """The same, of any format that tells it, with what this version knows of; what flowed before it was counted is 0.
+    """Read the run counters of a file; a counter that the file lacks is 0.
 
     Raises:
         ArithmeticError, LookupError, TypeError, ValueError: It is damaged, or no counter can be so.

@@ -84,7 +84,7 @@ def copy_known_fields(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]
 
 
 def _is_shorter(known: tuple[int, ...], field: tuple[int, ...], axes: int) -> bool:
-    """True when the shapes are the same but for the last ``axes``, along which less is known."""
+    """Return True if the shapes differ only in the last ``axes``, along which the saved array is shorter."""
     return known[:-axes] == field[:-axes] and max(known[-axes:]) <= field[-1]
 
 
@@ -136,7 +136,7 @@ def _invalid_state_reason(estimator: Estimator, begun: NDArray[np.void]) -> str:
 
 
 def _insane_filter(f: np.void) -> str:
-    """The same of the filter's part."""
+    """Return why the filter's state is invalid; empty if it is valid."""
     count, best = int(f["count"]), int(f["best"])
     if not 0 <= best < count <= HYPOTHESES:
         return f"{count} hypotheses, the best of them {best}"

@@ -30,7 +30,7 @@ class LazyGroup(TyperGroup):
         return TyperCommand(cmd_name, help=entry.help) if entry else None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that is called, imported."""
+        """Import and return the command that is called."""
         name, listed, rest = super().resolve_command(ctx, args)
         return name, _import(name, self.entries[name]) if name in self.entries else listed, rest
 

@@ -39,7 +39,7 @@ def find_build(given: Path | None) -> Path | None:
 
 @asynccontextmanager
 async def running_board(build: Path | None, truth: TrueSoc, *, rate_hz: int, speed: float) -> AsyncIterator[Board]:
-    """The firmware in its simulator where ``build`` holds it, else the board in Python.
+    """Run the firmware in its simulator if ``build`` holds it, else the board in Python.
 
     Args:
         build: Folder of the built firmware.

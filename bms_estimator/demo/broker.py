@@ -129,7 +129,7 @@ class DemoBroker:
 
 
 def choose_port(port: int | None, usual: int) -> int:
-    """The port to listen on: as asked, else the usual one, else a free one.
+    """Return the port to listen on: the requested one, else the usual one, else a free one.
 
     Raises:
         UserError: The port asked for is taken.

@@ -119,7 +119,7 @@ class Totals:
             self._last, self._last_true_soc = snapshot.estimate, self._true_soc()
 
     def summary(self) -> str:
-        """The run in a line."""
+        """Return the run in one line."""
         e, elapsed_s = self._last, time.monotonic() - self._started_s
         if e is None or e.soc is None or e.soc_std is None:
             return f"{elapsed_s:.1f} s, no sample came"

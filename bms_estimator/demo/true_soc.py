@@ -34,7 +34,7 @@ class TrueSoc:
         self._board_us = 0
 
     def __call__(self, time_s: float) -> Reading:
-        """What is at the pack's terminals at ``time_s`` [s]."""
+        """Return voltage and current at the pack's terminals at ``time_s`` [s]."""
         reading = self._pack(time_s)
         self._ahead.append((time_s, self._pack.soc))
         return reading
@@ -44,7 +44,7 @@ class TrueSoc:
         self._tail = (self._tail + data)[-TAIL_BYTES:]
 
     def soc(self) -> float:
-        """The pack's, 0..1, at the last sample that came; at the start before any has."""
+        """Return the pack's SOC, 0..1, at the last received sample; the initial SOC before the first one."""
         for frame in reversed(self._tail.split(DELIMITER)[:-1]):
             if (board_us := _board_us(frame)) is not None:
                 self._board_us += (board_us - self._board_us) % MODULUS
@@ -55,7 +55,7 @@ class TrueSoc:
 
 
 def _board_us(frame: bytes) -> int | None:
-    """The board's clock at a sample [us]; None for what is no frame of a sample."""
+    """Return the board's clock in a sample frame [us]; None for another frame."""
     try:
         packet = unseal(frame)
     except ProtocolError:

@@ -32,7 +32,7 @@ class Batcher:
         self._count, self._arrival_s, self._end_s = 0, 0.0, 0.0
 
     def __len__(self) -> int:
-        """Samples of the block that is open."""
+        """Return the number of samples in the open block."""
         return self._count
 
     def add(self, samples: SampleBlock, arrival_s: float) -> list[ReadyBlock]:

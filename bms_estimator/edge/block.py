@@ -62,7 +62,7 @@ class Block:
 
 
 def encode(block: Block) -> bytes:
-    """The bytes of a block.
+    """Encode a block.
 
     Raises:
         ValueError: It holds no sample, or more than ``MOST_SAMPLES``.
@@ -78,12 +78,12 @@ def encode(block: Block) -> bytes:
 
 
 def with_oldest(data: bytes, oldest: int) -> bytes:
-    """The bytes of a block with another ``oldest``."""
+    """Return an encoded block with another ``oldest``."""
     return data[:_OLDEST] + oldest.to_bytes(8, "little") + data[_OLDEST + 8 :]
 
 
 def decode(data: bytes) -> Block:
-    """The block in ``data``.
+    """Decode a block.
 
     Raises:
         BlockError: It is none, or damaged.

@@ -123,7 +123,7 @@ class BlockSender:
             self._watch_open_block()
 
     def health(self) -> EdgeHealth:
-        """What became of the blocks."""
+        """Return counters of the blocks."""
         store = self.store
         return EdgeHealth(
             blocks_kept=store.kept,
@@ -223,6 +223,6 @@ def check_edge(settings: EdgeSettings) -> list[str]:
 
 
 def _mqtt(settings: EdgeSettings) -> MqttSettings:
-    """The servers, and what opens their doors, as all connections have them."""
+    """Return the connection options that all servers share."""
     doors = ("url", "username", "password_file", "ca_file", "cert_file", "key_file")
     return MqttSettings(**{name: getattr(settings, name) for name in doors})

@@ -120,7 +120,7 @@ class BlockStore:
         self._wanted.set()
 
     def on_request(self, awaits: BlockRequest) -> None:
-        """A worker says which block it awaits next."""
+        """Handle a worker's request for its next block."""
         if self._settled is None or awaits.store < (made := self._settled.kept.made_s * NS):
             return
         if awaits.store > made or awaits.number > self._settled.kept.next:
@@ -154,11 +154,11 @@ class BlockStore:
                 return [QueuedMessage(number, self._message(number, data)) for number, data in page.blocks]
 
     def sent(self, number: int) -> None:
-        """The broker has acknowledged a block: it may still be lost, so it stays."""
+        """Record that the broker has acknowledged a block. It stays stored, because the server may still lose it."""
         self._handed.discard(number)
 
     def rewind(self) -> None:
-        """A connection is lost: hand out again, in order, what was not acknowledged."""
+        """Hand out again, in order, all blocks that were not acknowledged, after a connection was lost."""
         self._cursor = min(self._handed, default=self._cursor)
         self._handed.clear()
         self._filled.set()
@@ -178,7 +178,7 @@ class BlockStore:
         self._filled.set()
 
     def _begin_anew(self, after_s: int) -> None:
-        """A worker knows more than the disk, as of one that was set back: what comes must count as later."""
+        """Start a new store, because a worker is ahead of this disk, as after a restored backup; its number must be later."""
         if after_s < LATEST_S and after_s > self._after_s:
             log.warning("a worker has had later blocks than are kept here: a new store is begun", of_s=after_s)
             self._after_s = after_s
@@ -226,7 +226,7 @@ class BlockStore:
         return True
 
     def _know(self, settled: StoreResult) -> None:
-        """What is on disk now."""
+        """Take over the numbers that are now on disk."""
         before, self._settled = self._settled, settled
         if before is None or before.kept.made_s != settled.kept.made_s:
             self._change_to(settled, before)

@@ -102,7 +102,7 @@ class StoreTransaction:
         return StoreResult(kept, kept.next if oldest is None else oldest, dropped)
 
     def _begin(self, connection: sqlite3.Connection) -> StoreState:
-        """A new store, made when the first sample that waits for it was taken."""
+        """Create a store, stamped with the time of its first waiting sample."""
         connection.execute("DELETE FROM block")
         first_s = float(self.put[0][1].samples["time_s"][0]) if self.put else self.now_s
         return StoreState(max(int(first_s), self.known_s + 1, self.after_s + 1), 1, 0.0, 0, "", 0)
@@ -149,7 +149,7 @@ class Read:
 
 
 def _kept(connection: sqlite3.Connection) -> StoreState | None:
-    """The store that is there; None of one that cannot be."""
+    """Read the existing store; None if it is not valid."""
     row = connection.execute("SELECT made_s, next, last_s, bytes, run, taken FROM store").fetchone()
     if row is None or [*map(type, row)] != [int, int, float, int, str, int]:
         return None

@@ -48,7 +48,7 @@ class SampleClock:
             self._last_s, self._lead_s, self._told_s = time_s, math.nan, math.nan
 
     def place(self, told_s: Times, wall_s: float, steady_s: float) -> Times:
-        """Times of samples that have just come [s since 1970].
+        """Return timestamps of samples that have just arrived [s since 1970].
 
         Args:
             told_s: By the source's clock [s], shape (n,); what is not finite counts as the sample before.
@@ -70,7 +70,7 @@ class SampleClock:
         return steady_s + self._lead_s
 
     def _place(self, told_s: Times, now_s: float) -> Times:
-        """Times of samples in which the source's clock does not step back."""
+        """Return timestamps of samples during which the source's clock does not step back."""
         late_s = now_s - (float(told_s[-1]) + self._offset_s)
         if not told_s[0] >= self._told_s or late_s < -STEP_S:  # of a first one, too
             self._map_anew(told_s, now_s)
@@ -88,7 +88,7 @@ class SampleClock:
         return placed
 
     def _map_anew(self, told_s: Times, now_s: float) -> None:
-        """The last one has come just now, unless the first would be before what was placed."""
+        """Map the last sample to now, unless the first one would then precede an earlier sample."""
         offset_s = max(now_s - float(told_s[-1]), self._last_s - float(told_s[0]))
         self._offset_s, self._slew_s = math.ceil(offset_s * GRID) / GRID, 0.0
         self._told_s = float(told_s[0])

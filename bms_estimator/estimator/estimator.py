@@ -153,7 +153,7 @@ class Estimator:
 
 
 def estimator_of(settings: Settings, cell: PackModel) -> Estimator:
-    """The estimator of a pack.
+    """Make the estimator of a pack.
 
     Args:
         settings: The pack's.

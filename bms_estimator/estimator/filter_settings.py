@@ -50,7 +50,7 @@ def filter_settings(
     voltage_noise_v: float | None,
     sampling: Sampling = BOARD,
 ) -> NDArray[np.void]:
-    """The filter's settings record.
+    """Return the filter's settings record.
 
     Args:
         cell: The pack as one object.
@@ -96,7 +96,7 @@ def unmeasured_s(sampling: Sampling) -> float:
 
 
 def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> None:
-    """The error of E_o at 25 C, and what hysteresis and temperature do to it.
+    """Fill in the error of E_o at 25 C, hysteresis and the temperature coefficient.
 
     Args:
         p: Of dtype EKF_SETTINGS, with E_o; written.
@@ -139,7 +139,7 @@ def _ladder(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], 
 
 
 def ladder_of_branches(cell: CellModel) -> NDArray[np.float64]:
-    """The ladder's resistances [ohm] that stand for (2.5)-(2.9). Shape (GRID, RESISTANCES).
+    """Return the network's resistances [ohm] that are equivalent to (2.5)-(2.9). Shape (GRID, RESISTANCES).
 
     Each branch is shared between the two time constants of the ladder around its own, by the logarithm.
     """

@@ -29,7 +29,7 @@ exchange current."""
 
 
 def fuel_cell_settings(cell: FuelCellModel, of_observer: np.void) -> NDArray[np.void]:
-    """The learning law's settings record.
+    """Return the adaptive law's settings record.
 
     Nothing is injected: a voltage that is wrong as a whole is the exchange current's, not an offset's.
 

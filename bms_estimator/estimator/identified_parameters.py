@@ -39,7 +39,7 @@ class IdentifiedValue(NamedTuple):
 
 
 def present_elements(record: np.void) -> dict[str, IdentifiedValue]:
-    """The elements at the present SOC by name: ``ELEMENT_NAMES``, in ohm and farad.
+    """Return the elements at the present SOC by name: ``ELEMENT_NAMES``, in ohm and farad.
 
     Args:
         record: Of dtype ESTIMATOR_STATE, after a sample, identifying.
@@ -74,7 +74,7 @@ def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
 
 
 def relative_capacity(record: np.void) -> IdentifiedValue:
-    """True over declared capacity."""
+    """Return true over declared capacity."""
     ln_q, std = _bias(record, LN_Q)
     return IdentifiedValue(math.exp(ln_q), math.exp(ln_q) * std, 0.0)
 
@@ -114,7 +114,7 @@ def _bias(record: np.void, j: int) -> tuple[float, float]:
 def ocv_correction_with_std(
     record: np.void, settings: np.void, soc: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What the true OCV is above that of the cell file, of the likeliest hypothesis, and how sure that is.
+    """Return the learned correction of the cell file's OCV by the most likely hypothesis, and its standard deviation.
 
     Args:
         record: Of dtype ESTIMATOR_STATE.
@@ -133,7 +133,7 @@ def ocv_correction_with_std(
 
 @lru_cache(maxsize=64)
 def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What each node of the correction is worth at each SOC, and the error of the curve there [V]: of settings alone.
+    """Return the weight of each node of the correction at each SOC, and the error of the curve there [V].
 
     Args:
         settings: Of a record of EKF_SETTINGS, as all that it depends on.
@@ -150,7 +150,7 @@ def _on_nodes(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArra
 
 
 def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
-    """A cell file's values with what the filter has learned: OCV, capacity, resistances, each with its error.
+    """Return a cell file's values with the learned OCV, capacity and resistances, each with its error.
 
     Args:
         estimator: Of a pack of that cell, after samples, identifying.
@@ -180,7 +180,7 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
 
 
 def _corrected(record: np.void, settings: np.void, cell: CellModel, series: int) -> dict[str, Any]:
-    """The OCV of a cell as a table, corrected, other columns as they are."""
+    """Return the corrected OCV of a cell as a table; its other columns stay."""
     table = cell.ocv.model_dump() if isinstance(cell.ocv, TableOcv) else {"form": "table", "soc": EVEN}
     soc = np.array(table["soc"])
     correction_v, std_v = ocv_correction_with_std(record, settings, soc)

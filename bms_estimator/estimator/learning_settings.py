@@ -28,7 +28,7 @@ SCALED = {"r_s": (13, 15), "r_ts": (1, 3), "tau_ts": (7, 9), "r_tl": (4, 6), "ta
 
 
 def learning_settings(cell: CellModel, observer: ObserverSettings, of_observer: np.void) -> NDArray[np.void]:
-    """The learning law's settings record.
+    """Return the adaptive law's settings record.
 
     Args:
         cell: The pack as one object.

@@ -38,13 +38,13 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
 
 
 def _no_load_v(cell: FuelCellModel) -> float:
-    """The highest voltage of a stack, at the file's temperature [V]."""
+    """Return the highest voltage of a stack at the file's temperature [V]."""
     voltage_v, _ = polarisation(cell.a, np.zeros(LEARNABLE), np.zeros(1), np.full(1, np.nan))
     return float(voltage_v[0])
 
 
 def _ignored(settings: Settings, cell: FuelCellModel) -> Iterator[str]:
-    """What the file sets, but a fuel cell has not."""
+    """Return the settings that a fuel cell ignores."""
     if "law" in settings.observer.model_fields_set and settings.observer.law != "learning":
         yield f"observer.law = {settings.observer.law!r}: ignored: a fuel cell ({cell.cell.name}) always has 'learning'"
     if "enabled" in settings.identifier.model_fields_set and settings.identifier.enabled:

@@ -50,7 +50,7 @@ def estimator_settings(
     initial_soc: float | None,
     sampling: Sampling = BOARD,
 ) -> NDArray[np.void]:
-    """The settings record of the whole estimator.
+    """Return the settings record of the whole estimator.
 
     Args:
         cell: The pack as one object.
@@ -89,7 +89,7 @@ def estimator_settings(
 def observer_settings(
     cell: CellModel, observer: ObserverSettings, voltage_resolution_v: float, initial_soc: float | None
 ) -> NDArray[np.void]:
-    """The observer's settings record.
+    """Return the observer's settings record.
 
     Args:
         cell: The pack as one object.
@@ -113,7 +113,7 @@ def observer_settings(
 
 
 def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage_resolution_v: float) -> None:
-    """Settings of the observer for every pack: the gain, its dead zone, the lock, limits of a sample.
+    """Fill in the settings of every observer: gain, dead zone, lock, limits of a sample.
 
     Args:
         p: Of dtype ``OBSERVER_SETTINGS``; written.

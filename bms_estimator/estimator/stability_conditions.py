@@ -34,7 +34,7 @@ def lemma_conditions(cell: CellModel) -> list[Condition]:
 
 
 def failed_conditions(cell: CellModel) -> list[Condition]:
-    """The conditions that fail where they are needed."""
+    """Return the conditions that fail where they are needed."""
     needed = []
     for (amplitude, offset), number in zip(((7, 9), (10, 12)), "12", strict=True):
         big, small = cell.bounds(amplitude), cell.bounds(offset)

@@ -38,7 +38,7 @@ class _Listener(event.Listener):
         self._waiting, self._all, self._tell = kernels, len(kernels), tell
 
     def on_start(self, event: event.Event) -> None:
-        """A function, ours or numba's own; inner ones come after those that call them."""
+        """Count a kernel of this package; inner functions come after their callers."""
         kernel = event.data["dispatcher"].py_func
         if kernel in self._waiting:  # a kernel is compiled anew for each kind of argument
             self._waiting.remove(kernel)

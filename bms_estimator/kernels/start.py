@@ -50,7 +50,7 @@ def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, volta
 
 @njit(cache=True)
 def first_update(s: Record, p: Record, current_a: float, voltage_v: float) -> None:
-    """The first sample is an update by itself."""
+    """Update the filter by the first sample alone."""
     f = s.filter
     store_last_good_state(s.checks, f)
     add_to_window(f, current_a, voltage_v)
@@ -62,7 +62,7 @@ def first_update(s: Record, p: Record, current_a: float, voltage_v: float) -> No
 
 @njit(cache=True)
 def initialize_state(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """The first sample of all, of filter and learning law. Records as in ``step``."""
+    """Initialize filter and adaptive law at the first sample. Records as in ``step``."""
     s.learning.temperature_c = math.nan
     store_temperature(s.learning, temperature_c)
     if p.identify:
@@ -82,7 +82,7 @@ def store_temperature(m: Record, temperature_c: float) -> None:
 
 @njit(cache=True)
 def restart_after_unknown_gap(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
-    """The first sample of a new clock: nobody knows how long nobody measured. Records as in ``step``."""
+    """Restart at the first sample of a new clock, after a gap of unknown length. Records as in ``step``."""
     if p.identify:
         if is_temperature(temperature_c):
             s.filter.temperature_c, s.filter.sensed = temperature_c, 1

@@ -126,7 +126,7 @@ def step(
 
 @njit(cache=True)
 def is_gap(s: Record, p: Record, dt_s: float) -> bool:
-    """True when samples are missing in a step of ``dt_s``; such gaps are counted. Records as in ``validate_sample``."""
+    """Return True and count a gap if samples are missing in a step of ``dt_s``. Records as in ``validate_sample``."""
     gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
     s.step_s = dt_s
     if gap:
@@ -205,5 +205,5 @@ def write_filter_trace(row: Record, s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def value_and_std(e: Record, j: int) -> tuple[float, float]:
-    """An element of a record of EQUIVALENT, and its standard deviation, in its unit."""
+    """Return an element of a record of EQUIVALENT and its standard deviation, in its unit."""
     return e.value[j], e.value[j] * math.sqrt(e.ln_variance[j])

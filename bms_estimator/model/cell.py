@@ -236,7 +236,7 @@ class CellModel(Strict):
         return Bounds(upper=4.0 * value, lower=0.25 * value, weight_upper=0.2 * rate, weight_lower=0.8 * rate)
 
     def pack(self, series: int, parallel: int) -> "CellModel":
-        """The model of ``series`` x ``parallel`` of these: voltages, resistances, capacitances and capacity scaled."""
+        """Return the model of ``series`` x ``parallel`` cells: voltages, resistances, capacitances and capacity scaled."""
         if series == parallel == 1:
             return self
         return _scaled(self, series, parallel)
@@ -269,7 +269,7 @@ def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
 
 
 def _product(value: Any, factor: float) -> Any:
-    """A number, or each of a table's, times ``factor``."""
+    """Multiply a number, or each number of a table, by ``factor``."""
     return tuple(_product(v, factor) for v in value) if isinstance(value, tuple) else value * factor
 
 
@@ -304,7 +304,7 @@ def _names(folder: str) -> list[str]:
 
 
 def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> CellModel:
-    """A generic or a shipped cell by name, or a cell file by path.
+    """Load a generic or shipped cell by name, or a cell file by path.
 
     Args:
         name_or_path: As in ``generic_cells`` or ``shipped_cells``, else a path.
@@ -332,7 +332,7 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
 
 
 def with_capacity(cell: CellModel, capacity_ah: float) -> CellModel:
-    """The same cell, which holds another charge [Ah]; its resistances stay as they were measured."""
+    """Return the cell with another capacity [Ah]; its resistances stay as measured."""
     return cell.model_copy(
         update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": None})}
     )
@@ -344,7 +344,7 @@ def _packaged(name: str) -> CellModel:
 
 
 def existing(text: str) -> Path:
-    """The path of a cell file.
+    """Return the path of a cell file.
 
     Raises:
         UserError: There is none.

@@ -30,7 +30,7 @@ def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None
 
 
 def cell_text(cell: PackModel, remarks: Sequence[str] = ()) -> str:
-    """The text of a cell file."""
+    """Return the text of a cell file."""
     document = tomlkit.document()
     for remark in remarks:
         document.add(tomlkit.comment(remark))

@@ -19,7 +19,7 @@ class Clock:
 
 
 def since_boot() -> float:
-    """A clock that never steps and goes on while the machine sleeps [s]: the cell does not sleep."""
+    """Return the time since boot [s]; it never steps and counts while the machine sleeps, as the cell does not sleep."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 

@@ -38,7 +38,7 @@ class Columns(Mapping[str, NDArray[Any]]):
         return self.rows.dtype.names or ()
 
     def to_pandas(self) -> Any:
-        """A ``pandas.DataFrame`` of them; needs pandas."""
+        """Return the columns as a ``pandas.DataFrame``; needs pandas."""
         import pandas as pd  # noqa: PLC0415 - optional
 
         return pd.DataFrame(self.rows)

@@ -23,7 +23,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 def _number(value: object) -> object:
-    """A number as it is.
+    """Return a number unchanged.
 
     Raises:
         ValueError: pydantic would take it for one: ``true`` for 1, and the text "3_9" for 39.
@@ -129,7 +129,7 @@ def _line(path: str, model: type[BaseModel], table: object, detail: Any) -> str:
 
 
 def _keys(table: object, detail: Any) -> list[str]:
-    """The keys of the file that lead to what is wrong, without the names of models that pydantic puts between."""
+    """Return the keys of the file that lead to an error, without the model names that pydantic inserts."""
     keys, way = [], detail["loc"]
     for key in way[:-1]:
         if isinstance(table, dict) and key in table:
@@ -144,7 +144,7 @@ def _keys(table: object, detail: Any) -> list[str]:
 
 
 def _discriminator(detail: Any) -> str:
-    """The key that tells which of several models is meant."""
+    """Return the key that selects one of several models."""
     return str(detail["ctx"]["discriminator"]).strip("'")
 
 
@@ -158,7 +158,7 @@ def _meant(model: type[BaseModel], keys: list[str]) -> str:
 
 
 def _within(model: type[BaseModel], keys: list[str]) -> list[type[BaseModel]]:
-    """The models to which keys lead."""
+    """Return the models at the end of a path of keys."""
     current = [model]
     for key in keys:
         fields = [field for m in current for name, field in m.model_fields.items() if key in (name, field.alias)]
@@ -172,7 +172,7 @@ def _has(table: object, key: object) -> bool:
 
 
 def _description(model: type[BaseModel], keys: list[str]) -> str:
-    """What the last key means, from its field's description; empty where it has none."""
+    """Return the description of the last key's field; empty if it has none."""
     described, current = "", [model]
     for key in keys:
         fields = [m.model_fields[key] for m in current if key in m.model_fields]
@@ -183,7 +183,7 @@ def _description(model: type[BaseModel], keys: list[str]) -> str:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """The models within an annotation: itself, or the members of a union."""
+    """Return the models within an annotation: itself, or the members of a union."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models(part)]

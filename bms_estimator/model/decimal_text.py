@@ -15,7 +15,7 @@ _WHOLE = re.compile(NUMBER)
 
 
 def number(text: str) -> float:
-    """The number that ``text``, apart from blanks around it, is.
+    """Parse a number in ``text``, with blanks around it allowed.
 
     Raises:
         ValueError: It is none, or one that is too large to be held.

@@ -43,7 +43,7 @@ class _Found(NamedTuple):
 
 
 def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
-    """What happened between two snapshots.
+    """Yield the events between two snapshots.
 
     Args:
         before: The snapshot before; None: the service has just started.
@@ -117,7 +117,7 @@ def _suspicions(was: list[str], now: list[str]) -> Iterator[_Found]:
 
 
 def _kind(sentence: str) -> str:
-    """The part of a suspicion that does not change."""
+    """Return the constant part of a suspicion's sentence."""
     return next((suspect.text for suspect in InputFault if sentence.endswith(suspect.text)), sentence)
 
 

@@ -83,7 +83,7 @@ class FuelCellModel(Strict):
         return -self.fuel_cell.tafel_slope_v * math.log(self.fuel_cell.exchange_current_a)
 
     def identified(self, a: NDArray[np.float64], std: dict[Parameter, float]) -> "FuelCellModel":
-        """The same stack with other parameters.
+        """Return the same stack with other parameters.
 
         Args:
             a: As the property ``a``; what stands for conditions is not looked at.
@@ -104,7 +104,7 @@ class FuelCellModel(Strict):
         return self.model_copy(update={"fuel_cell": losses, "std": rounded})
 
     def pack(self, series: int, parallel: int) -> "FuelCellModel":
-        """The model of ``series`` x ``parallel`` of these: voltages, resistance, capacitance and currents scaled.
+        """Return the model of ``series`` x ``parallel`` stacks: voltages, resistance, capacitance and currents scaled.
 
         Raises:
             UserError: Their exchange current is 1 A and more: no activation loss at 1 A is left to be learned.
@@ -135,7 +135,7 @@ PackModel = CellModel | FuelCellModel
 
 
 def load_fuel_cell(name_or_path: str | Path) -> FuelCellModel:
-    """A shipped fuel cell by name, or a fuel cell's file by path.
+    """Load a shipped fuel cell by name, or a fuel cell file by path.
 
     Raises:
         UserError: No such name or file, or a value in it that is not allowed.
@@ -148,7 +148,7 @@ def load_fuel_cell(name_or_path: str | Path) -> FuelCellModel:
 
 
 def load_any(name_or_path: str | Path, capacity_ah: float | None = None) -> PackModel:
-    """A cell as ``load_cell`` finds it, or a fuel cell.
+    """Load a cell as ``load_cell`` does, or a fuel cell.
 
     Raises:
         UserError: As ``load_cell``; a fuel cell is given a capacity.

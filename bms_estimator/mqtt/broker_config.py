@@ -22,7 +22,7 @@ class Broker(NamedTuple):
 
 
 def brokers(settings: MqttSettings) -> list[Broker]:
-    """The brokers in the order in which they are tried.
+    """Return the brokers in the order of attempts.
 
     Raises:
         UserError: A URL cannot be used, or a certificate is given where it cannot be shown.
@@ -36,7 +36,7 @@ def brokers(settings: MqttSettings) -> list[Broker]:
 
 
 def password(settings: MqttSettings) -> str | None:
-    """The broker's password, read anew.
+    """Read the broker's password.
 
     Raises:
         UserError: The file cannot be read.

@@ -241,7 +241,7 @@ class Client(aiomqtt.Client):
 async def connected(
     arguments: dict[str, Any], protocol: ProtocolVersion, hello: ConnectOptions, patience: Timeouts
 ) -> AsyncIterator[Client]:
-    """A connection while the context lasts; whoever leaves it by an exception has the broker publish the will.
+    """Connect while the context lasts; leaving it by an exception makes the broker publish the will.
 
     Raises:
         aiomqtt.MqttError: The broker cannot be reached, or refuses.

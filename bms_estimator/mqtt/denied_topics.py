@@ -30,7 +30,7 @@ class DeniedTopics:
         self._again: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
-        """A new connection, which has denied nothing yet."""
+        """Clear the denied topics for a new connection."""
         self.end()
         for of_the_last in (self._said, self._denied, self._for_now):
             of_the_last.clear()
@@ -44,17 +44,17 @@ class DeniedTopics:
             self._again = None
 
     def deny(self, topic: str, why: str) -> None:
-        """A topic is denied."""
+        """Record that a topic is denied."""
         self._denied[topic] = None
         self._say("broker refuses a topic; see its access list", topic, why)
 
     def allow(self, topic: str) -> None:
-        """It was not."""
+        """Record that a topic is allowed."""
         self._denied.pop(topic, None)
         self._show()
 
     def record_result(self, message: Message, refusal: PublishRejection | None) -> None:
-        """The broker has taken a message, or refused it."""
+        """Record that the broker accepted or rejected a message."""
         if refusal is not None and refusal.is_retryable:
             self._for_now[message.topic] = None
             self._say("broker refuses a topic for now; it is tried again", message.topic, refusal.why)

@@ -36,10 +36,10 @@ class MessageQueue(Protocol):
         """Wait until there is a message, and hand out up to ``most`` of the oldest that were not since ``rewind``."""
 
     def sent(self, number: int) -> None:
-        """The broker has acknowledged a message."""
+        """Record that the broker has acknowledged a message."""
 
     def rewind(self) -> None:
-        """A connection is lost: hand out again, in order, what was not acknowledged."""
+        """Hand out again, in order, all messages that were not acknowledged, after a connection was lost."""
 
 
 class QueueSender:

@@ -37,6 +37,6 @@ def is_final(reason: ReasonCode) -> bool:
 
 
 def words(reason: ReasonCode) -> str:
-    """A reason code as text: name, number, hint."""
+    """Return a reason code as text: name, number, hint."""
     hint = HINTS.get(reason.value)
     return f"{reason.getName()} ({reason.value})" + (f": {hint}" if hint else "")

@@ -154,7 +154,7 @@ def parsed(payload: bytes) -> Any:
 
 
 def _finite(token: str) -> float:
-    """A number of a payload.
+    """Parse a finite number of a payload.
 
     Raises:
         ValueError: It is NaN or infinite, which JSON does not know.

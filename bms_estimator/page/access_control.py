@@ -64,7 +64,7 @@ class AccessControl:
 
 
 def guard_of(settings: PageSettings) -> AccessControl:
-    """The guard that settings ask for.
+    """Make the access control of the settings.
 
     Raises:
         UserError: The token cannot be read, or is too short.

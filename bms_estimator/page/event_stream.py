@@ -51,7 +51,7 @@ class LatestValues:
 
     @contextmanager
     def reading(self) -> Iterator["Reader"]:
-        """A reader, who finds all that is known first."""
+        """Return a new reader, which first gets all present values."""
         reader = Reader(self)
         self._readers.add(reader)
         try:

@@ -63,7 +63,7 @@ class HistoryQuery:
             self._read.pop((pack, name), None)
 
     def read(self, pack: str, name: str) -> bytes:
-        """A span of a pack's history as JSON, by columns; to be called in ``thread``.
+        """Read a span of a pack's history as JSON columns; call it in ``thread``.
 
         Args:
             pack: Its name.

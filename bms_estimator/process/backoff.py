@@ -24,11 +24,11 @@ class Backoff:
         self._first_s = self._next_s = first_s
 
     def next_s(self) -> float:
-        """The next one [s]."""
+        """Return the next delay [s]."""
         delay_s = self._next_s
         self._next_s = min(2.0 * delay_s, LONGEST_DELAY_S)
         return delay_s * random.uniform(0.5, 1.0)
 
     def reset(self) -> None:
-        """It went well: the first comes next."""
+        """Restart with the first delay after a success."""
         self._next_s = self._first_s

@@ -51,7 +51,7 @@ def flush_logs() -> Iterator[None]:
 
 
 def set_level(pack: str, level: LogLevel) -> None:
-    """What is logged at least; of a process with several packs by the most talkative of them."""
+    """Set a pack's minimum log level; a process with several packs uses the lowest of them."""
     _levels[pack] = level
 
 

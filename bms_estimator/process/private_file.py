@@ -10,7 +10,7 @@ class UnsafeFileError(Exception):
 
 
 def read_private(path: Path, longest: int) -> bytes:
-    """A whole file, but not through a link nor from what is no file.
+    """Read a whole regular file; refuse links and other file types.
 
     Args:
         path: The file.

@@ -34,7 +34,7 @@ class SystemdNotifier:
         """Time after which systemd takes us for dead [s]; 0: it does not watch."""
 
     def ready(self, pack: str) -> None:
-        """The pack's loop runs, or goes on after its settings were read."""
+        """Report that the pack's loop runs."""
         self._send_with_last(pack, "READY=1", f"\n{self._status}")
 
     def status(self, pack: str, text: str) -> None:
@@ -43,11 +43,11 @@ class SystemdNotifier:
         self._send(self._status)
 
     def alive(self, pack: str) -> None:
-        """The pack's loop turns."""
+        """Report that the pack's loop is alive."""
         self._send_with_last(pack, "WATCHDOG=1")
 
     def stopping(self, pack: str) -> None:
-        """The pack's loop has ended."""
+        """Report that the pack's loop has ended."""
         self._send_with_last(pack, "STOPPING=1")
 
     @property
@@ -63,7 +63,7 @@ class SystemdNotifier:
             self._send(f"{state}{more}")
 
     def _send(self, state: str) -> None:
-        """A deaf systemd is no reason to fail."""
+        """Send to systemd; ignore errors, because the service works without it."""
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel:
@@ -75,7 +75,7 @@ class SystemdNotifier:
 
 
 def credential(name: Path) -> Path:
-    """The file of this name in ``$CREDENTIALS_DIRECTORY`` where there is one, else ``name`` as it stands."""
+    """Return the path of this name in ``$CREDENTIALS_DIRECTORY`` if it exists there, else ``name`` itself."""
     own = Path(os.environ.get("CREDENTIALS_DIRECTORY", ""), name)
     return own if os.access(own, os.R_OK) else name
 

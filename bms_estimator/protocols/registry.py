@@ -18,12 +18,12 @@ BOARD = "binary"
 
 
 def _find_devices() -> dict[str, Device]:
-    """Import every module of ``protocols.devices``; return its ``DEVICE`` by name."""
+    """Import every module of ``protocols.devices``; return its ``DEVICE`` by name, devices that send text first."""
     modules = (
         importlib.import_module(f"{devices.__name__}.{each.name}") for each in pkgutil.iter_modules(devices.__path__)
     )
     found: list[Device] = [module.DEVICE for module in modules]
-    return {device.name: device for device in found}
+    return {device.name: device for device in sorted(found, key=lambda device: (device.has_binary_frames, device.name))}
 
 
 DEVICES: Mapping[str, Device] = _find_devices()

@@ -330,5 +330,5 @@ def _sides(condition: Condition) -> str:
 
 
 def ocv_error_ohm(cell: CellModel) -> float:
-    """What an E_o wrong by ``OCV_ERROR_V`` adds to R_s by (4.2) at C/20 [ohm]."""
+    """Return the error of R_s by (4.2) at C/20 for an E_o error of ``OCV_ERROR_V`` [ohm]."""
     return OCV_ERROR_V / (SLOW_C * cell.cell.capacity_ah)

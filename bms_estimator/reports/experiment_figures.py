@@ -229,7 +229,7 @@ def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> F
 
 
 def figure_35(experiment: Experiment) -> Figure:
-    """Steps."""
+    """Draw the voltage under current steps."""
     return _step_voltage(experiment, "35", "Constant steps: actual and estimated voltage", 0)
 
 

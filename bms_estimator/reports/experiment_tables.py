@@ -125,7 +125,7 @@ def _over_limit(index: int) -> float:
 
 
 def table_11(experiment: Experiment) -> Table:
-    """Validation."""
+    """Compute the validation table."""
     protocol, coarse = experiment.protocol, experiment.coarse
     columns = ["load", "mean current [A]", "serves", "printed mean %", "mean %", "max %", "RMS [mV]"]
     columns += ["at SOC", f"mean %, SOC > {KNEE_SOC:g}", f"max %, SOC > {KNEE_SOC:g}"]

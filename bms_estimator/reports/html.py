@@ -80,7 +80,7 @@ any step length. Errors are always in percent of the true value.</p>
 
 
 def page(report: Report) -> str:
-    """The whole page."""
+    """Return the whole page."""
     chapters = "".join(
         f"<h2>{escape(chapter)}</h2>{''.join(_article(item) for item in items)}" for chapter, items in report.chapters
     )

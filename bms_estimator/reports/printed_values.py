@@ -168,7 +168,7 @@ DECIMALS_5 = {1: 4, 2: 4, 3: 4, 4: 4, 5: 4, 6: 4, 7: 4, 8: 4, 9: 2, 10: 1, 11: 4
 
 
 def bounds(table: str, index: int) -> Bounds:
-    """What (3.18) runs with for Table 5 or 10: as printed, the weights those of ``INFERRED_WEIGHTS``."""
+    """Return the bounds of (3.18) for Table 5 or 10: as printed, with the weights of ``INFERRED_WEIGHTS``."""
     upper, lower, x, y = BOUNDS[index]
     x, y = INFERRED_WEIGHTS[table].get(index, (x, y))
     return Bounds(upper=upper, lower=lower, weight_upper=x, weight_lower=y, initial=initial(table, index))
@@ -180,7 +180,7 @@ def initial(table: str, index: int) -> float:
 
 
 def mean_from_start(table: str, index: int) -> float:
-    """The mean (3.19) of (3.18) over the first ``START_MEAN_S`` of Table 5 or 10, e = 0: the integral of (4.5)."""
+    """Return the mean (3.19) of (3.18) over the first ``START_MEAN_S`` of Table 5 or 10 at e = 0: integral of (4.5)."""
     b = bounds(table, index)
     return b.limit + (initial(table, index) - b.limit) / (b.rate * START_MEAN_S[table])
 
@@ -196,7 +196,7 @@ def implied_rates(index: int) -> tuple[float, float]:
 
 
 def worst_mean_percent() -> float:
-    """The largest difference between ``mean_from_start`` and an estimate of Table 10, of the estimate; a5 as E5 [%]."""
+    """Return the largest relative difference between ``mean_from_start`` and Table 10; a5 as in erratum 5 [%]."""
     estimates = {i: row[1] for i, row in TABLE_10.items()} | {5: A5}
     return max(100.0 * abs(mean_from_start("10", i) / estimate - 1.0) for i, estimate in estimates.items())
 

@@ -75,7 +75,7 @@ class Capture:
 
 
 def kind_of(name: str, samples: SampleBlock, capacity_ah: float) -> Kind:
-    """What a capture is good for, by its current."""
+    """Classify a capture by its current."""
     good = remove_glitches(samples, name)
     current_a = good["current_a"]
     rest_a = rest_current_a(current_a, capacity_ah)
@@ -110,7 +110,7 @@ class Procedure:
                 raise UserError(f"the protocol needs a {needed}; given: {listed or 'nothing'}")
 
     def of(self, *kinds: Kind) -> list[Capture]:
-        """The captures of given kinds."""
+        """Return the captures of given kinds."""
         return [capture for capture in self.captures if capture.kind in kinds]
 
     @property
@@ -223,7 +223,7 @@ class Procedure:
         return fit_series_resistance(self.r_s_mean, self.lowest_soc)
 
     def r_s_without(self, name: str) -> SeriesResistanceFit:
-        """The same without the capture ``name``."""
+        """Return the R_s of all captures but ``name``."""
         if name not in self.r_s_curves:
             return self.r_s_fit
         others = [curve for load, curve in self.r_s_curves.items() if load != name]

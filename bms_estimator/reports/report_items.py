@@ -86,7 +86,7 @@ def label(item: Item) -> str:
 
 
 def number(value: float, digits: int = 4) -> str:
-    """A number as tables show it: significant digits, no needless exponent."""
+    """Format a number for tables: significant digits, no needless exponent."""
     if value != value:  # NaN  # noqa: PLR0124
         return "-"
     text = f"{value:.{digits}g}"

@@ -50,7 +50,7 @@ class SensorChain:
         return float(CURRENT_RANGE_A / 2**self.bits)
 
     def read(self, samples: SampleBlock, seed: int) -> SampleBlock:
-        """What the board reports of true samples."""
+        """Return the board's reading of true samples."""
         noise = np.random.default_rng(seed)
         seen = samples.copy()
         for name, step in (("voltage_v", self.voltage_step_v), ("current_a", self.current_step_a)):
@@ -60,7 +60,7 @@ class SensorChain:
 
 
 def pack() -> CellModel:
-    """The true pack, with what (3.18) runs with for Table 10."""
+    """Return the true pack with the settings of (3.18) for Table 10."""
     model, chen_mora = load_cell("thunder_power_6s"), load_cell("chen_mora")
     elements = {name: getattr(chen_mora, name) for name in ("r_ts", "r_tl", "c_ts", "c_tl")}
     adaptation = {f"a{i}": printed_values.bounds("10", i) for i in printed_values.BOUNDS}
@@ -76,7 +76,7 @@ def resistance_ohm(load: str) -> float:
 
 
 def run_down(cell: CellModel, schedule: list[tuple[float, str]], step_s: float = 1.0) -> SampleBlock:
-    """A full pack under a schedule of (seconds, load) that repeats until the pack is empty, without the sensor."""
+    """Simulate a full pack under a repeating schedule of (seconds, load) until it is empty, without the sensor."""
     a, capacity_as = cell.a, cell.cell.capacity_ah * 3600.0
     state = (1.0, 0.0, 0.0)
     time_s, currents, voltages = 0.0, [], []
@@ -100,7 +100,7 @@ def run_down(cell: CellModel, schedule: list[tuple[float, str]], step_s: float =
 
 
 def experiments() -> list[Capture]:
-    """The experiments of chapter 5 as they are: relaxation tests, constant loads, steps."""
+    """Simulate the experiments of chapter 5: relaxation tests, constant loads, steps."""
     cell = pack()
     rest, pulse = (QUARTER_HOUR_S, ""), (QUARTER_HOUR_S, "12.5 ohm")
     found = [
@@ -118,5 +118,5 @@ def experiments() -> list[Capture]:
 
 
 def captures(true: list[Capture], chain: SensorChain) -> list[Capture]:
-    """The experiments as the sensor chain reports them."""
+    """Return the experiments as the sensor chain reports them."""
     return [Capture(c.name, c.kind, chain.read(c.samples, seed)) for seed, c in enumerate(true)]

@@ -89,7 +89,7 @@ def block(time_s: Floats, current_a: Floats, voltage_v: Floats) -> SampleBlock:
 
 
 def discharge(cell: CellModel, current_a: float, step_s: float, first_s: Floats | None = None) -> SampleBlock:
-    """A full cell under constant current down to SOC 0.005.
+    """Simulate a full cell under constant current down to SOC 0.005.
 
     Args:
         cell: The cell.
@@ -113,12 +113,12 @@ def observer_settings(law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> O
 
 
 def with_bounds(cell: CellModel, bounds: dict[int, Bounds]) -> CellModel:
-    """The cell with other bounds of (3.18)."""
+    """Return the cell with other bounds of (3.18)."""
     return cell.model_copy(update={"adaptation": {f"a{i}": b for i, b in bounds.items()}})
 
 
 def table_5_cell() -> CellModel:
-    """The cell of Chen and Mora with what (3.18) runs with for Table 5."""
+    """Return the cell of Chen and Mora with the settings of (3.18) for Table 5."""
     return with_bounds(load_cell("chen_mora"), {i: printed_values.bounds("5", i) for i in printed_values.BOUNDS})
 
 
@@ -134,11 +134,11 @@ class Simulation:
         return discharge(self.cell, CURRENT_A, STEP_S)
 
     def _scheme(self, law: str) -> AdaptiveRun:
-        """A run of a scheme from the rounded a1..a15, with x2(0) = x3(0) = 0."""
+        """Run a scheme from the rounded a1..a15, with x2(0) = x3(0) = 0."""
         return adaptive_run(self._observer(law), self.truth)
 
     def _observer(self, law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> Estimator:
-        """A scheme with the rates and targets that Tables 2 to 4 are of."""
+        """Make a scheme with the rates and targets of Tables 2 to 4."""
         settings = observer_settings(law, lambda_, alpha)
         estimator = Estimator(self.cell, settings, identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0)
         record = estimator.settings[0]
@@ -160,7 +160,7 @@ class Simulation:
         return discharge(self.cell, CURRENT_A, AFTER_START_S, START_TIMES_S)
 
     def _started(self, law: str, start_v: float, lambda_: float, alpha: float) -> AdaptiveRun:
-        """A run of a scheme that begins with x2 = x3 = start_v / 2."""
+        """Run a scheme from x2 = x3 = start_v / 2."""
         estimator = self._observer(law, lambda_, alpha)
         estimator.run(self.started_truth[:1])
         estimator.state["v_ts"][0] = estimator.state["v_tl"][0] = 0.5 * start_v
@@ -208,7 +208,7 @@ class Simulation:
         return OneStart(float(start_v), float(error_v), float(lambda_), alpha, runs[0], runs[1])
 
     def frozen(self, a: Floats, lowest_soc: float = 0.01) -> Prediction:
-        """A model with parameters ``a`` frozen, under the current of ``truth``; every tenth sample."""
+        """Run a model with constant parameters ``a`` under the current of ``truth``; every tenth sample."""
         return predict(self.cell, self.truth[::10], 1.0, a=a, lowest_soc=lowest_soc)
 
     @cached_property
@@ -261,7 +261,7 @@ class Simulation:
         return block(time_s, current_a, voltage_v)
 
     def dynamic(self, a: Floats, lowest_soc: float = FINAL_SOC) -> Prediction:
-        """A model on the pulsed load."""
+        """Run a model on the pulsed load."""
         return predict(self.cell, self.pulsed, 1.0, a=a, lowest_soc=lowest_soc)
 
     def constant_error_percent(self, current_a: float) -> float:
@@ -275,7 +275,7 @@ class Simulation:
         return float(np.interp(0.5, curve.soc, curve.r_s_ohm))
 
     def static(self, a: Floats, lowest_soc: float = FINAL_SOC) -> Prediction:
-        """The same with its elements frozen at ``STATIC_SOC``."""
+        """Run a model on the pulsed load with its elements fixed at ``STATIC_SOC``."""
         return self.dynamic(static_elements(a, STATIC_SOC), lowest_soc)
 
 
@@ -283,7 +283,7 @@ ELEMENTS = {"R_ts": r_ts, "C_ts": c_ts, "R_tl": r_tl, "C_tl": c_tl}
 
 
 def element(name: str, a: Floats, soc: Floats = SOC_GRID) -> Floats:
-    """An element, or a product "R_ts C_ts", over SOC."""
+    """Return an element, or a product "R_ts C_ts", over SOC."""
     values = np.ones(soc.size)
     for part in name.split():
         values *= np.array([ELEMENTS[part](x, a) for x in soc])

@@ -29,7 +29,7 @@ WEAK_SOC = (0.85, 0.7)
 
 
 def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, float] | None = None) -> Figure:
-    """An element or the EMF of the cell over SOC."""
+    """Draw an element or the EMF of the cell over SOC."""
 
     def draw(axes: Any) -> None:
         axes.plot(WHOLE, values)
@@ -72,7 +72,7 @@ def figure_8(s: Simulation) -> Figure:
 
 
 def figure_9(_: Simulation) -> Figure:
-    """The block diagram."""
+    """Draw the block diagram."""
     return Figure(
         "9",
         "Mittag-Leffler function as a Nussbaum function: block diagram",
@@ -216,7 +216,7 @@ def crossing_plot(axes: Any, run: AdaptiveRun) -> None:
 
 
 def condition_plot(ax: Any, i: int, value: float, met_at: float) -> None:
-    """The bound that a8 or a11 must stay above, and the SOC where ``value`` meets it."""
+    """Draw the bound of a8 or a11, and the SOC where ``value`` meets it."""
     low, high = 0.4 * max(met_at, 1e-3), 12.0 * max(met_at, 1e-3)
     soc = np.linspace(low, high, 400)
     ax.plot(soc, value * met_at / soc, label=f"$-\\ln(a_{{{i + 1}}}/a_{{{i - 1}}})/x_1$")
@@ -227,7 +227,7 @@ def condition_plot(ax: Any, i: int, value: float, met_at: float) -> None:
 
 
 def figure_19(s: Simulation) -> Figure:
-    """The crossings."""
+    """Draw the crossings."""
     c8, c11 = s.improved.crossings
     return Figure(
         "19",
@@ -277,7 +277,7 @@ def products_plot(axes: Any, true: Floats | None, estimated: Floats) -> None:
 
 
 def figure_21(s: Simulation) -> Figure:
-    """The elements."""
+    """Draw the elements."""
 
     def draw(axes: Any) -> None:
         elements_plot(axes, s.cell.a, s.improved.average, [c.soc for c in s.improved.crossings])
@@ -314,7 +314,7 @@ def figure_22(s: Simulation) -> Figure:
 
 
 def figure_23(s: Simulation) -> Figure:
-    """Final model."""
+    """Draw the final model."""
     runs = {
         "Tables 5 and 6": s.frozen(s.printed_a, FINAL_SOC),
         "steps 2 and 3 as run here": s.frozen(s.improved_a, FINAL_SOC),

@@ -23,7 +23,7 @@ from bms_estimator.reports.theorem_4_1_2 import measure
 
 
 def table_1(_: Simulation) -> Table:
-    """The open-circuit voltage of Chen and Mora."""
+    """Compute the open-circuit voltage of Chen and Mora."""
     return Table(
         "1",
         "a16 to a21 for the simulations",
@@ -160,7 +160,7 @@ def table_4(simulation: Simulation) -> Table:
 
 
 def table_5(simulation: Simulation) -> Table:
-    """The improved method."""
+    """Compute the table of the improved method."""
     rows = []
     for i, (initial, estimate, desired, error) in printed_values.TABLE_5.items():
         upper, lower, x, y = printed_values.BOUNDS[i]
@@ -336,7 +336,7 @@ def table_12(simulation: Simulation) -> Table:
 
 
 def theorem_4_1_2(_: Simulation) -> Table:
-    """The claim of the theorem, measured."""
+    """Measure the claim of the theorem."""
     rows = tuple(
         (
             m.bounds,

@@ -67,7 +67,7 @@ def plot(draw: Callable[[Any], None], *, rows: int = 1, columns: int = 1, salt: 
 
 
 def thin(x: Floats, *curves: Floats, points: int = POINTS) -> tuple[Floats, ...]:
-    """The same curves with fewer points; of each stretch its first, lowest and highest by the first curve are kept."""
+    """Reduce the points of curves; keep first, lowest and highest of the first curve in each interval."""
     if x.size <= points:
         return (x, *curves)
     y = curves[0]

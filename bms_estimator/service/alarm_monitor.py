@@ -91,7 +91,7 @@ class AlarmMonitor:
         return known
 
     def _counts(self) -> SampleCounts:
-        """A damaged frame is missing in the sequence, too, where there is one."""
+        """Return the sample counters. A damaged frame also counts as missing in a numbered sequence."""
         line, samples = self._source.counters, sample_counters(self._estimator.state[0])
         lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
         return SampleCounts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE))

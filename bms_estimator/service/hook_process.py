@@ -105,7 +105,7 @@ async def _find(leader: int, entry: bytes) -> list[int] | None:
 
 
 def _processes(leader: int, entry: bytes) -> list[int]:
-    """Processes of the session of ``leader``, those whose environment has ``entry``, and their descendants.
+    """Return processes in the session of ``leader`` whose environment has ``entry``, and their descendants.
 
     Raises:
         OSError: No descriptor is free.

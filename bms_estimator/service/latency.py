@@ -31,7 +31,7 @@ class Latency:
 
 
 def _percentile(counts: list[int], share: float, most_s: float) -> float:
-    """The upper end of the bin in which it lies, or the longest [s]."""
+    """Return the upper edge of the percentile's bin, or the maximum [s]."""
     wanted, seen = share * sum(counts), 0
     for i, count in enumerate(counts):
         seen += count

@@ -142,7 +142,7 @@ async def run_estimation_loop(
 
 
 def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
-    """The estimator of a pack, its kernels loaded: nothing compiles once samples come."""
+    """Make the estimator of a pack with its kernels loaded, so that nothing compiles once samples arrive."""
     estimator_of(settings, cell).run(np.zeros(1, dtype=SAMPLE))
     return estimator_of(settings, cell)
 

@@ -200,7 +200,7 @@ class Publisher:
         )
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
-        """The estimate of this window; of the rest, what is old enough to be made anew."""
+        """Return this window's estimate; recompute the other payloads that are old enough."""
         _, parameters, health, info, _ = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
         estimate = self._estimate(summary, wall_s) if summary else None
@@ -284,6 +284,6 @@ class Publisher:
         return f"{text}; {self._impossible}" if self._impossible else text
 
     def _dropped(self) -> dict[str, int]:
-        """Samples that were not used, by kind."""
+        """Return the dropped samples by kind."""
         counted = sample_counters(self._estimator.state[0]).items()
         return {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}

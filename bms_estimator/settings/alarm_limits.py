@@ -88,7 +88,7 @@ class _Default(NamedTuple):
 
 
 def watched(settings: Settings, cell: PackModel) -> tuple[AlarmDefinition, ...]:
-    """What is watched of a pack, in the order of ``ALARMS``.
+    """Return the monitored alarms of a pack, in the order of ``ALARMS``.
 
     Args:
         settings: The pack's.

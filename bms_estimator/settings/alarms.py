@@ -178,7 +178,7 @@ class AlarmSettings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _over_its_own_defaults(cls, table: object) -> object:
-        """What an alarm's table leaves out is as that alarm has it, not as its kind has it."""
+        """Fill an alarm's missing settings from its own defaults, not from those of its kind."""
         if not isinstance(table, dict):
             return table
         return {
@@ -188,7 +188,7 @@ class AlarmSettings(Strict):
 
 
 def _completed(default: AlarmRule, told: Any) -> Any:
-    """What was told of an alarm over its defaults."""
+    """Merge an alarm's settings into its defaults."""
     if not isinstance(told, dict):
         return told
     return default.model_dump(exclude_none=True) | told

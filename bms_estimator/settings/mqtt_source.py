@@ -56,7 +56,7 @@ class ValueLocation(Strict):
         return (self.topic,) if isinstance(self.topic, str) else self.topic or ()
 
     def si(self, number: float) -> float:
-        """What came as V, A, degC or s."""
+        """Convert a number to V, A, C or s."""
         factor, offset = LINEAR.get(self.unit or "V", (1.0, 0.0))
         return factor * (self.scale * number + self.offset) + offset
 
@@ -105,7 +105,7 @@ class MqttSource(PolledSource):
     @model_validator(mode="before")
     @classmethod
     def _as_the_profile_has_it(cls, table: object) -> object:
-        """What is told goes before the profile; of a quantity each part."""
+        """Merge settings into the profile, part by part for each quantity."""
         profile = PROFILES.get(table.get("profile", "")) if isinstance(table, dict) else None
         if profile is None or not isinstance(table, dict):
             return table
@@ -139,14 +139,14 @@ class MqttSource(PolledSource):
         return self
 
     def places(self) -> Iterator[tuple[str, ValueLocation]]:
-        """The quantities that are to be found, by name."""
+        """Return the quantities to read, by name."""
         for name in self.quantities:
             place = getattr(self, name)
             if place is not None:
                 yield name, place
 
     def filled(self, text: str) -> str:
-        """A topic or a path with prefix and instance in it."""
+        """Fill prefix and instance into a topic or a path."""
         return text.replace("{prefix}", self.prefix or "").replace("{instance}", self.instance)
 
     def topics(self, place: ValueLocation) -> list[str]:

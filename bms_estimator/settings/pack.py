@@ -125,7 +125,7 @@ class Settings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _sensor_of_the_source(cls, tables: object) -> object:
-        """What a source that is no serial line makes of ``[sensor]``: it hands on lines of text.
+        """Return the ``[sensor]`` defaults of a source that is not a serial port: it yields text lines.
 
         Raises:
             ValueError: The table is of a serial device.

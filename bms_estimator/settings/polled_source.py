@@ -30,7 +30,7 @@ class PolledSource(Strict):
 
 
 def with_profile(table: object, profiles: Mapping[str, Mapping[str, object]]) -> object:
-    """A section of the settings with what its ``profile`` says and it does not.
+    """Fill a settings section from its ``profile`` where it leaves a value out.
 
     Raises:
         ValueError: There is no profile of this name.

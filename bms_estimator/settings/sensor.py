@@ -66,7 +66,7 @@ class SensorSettings(Strict):
     @model_validator(mode="wrap")
     @classmethod
     def _as_the_device_does(cls, table: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """What is left out is as the protocol has it, and does not count as set."""
+        """Fill in the protocol's defaults without counting them as set."""
         if not isinstance(table, dict):
             return validate(table)
         made = validate(_filled(table))

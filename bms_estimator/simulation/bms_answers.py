@@ -29,7 +29,7 @@ Answers = Mapping[bytes, Callable[[Measured], bytes]]
 
 
 def _steps(value: float, per_unit: float, least: int, most: int) -> int:
-    """What a converter makes of a value: steps within its range."""
+    """Quantize a value to a converter's steps within its range."""
     return min(max(round(value * per_unit), least), most)
 
 

@@ -102,7 +102,7 @@ class SimulatedNode:
 
 
 def _apart(cells: int, dice: random.Random) -> Sequence[float]:
-    """What each cell has more than their mean [V]."""
+    """Return the deviation of each cell from their mean [V]."""
     apart_v = [dice.gauss(0.0, SPREAD_V) for _ in range(cells)]
     mean_v = sum(apart_v) / cells
     return [v - mean_v for v in apart_v]

@@ -76,7 +76,7 @@ class SimulatedBms(SimulatedMeter):
         return b""
 
     def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:
-        """An answer to each question in ``heard``, in their order."""
+        """Respond to each query in ``heard``, in order."""
         said, end = b"", 0
         while found := min(
             ((at, question) for question in self._answers if (at := heard.find(question, end)) >= 0), default=None
@@ -94,7 +94,7 @@ class SimulatedBms(SimulatedMeter):
         )
 
     def _spoiled(self, answer: bytes) -> bytes:
-        """What a fault makes of an answer."""
+        """Apply a fault to a response."""
         match self._faults.popleft() if self._faults else None:
             case BmsFault.SILENCE:
                 return b""

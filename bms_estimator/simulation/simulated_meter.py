@@ -55,10 +55,10 @@ class SimulatedMeter(ABC):
 
     @abstractmethod
     def message(self, reading: Reading) -> bytes:
-        """What it tells of a reading."""
+        """Encode a reading."""
 
     def answer(self, heard: bytes, reading: Reading) -> tuple[bytes, int]:  # noqa: ARG002 - for those that are asked
-        """What it says to ``heard``, and how many bytes of that it has understood."""
+        """Respond to ``heard``; return the response and the number of bytes consumed."""
         return b"", len(heard)
 
     def send(self, data: bytes) -> None:
@@ -103,7 +103,7 @@ class SimulatedMeter(ABC):
             self.send(self.message(self._read(now_s)))
 
     def _read(self, now_s: float) -> Reading:
-        """What is at its sensors now."""
+        """Return the values at its sensors now."""
         self.time_s = now_s
         self.samples += 1
         self.last = self._signal(now_s)
@@ -177,7 +177,7 @@ class SimulatedPylontech(SimulatedMeter):
         self._cells = cells
 
     def message(self, reading: Reading) -> bytes:
-        """The table of all batteries."""
+        """Return the table of all batteries."""
         each, warm = round(1e3 * reading.voltage_v / self._cells), self._warm(reading)
         head = (
             "Power Volt   Curr   Tempr  Tlow   Thigh  Vlow   Vhigh  Base.St  Volt.St  Curr.St  Temp.St  Coulomb  Time"

@@ -39,7 +39,7 @@ def pulses(current_a: float, _seed: int = 0) -> Load:
 
 
 def random_steps(current_a: float, seed: int = 0) -> Load:
-    """Steps of random length and height, some of them charging."""
+    """Return a schedule of steps of random length and height, some of them charging."""
     dice = random.Random(seed)
     while True:
         yield dice.uniform(SHORTEST_STEP_S, LONGEST_STEP_S), current_a * dice.uniform(-MOST_CHARGE, 1.0)
@@ -88,7 +88,7 @@ class SimulatedPack:
         return self._state[0]
 
     def __call__(self, time_s: float) -> Reading:
-        """What is at the pack's terminals at ``time_s`` [s]."""
+        """Return voltage and current at the pack's terminals at ``time_s`` [s]."""
         dt_s, self.time_s = time_s - self.time_s, time_s
         self._state = cell_step(self._state, self._current_a, dt_s, self._capacity_as, self._a)
         self._current_a = self._next_current(dt_s)

@@ -75,7 +75,7 @@ class VirtualConverter:
         self._cursor = 0
 
     def window(self, reading: Reading, count: int) -> Sums:
-        """Sums of ``count`` pairs of conversions."""
+        """Return the sums of ``count`` pairs of conversions."""
         parts = self.parts
         voltage = self.convert(reading.voltage_v / parts.divider / parts.supply_v, count)
         current = self.convert(parts.current_zero + reading.current_a * parts.part_per_ampere, count)
@@ -118,6 +118,6 @@ def window_of(rate_hz: int) -> tuple[int, int]:
 
 
 def aux_readings_of(rate_hz: int) -> int:
-    """Readings of NTC or bandgap in one window: odd, as the firmware makes them."""
+    """Return the number of NTC or bandgap readings in one window: odd, as in the firmware."""
     wanted = AUX_PER_S // rate_hz
     return 1 if wanted == 0 else min((wanted - 1) | 1, AUX_MAX)

@@ -188,7 +188,7 @@ class VirtualBoard:
             self._unhear()
 
     def _unhear(self) -> None:
-        """The loop in which it runs, if it does, looks at the line no longer."""
+        """Stop watching the line in the event loop, if it runs in one."""
         if self._loop is not None and self._master >= 0:
             self._loop.remove_reader(self._master)
             self._loop.remove_writer(self._master)
@@ -298,7 +298,7 @@ class VirtualBoard:
         return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, n, int(status))
 
     def _text(self, message: SampleMessage, reading: Reading) -> bytes:
-        """The line that a hobby sketch prints."""
+        """Return the line that a hobby sketch prints."""
         parts = self._converter.parts
         volts_per_step = parts.supply_v / FULL_SCALE / message.count
         voltage_v = message.voltage_sum * volts_per_step * parts.divider
@@ -415,7 +415,7 @@ class VirtualBoard:
         self._answer(MessageType.COMMAND_SET_RELAY, AckResult.OK if good else AckResult.BAD_VALUE, self._relay_word)
 
     def _watch_relay(self) -> None:
-        """What becomes of the relay when the host is silent."""
+        """Apply the relay's fallback when the host is silent."""
         if self._relay_then != RELAY_KEEP and self.time_s - self._relay_told_s >= self._relay_s:
             self.relay_high, self._relay_then = self._relay_then == RELAY_HIGH, RELAY_KEEP
 

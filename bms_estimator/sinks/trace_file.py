@@ -132,7 +132,7 @@ def _create(path: Path) -> IO[bytes]:
 
 
 def _csv_writer() -> Callable[[NDArray[np.void]], bytes]:
-    """The faster of the two that can be had."""
+    """Return the faster available CSV writer."""
     try:
         import pyarrow  # noqa: F401, ICN001, PLC0415 - optional
     except ModuleNotFoundError:

@@ -18,7 +18,7 @@ KINDS: Mapping[str, str] = {
 
 
 def make_line_producer(settings: Settings) -> LineProducer | None:
-    """What ``[source]`` asks for; None where the source is a serial line.
+    """Make the line producer of ``[source]``; None if the source is a serial port.
 
     Raises:
         UserError: A setting cannot be used.
@@ -32,7 +32,7 @@ def make_line_producer(settings: Settings) -> LineProducer | None:
 
 
 def open_line_source(settings: Settings, *, tap: ReadTap | None = None) -> LineSource | None:
-    """The source that ``[source]`` asks for; None where it is a serial line.
+    """Open the source of ``[source]``; None if it is a serial port.
 
     Raises:
         UserError, ModuleNotFoundError: As ``make_line_producer``.

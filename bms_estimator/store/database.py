@@ -91,7 +91,7 @@ class Database:
         await self._wait(asyncio.wrap_future(self._thread.submit(self._file.close)))
 
     def begin_shutdown(self) -> None:
-        """The end has begun: all that is still written may take ``ENDING_S``, and what is waited for no longer."""
+        """Begin the shutdown: pending writes get ``ENDING_S`` in total, and nothing is waited for longer."""
         self._end_s = min(self._end_s, asyncio.get_running_loop().time() + ENDING_S)
         for wait in self._waits:
             if not wait.expired():
@@ -205,7 +205,7 @@ class _File:
             connection.close()
 
     def _opened(self) -> sqlite3.Connection:
-        """The connection to the file that is there: one that was deleted would take everything and keep nothing."""
+        """Return a connection to the present file; a deleted one would accept data and keep nothing."""
         if self._connection is not None and _inode(self._path) == self._inode:
             return self._connection
         self.close()

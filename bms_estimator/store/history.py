@@ -31,7 +31,7 @@ _LAST = ("soc", "soc_std")
 
 
 def _merged(column: str) -> str:
-    """SQL of a column of two rows of one minute: a service that is started again in it goes on with it."""
+    """Return SQL that merges a column of two rows of one minute, as after a restart within it."""
     old, new = f"minute.{column}", f"excluded.{column}"
     if column in _LAST:
         return f"{column} = coalesce({new}, {old})"
@@ -167,7 +167,7 @@ def _second(connection: sqlite3.Connection, row: Minute) -> int:
 
 
 def _remove(waiting: deque[tuple[int, Row]], last: int) -> None:
-    """What was written, up to number ``last``."""
+    """Remove the written items up to number ``last``."""
     while waiting and waiting[0][0] <= last:
         waiting.popleft()
 

@@ -55,7 +55,7 @@ class HistoryFile:
         return [Minute._make((*row[:10], *row[-2:], *row[10:16])) for row in found]
 
     def events(self, since_s: float, until_s: float) -> list[PastEvent]:
-        """What happened, oldest first.
+        """Yield the events, oldest first.
 
         Args:
             since_s: From [s since 1970].
@@ -85,7 +85,7 @@ class HistoryFile:
 
 
 def _mean(quantity: str, unit: str) -> str:
-    """SQL of mean and extremes of a quantity over rows of minutes."""
+    """Return SQL of mean and extremes of a quantity over one-minute rows."""
     mean, least, most = (f"{quantity}_{part}{unit}" for part in ("", "min_", "max_"))
     weight = f"sum(CASE WHEN {mean} IS NULL THEN 0 ELSE publications END)"
     return f"sum({mean} * publications) / {weight}, min({least}), max({most})"

@@ -85,7 +85,7 @@ class MinuteAccumulator:
         self._energy_ws[estimate.power_w < 0.0] += abs(estimate.power_w) * seen_s
 
     def row(self) -> Minute | None:
-        """What it came to; None when nothing was published."""
+        """Return the row of the minute; None if nothing was published."""
         if self._last is None:
             return None
         charge_out, charge_in = (each / 3600.0 for each in self._charge_as)

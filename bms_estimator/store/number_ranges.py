@@ -19,7 +19,7 @@ class NumberRanges:
         return self._count
 
     def __iter__(self) -> Iterator[range]:
-        """The runs."""
+        """Iterate over the ranges."""
         return iter(self._runs)
 
     def __contains__(self, number: int) -> bool:
@@ -59,9 +59,9 @@ class NumberRanges:
         return taken
 
     def moved(self, by: int) -> "NumberRanges":
-        """The same, each number higher by so much."""
+        """Return the ranges with each number increased by ``by``."""
         return NumberRanges(range(run.start + by, run.stop + by) for run in self._runs)
 
     def both(self, other: "NumberRanges") -> "NumberRanges":
-        """What is in both."""
+        """Return the intersection of two sets of ranges."""
         return NumberRanges(range(max(a.start, b.start), min(a.stop, b.stop)) for a in self._runs for b in other)

@@ -87,11 +87,11 @@ class Outbox:
         return taken
 
     def sent(self, number: int) -> None:
-        """The broker has acknowledged a message."""
+        """Record that the broker has acknowledged a message."""
         self._queue.sent(number)
 
     def rewind(self) -> None:
-        """A connection is lost: hand out again, in order, what was not acknowledged."""
+        """Hand out again, in order, all messages that were not acknowledged, after a connection was lost."""
         self._queue.rewind()
         self._tell()
 
@@ -157,7 +157,7 @@ class Outbox:
         )
 
     def _done(self, outcome: Outcome) -> None:
-        """A transaction is on disk."""
+        """Record that a transaction is on disk."""
         queue = self._queue
         if outcome.stored is not None:
             queue.left(outcome.stored)

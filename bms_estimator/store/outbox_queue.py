@@ -90,7 +90,7 @@ class Queue:
         return taken
 
     def sent(self, number: int) -> None:
-        """A message is acknowledged."""
+        """Record that a message is acknowledged."""
         if self.in_flight.pop(number, None):
             self._forget(number)
 
@@ -100,7 +100,7 @@ class Queue:
         self.in_flight.clear()
 
     def unwritten(self) -> list[QueuedMessage]:
-        """What is in memory alone."""
+        """Return the messages that are in memory only."""
         return [
             waiting for waiting in self._in_memory() if not self.disk_state_known or waiting.number not in self._written
         ]
@@ -110,7 +110,7 @@ class Queue:
         self._written.update(waiting.number for waiting in rows)
 
     def wrote(self) -> None:
-        """What was to be written is on disk: of the tail, memory keeps what is ready."""
+        """Record that the pending messages are on disk; of the tail, keep the ready ones in memory."""
         while self._tail and self._tail[0].number in self._written:
             newest = self._tail.popleft()
             if not self.stored and len(self._ready) < PAGE:
@@ -128,7 +128,7 @@ class Queue:
         self._lose(len(wanted) - len(read))
 
     def found(self, runs: NumberRanges) -> int:
-        """An earlier run left messages on disk: they go before all that was not handed out.
+        """Take over messages that an earlier run left on disk; they precede all that were not handed out.
 
         Args:
             runs: Their numbers on disk.
@@ -154,7 +154,7 @@ class Queue:
         self._lose(before - len(self.stored))
 
     def gaps(self) -> list[tuple[int, int]]:
-        """What is not kept: from each number to before the other. It never comes to be kept again."""
+        """Yield ranges of numbers that are not stored and never will be again."""
         kept = [range(waiting.number, waiting.number + 1) for waiting in self._in_memory()]
         gaps, begin = [], LOWEST
         for run in sorted([*kept, *self.stored], key=lambda run: run.start):
@@ -167,13 +167,13 @@ class Queue:
         return chain(self.in_flight.values(), self._ready, self._tail)
 
     def _forget(self, number: int) -> None:
-        """What may be on disk need not be any more."""
+        """Mark a message on disk as no longer needed."""
         if number in self._written:
             self._written.discard(number)
             self.stale = True
 
     def _lose(self, count: int) -> None:
-        """What was on disk alone cannot be read: what may be there of it need not be any more."""
+        """Drop messages that are only on an unreadable disk, and mark what may remain there as not needed."""
         if count:
             self.dropped += count
             self.stale = True

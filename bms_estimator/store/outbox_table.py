@@ -29,7 +29,7 @@ class StoredBacklog(NamedTuple):
 
 
 def read_backlog(connection: sqlite3.Connection) -> StoredBacklog:
-    """What an earlier run left."""
+    """Read the messages that an earlier run left."""
     beyond = "DELETE FROM outbox WHERE +number <= ? OR +number >= ?"
     damaged = connection.execute(beyond, (-FARTHEST, FARTHEST)).rowcount
     return StoredBacklog(_runs(connection, -FARTHEST, FARTHEST), damaged)
@@ -93,7 +93,7 @@ class OutboxTransaction:
 
 
 def _message(topic: Any, payload: Any, qos: Any, retain: Any) -> Message | None:
-    """A message as it was written; None of a row that is damaged: nobody could send it."""
+    """Return a stored message; None for a damaged row, which could not be sent."""
     sound = isinstance(topic, str) and _TOPIC.fullmatch(topic) and len(topic.encode()) <= LONGEST_TOPIC
     if not sound or not isinstance(payload, bytes) or qos not in (0, 1, 2) or retain not in (0, 1):
         return None

@@ -80,7 +80,7 @@ class AlarmState:
         return turns
 
     def raise_at(self, at_s: float, raising: RaisedAlarm) -> list[AlarmTransition]:
-        """It is raised, whatever came before; unless it is already."""
+        """Raise the alarm, unless it is already raised."""
         if self.raising is not None:
             return []
         self.raising, self._held_s = raising, None

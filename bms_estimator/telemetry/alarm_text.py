@@ -31,7 +31,7 @@ _WHAT: dict[AlarmName, tuple[str, str]] = {
 
 
 def alarm_text(watched: AlarmDefinition, value: float | None, reasons: Sequence[str], *, gone: bool) -> str:
-    """A sentence or two: what is wrong, and what to do.
+    """Return a sentence or two: the fault, and its remedy.
 
     Args:
         watched: The alarm.

@@ -211,7 +211,7 @@ class AlarmEvaluator:
         return tuple(name for name in self._unwatched if self._states[name].watched.severity == "critical")
 
     def changes(self) -> list[Change]:
-        """Changes since the last call, oldest first."""
+        """Return the changes since the last call, oldest first."""
         changes, self._changes = self._changes, []
         return changes
 
@@ -369,7 +369,7 @@ class AlarmEvaluator:
         return lost + self._reasons.get(name, _NO_REASONS).texts
 
     def _lost_text(self, quantity: Quantity) -> str:
-        """A lost quantity with the alarms that need it."""
+        """Describe a lost quantity and the alarms that need it."""
         names = ", ".join(name for name in self._unwatched if quantity in NEEDED.get(name, ()))
         return f"{LOST[quantity]}: {names} cannot be raised" if names else LOST[quantity]
 

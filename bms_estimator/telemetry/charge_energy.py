@@ -20,7 +20,7 @@ class ChargeEnergy(NamedTuple):
 
     @classmethod
     def of(cls, total: Totals) -> Self:
-        """The part of ``total`` that has flowed."""
+        """Return the charge and energy part of ``total``."""
         return cls(*(getattr(total, name) for name in cls._fields))
 
     def plus_net(self, charge_as: float, energy_ws: float) -> "ChargeEnergy":
@@ -34,7 +34,7 @@ class ChargeEnergy(NamedTuple):
         )
 
     def at_least(self, other: "ChargeEnergy") -> "ChargeEnergy":
-        """The larger of each."""
+        """Return the larger value of each field."""
         return ChargeEnergy(*map(max, self, other))
 
 

@@ -15,7 +15,7 @@ VALID_STD = 0.3
 
 
 def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parameter]:
-    """The values of ``[fuel_cell]`` as they are learned now, at the file's temperature.
+    """Return the values of ``[fuel_cell]`` as learned now, at the file's temperature.
 
     Args:
         estimator: Of a fuel cell, after a sample; read only.

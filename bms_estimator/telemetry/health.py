@@ -32,12 +32,12 @@ def resident_mib() -> float | None:
 
 
 def sample_counters(state: np.void) -> dict[str, int]:
-    """Samples accepted and dropped by kind, of a record of OBSERVER_STATE."""
+    """Return the samples accepted and dropped by kind, from a record of OBSERVER_STATE."""
     return dict(zip(_SAMPLE_COUNTERS, state[_SAMPLE_COUNTERS].item(), strict=True))
 
 
 def dropped_text(dropped: Mapping[str, int]) -> str:
-    """What was not used, for people: counts by kind, the kinds without ``dropped_``."""
+    """Describe dropped samples: counts by kind, names without ``dropped_``."""
     words = {"range": "outside the cell's range"}
     return ", ".join(f"{n:,} {words.get(kind, kind).replace('_', ' ')}" for kind, n in dropped.items() if n) or "none"
 
@@ -49,7 +49,7 @@ def identifier_counters(record: np.void) -> dict[str, int]:
 
 
 def suspicions(record: np.void, settings: np.void) -> list[str]:
-    """What the filter suspects of its input: one sentence each.
+    """Return the filter's suspicions of its input, one sentence each.
 
     Args:
         record: Of dtype ESTIMATOR_STATE.
@@ -142,7 +142,7 @@ def make_health_payload(
 
 
 def out_of_range_reason(block: SampleBlock, settings: np.void) -> str | None:
-    """The last sample of a block that is out of range or has no number, for people; None where there is none.
+    """Describe the last sample of a block that is out of range or not a number; None without one.
 
     Args:
         block: Some of its samples were dropped.

@@ -26,7 +26,7 @@ class OcvFormulaFit(NamedTuple):
 
 
 def formula(cell: CellModel) -> OcvFormulaFit | None:
-    """That of a cell's table; None where the cell file gives (2.10) itself."""
+    """Fit (2.10) to a cell's OCV table; None if the cell file gives (2.10) itself."""
     return _fitted(cell.ocv) if isinstance(cell.ocv, TableOcv) else None
 
 

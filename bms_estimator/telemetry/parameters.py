@@ -113,7 +113,7 @@ def _of_cell_file(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:
 
 
 def _ocv(estimator: Estimator) -> OcvCurve:
-    """The filter's curve with its error: the cell file's, and what was learned on top."""
+    """Return the filter's OCV with its error: the cell file's plus the learned correction."""
     record, settings = estimator.record[0], estimator.settings_record[0]
     p = settings["filter"]
     correction_v, std_v = ocv_correction_with_std(record, settings, OCV_SOC)
@@ -123,7 +123,7 @@ def _ocv(estimator: Estimator) -> OcvCurve:
 
 @lru_cache(maxsize=64)
 def _given_v(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
-    """The cell file's OCV at ``OCV_SOC`` [V], of what the filter has of it."""
+    """Return the cell file's OCV at ``OCV_SOC`` [V], from the filter's tables."""
     curve, slope = np.frombuffer(bytearray(ocv_v)), np.frombuffer(bytearray(ocv_slope_v))
     return np.array([chen_mora.ocv(soc, curve, slope) for soc in OCV_SOC])
 

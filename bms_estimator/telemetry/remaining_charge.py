@@ -26,7 +26,7 @@ class RemainingCharge:
 
 
 def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
-    """What is left.
+    """Return the remaining charge, energy and time.
 
     Args:
         estimator: Read only.

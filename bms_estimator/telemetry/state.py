@@ -20,7 +20,7 @@ from bms_estimator.version import __version__
 
 
 def finite(value: float) -> float | None:
-    """The value as a float, or None where it is NaN or infinite."""
+    """Return the value as a float, or None if it is NaN or infinite."""
     number = float(value)
     return number if math.isfinite(number) else None
 

@@ -49,5 +49,5 @@ def test_settings_list_all_protocols() -> None:
 
 
 def test_unknown_protocol_is_refused_with_the_list() -> None:
-    with pytest.raises(ValidationError, match="must be one of binary, daly, jbd, "):
+    with pytest.raises(ValidationError, match="must be one of binary, junctek, pylontech, text, "):
         SensorSettings.model_validate({"protocol": "x"})

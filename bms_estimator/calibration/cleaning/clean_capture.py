@@ -97,7 +97,7 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
 
 
 def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
-    """Samples whose voltage and current their neighbours bear out."""
+    """Remove samples whose voltage or current differs from both neighbors."""
     off_v = np.abs(_off_median(samples["voltage_v"]))
     off_a = np.abs(_off_median(samples["current_a"]))
     ohm = EXPLAINED * (cell.a[13] * np.exp(-0.5 * cell.a[14]) + cell.a[15])

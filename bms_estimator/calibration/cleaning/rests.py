@@ -25,7 +25,7 @@ SOC_SLACK = 0.03
 
 
 def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
-    """Samples that can be true: finite, time going on, voltage within half of the median of those above 0 V.
+    """Return the valid samples: finite, time increasing, voltage within half of the median of those above 0 V.
 
     Raises:
         UserError: Nothing is left, most voltages are glitches, or time goes back and goes on from there.

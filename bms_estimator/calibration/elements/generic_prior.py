@@ -14,7 +14,7 @@ RESTS_STD = 0.35
 
 
 def nearest_generic_cell(soc: Floats, ocv_v: Floats, capacity_ah: float, series_count: int) -> CellModel:
-    """The generic cell of this capacity whose curve is nearest, as a pack of as many in series.
+    """Return the generic cell of this capacity with the nearest OCV curve, as a pack of the same cells in series.
 
     Args:
         soc: Shape (n,), increasing.

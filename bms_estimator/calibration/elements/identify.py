@@ -142,7 +142,7 @@ class Run:
     """By how much more charge was moved than the capture says, relative; ``soc`` counts it."""
 
     def recounted(self, more: float) -> "Run":
-        """The same with a miscount that is larger by ``more``."""
+        """Return a copy whose miscount is larger by ``more``."""
         miscount = self.miscount + more
         moved = (self.soc - self.soc[0]) / (1.0 + self.miscount)
         return replace(self, soc=self.soc[0] + (1.0 + miscount) * moved, miscount=miscount)
@@ -388,7 +388,7 @@ def _ocv_error(cell: CellModel) -> Floats:
 
 
 def _middle_error(cell: CellModel) -> Floats:
-    """The same of the curve alone, at ``EVEN`` [V]: without the least of what is not known of the hysteresis.
+    """Return the error of the curve alone at ``EVEN`` [V], without the minimum error of the hysteresis.
 
     Drives are discharges: they would take what is wrong of the hysteresis for an error of the curve, and charges would find
     it twice as far away.
@@ -405,7 +405,7 @@ def _per_kelvin(cell: CellModel) -> tuple[float, ...] | None:
 
 
 def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOcv:
-    """The cell's OCV with the correction, as an increasing table; its hysteresis stays, its error too."""
+    """Return the corrected OCV as an increasing table. Hysteresis and error columns stay as in the cell."""
     given = cell.ocv if isinstance(cell.ocv, TableOcv) else None
     soc = np.linspace(0.0, 1.0, round(1.0 / OCV_STEP) + 1)
     grid_v = ocv_grid(cell)[0]
@@ -427,7 +427,7 @@ def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOc
 
 
 def _rms(cell: CellModel, run: Run) -> float:
-    """What the cell leaves of a capture's voltage, as at 25 C, each second weighing the same [V]."""
+    """Return the RMS error of the cell's voltage on a capture at 25 C, weighted by time [V]."""
     grid_v = ocv_grid(cell)[0]
     e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
     error_v = run.load.voltage_v - e_o + overpotential(cell, run.warm_load, run.soc)

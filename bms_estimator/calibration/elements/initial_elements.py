@@ -58,7 +58,7 @@ class InitialElements:
 
 
 def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: float) -> InitialElements:
-    """The medians over the rests of one test.
+    """Return the medians over the rests of one test.
 
     Args:
         samples: What ``test`` was made of, dtype ``SAMPLE``, raw.

@@ -104,7 +104,7 @@ class Moments:
     seen: float
 
     def miscount(self, fit: "LadderFit") -> float:
-        """What the count is off beyond that of the moments, relative: the fit's voltage lies on the capture's then."""
+        """Return the relative error of the charge count at which the fit's voltage matches the capture's."""
         return float((self.seen - self.along @ fit.coefficients) / self.own)
 
 
@@ -185,7 +185,7 @@ def moments(
     series: int,
     miscount: float,
 ) -> Moments:
-    """What ``load`` says.
+    """Accumulate the moments of the regression over ``load``.
 
     Args:
         load: From rest.
@@ -235,7 +235,7 @@ def moments(
 
 
 def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:
-    """The model's rows, not weighted. Shape (n, FREE + 2 PART)."""
+    """Return the unweighted rows of the model. Shape (n, FREE + 2 PART)."""
     places = (currents[:, :, None] * linear_interpolation_matrix(soc, SOC_NODES)[:, None, :]).reshape(soc.size, -1)
     return np.hstack(
         [
@@ -248,7 +248,7 @@ def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:
 
 
 def fit_ladder(captures: list[Moments], prior: Prior) -> LadderFit:
-    """The resistances that explain all ``captures`` best."""
+    """Fit the resistances to all ``captures`` by least squares."""
     information = _prior_information(prior) + sum(one.information for one in captures)
     right = np.asarray(sum(one.right for one in captures))
     to_all = np.eye(FREE + 2 * PART)
@@ -315,7 +315,7 @@ def _weights(load: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _clean_steps(load: CleanCapture) -> NDArray[np.bool_]:
-    """Samples right behind a step of current that is held before and behind it."""
+    """Return the samples right after a current step that is held before and after it."""
     largest_a = float(np.abs(load.current_a).max())
     change_a = np.abs(np.diff(load.current_a, prepend=load.current_a[0]))
     step_s = np.diff(load.time_s, prepend=load.time_s[0])

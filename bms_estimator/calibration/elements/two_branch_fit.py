@@ -21,7 +21,7 @@ SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT), "r_tl": (1 + SHORT, RESISTANC
 
 
 def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
-    """The five sections of a cell file."""
+    """Return the five sections of a cell file."""
     total = (
         linear_interpolation_matrix(SOC, np.array(ladder.soc))
         @ (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).T

@@ -93,7 +93,7 @@ def _with_exponent(points: Points, exponent: float, upper: Floats) -> tuple[floa
 
 
 def _standard_errors(a: Floats, upper: Floats, soc: Floats, residual_v: Floats) -> Floats:
-    """Standard errors of a16..a21 from the Jacobian of (2.10); a parameter at its bound is held and has none."""
+    """Return standard errors of a16..a21 from the Jacobian of (2.10); NaN for a parameter at its bound."""
     a16, a17 = a[0], a[1]
     decay = np.exp(-a17 * soc)
     jacobian = np.column_stack([-decay, a16 * soc * decay, np.ones_like(soc), soc, -(soc**2), soc**3])

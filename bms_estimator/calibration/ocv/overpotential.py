@@ -30,7 +30,7 @@ def temperature_of(load: CleanCapture, otherwise_c: float = REFERENCE_C) -> Floa
 
 
 def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
-    """What the voltage lies under E_o(SOC) at 25 C, dE/dT and hysteresis included [V].
+    """Return the drop of the voltage below E_o(SOC) at 25 C, with dE/dT and hysteresis [V].
 
     Args:
         cell: Its ladder counts, else its a1..a15; these know no temperature.
@@ -46,7 +46,7 @@ def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
 
 
 def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
-    """What temperature and hysteresis add to E_o(SOC) at 25 C [V]; a load begins after a charge."""
+    """Return the change of E_o(SOC) by temperature and hysteresis [V]. The load begins after a charge."""
     ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(load)
     if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
         added_v += np.interp(soc, ocv.soc, ocv.per_kelvin_v) * (temperature_c - REFERENCE_C)
@@ -57,7 +57,7 @@ def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
 
 
 def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Floats, first: int) -> Floats:
-    """What resistances ``first`` and on take of a current that has flowed for hours [V].
+    """Return the steady voltage drop across resistances ``first`` and later of a current that has flowed for hours [V].
 
     Args:
         ladder: Of the cell.

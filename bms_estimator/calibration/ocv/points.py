@@ -69,7 +69,7 @@ class Points:
 
 
 def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
-    """The rests of one test as points.
+    """Return the rests of one test as points.
 
     Args:
         test: What ``relaxation_test`` found.
@@ -123,7 +123,7 @@ def joined(sources: Sequence[Points]) -> Points:
 
 
 def pooled(tests: Sequence[RelaxationTest]) -> Points:
-    """The points of several tests as one set, in the order of SOC."""
+    """Merge the points of several tests into one set, ordered by SOC."""
     return joined([points_of(test) for test in tests])
 
 

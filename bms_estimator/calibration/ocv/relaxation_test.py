@@ -164,7 +164,7 @@ def relaxation_test(
 def find_rests(
     good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], series_count: int
 ) -> tuple[list[Rest], list[str]]:
-    """The rests of a capture that are good for a point, and why the others are not, one line each.
+    """Return the rests of a capture that give a point, and one line for each other rest that says why it does not.
 
     Args:
         good: Dtype ``SAMPLE``, without glitches.
@@ -234,7 +234,7 @@ def initial_rest_v(samples: SampleBlock, name: str, capacity_ah: float) -> float
 
 
 def _relaxed(rest: SampleBlock, soc: float, *, after_charge: bool) -> Rest:
-    """The rest's end, extrapolated to infinite time by an exponential through its latter half."""
+    """Extrapolate a rest to infinite time by an exponential fitted to its second half."""
     time_s = rest["time_s"] - rest["time_s"][0]
     duration_s = float(time_s[-1])
     late = time_s >= LATE_FROM * duration_s

@@ -104,7 +104,7 @@ class SlowCurve:
 
 
 def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
-    """The slow discharges and charges of a capture without glitches; none: it is of another kind.
+    """Return the slow discharges and charges of a capture without glitches; empty for another kind of capture.
 
     Raises:
         UserError: The voltage goes the other way than the current.
@@ -220,7 +220,7 @@ def _are_pair(discharge: SlowBranch, charge: SlowBranch) -> bool:
 
 
 def _pair(down: SlowBranch, soc: Floats, up: SlowBranch, up_soc: Floats, series_count: int) -> SlowCurve:
-    """The mean of the two; where one is missing the other, off by half of what they differ by in the middle."""
+    """Average discharge and charge. Where one is missing, shift the other by half of their mean difference."""
     low, high = max(soc[-1], up_soc[0]), min(soc[0], up_soc[-1])
     high = high if high > ENDS[1] else high - TURN  # a charge that ends early rises before it ends
     both = GRID[(low <= GRID) & (high >= GRID)]

@@ -196,7 +196,7 @@ def _of_given(curve: ExternalCurve, series_count: int) -> Source:
 
 
 def _telling(sources: Sequence[Source]) -> Source | None:
-    """The source nearest to 25 C that tells of hysteresis."""
+    """Return the source nearest to 25 C that shows hysteresis."""
     telling = [source for source in sources if source.hysteresis_v is not None]
     return min(telling, key=lambda one: _from_reference(one.temperature_c), default=None)
 
@@ -227,7 +227,7 @@ def _share(telling: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> f
 
 
 def _usual_share(telling: Source, series_count: int) -> float:
-    """The same where no rest tells it."""
+    """Return the usual share of the hysteresis where no rest shows it."""
     return PLATEAU_SHARE if has_plateau(telling.points.soc, telling.points.ocv_v, series_count) else REST_SHARE
 
 
@@ -306,7 +306,7 @@ def _without_branches(source: Source, ladder: Ladder) -> Source:
 
 
 def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSources:
-    """Sources of which none tells of hysteresis, brought to the middle of what is usual: discharges alone lie below it.
+    """Shift sources that do not show hysteresis by half of a typical one, because discharges alone lie below the mean.
 
     Args:
         found: Of ``find_sources``.

@@ -90,7 +90,7 @@ class TableFit:
         return np.asarray(PchipInterpolator(self.soc, self.ocv_v)(soc), dtype=np.float64)
 
     def error_at(self, soc: Floats) -> Floats:
-        """Standard deviation of E_o(SOC) [V]."""
+        """Return the standard deviation of E_o(SOC) [V]."""
         return np.asarray(np.interp(soc, self.soc, self.error_v))
 
     def table(self, hysteresis_v: Floats | None = None, hysteresis_std_v: Floats | float = 0.0) -> TableOcv:
@@ -124,7 +124,7 @@ class _Model:
 
 
 def fit_table(points: Points) -> TableFit:
-    """A smooth increasing curve through points, their sources' common errors taken out.
+    """Fit a smooth increasing curve through points, with the systematic error of each source as a parameter.
 
     Raises:
         UserError: Too few points, or points that span too little SOC.
@@ -164,7 +164,7 @@ def fit_table(points: Points) -> TableFit:
 
 
 def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells: float) -> _Model:
-    """The rows; those of the points are not yet divided by their standard deviations."""
+    """Return the rows of the model; rows of points are not yet divided by their standard deviations."""
     spline = _spline(points.soc)
     warmer = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
     columns, stds = [spline], [np.zeros(0)]
@@ -186,12 +186,12 @@ def _model(points: Points, slope_v: Floats, common: float, bends: Floats, cells:
 
 
 def _shifts(soc: Floats, slope_v: Floats) -> Floats:
-    """What an error of the first SOC, and of the capacity, makes of a voltage. Shape (n, 2)."""
+    """Return the derivatives of a voltage by the first SOC and by the capacity. Shape (n, 2)."""
     return np.column_stack([slope_v, slope_v * (1.0 - soc)])
 
 
 def _solved(model: _Model, points: Points, std_v: Floats, cells: float) -> Floats:
-    """The model's coefficients with increasing spline coefficients, which make an increasing spline.
+    """Solve for the model's coefficients under increasing spline coefficients, which make the spline increase.
 
     What a source is off can be told from another only: 0 where there is one.
     """
@@ -243,7 +243,7 @@ def _spline(soc: Floats, derivative: int = 0) -> Floats:
 
 
 def _edges() -> Floats:
-    """Ends of the stretches over which a bend is looked at: a quarter of those between knots."""
+    """Return the ends of the intervals over which curvature is penalized: a quarter of the knot spacing."""
     edges: Floats = np.unique(np.concatenate([np.linspace(a, b, 5) for a, b in itertools.pairwise(KNOTS)]))
     return edges
 

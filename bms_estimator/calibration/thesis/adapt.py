@@ -100,14 +100,14 @@ def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = N
 
 
 def _adapted(cell: CellModel, starts: Sequence[Start]) -> tuple[AdaptedElements, CellModel]:
-    """Result of steps 2 and 3, and the cell with it."""
+    """Return the result of steps 2 and 3, and the cell with it."""
     bounded = cell.model_copy(update={"adaptation": printed_bounds(cell) | cell.adaptation})
     steps = steps_2_and_3(bounded, starts, LOWEST_SOC)
     return steps, _with_elements(cell, steps, starts)
 
 
 def _with_elements(cell: CellModel, steps: AdaptedElements, starts: Sequence[Start]) -> CellModel:
-    """The cell with a1..a15, and a ladder of its two branches that carries their errors."""
+    """Return the cell with a1..a15 and with an RC network of its two branches that carries their errors."""
     a, update = steps.a, dict[str, object]()
     for name, first in (("r_ts", 1), ("r_tl", 4), ("c_ts", 7), ("c_tl", 10)):
         section = getattr(cell, name)

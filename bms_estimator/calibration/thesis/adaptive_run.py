@@ -76,7 +76,7 @@ class AdaptiveRun:
     outcome: str
 
     def condition(self, parameter: str) -> Floats:
-        """The bound that a8 (a11) must exceed, over time: right side of the condition in Lemma 4.1.1, Fig. 19."""
+        """Return the bound that a8 (a11) must exceed over time: right side of the condition in Lemma 4.1.1, Fig. 19."""
         amplitude, offset = {"a8": (7, 9), "a11": (10, 12)}[parameter]
         rows = zip(self.soc, self.a[:, offset], self.a[:, amplitude], strict=True)
         return np.array([crossing(max(soc, 1e-6), low, high) for soc, low, high in rows])

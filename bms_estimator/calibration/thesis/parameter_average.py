@@ -128,7 +128,7 @@ def _knee(time_s: Floats, voltage_v: Floats) -> float | None:
 
 
 def averaged(time_s: Floats, a: Floats, window: AveragingWindow) -> Floats:
-    """The mean of a_i(t) over t_int..t_unst, (3.19).
+    """Return the mean of a_i(t) over t_int..t_unst, (3.19).
 
     Args:
         time_s: Shape (n,), increasing, in steps of any length [s].

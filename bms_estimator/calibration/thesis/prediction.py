@@ -71,7 +71,7 @@ class Prediction:
         return float(self.error_percent[self.aligned].max())
 
     def above(self, soc: float) -> "Prediction":
-        """The same until SOC falls to ``soc``; at least its first sample."""
+        """Return the samples until SOC falls to ``soc``; at least the first sample."""
         end = max(int(np.argmax(np.r_[self.soc <= soc, True])), 1)
         return Prediction(**{column.name: getattr(self, column.name)[:end] for column in fields(self)})
 

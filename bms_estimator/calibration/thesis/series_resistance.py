@@ -101,7 +101,7 @@ def series_resistance(cell: CellModel, run: Prediction) -> SeriesResistance:
 
 
 def mean_of(curves: Sequence[SeriesResistance]) -> SeriesResistance:
-    """The mean over several currents, each with its weight, where at least one has data: Fig. 22 and 31."""
+    """Return the weighted mean over several currents where at least one has data: Fig. 22 and 31."""
     soc, r_s, weight = (np.concatenate([getattr(c, name) for c in curves]) for name in ("soc", "r_s_ohm", "weight"))
     bins = _bins(soc)
     total: Floats = np.bincount(bins, weight).astype(np.float64)

@@ -100,7 +100,7 @@ def alarms(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """What the service would log is what is shown here."""
+    """Silence the log, because the command itself prints what the service would log."""
     before = structlog.get_config()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
     try:

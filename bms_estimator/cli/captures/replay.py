@@ -97,7 +97,7 @@ def replay(
 
 
 def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
-    """What of a capture could not be read."""
+    """Return a warning about the part of a capture that was not read; empty if all was read."""
     if source.damaged:
         yield f"damaged after {duration_s:.1f} s; the rest was not read"
     if source.unread_bytes:
@@ -149,7 +149,7 @@ async def _publisher(
 
 @contextmanager
 def _progress(source: Replay) -> Iterator[Callable[[], None]]:
-    """A bar on stderr where that is a terminal; the value is called after each block."""
+    """Show a progress bar on stderr if it is a terminal. Yield a function to call after each block."""
     console = Console(stderr=True)
     columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[samples]:,} samples"), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
@@ -158,7 +158,7 @@ def _progress(source: Replay) -> Iterator[Callable[[], None]]:
 
 
 def result_table(title: str, result: Result) -> Table:
-    """The outcome for people."""
+    """Return the result as a table."""
     table = Table(title=title, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column(justify="right")
@@ -210,7 +210,7 @@ def _set_back(result: Result) -> str:
 
 
 def _dropped(result: Result) -> str:
-    """What was not used, and, where that is more than single samples, why."""
+    """Return the rows on dropped samples, with the reasons if they are more than single samples."""
     text, number = dropped_text(result.dropped), sum(result.dropped.values())
     return f"{text}; {result.impossible}" if result.impossible and number > MANY * result.samples else text
 

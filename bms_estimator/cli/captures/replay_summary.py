@@ -81,7 +81,7 @@ class Summary:
         self._soc_difference += float(difference @ difference)
 
     def result(self, estimator: Estimator, read: int, wall_s: float) -> Result:
-        """The outcome.
+        """Return the result of the replay.
 
         Args:
             estimator: After the last sample.

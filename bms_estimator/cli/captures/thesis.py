@@ -78,7 +78,7 @@ def _recorded(
 
 @contextmanager
 def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on stderr where that is a terminal; the value is told what is made next."""
+    """Show a progress bar on stderr if it is a terminal. Yield a function that takes the name of the next item."""
     console = Console(stderr=True)
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
@@ -87,7 +87,7 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def _show(console: Console, report: Report) -> None:
-    """What was asked for, in the terminal."""
+    """Print the requested items of the report."""
     for item in report.items:
         if isinstance(item, report_items.Table):
             shown = Table(title=f"{report_items.name(item)}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)

@@ -76,7 +76,7 @@ def _number(value: float) -> float | None:
 
 
 def _tables(capture: Path, found: Validation) -> Group:
-    """The outcome for people."""
+    """Return the result as tables."""
     table = Table(title=capture.name, title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("", "samples", "RMS", "mean", "max"):
         table.add_column(column, justify="left" if not column else "right")

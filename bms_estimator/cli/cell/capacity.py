@@ -121,7 +121,7 @@ def _counted(anchors: int) -> str:
 
 
 def _shown(result: CapacityResult) -> Group:
-    """The outcome for people."""
+    """Return the result as a table."""
     anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "off", box=box.SIMPLE_HEAD)
     for column in anchors.columns[1:]:
         column.justify, column.no_wrap = "right", True

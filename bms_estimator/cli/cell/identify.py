@@ -147,7 +147,7 @@ def _scores(found: Identification) -> str:
 
 
 def _tables(out: Path, found: Identification, seconds: float) -> Group:
-    """The outcome for people."""
+    """Return the result as tables."""
     shown = Table("SOC", *(f"{soc:g}" for soc in found.elements), title=f"{out}: written", box=box.SIMPLE_HEAD)
     shown.title_justify = "left"
     for name in next(iter(found.elements.values())):

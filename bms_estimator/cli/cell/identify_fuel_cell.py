@@ -83,7 +83,7 @@ def identify_fuel_cell(
 def _source(
     name: str, path: Path, model: FuelCellModel, temperature_c: float | None, sign: CurrentSign | None
 ) -> Source:
-    """A polarisation curve where the file has no times, else a record, without what no such stack can give."""
+    """Read a polarization curve if the file has no times, else a record; drop samples that no such stack can give."""
     points = read_polarisation(path)
     if points is not None:
         time_s, (current_a, voltage_v, sensed_c) = None, points.T
@@ -132,7 +132,7 @@ def _remarks(cell: str, fit: FuelCellFit) -> list[str]:
 
 
 def _tables(out: Path, values: dict[str, Value], fit: FuelCellFit, seconds: float) -> Group:
-    """The outcome for people."""
+    """Return the result as tables."""
     table = Table(title=f"{out}: written", title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("", "identified", "±", "before"):
         table.add_column(column, justify="right" if column else "left")

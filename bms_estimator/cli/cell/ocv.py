@@ -180,7 +180,7 @@ def ocv(
 
 
 def _moving(one: Recording) -> NDArray[np.float64]:
-    """The voltage without glitches [V].
+    """Return the voltage without glitches [V].
 
     Raises:
         UserError: It is always the same.
@@ -209,7 +209,7 @@ def _cells_in_series(voltage_v: NDArray[np.float64], told: int | None) -> int:
 
 
 def _check_ends(fit: ChenMoraFit | TableFit, found: OcvSources) -> None:
-    """That the curve does not fall to nothing where no point is.
+    """Check that the curve does not fall to 0 V beyond its points.
 
     Raises:
         UserError: It does.
@@ -304,7 +304,7 @@ def _cell(
 
 
 def _warmest(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
-    """The one nearest to 25 C; the first where none says."""
+    """Return the test nearest to 25 C; the first test if none has a temperature."""
     away_k = [np.nan_to_num(abs(test.temperature_c - REFERENCE_C), nan=np.inf) for test in tests]
     return tests[int(np.argmin(away_k))] if tests else None
 
@@ -322,7 +322,7 @@ def _remarks(result: OcvResult) -> list[str]:
 
 
 def _table(out: Path, result: OcvResult, found: OcvSources) -> Table:
-    """The outcome for people."""
+    """Return the result as a table."""
     table = Table(title=f"{out}: written", title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column(justify="right")
@@ -353,7 +353,7 @@ def _table(out: Path, result: OcvResult, found: OcvSources) -> Table:
 
 
 def _sources_table(result: OcvResult) -> Table:
-    """What each source was found to be."""
+    """Return a table of the kind that each source was recognized as."""
     table = Table("source", "found to be", "C", "off", "hysteresis", box=box.SIMPLE_HEAD)
     for source in result.sources:
         table.add_row(

@@ -69,7 +69,7 @@ def epoch_s(time: datetime | None, otherwise_s: float) -> float:
 async def fetched(
     pack: str, since_s: float, until_s: float, where: tuple[str, Path | None, Path | None]
 ) -> "BlockCapture":
-    """What the server has of a pack.
+    """Return the blocks of a pack that the server still has.
 
     Raises:
         UserError: It cannot be asked.

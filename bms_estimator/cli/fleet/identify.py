@@ -112,7 +112,7 @@ def _names(packs: Sequence[str], from_file: Path | None) -> list[str]:
 
 
 def _listed(path: Path) -> list[str]:
-    """The column ``pack`` of a CSV, or the first one."""
+    """Return the column ``pack`` of a CSV file, or its first column."""
     try:
         rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row and row[0].strip()]
     except (OSError, UnicodeDecodeError, csv.Error) as error:

@@ -101,7 +101,7 @@ def pack_files(pack: str, known: PackRegistry) -> dict[str, str]:
 
 
 def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:
-    """That each pack is in the table.
+    """Check that each pack is in the table.
 
     Raises:
         UserError: Some are not.

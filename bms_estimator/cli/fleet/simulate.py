@@ -108,7 +108,7 @@ def _broker(url: str, **given: str | Path | None) -> MqttSettings:
 
 
 def _with_options(said: str) -> str:
-    """What is said of settings, of the options that they were given by."""
+    """Replace names of settings in an error by the options that set them."""
     for setting, option in (("url", "--mqtt"), ("password_file", "--password-file"), ("ca_file", "--ca")):
         said = said.replace(f"mqtt.{setting} = ", f"{option} ")
     return said

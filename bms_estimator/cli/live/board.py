@@ -136,7 +136,7 @@ def _accept_next(settings: Settings, folder: Path) -> None:
 
 
 def _bandgap_v(asked: BoardClient, hello: Hello, aref_v: float) -> float:
-    """The bandgap with which the board's reference is ``aref_v``.
+    """Return the bandgap voltage at which the board's reference is ``aref_v``.
 
     Raises:
         UserError: No board has such a bandgap.

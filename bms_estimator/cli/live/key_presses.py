@@ -58,7 +58,7 @@ def keys(press: Callable[[str], None]) -> Iterator[None]:
 
 
 def meanings(pressed: bytes) -> Iterator[str]:
-    """What is meant by what a terminal has sent; what means nothing is passed over."""
+    """Return the actions of the keys in a terminal's input; skip keys without an action."""
     while pressed:
         for length in range(LONGEST, 0, -1):
             if pressed[:length] in KEYS:

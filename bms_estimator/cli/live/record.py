@@ -87,14 +87,14 @@ async def _end(recording: CaptureRecorder) -> None:
 
 
 async def _time_over(recording: CaptureRecorder, seconds: float | None) -> None:
-    """Ends ``seconds`` after the first bytes; with None never."""
+    """Wait until ``seconds`` after the first bytes; forever if None."""
     while seconds is None or not recording.bytes:  # noqa: ASYNC110 - the tap has no event for it
         await asyncio.sleep(REDRAW_S)
     await asyncio.sleep(seconds)
 
 
 async def _show(console: Console, progress: "Progress", log: deque[str]) -> None:
-    """A progress line where there is a terminal, the log's lines above it."""
+    """Show a progress line on a terminal, with the log's lines above it."""
     with Live(console=console, auto_refresh=False, transient=True) as live:
         while True:
             while log:

@@ -23,12 +23,12 @@ def decimal(least: float = -math.inf, most: float = math.inf) -> Callable[[str |
 
 
 def whole(least: float = -math.inf, most: float = math.inf) -> Callable[[str | int], int]:
-    """The same of one without a fraction."""
+    """Return a parser of an integer within limits."""
     return _within(_whole, least, most)
 
 
 def _whole(text: str) -> int:
-    """The whole number that ``text`` is.
+    """Parse an integer.
 
     Raises:
         ValueError: It is none.

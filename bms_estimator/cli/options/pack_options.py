@@ -17,7 +17,7 @@ TABLE_RESOLUTION_V = 1e-3
 
 
 def load_pack(path: Path) -> tuple[Settings, PackModel]:
-    """A pack's settings and the pack as one object.
+    """Load a pack's settings and its cell as one object.
 
     A cell file is looked for beside the pack file first, then in the working directory.
 
@@ -29,12 +29,12 @@ def load_pack(path: Path) -> tuple[Settings, PackModel]:
 
 
 def unpacked_cell(path: Path, settings: Settings) -> CellModel:
-    """The cell of a pack file as ``load_pack`` finds it, one of those that the pack is made of."""
+    """Return the cell of a pack file before series and parallel are applied, found as in ``load_pack``."""
     return load_cell(_found(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
 def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None) -> tuple[Settings, PackModel]:
-    """The settings of ``pack``; ``cell`` and ``capacity_ah`` [Ah] in place of its own where they are given.
+    """Load the settings of ``pack``; ``cell`` and ``capacity_ah`` [Ah] replace its own if given.
 
     Raises:
         UserError: Neither ``pack`` nor ``cell`` is given, or as ``load_pack``.
@@ -51,13 +51,13 @@ def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None)
 
 
 def _found(pack: Path, cell: str) -> str:
-    """The cell file beside a pack file where there is one, else what may be a name or lie elsewhere."""
+    """Return the cell file beside a pack file if it exists, else ``cell``, which may be a name or another path."""
     beside = pack.parent / cell
     return str(beside) if beside.is_file() else cell
 
 
 def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
-    """The pack as one object, made of ``cell``."""
+    """Return the pack as one object built from ``cell``."""
     model = load_any(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
     if settings.pack.initial_soc is not None:
         reject_soc_for_fuel_cell(model, "pack.initial_soc")
@@ -79,13 +79,13 @@ def reject_soc_for_fuel_cell(model: PackModel, told: str) -> None:
 
 
 def with_pack(settings: Settings, **changes: object) -> Settings:
-    """Settings with some of ``[pack]`` changed."""
+    """Return settings with changed values of ``[pack]``."""
     pack = PackSettings.model_validate(settings.pack.model_dump() | changes)
     return settings.model_copy(update={"pack": pack})
 
 
 def with_sensor(settings: Settings, **changes: object) -> Settings:
-    """Settings with some of ``[sensor]`` changed; None leaves a value as it is.
+    """Return settings with changed values of ``[sensor]``; None leaves a value unchanged.
 
     Raises:
         UserError: It is about a serial line, and the source is none.
@@ -100,7 +100,7 @@ def with_sensor(settings: Settings, **changes: object) -> Settings:
 
 
 def with_broker(settings: Settings, url: str) -> Settings:
-    """Settings with another broker.
+    """Return settings with another broker.
 
     Raises:
         UserError: ``url`` is none.

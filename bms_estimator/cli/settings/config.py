@@ -69,7 +69,7 @@ def init(
 
 
 def _probed(ports: Sequence[str]) -> Given:
-    """What follows for the settings from the device that is there; says what that is.
+    """Return the settings for the detected device, and print what it is.
 
     Raises:
         UserError: There is none, or more than one.
@@ -139,7 +139,7 @@ def show(file: Annotated[Path | None, typer.Argument(help="settings of the pack;
 
 
 def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
-    """What is not set but follows: of the pack, of the observer, at the limits of Lemma 4.1.3."""
+    """Return values that follow from the settings: of the pack, of the observer, limits of Lemma 4.1.3."""
     record = estimator_settings(
         cell,
         settings.observer,
@@ -168,7 +168,7 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
 
 
 def _here(section: str, doors: Doors) -> tuple[Doors, list[str]]:
-    """The settings without what only the running service can read, and a warning for each such file."""
+    """Return the settings without files that only the running service can read, and a warning for each such file."""
     without, warnings = _unread(section, doors, "password_file", "cert_file", "key_file")
     if without & {"cert_file", "key_file"}:  # one is of no use without the other
         without |= {"cert_file", "key_file"}
@@ -178,14 +178,14 @@ def _here(section: str, doors: Doors) -> tuple[Doors, list[str]]:
 def _unread(
     section: str, settings: MqttSettings | EdgeSettings | InfluxSettings | PageSettings, *keys: str
 ) -> tuple[set[str], list[str]]:
-    """The keys of files that only the running service can read, and a warning for each."""
+    """Return the keys of files that only the running service can read, and a warning for each."""
     files = {key: getattr(settings, key) for key in keys}
     unread = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
     return set(unread), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unread.items()]
 
 
 def _lemma(cell: PackModel) -> list[str]:
-    """What Lemma 4.1.1 asks of the bounds and does not get; of a fuel cell it asks nothing."""
+    """Return the conditions of Lemma 4.1.1 that the bounds fail; empty for a fuel cell."""
     return [f"{cell.cell.name}: {_unmet(c)}" for c in failed_conditions(cell)] if isinstance(cell, CellModel) else []
 
 

@@ -49,7 +49,7 @@ def _settings(section: type[BaseModel], given: Mapping[str, object]) -> Iterator
 
 
 def _value(field: FieldInfo) -> str:
-    """The default as TOML, or what it must be; nothing where there is neither."""
+    """Return the default as TOML, or the constraint if there is no default; empty without either."""
     if get_origin(field.annotation) is Literal and field.is_required():
         return f'"{get_args(field.annotation)[0]}"'
     default = None if field.is_required() else field.get_default(call_default_factory=True)
@@ -92,7 +92,7 @@ def _limit(constraint: Any) -> str:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """The models in an annotation that may also allow None, or have one of several."""
+    """Return the models of an annotation, which may be optional or a union."""
     if isinstance(annotation, type):
         return [annotation] if issubclass(annotation, BaseModel) else []
     return [model for option in get_args(annotation) for model in _models(option)]

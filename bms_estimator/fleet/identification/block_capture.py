@@ -120,7 +120,7 @@ def _wall_s(block: Block, sample: int) -> float:
 
 
 async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: float = math.inf) -> BlockCapture:
-    """The blocks of a pack that the stream still has.
+    """Fetch the blocks of a pack that the stream still has.
 
     Args:
         nc: Connected as the tenant.

@@ -98,7 +98,7 @@ class _NotEnoughError(ValueError):
 
 
 def cell_name(pack: str) -> str:
-    """What the cell of a pack is called that was identified anew."""
+    """Return the name of a pack's re-identified cell."""
     return f"of-{pack}"
 
 
@@ -144,7 +144,7 @@ class _Pack:
             )
 
     def found(self) -> ReidentificationResult:
-        """The better of the ways, where it is better than what there is."""
+        """Return the better method's result if it beats the old cell; else None."""
         learned, soc, std = self._learn()
         ways = {"learned": learned}
         remark = ""
@@ -174,7 +174,7 @@ class _Pack:
         return replace(outcome, cell_file=self._written(cell, best, before.rms_v, rms_v))
 
     def _learn(self) -> tuple[CellModel, Floats, Floats]:
-        """The cell that the filter has learned by the end of the training; SOC with its std at the training's samples."""
+        """Return the cell that the filter has learned at the end of the training, and SOC with its std at the training samples."""
         estimator = self._estimator(self._cell)
         soc, std = _estimated(estimator, np.concatenate(self._training))
         if not estimator.state[0]["started"]:
@@ -244,7 +244,7 @@ def _battery(kind: PackSpec, cell_file: str | None) -> CellModel:
 
 
 def _of_one(samples: SampleBlock, kind: PackSpec) -> SampleBlock:
-    """What one object of the cell file has of the pack's voltage and current; only samples that go on in time."""
+    """Return voltage and current of one cell-file object; only samples whose time increases."""
     latest_s = np.maximum.accumulate(np.r_[-math.inf, samples["time_s"][:-1]])
     one = samples[samples["time_s"] > latest_s]
     one["voltage_v"] /= kind.series
@@ -258,7 +258,7 @@ def _pieces(samples: SampleBlock) -> list[SampleBlock]:
 
 
 def _clipped(pieces: list[SampleBlock], since_s: float, until_s: float) -> Iterator[SampleBlock]:
-    """What of the pieces is from ``since_s`` on and before ``until_s``, where enough is left."""
+    """Return the pieces within ``since_s`` and ``until_s`` that are long enough."""
     for piece in pieces:
         part = piece[(piece["time_s"] >= since_s) & (piece["time_s"] < until_s)]
         if part.size and np.ptp(part["time_s"]) >= LEAST_PIECE_S:

@@ -133,7 +133,7 @@ def addresses(servers: str) -> list[str]:
 
 
 def readable(creds: Path) -> Path:
-    """A file of credentials that is there.
+    """Check that a credentials file can be read.
 
     Raises:
         UserError: It cannot be read, or holds none.

@@ -18,7 +18,7 @@ CONNECT_S, RETRY_S = 5, 0.1
 
 @asynccontextmanager
 async def connected(server: str, creds: Path | None = None, ca: Path | None = None) -> AsyncIterator[Client]:
-    """A connection that is not made again: what breaks it ends the command.
+    """Connect without reconnecting: a lost connection ends the command.
 
     Raises:
         UserError: Nobody answers there, or refuses; a file cannot be read; later, as a stream cannot be read.

@@ -62,7 +62,7 @@ def read_table(path: Path) -> PackTable:
 
 
 def check_models(path: Path, table: PackTable, cell_files: Mapping[str, str]) -> None:
-    """That each kind of pack has a cell.
+    """Check that each kind of pack has a cell.
 
     Args:
         path: What the table is called.
@@ -125,7 +125,7 @@ class _Reader:
             raise UserError(f"{self._path}: not UTF-8 (byte {error.start}); save it as CSV in UTF-8") from None
 
     def _columns(self, header: Sequence[str]) -> list[str]:
-        """The columns by the first line.
+        """Return the columns named in the first line.
 
         Raises:
             UserError: One is unknown, twice or missing.
@@ -152,7 +152,7 @@ class _Reader:
         return name, *self._kinds[key]
 
     def _kind(self, told: Mapping[str, str]) -> PackSpec:
-        """What packs of the same values have in common."""
+        """Return the values that packs of one kind share."""
         values: dict[str, object] = {column: _value(column, value) for column, value in told.items()}
         cell = told.get("cell", "")
         if cell.endswith(CELL_FILE):
@@ -169,7 +169,7 @@ class _Reader:
             raise _RowError(_said(column, told[column], f"{message} ({described})")) from None
 
     def _cell_file(self, value: str) -> str:
-        """The name of the cell in a file."""
+        """Return the name of the cell in a file."""
         path = self._path.parent / value
         name = path.name.removesuffix(CELL_FILE)
         if not path.is_file():
@@ -202,7 +202,7 @@ def _said(column: str, value: str, wrong: str) -> str:
 
 
 def _separator(text: str) -> str:
-    """The one that the first line has more of."""
+    """Return the separator that is more frequent in the first line."""
     first = text.partition("\n")[0]
     return max(",;", key=first.count)
 
@@ -219,7 +219,7 @@ def _refuse(path: Path, errors: Sequence[str]) -> None:
 
 
 def table_lines(packs: Mapping[str, PackSpec]) -> Iterator[str]:
-    """The same as CSV, lines with their ends: only the columns of which at least one pack has something."""
+    """Return the table as CSV lines with their line ends; a column without any value is left out."""
     told = {name: kind.model_dump(exclude_defaults=True) for name, kind in sorted(packs.items())}
     columns = [column for column in COLUMNS if column == "pack" or any(column in row for row in told.values())]
     yield ",".join(columns) + "\n"

@@ -38,7 +38,7 @@ class PackRegistry:
         return pack in self._rows
 
     def __call__(self, pack: str) -> tuple[Settings, PackModel] | None:
-        """The settings of its kind, the same object for all of them and without the pack's name, and its model; None: ``reason``."""
+        """Return settings and model of a pack's kind, one object for all packs of the kind; None if ``reason`` has an error."""
         found = self._found(pack)
         return None if isinstance(found, str) else found
 
@@ -53,11 +53,11 @@ class PackRegistry:
         return None if data is None else self._kind(data)
 
     def cell_file(self, name: str) -> str | None:
-        """The text of a cell file; None where there is none, or the package's cell of that name goes before."""
+        """Return the text of a cell file; None if there is none or a shipped cell has this name."""
         return None if name in known_cells() else self._cells.get(name)
 
     def set_row(self, pack: str, data: bytes | None) -> bool:
-        """A pack has another row; None: none any more. Whether this is news."""
+        """Set or remove (None) a pack's row. Return True if this is a change."""
         if data == self._rows.get(pack):
             return False
         if data is None:
@@ -67,7 +67,7 @@ class PackRegistry:
         return True
 
     def set_cell(self, name: str, file: bytes | None) -> bool:
-        """A cell file is another; None: there is none any more. Whether this is news."""
+        """Set or remove (None) a cell file. Return True if this is a change."""
         text = None if file is None else file.decode(errors="replace")
         if text == self._cells.get(name):
             return False
@@ -78,7 +78,7 @@ class PackRegistry:
         return True
 
     def made_of(self, cells: Collection[str]) -> set[str]:
-        """The packs that are made of one of some cells; looks at all packs."""
+        """Return the packs that use one of some cells; searches all packs."""
         found = set[str]()
         for pack, data in self._rows.items() if cells else ():
             kind = self._kind(data)

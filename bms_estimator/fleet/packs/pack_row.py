@@ -69,12 +69,12 @@ COLUMNS = ("pack", *PackSpec.model_fields)
 
 
 def stored(kind: PackSpec) -> bytes:
-    """What the server keeps of a pack; the same bytes for the same values."""
+    """Encode a pack's row for the server; equal values give equal bytes."""
     return kind.model_dump_json(exclude_defaults=True).encode()
 
 
 def kind_of(data: bytes) -> PackSpec:
-    """What ``stored`` made.
+    """Decode a row encoded by ``stored``.
 
     Raises:
         ValueError: It did not; the message says what is wrong.
@@ -89,7 +89,7 @@ def kind_of(data: bytes) -> PackSpec:
 
 
 def settings_of(row: PackSpec) -> Settings:
-    """The settings of a pack; of a kind, its name is the default one."""
+    """Return the settings of a pack; those of a kind have the default name."""
     told = row.model_dump(exclude_none=True)
     if isinstance(row, PackRow):
         told["name"] = row.pack
@@ -106,7 +106,7 @@ def known_cells() -> tuple[str, ...]:
 
 
 def model_of(kind: PackSpec, cell_file: str | None) -> PackModel:
-    """The pack as one object.
+    """Return the pack as one object.
 
     Args:
         kind: Names the cell, and says what it holds and how many there are.

@@ -71,7 +71,7 @@ class PackTypes:
         self._known: dict[tuple[int, int], tuple[Settings, PackModel, PackType]] = {}
 
     def of(self, settings: Settings, cell: PackModel) -> PackType:
-        """The type of packs with these settings: that of the same two objects is made once.
+        """Return the type of packs with these settings; cached by the identity of both objects.
 
         Args:
             settings: Of the packs.
@@ -86,7 +86,7 @@ class PackTypes:
 
 
 def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> PackType:
-    """The type of a pack with these settings.
+    """Make the type of packs with these settings.
 
     Args:
         settings: The pack's.
@@ -106,7 +106,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
 
 
 def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
-    """An estimator of packs with these settings: of all partitions of a process the same.
+    """Return the estimator of packs with these settings, shared by all partitions of a process.
 
     Args:
         settings: Of the packs.

@@ -83,7 +83,7 @@ async def fleet_page(
 
 
 async def _draw(view: FleetView, newest: LatestValues, step_s: float) -> None:
-    """A picture now and then; while the server is lost the last one stays."""
+    """Send a picture at intervals; while the server is lost the last one stays."""
     while True:
         if view.listening:
             newest.set_value(FLEET, view.text(time.monotonic(), time.time()))

@@ -151,7 +151,7 @@ class FleetFeed:
             await asyncio.sleep(TABLE_S)
 
     async def _read_hours(self, nc: Client) -> None:
-        """What the last hour's summaries said, before this page was there."""
+        """Read the summaries of the last hour from before this page started."""
         since_s = time.time() - HOURS_S
 
         async def read() -> None:

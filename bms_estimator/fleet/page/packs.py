@@ -78,7 +78,7 @@ class FleetPacks:
         """Heard so far; those that were no JSON object."""
 
     def list_pack(self, name: str, kind: str | None) -> None:
-        """A pack is in the fleet's table as of a type, such as ``lfp 16s2p``; None: it is no more."""
+        """Set the type of a pack in the fleet's table, such as ``lfp 16s2p``; None removes it."""
         row = self._row(name)
         row["listed"] = kind is not None
         row["type"] = self._types.setdefault(kind or UNLISTED, min(len(self._types), 65_535))
@@ -109,7 +109,7 @@ class FleetPacks:
             self._row(name)["suspects"] = suspects
 
     def find(self, prefix: str) -> list[str]:
-        """The first names that begin so, in order."""
+        """Return the first names with this prefix, in order."""
         if len(self._sorted) != len(self._names):
             self._sorted = sorted(self._names)
         first = bisect.bisect_left(self._sorted, prefix)
@@ -131,7 +131,7 @@ class FleetPacks:
         }
 
     def picture(self, now_s: float, since_s: float) -> dict[str, Any]:
-        """The fleet at a glance.
+        """Return an overview of the fleet.
 
         Args:
             now_s: The clock.
@@ -252,7 +252,7 @@ def _number(value: Any) -> float:
 
 
 def _object(data: bytes) -> dict[str, Any] | None:
-    """A JSON object; None: it is none."""
+    """Decode a JSON object; None if it is not one."""
     try:
         value = from_json(data, allow_inf_nan=False)
     except ValueError:

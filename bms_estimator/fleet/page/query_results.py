@@ -15,7 +15,7 @@ LISTED = 20
 
 
 def answer(folder: Path, name: str) -> dict[str, Any]:
-    """The answer to one of ``ASKED``.
+    """Return the result of one of the queries ``ASKED``.
 
     Args:
         folder: Of the hours, as ``fleet collect`` writes it.

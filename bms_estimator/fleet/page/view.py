@@ -38,7 +38,7 @@ class FleetView:
         self.workers.forget()
 
     def end(self) -> None:
-        """The server is lost."""
+        """Mark the server as lost."""
         self.listening = False
 
     def hear_worker(self, data: bytes, now_s: float) -> None:
@@ -49,20 +49,20 @@ class FleetView:
             self.damaged += 1
 
     def hear_unknown(self, name: str, why: str) -> None:
-        """A worker holds blocks of a pack that it does not know."""
+        """Record that a worker holds blocks of a pack that it does not know."""
         self._unknown.pop(name, None)
         self._unknown[name] = why
         if len(self._unknown) > MOST_UNKNOWN:
             del self._unknown[next(iter(self._unknown))]
 
     def know(self, name: str, kind: str | None) -> None:
-        """A pack is in the table as of a type; None: it is no more."""
+        """Set the type of a pack in the table; None removes it."""
         self.packs.list_pack(name, kind)
         if kind is not None:
             self._unknown.pop(name, None)
 
     def text(self, now_s: float, wall_s: float) -> str:
-        """What is sent, JSON in one line."""
+        """Return the JSON to send, in one line."""
         return json.dumps(self.picture(now_s, wall_s), allow_nan=False, separators=(",", ":"))
 
     def picture(self, now_s: float, wall_s: float) -> dict[str, Any]:

@@ -53,7 +53,7 @@ class FleetWorkers:
         return count, sorted({name for heard in alive.values() for name in heard[-1].heartbeat.unknown})
 
     def picture(self, now_s: float) -> dict[str, Any]:
-        """The workers at a glance.
+        """Return an overview of the workers.
 
         Returns:
             ``workers`` (each: id, alive, what it holds and does), ``holders`` (of each partition the place of its worker, -1
@@ -84,7 +84,7 @@ class FleetWorkers:
 
 
 def _lag(heard: deque[_Heard]) -> float | None:
-    """The longest of late [s]; None where no block came."""
+    """Return the largest recent lag [s]; None without any block."""
     lags = [each.heartbeat.lag_s for each in heard if each.heartbeat.lag_s is not None]
     return max(lags, default=None)
 

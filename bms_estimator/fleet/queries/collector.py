@@ -94,7 +94,7 @@ class Collector:
             ) from None
 
     async def _fetch(self, stop: asyncio.Event) -> Sequence[Msg]:
-        """What has come, at most ``AT_ONCE``; nothing while the server is away."""
+        """Fetch up to ``AT_ONCE`` messages; none while the server is away."""
         try:
             self._subscription = self._subscription or await self._subscribe()
             return await self._subscription.fetch(AT_ONCE, timeout=FETCH_S)
@@ -119,7 +119,7 @@ class Collector:
                 self._waiting.append((message, row))
 
     async def _unreadable(self, message: Msg, error: ValidationError) -> None:
-        """It will never be readable: it is said, and not asked for again by us; the stream keeps it as long as all."""
+        """Report a message that cannot be decoded. It is not fetched again; the stream keeps it like any other."""
         self.counters["unreadable"] += 1
         fault = error.errors()[0]
         reason = f"{'.'.join(map(str, fault['loc'])) or 'all of it'}: {fault['msg']}"

@@ -140,7 +140,7 @@ def select(folder: Path, query: str, *, days: int | None = None) -> Answer:
 
 @contextlib.contextmanager
 def opened(folder: Path, days: int | None = None) -> Iterator[duckdb.DuckDBPyConnection]:
-    """A database with the view ``hours``: a row for each hour of each pack, once.
+    """Open a database with the view ``hours``: one row for each hour of each pack.
 
     Raises:
         UserError: There is no such folder, no file in it, or one that is damaged.
@@ -161,7 +161,7 @@ def _damage(folder: Path) -> Iterator[None]:
 
 
 def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
-    """The files by the folder of their day; ``days``: of the last so many.
+    """Return the files by day folder; ``days``: of the last days only.
 
     Raises:
         UserError: There are none, or one is not whole.
@@ -183,7 +183,7 @@ def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
 
 
 def _view(base: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
-    """The view ``hours``: one file made of many holds no row twice, which spares looking for such in most of them.
+    """Create the view ``hours``. A merged file has no duplicate rows, so that most files need no deduplication.
 
     Raises:
         UserError: The files hold something else.

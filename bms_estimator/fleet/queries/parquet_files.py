@@ -137,13 +137,13 @@ def compact(day: Path) -> Path:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """What one that was killed has left; nobody else may write to ``folder`` now."""
+    """Remove files that a killed process left unfinished; nobody else may write to ``folder`` now."""
     for file in folder.glob(f"{FOLDER}*/.*{UNFINISHED}"):
         file.unlink(missing_ok=True)
 
 
 def sound_files(day: Path) -> list[Path]:
-    """The files of a day that are whole, by name."""
+    """Return the complete files of a day by name."""
     return [file for file in sorted(day.glob("*.parquet")) if is_whole(file)]
 
 

@@ -72,7 +72,7 @@ def read_accounts(folder: Path) -> Accounts:
 
 
 def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: datetime | None = None) -> str:
-    """What an edge shows as MQTT's password.
+    """Make the token that an edge sends as MQTT password.
 
     Args:
         folder: Of the keys.
@@ -113,7 +113,7 @@ def _tenant(folder: Path, name: str, settings: TenantSettings) -> Tenant:
 
 
 def _write_users(folder: Path, account: str, now: datetime) -> None:
-    """What users may do stands in the account's claims, so that these need not be made again."""
+    """Write the users' permissions into the account's claims, so that tokens need not be renewed."""
     for role in Role:
         path = credentials_file(folder.parent, folder.name, role)
         if role is Role.EDGE or path.exists():
@@ -125,7 +125,7 @@ def _write_users(folder: Path, account: str, now: datetime) -> None:
 
 
 def _key(path: Path, kind: int) -> Key:
-    """The key of a file, which is made where it is missing."""
+    """Read the key of a file; make the file if it is missing."""
     if not path.exists():
         _write(path, jwt_claims.new_key(kind).seed)
     return _read_key(path)

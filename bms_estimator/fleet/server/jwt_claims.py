@@ -104,7 +104,7 @@ class Key:
         return str(nkeys.from_seed(self.seed).public_key.decode())
 
     def sign(self, data: bytes) -> bytes:
-        """An ed25519 signature."""
+        """Return an ed25519 signature."""
         return bytes(nkeys.from_seed(self.seed).sign(data))
 
     def __repr__(self) -> str:
@@ -112,12 +112,12 @@ class Key:
 
 
 def new_key(kind: int) -> Key:
-    """A key of ``ACCOUNT``, ``OPERATOR`` or ``USER``."""
+    """Make a key of kind ``ACCOUNT``, ``OPERATOR`` or ``USER``."""
     return Key(nkeys.encode_seed(os.urandom(32), kind))
 
 
 def key_of(seed: bytes) -> Key:
-    """The key of a seed, as it is written.
+    """Return the key of a seed in its text form.
 
     Raises:
         ValueError: It is none.
@@ -130,7 +130,7 @@ def key_of(seed: bytes) -> Key:
 
 
 def user_key(signer: Key, role: Role, name: str) -> Key:
-    """The key of a user, always the same, so that its tokens can be revoked by the name."""
+    """Return the key of a user, derived from the name so that its tokens can be revoked by name."""
     text = f"{role.value} {name}".encode()
     return Key(nkeys.encode_seed(hashlib.sha256(signer.seed + b"\0" + text).digest(), USER))
 
@@ -190,7 +190,7 @@ def system_account(operator_key: Key, public: str) -> str:
 
 
 def user(signer: Key, account_key: str, role: Role, name: str, made: datetime, expires: datetime | None = None) -> str:
-    """The token of a user.
+    """Make the token of a user.
 
     Args:
         signer: That of the role.
@@ -207,7 +207,7 @@ def user(signer: Key, account_key: str, role: Role, name: str, made: datetime, e
 
 
 def credentials(token: str, key: Key) -> bytes:
-    """The file with which a program connects: its token, and the key with which it shows that it is its own."""
+    """Return a credentials file: the token of a program and the key that proves its possession."""
     return (
         f"-----BEGIN NATS USER JWT-----\n{token}\n------END NATS USER JWT------\n\n"
         f"-----BEGIN USER NKEY SEED-----\n{key.seed.decode()}\n------END USER NKEY SEED------\n"
@@ -215,7 +215,7 @@ def credentials(token: str, key: Key) -> bytes:
 
 
 def _scope(role: Role, public: str) -> dict[str, Any]:
-    """What the users may do that a key signs."""
+    """Return the permissions of users that a key signs."""
     publish, subscribe = _ALLOWED[role]
     template = {
         "pub": _permission(publish, _DENIED.get(role, ())),

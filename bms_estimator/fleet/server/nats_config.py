@@ -93,7 +93,7 @@ class Node:
 
 
 def configuration(node: Node) -> str:
-    """The server's configuration file."""
+    """Return the server's configuration file."""
     tls = _tls(node.tls) if node.tls else ""
     patience = f"authorization {{ timeout: {LET_IN_S} }}"
     lines = [

@@ -69,7 +69,7 @@ class NodeLocation:
 
 
 def find_server() -> Path:
-    """The nats-server beside the running Python, else that of PATH.
+    """Find nats-server beside the running Python, else in PATH.
 
     Raises:
         UserError: There is none, or it is too old.
@@ -103,7 +103,7 @@ class ServerSpec:
 
 
 def node_of(place: NodeLocation, told: ServerSpec) -> Node:
-    """What the server is told."""
+    """Return the node's configuration."""
     server, tls = told.settings.server, told.settings.tls
     own = place.nodes[place.number - 1] if place.nodes else ""
     return Node(
@@ -215,7 +215,7 @@ async def _reload_on_signal(
 
 @contextlib.asynccontextmanager
 async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subprocess.Process, asyncio.Event]]:
-    """The server as a child, which ends with us, and whether a signal has asked it to."""
+    """Run the server as a child that ends with this process. Yield it and a flag that a signal sets."""
     for left in file.parent.glob("*.ports"):  # of one that was killed
         left.unlink()
     process = await asyncio.create_subprocess_exec(
@@ -261,7 +261,7 @@ async def _make_ready(place: NodeLocation, told: ServerSpec, pid: int, say: Call
 
 
 async def _make_all_streams(place: NodeLocation, told: ServerSpec, say: Callable[[str], None]) -> None:
-    """The streams of all tenants, made by one node of several: that which has the keys, or the first."""
+    """Make the streams of all tenants from one of several nodes: the one with the keys, else the first."""
     node = node_of(place, told)
     if place.number != 1 if node.accounts is None else not credentials.has_keys(place.keys):
         say("ready; streams are made by the node that has the keys, the first")
@@ -298,7 +298,7 @@ async def _make_streams(place: NodeLocation, told: ServerSpec, name: str, tenant
 
 
 async def connect(node: Node, credentials_file: Path | None) -> Client:
-    """A connection to the server of this machine.
+    """Connect to the server on this machine.
 
     Raises:
         NatsError: It refuses.
@@ -327,14 +327,14 @@ def _has_reloaded(before: Mapping[str, object], varz: Mapping[str, object]) -> b
 
 
 async def _wait(node: Node, what: str, is_so: Callable[[Mapping[str, object]], bool]) -> Mapping[str, object]:
-    """What the server's monitor says, once it says so."""
+    """Poll the server's monitor until a condition holds; return its response."""
     while not is_so(said := await _ask(node, what)):  # noqa: ASYNC110 - it has no other way to tell
         await asyncio.sleep(ASK_AGAIN_S)
     return said
 
 
 async def _ask(node: Node, what: str) -> Mapping[str, object]:
-    """What the server's monitor says; empty where it says nothing."""
+    """Return the response of the server's monitor; empty without a response."""
     host, port = reachable(node.monitor)
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/{what}"
     with contextlib.suppress(aiohttp.ClientError, TimeoutError, ValueError):

@@ -210,7 +210,7 @@ def _who(seen: DemoObserver) -> str:
 
 
 async def _counted(nc: Client, seen: DemoObserver, processes: "Processes", stop: asyncio.Event) -> str:
-    """What came, and what was taken of it."""
+    """Count the blocks that arrived and those that were processed."""
     kept = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages
 
     def all_taken() -> bool:
@@ -254,7 +254,7 @@ async def _listen(nc: Client, fleet: SimulatedFleet) -> DemoObserver:
 
 @contextlib.asynccontextmanager
 async def _connected(server: str, processes: "Processes", stop: asyncio.Event) -> AsyncIterator[Client]:
-    """A connection, once the server has its streams."""
+    """Connect once the server has its streams."""
     log = processes.folder / "server.log"
     await processes.until(lambda: "streams ready" in log.read_text(), stop)
     nc = await nats.connect(server)
@@ -311,7 +311,7 @@ class Processes:
             await asyncio.sleep(HEARTBEAT_S / 10.0)
 
     def check(self) -> None:
-        """That all run.
+        """Check that all processes run.
 
         Raises:
             UserError: One has ended.
@@ -348,7 +348,7 @@ class Processes:
 
 
 def free_port() -> int:
-    """A port of the loopback on which nobody listens; never the same twice in a row.
+    """Return a free loopback port; never the same one twice in a row.
 
     Raises:
         UserError: There is none.

@@ -49,7 +49,7 @@ class SimulatedEdges:
         self.resends = self.sent = self.again = 0
 
     def due(self, now_s: float, most: int) -> Due:
-        """The blocks that are complete at ``now_s`` [s since 1970] and not sent yet; of more than ``most`` the oldest."""
+        """Return the blocks complete at ``now_s`` [s since 1970] and not sent yet; beyond ``most`` only the oldest."""
         ready_s = self._ready_s(self.next)
         open_ = ready_s <= now_s if self._last is None else (ready_s <= now_s) & (self.next <= self._last)
         packs = np.flatnonzero(open_)

@@ -143,11 +143,11 @@ class SimulatedFleet:
         return Truth(capacity * rated_as[self._kind], resistance)
 
     def kind(self, pack: int) -> Kind:
-        """What a pack is declared to be."""
+        """Return the declared kind of a pack."""
         return KINDS[self._kind[pack]]
 
     def blocks(self, packs: Whole, numbers: Whole, arrival_s: Floats) -> Iterator[bytes]:
-        """What edges send, one block a pack.
+        """Return one block for each pack, as edges send it.
 
         Args:
             packs: Which, shape (n,).
@@ -177,20 +177,20 @@ class SimulatedFleet:
         return samples
 
     def table(self) -> str:
-        """The table of packs, as ``fleet packs load`` reads it."""
+        """Return the table of packs in the format that ``fleet packs load`` reads."""
         lines = [",".join(COLUMNS)]
         lines += [_row(name, KINDS[kind]) for name, kind in zip(self.names, self._kind.tolist(), strict=True)]
         return "\n".join(lines) + "\n"
 
     def truth_table(self) -> str:
-        """What no estimator is told, as CSV."""
+        """Return the ground truth as CSV, which no estimator gets."""
         rows = zip(self.names, self.truth.capacity_as.tolist(), self.truth.resistance.tolist(), strict=True)
         lines = ["pack,capacity_ah,resistance_factor"]
         lines += [f"{name},{capacity_as / 3600.0:.4f},{factor:.4f}" for name, capacity_as, factor in rows]
         return "\n".join(lines) + "\n"
 
     def soc(self, packs: Whole, time_s: Floats) -> Floats:
-        """The true SOC 0..1 of each pack at its edge's ``time_s``: of the same shape."""
+        """Return the true SOC 0..1 of each pack at its edge's ``time_s``, in the same shape."""
         minute = np.floor(time_s / BLOCK_S)
         pulse_a = self._pulse_a(packs, minute.astype(np.int64))
         pulse_as = pulse_a * _pulse_charge_s(time_s - minute * BLOCK_S)
@@ -201,7 +201,7 @@ class SimulatedFleet:
         return MIDDLE_SOC + SWING_SOC * (SLOW * np.sin(angle) + QUICK * np.sin(QUICKNESS * angle))
 
     def _slow_a(self, packs: Whole, time_s: Floats) -> Floats:
-        """The current [A] that makes ``_slow_soc``, positive on discharge."""
+        """Return the current [A] that produces ``_slow_soc``, positive on discharge."""
         angle, omega = self._omega[packs] * time_s + self._phase[packs], self._omega[packs]
         slope = SWING_SOC * omega * (SLOW * np.cos(angle) + QUICKNESS * QUICK * np.cos(QUICKNESS * angle))
         return -slope * self.truth.capacity_as[packs]
@@ -211,7 +211,7 @@ class SimulatedFleet:
         return PULSE_C / 3600.0 * self.truth.capacity_as[packs] * (2.0 * self._dice(packs, 11, minutes) - 1.0)
 
     def _terminals(self, packs: Whole, numbers: Whole, curves: _Curves) -> tuple[Floats, Floats]:
-        """Current [A] and voltage [V] in each second of a block, as they are: both of shape (n, BLOCK_S)."""
+        """Return true current [A] and voltage [V] in each second of a block, both of shape (n, BLOCK_S)."""
         column, second = packs[:, None], np.arange(BLOCK_S, dtype=np.float64)
         time_s = (numbers[:, None] - 1) * BLOCK_S + second
         slow_a, late_a = self._slow_a(column, time_s), self._slow_a(column, time_s - TAU_TL_S)
@@ -247,7 +247,7 @@ def _row(name: str, kind: Kind) -> str:
 
 
 def _read(values: Floats, noise: Floats, step: float) -> Floats:
-    """What a converter makes of ``values`` with ``noise`` in steps."""
+    """Quantize ``values`` with ``noise`` to the steps of a converter."""
     read: Floats = np.rint(values / step + noise) * step
     return read
 
@@ -258,7 +258,7 @@ def _pulse_charge_s(second: Floats) -> Floats:
 
 
 def _response() -> tuple[Floats, Floats, Floats]:
-    """What is felt of a pulse of 1 A [A].
+    """Return the response to a pulse of 1 A [A].
 
     Returns:
         The current in each second of its minute; what a branch of ``TAU_TS_S`` feels of it then; what it still feels at

@@ -60,7 +60,7 @@ def classify_block(d: np.void, block: Block) -> BlockOrder:
 
 
 def mark_taken(d: np.void) -> None:
-    """The block that was awaited is taken; ``d`` as in ``classify_block``."""
+    """Advance to the block after the expected one; ``d`` as in ``classify_block``."""
     _await(d, int(d["awaited"]) + 1)
     d["blocks"] += 1
 
@@ -85,7 +85,7 @@ def _await(d: np.void, number: int) -> int:
 
 
 def edge_reply(order: BlockOrder, d: np.void, block: Block, *, first: bool) -> BlockRequest | None:
-    """What the edge is told of a block.
+    """Return the reply to an edge about a block.
 
     Args:
         order: What it was.

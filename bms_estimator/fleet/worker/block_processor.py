@@ -70,7 +70,7 @@ class BlockProcessor:
         return state, self._parameters(of_type.estimator, arrival_s, now_s) if told else None, rows
 
     def forget(self) -> None:
-        """A block has failed: nothing of it goes into the next one's window."""
+        """Drop the samples of a failed block from the publish window."""
         self._window = Window()
 
     def _settle(self, of_type: PackType, former: Fields | None, block: Block) -> None:
@@ -134,7 +134,7 @@ class BlockProcessor:
         return _json(make_parameters_payload(estimator, arrival_s).model_copy(update={"publish_time": iso_utc(now_s)}))
 
     def _check_times(self, samples: SampleBlock) -> None:
-        """A sample whose time cannot be has none."""
+        """Set implausible timestamps to NaN."""
         times = samples["time_s"]
         fit = (times >= 0.0) & (times <= LONGEST_STORE_S)
         if not fit.all():
@@ -181,7 +181,7 @@ class BlockProcessor:
 
 
 def _parts(block: Block) -> Iterator[Block]:
-    """A block in parts of at most ``AT_ONCE`` samples."""
+    """Split a block into parts of at most ``AT_ONCE`` samples."""
     if block.samples.size <= AT_ONCE:
         yield block
         return

@@ -47,12 +47,12 @@ class PreviousLayoutState(NamedTuple):
 
 
 def layout_of(dtype: np.dtype[Any]) -> str:
-    """The fields of a record as text."""
+    """Return the fields of a record as text."""
     return json.dumps(_described(dtype), separators=(",", ":"))
 
 
 def dtype_of(layout: str) -> np.dtype[Any]:
-    """What ``layout_of`` describes.
+    """Return the dtype that ``layout_of`` describes.
 
     Raises:
         ValueError: It describes none.
@@ -102,7 +102,7 @@ class PartitionCheckpoint:
     deferred: Mapping[str, Span] = field(default_factory=dict)
 
     def chunks(self) -> Iterator[bytes]:
-        """The bytes, about ``CHUNK_BYTES`` at a time."""
+        """Yield the checkpoint's bytes in chunks of about ``CHUNK_BYTES``."""
         layouts = list(dict.fromkeys([PRESENT, *(each.layout for each in self.former.values())]))[:_MOST_LAYOUTS]
         header = {
             "partition": self.number,
@@ -143,7 +143,7 @@ def _sealed(entries: list[bytes]) -> tuple[bytes, bytes]:
 
 
 def read_checkpoint(data: bytes) -> PartitionCheckpoint:
-    """What ``PartitionCheckpoint.chunks`` wrote, all of it in one.
+    """Read a whole checkpoint written by ``PartitionCheckpoint.chunks``.
 
     Raises:
         CheckpointError: It is none, damaged, or of a version that is not known.

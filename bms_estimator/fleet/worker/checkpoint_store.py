@@ -108,7 +108,7 @@ class CheckpointStore:
         return claim
 
     async def confirm_claim(self, claim: Claim) -> Claim:
-        """The claim as it stands: the last write may have been done though no answer came.
+        """Read the claim again, because the last write may have succeeded though no response came.
 
         Raises:
             FencedError: Another worker has taken the partition over.
@@ -121,7 +121,7 @@ class CheckpointStore:
         raise FencedError(found[1].worker)
 
     async def load(self, claim: Claim) -> AsyncGenerator[tuple[CheckpointInfo, bytes], None]:
-        """The checkpoints that can be read, the newest first; of others is said what is wrong."""
+        """Yield the readable checkpoints, the newest first; log why others are not readable."""
         for kept in claim.pointer.kept:
             try:
                 data = await self._read(kept.object)
@@ -212,7 +212,7 @@ class CheckpointStore:
         return size
 
     async def _read(self, name: str) -> bytes | None:
-        """The bytes of an object; None: some are missing, or others than were written."""
+        """Return the bytes of an object; None if some are missing or the digest differs."""
         info = await self._states.get_info(name)
         subject = f"$O.{subjects.STATES_BUCKET}.C.{info.nuid}"
         last = (await self._js.get_last_msg(_STREAM, subject)).seq or 0

@@ -30,7 +30,7 @@ Sums = NDArray[np.void]
 
 
 def hour_of(block: Block) -> int:
-    """The hour a block belongs to, by the edge's clock at its last sample [hours since 1970].
+    """Return the hour of a block by the edge's clock at its last sample [hours since 1970].
 
     A block whose last time stamp is not finite belongs to that of its store.
     """
@@ -67,7 +67,7 @@ def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> No
 
 
 def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour:
-    """The finished hour.
+    """Return the row of a finished hour.
 
     Args:
         pack: What it is, as its settings have it.
@@ -126,7 +126,7 @@ def _measured(h: np.void) -> dict[str, object]:
 
 
 def _observed(record: np.void) -> dict[str, object]:
-    """What the observer says; nothing before the first sample."""
+    """Return the observer's values; empty before the first sample."""
     s = record["observer"]
     return {name: float(s[name]) for name in ("soc", "delta_1", "delta_2")} if s["started"] else {}
 
@@ -147,7 +147,7 @@ _ELEMENTS = (
 
 
 def _identified(estimator: Estimator) -> dict[str, object]:
-    """What the filter says; nothing without it, and before its first sample."""
+    """Return the filter's values; empty without a filter and before its first sample."""
     record, settings = estimator.record[0], estimator.settings_record[0]
     f = record["filter"]
     if not (estimator.identifying and f["started"]):

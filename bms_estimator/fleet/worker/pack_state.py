@@ -124,5 +124,5 @@ class WorkRecord:
         lost["lost_blocks"] = min(int(lost["lost_blocks"]) + blocks, MOST_LOST)
 
     def take(self) -> bytes:
-        """The pack as it is now."""
+        """Return the pack's record, packed."""
         return self._packed[: pack(self._words, self._mirror, self._packed)].tobytes()

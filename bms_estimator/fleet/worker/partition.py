@@ -105,7 +105,7 @@ class Partition:
         return made
 
     def snapshot(self) -> PartitionCheckpoint:
-        """The partition as it is now, whatever comes later; costs no more than a list of its packs."""
+        """Return a snapshot of the partition; it costs only a copied list of packs."""
         spans = self.deferred.spans()
         return PartitionCheckpoint(
             self.number, self.sequence, dict(self._counters), dict(self._packs), dict(self._former), spans
@@ -122,7 +122,7 @@ class Partition:
         return tuple(pack for pack in self.deferred if not self.is_known(pack))
 
     def state(self, pack: str) -> NDArray[np.void] | None:
-        """A copy of the record of a pack, shape (1,), dtype PACK_STATE; None where there is none of this version."""
+        """Return a copy of a pack's record, shape (1,), dtype PACK_STATE; None if this version has none."""
         packed = self._packs.get(pack)
         if packed is None:
             return None
@@ -253,7 +253,7 @@ class Partition:
             log.warning("a block is refused", partition=self.number, pack=pack, reason=why)
 
     def _step(self, pack: str, block: Block, of_type: PackType, former: Fields | None) -> BlockResult | None:
-        """What comes of the next block; None: of this one nothing can."""
+        """Process the next block; None if it cannot be processed."""
         try:
             return BlockResult(pack, None, *self._stepping.step(pack, block, of_type, former))
         except Exception:  # a fault of ours, with one block: awaited for ever it would stop the pack

@@ -204,7 +204,7 @@ class PartitionLease:
             log.warning("not given back: that takes its time", partition=self.number, reason=error_text(error))
 
     def settings_changed(self, pack: str) -> None:
-        """A pack has other settings, or is known now."""
+        """Handle new settings of a pack, or a pack that became known."""
         if self.partition:
             self.partition.settings_changed(pack)
             self._turns.set()
@@ -382,7 +382,7 @@ class PartitionLease:
                 await self._nc.publish(subjects.published(taken.pack, topic), payload)
 
     async def _look(self) -> None:
-        """The server has let our pin lapse: does the partition belong to somebody else now?"""
+        """Check after a lapse of the pin whether another worker owns the partition now."""
         async with self._changing:
             await self._confirm()
         self._lost = False
@@ -418,7 +418,7 @@ class PartitionLease:
 
 
 def _later(before: BlockResult | None, taken: BlockResult) -> BlockResult:
-    """What is to go out of two messages of one pack."""
+    """Return the messages to send out of two successive ones of one pack."""
     if before is None:
         return taken
     return taken._replace(

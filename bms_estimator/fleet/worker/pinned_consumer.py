@@ -88,7 +88,7 @@ class PinnedConsumer:
         await self._ask(BATCH if len(self.waiting) < BATCH else 1)
 
     async def take(self) -> DeliveredMessage | None:
-        """The next message; None: none is here."""
+        """Return the next message; None without one."""
         if not self.waiting:
             return None
         self._taken += 1
@@ -138,7 +138,7 @@ class PinnedConsumer:
 
 
 def sequences(reply: str) -> tuple[int, int]:
-    """A message's number in its stream, and that of the consumer, which has no holes.
+    """Return a message's sequence number in its stream, and its gapless one in the consumer.
 
     Args:
         reply: Where it would be acknowledged (ADR-15): 9 tokens, or 11 and more with the server's domain.

@@ -197,5 +197,5 @@ def delta(exponent: float, offset: float, amplitude: float) -> float:
 
 @njit(cache=True)
 def crossing(soc: float, offset: float, amplitude: float) -> float:
-    """The bound that a8 (a11) must exceed at ``soc``: right side of the condition in Lemma 4.1.1, Fig. 19."""
+    """Return the bound that a8 (a11) must exceed at ``soc``: right side of the condition in Lemma 4.1.1, Fig. 19."""
     return -math.log(offset / amplitude) / soc

@@ -18,7 +18,7 @@ LONGEST_FLOW_S = 3600.0
 
 @njit(cache=True)
 def interpolated_current(dt_s: float, before_a: float, now_a: float, unmeasured_s: float = UNMEASURED_S) -> float:
-    """Current over a step of ``dt_s``: straight between its ends; what both agree on where nobody measured [A]."""
+    """Return the mean current over a step of ``dt_s``: linear between samples; in a gap only what both ends share [A]."""
     if dt_s <= unmeasured_s:
         return 0.5 * (before_a + now_a)
     if before_a * now_a <= 0.0:
@@ -28,7 +28,7 @@ def interpolated_current(dt_s: float, before_a: float, now_a: float, unmeasured_
 
 @njit(cache=True)
 def ramp_correction(change_a: float, taus: float, decay: float) -> float:
-    """What a branch gains when the current goes straight from one sample to the next, beyond its mean [A].
+    """Return the change of a branch current by a linear ramp between samples, beyond that of its mean [A].
 
     Args:
         change_a: From one sample to the next [A].

@@ -61,7 +61,7 @@ def nernst(temperature_k: float, hydrogen_atm: float, oxygen_atm: float) -> floa
 
 @njit(cache=True)
 def load_constants(given: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - a cell's needs the SOC
-    """The file's parameters, and E at ``temperature_c`` [C], into ``given``; ``p`` is a record of ESTIMATOR_SETTINGS."""
+    """Load the file's parameters, and E at ``temperature_c`` [C], into ``given``; ``p`` is a record of ESTIMATOR_SETTINGS."""
     load_file_constants(given, p.learning.file, temperature_c)
 
 
@@ -107,7 +107,7 @@ def settled(theta: Floats, given: Floats, current_a: float, slope: Floats) -> fl
 
 @njit(cache=True)
 def advance(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, dt_s: float) -> None:
-    """The overpotential and its sensitivities after ``dt_s`` under a held current, exactly.
+    """Advance the overpotential and its sensitivities by ``dt_s`` under a held current, exactly.
 
     Args:
         x: States [V], shape (2,): v; the second is not used. Updated.
@@ -156,14 +156,14 @@ def output(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float
 
 @njit(cache=True)
 def steady_state(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
-    """The state that ``current_a`` leads to, and its sensitivities, whatever they were; arguments as of ``advance``."""
+    """Set the state and its sensitivities to their steady values under ``current_a``; arguments as in ``advance``."""
     dx[1] = 0.0
     x[0], x[1] = settled(theta, given, current_a, dx[0]), 0.0
 
 
 @njit(cache=True)
 def write(theta: Floats, file: Floats, a: Floats) -> None:
-    """The parameters that theta stands for, from ``a[1]`` on in the order of ``NAMES``; the rest as the file has it."""
+    """Write the parameters of theta to ``a[1]`` and later, in the order of ``NAMES``; the rest comes from the file."""
     for j in range(len(NAMES)):
         a[1 + j] = file[1 + j] * math.exp(theta[j])
     for i in range(1 + len(NAMES), a.shape[0]):

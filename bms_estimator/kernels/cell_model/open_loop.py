@@ -25,7 +25,7 @@ LEAST_CAPACITANCE = 1e-3
 
 @njit(cache=True)
 def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
-    """The current filtered by each time constant of the ladder.
+    """Filter the current by each time constant of the RC network.
 
     Args:
         time_s: Shape (n,), increasing [s].

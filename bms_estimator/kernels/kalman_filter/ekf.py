@@ -60,7 +60,7 @@ VARYING_C = 0.2
 
 @njit(cache=True)
 def transition_diagonal(s: Record, p: Record) -> None:
-    """The diagonal of F over the window into ``s.f``; the same for all hypotheses but that of CURVE."""
+    """Write the diagonal of F over the window to ``s.f``; only the element of CURVE differs between hypotheses."""
     f, dt_s, through = s.f, s.window.time_s, s.window.throughput_as / p.capacity_as
     for j in range(STATES):
         f[j] = 1.0
@@ -107,7 +107,7 @@ def predict(s: Record, p: Record, q: int) -> None:
 
 @njit(cache=True)
 def apply_offdiagonal_transition(cov: Floats, f: Floats, by_offset: float, moved: float) -> None:
-    """What is off the diagonal of F: SOC by the offset [1/A] and ln Q, branches by the offset."""
+    """Apply the off-diagonal elements of F: SOC by offset [1/A] and ln Q, branches by offset."""
     for k in range(STATES):
         cov[SOC, k] += by_offset * cov[OFFSET, k] + moved * cov[LN_Q, k]
         for j in range(X, X + BRANCHES):
@@ -161,7 +161,7 @@ def update(s: Record, p: Record, q: int, variance_v2: float) -> tuple[float, flo
 def compute_innovation(
     s: Record, p: Record, q: int, variance_v2: float, about_soc: float, about_variance: float
 ) -> tuple[float, float, float]:
-    """What ``update`` returns, linear about an SOC to a variance; P H' into ``s.ph``."""
+    """Compute the innovation for ``update``, linearized about an SOC; write P H' to ``s.ph``."""
     cov, h, ph = s.covariance[q], s.h, s.ph
     predicted_v, curved_v = linearise(s, p, q, about_soc, about_variance)
     innovation_v = s.window.sum_v / s.window.samples - predicted_v

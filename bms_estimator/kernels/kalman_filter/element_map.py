@@ -171,7 +171,7 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
 
 @njit(cache=True)
 def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -> float:
-    """The exponent of least cost: a logarithmic search, then golden sections around its best point."""
+    """Return the exponent of least cost: a logarithmic search, then golden sections around its best point."""
     ratio = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
     lowest, highest = math.log(EXPONENT_MIN), math.log(EXPONENT_MAX)
     best = min(max(math.log(start), lowest), highest)

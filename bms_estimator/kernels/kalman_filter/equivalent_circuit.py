@@ -98,7 +98,7 @@ def one_branch(e: Record, first: int, end: int, at: int, scale_variance: float, 
 
 @njit(cache=True)
 def branch_rise_within_sample(f: Record, e: Record) -> float:
-    """What the branches add to a step of the voltage within a sample [ohm]: nobody sees how much of it is R_s."""
+    """Return the rise of the branches within one sample after a step [ohm]. How much of it is R_s cannot be observed."""
     ohm = 0.0
     for k in range(BRANCHES):
         ohm += e.ohm[1 + k] * (1.0 - math.exp(-min(f.decay_s, LONGEST_S) / TAUS[k]))

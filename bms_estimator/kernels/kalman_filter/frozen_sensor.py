@@ -83,7 +83,7 @@ def ocv_has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v:
 
 @njit(cache=True)
 def rewind_to_freeze(c: Record, f: Record, p: Record) -> None:
-    """What was concluded since one of the two froze is worth nothing: the SOC of then, and counted since, if the current is one."""
+    """Return to the SOC before a sensor froze, and count charge from there if the current is the live one."""
     if c.frozen_a_s > FROZEN_S:
         f.soc, f.soc_std = c.same_soc, c.same_soc_std + p.load_mean_c * c.same_s / 3600.0
     else:

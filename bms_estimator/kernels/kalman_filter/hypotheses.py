@@ -200,7 +200,7 @@ def update_hypotheses(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def innovation_scale(s: Record, p: Record) -> float:
-    """What S is in truth, over what the filters take it for.
+    """Return the ratio of the true innovation variance to S.
 
     R and the biases allow for loads and cells that the file fits worst. Mostly it fits better, once what was before switch-on
     is forgotten: innovations far within S would leave it to ln S to judge, and the hypothesis of the smallest S would win.

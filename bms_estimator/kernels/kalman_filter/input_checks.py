@@ -232,7 +232,7 @@ def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, volt
 
 @njit(cache=True)
 def unusable_input_bits(c: Record, p: Record) -> int:
-    """The bits of why no voltage can be believed, 0: it can."""
+    """Return the bits of faults that forbid the use of the voltage; 0: the voltage is usable."""
     if sign_is_wrong(c, p):
         return SIGN_OF_CURRENT
     return (VOLTAGE if c.frozen_v_s > FROZEN_S else 0) | (CURRENT if c.frozen_a_s > FROZEN_S else 0)
@@ -247,7 +247,7 @@ def sign_is_wrong(c: Record, p: Record) -> bool:
 
 @njit(cache=True)
 def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
-    """A sample while voltage and current do not belong together: no voltage can be believed.
+    """Process a sample without using its voltage, while voltage and current do not belong together.
 
     With the wrong sign of the current the SOC errs by twice the charge, always the same way; a current that is not measured may be
     anything common. What was learned with the wrong sign is worth nothing: the filter starts anew afterwards.

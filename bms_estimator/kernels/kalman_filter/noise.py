@@ -167,7 +167,7 @@ def add_process_noise(s: Record, p: Record, q: int, moved: float, bias_v2: float
 
 @njit(cache=True)
 def add_gap_noise(p: Record, cov: Floats, f: Floats, std_a: float, soc_per_a: float) -> None:
-    """A current that nobody saw: the same all the time it moved the SOC and the branches together.
+    """Add the noise of an unmeasured current that stays constant, so that it moves SOC and branches together.
 
     It changed, too, by as much: the branches, which know the last seconds or minutes, are of another mean than the SOC. Without
     that the voltage after the gap would tell the SOC.

@@ -26,7 +26,7 @@ NEIGHBOURS = math.exp(-1.0 / (NODES - 1) / ALIKE_SOC)
 
 @njit(cache=True)
 def node_position(soc: float) -> tuple[int, float]:
-    """The node below ``soc``, and how far it is on the way to the next."""
+    """Return the node below ``soc``, and the fraction of the distance to the next one."""
     position = min(max(soc, 0.0), 1.0) * (NODES - 1)
     i = min(int(position), NODES - 2)
     return i, position - i
@@ -41,7 +41,7 @@ def node_error_scale(p: Record, soc: float, t: float) -> float:
 
 @njit(cache=True)
 def ocv_correction(p: Record, x: Floats, soc: float) -> float:
-    """What the true curve is above that of the cell file, as far as it was learned [V]."""
+    """Return the learned correction of the cell file's OCV [V]."""
     i, t = node_position(soc)
     return node_error_scale(p, soc, t) * ((1.0 - t) * x[NODE + i] + t * x[NODE + i + 1])
 

@@ -44,7 +44,7 @@ WARMEST_C = 80.0
 
 @njit(cache=True)
 def propagate_self_heating(s: Record, p: Record) -> None:
-    """The temperature at the end of the window under the losses i^2 R_0 + sum x_k^2 R_k, in a room of ``REFERENCE_C``."""
+    """Compute the temperature at the end of the window from losses i^2 R_0 + sum x_k^2 R_k, at ``REFERENCE_C`` ambient."""
     w, x = s.window, s.mean[s.best]
     resistances(s.soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
     current_a = w.charge_as / w.time_s
@@ -64,6 +64,6 @@ def is_temperature(temperature_c: float) -> bool:
 
 @njit(cache=True)
 def update_arrhenius_factors(s: Record) -> None:
-    """The Arrhenius factors at the cell's temperature."""
+    """Compute the Arrhenius factors at the cell's temperature."""
     s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
     s.hysteresis = arrhenius(HYSTERESIS_J, s.temperature_c)

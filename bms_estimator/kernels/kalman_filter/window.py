@@ -102,7 +102,7 @@ def add_to_window(s: Record, current_a: float, voltage_v: float) -> None:
 
 @njit(cache=True)
 def prepare_transition(s: Record, p: Record) -> None:
-    """What the time of the window does to the temperature, where nobody measures it, and to F."""
+    """Propagate the temperature over the window if it is not measured, and compute F."""
     if not s.sensed:
         propagate_self_heating(s, p)
     transition_diagonal(s, p)

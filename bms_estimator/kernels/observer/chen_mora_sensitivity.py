@@ -33,7 +33,7 @@ def load_constants(given: Floats, p: Record, soc: float, temperature_c: float) -
 
 @njit(cache=True)
 def steady_state(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:  # noqa: ARG001
-    """The states of a cell at rest: its branches are empty."""
+    """Set the states of a cell at rest: the branches are at zero."""
     x[:] = 0.0
     dx[:] = 0.0
 
@@ -74,6 +74,6 @@ def write(theta: Floats, file: Floats, a: Floats) -> None:
 
 @njit(cache=True)
 def scale(file: Floats, a: Floats, i: int, ln_ratio: float) -> None:
-    """The element whose parameters are a_i, a_i+1, a_i+2: ``ln_ratio`` over that of the file."""
+    """Scale the element of parameters a_i, a_i+1, a_i+2 by e^``ln_ratio`` over the file's."""
     ratio = math.exp(ln_ratio)
     a[i], a[i + 1], a[i + 2] = file[i] * ratio, file[i + 1], file[i + 2] * ratio

@@ -22,7 +22,7 @@ RESTING_C = 0.02
 
 @njit(cache=True)
 def initialize_learning(s: Record, p: Record, voltage_v: float) -> None:
-    """The file's parameters, nothing remembered, and a cell at rest."""
+    """Initialize with the file's parameters, no information, and a cell at rest."""
     m, q = s.learning, p.learning
     for j in range(q.count):
         m.theta[j] = 0.0
@@ -45,7 +45,7 @@ def reset_information(m: Record, q: Record) -> None:
 
 @njit(cache=True)
 def initialize_states_at_rest(s: Record, p: Record, voltage_v: float) -> None:
-    """The states of a cell at rest. What else is in the voltage is the offset's, and tells nothing of the parameters.
+    """Initialize the states of a cell at rest. The rest of the voltage goes to the offset and does not move the parameters.
 
     Nothing is learned until the states would have forgotten that they were otherwise.
     """
@@ -95,7 +95,7 @@ def learning_step(s: Record, p: Record, dt_s: float, before_a: float, voltage_v:
 
 @njit(cache=True)
 def inject_output_error(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """The offset follows e, and the sensitivities know: ``m.psi`` becomes that of y^ with the offset."""
+    """Move the offset by e and update its sensitivities: ``m.psi`` becomes that of y^ with the offset."""
     share = -math.expm1(-dt_s / q.offset_s)
     m.offset_v += share * e
     for j in range(q.count):
@@ -119,7 +119,7 @@ def accumulate_information(m: Record, q: Record, dt_s: float, e: float) -> None:
 
 @njit(cache=True)
 def discount_information(m: Record, q: Record, times: float) -> None:
-    """What is remembered counts e^-times as much."""
+    """Discount the accumulated information by e^-times."""
     keep = math.exp(-times)
     for j in range(q.count):
         m.pull[j] *= keep
@@ -129,7 +129,7 @@ def discount_information(m: Record, q: Record, times: float) -> None:
 
 @njit(cache=True)
 def solve_parameter_step(m: Record, q: Record) -> bool:
-    """The way from theta to where memory and leakage balance, into ``m.step``; False where there is none."""
+    """Write the step from theta to the balance of information and leakage to ``m.step``; return False if singular."""
     n = q.count
     for j in range(n):
         m.step[j] = m.pull[j] + q.leak_v2s[j] * (q.middle[j] - m.theta[j])
@@ -185,7 +185,7 @@ def apply_parameter_step(m: Record, q: Record, share: float) -> None:
 
 @njit(cache=True)
 def write_observer_state(s: Record, p: Record, estimate_v: float) -> None:
-    """What the observer's record says of the law: states, parameters, gain, estimated voltage."""
+    """Write the adaptive law's states, parameters, gain and estimated voltage to the observer's record."""
     m, q, o = s.learning, p.learning, s.observer
     o.v_ts, o.v_tl = m.x[0], m.x[1]
     o.voltage_estimate_v = estimate_v

@@ -27,7 +27,7 @@ NAMES = {Model.CHEN_MORA: chen_mora_sensitivity.NAMES, Model.FUEL_CELL: fuel_cel
 
 @njit(cache=True)
 def load_constants(model: int, given: Floats, p: Record, soc: float, temperature_c: float) -> None:
-    """What is not learned, at this sample; ``p`` is a record of ESTIMATOR_SETTINGS."""
+    """Load the model's constants for this sample; ``p`` is a record of ESTIMATOR_SETTINGS."""
     if model == _CHEN_MORA:
         chen_mora_sensitivity.load_constants(given, p, soc, temperature_c)
     elif model == _FUEL_CELL:
@@ -36,7 +36,7 @@ def load_constants(model: int, given: Floats, p: Record, soc: float, temperature
 
 @njit(cache=True)
 def steady_state(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
-    """The states and their derivatives at a first sample, when nobody knows what was before; in place."""
+    """Set states and derivatives at a first sample, whose history is unknown; in place."""
     if model == _CHEN_MORA:
         chen_mora_sensitivity.steady_state(x, dx, theta, given, current_a)
     elif model == _FUEL_CELL:
@@ -64,7 +64,7 @@ def output(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, curr
 
 @njit(cache=True)
 def write(model: int, theta: Floats, file: Floats, a: Floats) -> None:
-    """The parameters that are published, ``a`` (16,), from the file's and theta."""
+    """Write the published parameters ``a`` (16,) from the file's and theta."""
     if model == _CHEN_MORA:
         chen_mora_sensitivity.write(theta, file, a)
     elif model == _FUEL_CELL:

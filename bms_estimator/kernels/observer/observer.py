@@ -20,7 +20,7 @@ LOST, REGAINED = -1, 1
 
 @njit(cache=True)
 def initialize(s: Record, p: Record, time_s: float, current_a: float, voltage_v: float) -> None:
-    """Initial conditions of Algorithm 1 at the first sample."""
+    """Set the initial conditions of Algorithm 1 at the first sample."""
     s.time_s = time_s
     s.current_a = current_a
     for i in range(1, 16):

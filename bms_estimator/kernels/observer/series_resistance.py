@@ -49,7 +49,7 @@ def begin_series_resistance(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def flows(current_a: float, p: Record) -> bool:
-    """True for a current that (4.2) can be evaluated at; ``p`` is a record of ESTIMATOR_SETTINGS."""
+    """Return True if (4.2) can be evaluated at a current; ``p`` is a record of ESTIMATOR_SETTINGS."""
     return abs(current_a) > SMALLEST_CURRENT_C * p.observer.capacity_as / 3600.0
 
 

@@ -35,8 +35,11 @@ class Device:
         name: Value of ``sensor.protocol``.
         make: Makes the protocol from the sign of the current and the address (None: the first device that answers).
         resolution: Defaults of ``[sensor]``.
+        has_binary_frames: True if its frames are not lines of text. A search for devices queries such devices last, because a
+            device that reads lines takes their queries for the beginning of a line.
     """
 
     name: str
     make: Callable[[CurrentSign, int | None], DeviceProtocol]
     resolution: Resolution
+    has_binary_frames: bool = False

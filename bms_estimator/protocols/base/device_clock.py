@@ -57,7 +57,7 @@ class DeviceClock:
         return self._last_s
 
     def _lost(self, step_s: float, passed_s: float) -> float:
-        """What a clock has not told of that turns out to be slow [s]; else 0."""
+        """Return the time that a slow clock has lost [s]; else 0."""
         if 2.0 * step_s >= passed_s:
             self._lag_s, self._lags = 0.0, 0
             return 0.0

@@ -89,14 +89,14 @@ class DeviceProtocol(ABC):
         return np.concatenate(blocks)
 
     def serial_number_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for those that tell one
-        """Serial number that the device would have told by the end of ``data``, which is not fed; None: it would tell none there."""
+        """Return the serial number that the device would have at the end of ``data`` without feeding it; None without one."""
         return None
 
     def on_port_opened(self) -> None:  # noqa: B027 - most have nothing to forget
-        """The port was opened anew: what comes next may be another device's, or the same one's after a reset."""
+        """Reset after the port was opened: the next bytes may be another device's, or the same one's after a reset."""
 
     def next_output(self, now_s: float) -> bytes:  # noqa: ARG002 - for those that ask
-        """What is to be sent now. A device that speaks by itself is sent nothing before it was understood.
+        """Return the bytes to send now; nothing before a device that sends on its own was recognized.
 
         Args:
             now_s: On the clock of the arrivals [s].

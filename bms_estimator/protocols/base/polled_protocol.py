@@ -81,7 +81,7 @@ class PolledProtocol(ReadingProtocol):
 
     @abstractmethod
     def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
-        """What a whole frame says; None where that is no sample."""
+        """Decode a whole frame; None if it is not a sample."""
 
     def on_port_opened(self) -> None:
         """Ask at once, first in the first way. What was decoded stays: a recording does not tell of openings."""
@@ -89,7 +89,7 @@ class PolledProtocol(ReadingProtocol):
         self._round_s = self._asked_s = -math.inf
 
     def next_output(self, now_s: float) -> bytes:
-        """The next question of the round, or nothing while the device has time to answer."""
+        """Return the next query of the poll cycle; nothing while the device has time to respond."""
         if now_s - self._asked_s < GAP_S:
             return b""
         if not self._due:

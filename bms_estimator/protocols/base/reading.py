@@ -58,7 +58,7 @@ _PAIR = re.compile(
 
 
 def read_line(line: bytes) -> Reading | None:
-    """What a line says; None where it does not tell voltage and current.
+    """Parse a line; None if it has no voltage and current.
 
     ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
     ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
@@ -96,7 +96,7 @@ def _members(line: bytes) -> Iterable[Said]:
 
 
 def _told(said: Iterable[Said]) -> Reading | None:
-    """The reading of named values.
+    """Return the reading of named values.
 
     Raises:
         ValueError: A name comes twice, or has an unknown unit or the wrong number of values.
@@ -126,7 +126,7 @@ def sample_json_line(
     cells_v: Sequence[float | None] = (),
     time_s: float | None = None,
 ) -> bytes:
-    """The line of one sample.
+    """Return the JSON line of one sample.
 
     Args:
         voltage_v: Of the pack's terminals [V].

@@ -70,7 +70,7 @@ class ReadingProtocol(DeviceProtocol):
 
     @abstractmethod
     def _read(self, arrival_s: float, data: bytes) -> Iterable[Reading]:
-        """What a read of the line says; what is wrong with it goes to ``_count_fault``."""
+        """Decode a chunk; report its faults to ``_count_fault``."""
 
     def _count_fault(self, counter: str, wrong: str) -> None:
         """Count a fault; the first since the last good reading is told to people."""
@@ -78,7 +78,7 @@ class ReadingProtocol(DeviceProtocol):
         self._wrong = self._wrong or wrong
 
     def _times(self, arrival_s: float, count: int) -> NDArray[np.float64]:
-        """Times of ``count`` samples that came together, evenly over the time since those before [s]."""
+        """Return evenly spaced times of ``count`` samples that arrived together [s]."""
         if self._counts["frames_received"] == count:
             self._first_s = self._last_s = arrival_s
             return np.zeros(count)

@@ -135,6 +135,7 @@ DEVICE = Device(
     "daly",
     lambda sign, address: DalyProtocol(current_sign=sign, address=address),
     Resolution(9600, None, 1.0, 0.1, 0.1, 2.5),
+    has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 0.1 V and 0.1 A. Users found its parameter DfilterCur at 2 A and at 2.5 A
 (github.com/softwarecrash/Daly2MQTT, issue 171; github.com/fl4p/batmon-ha, issue 144)."""

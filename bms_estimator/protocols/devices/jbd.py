@@ -100,6 +100,7 @@ DEVICE = Device(
     "jbd",
     lambda sign, _: JbdProtocol(current_sign=sign),
     Resolution(9600, "charge_positive", 1.0, 0.01, 0.01, 0.5),
+    has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. Users saw nothing below 0.2 A, and nothing below 0.5 A on one of
 120 A (github.com/smagicld/xiaoxiangBMS, issues 115 and 39)."""

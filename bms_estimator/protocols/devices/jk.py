@@ -58,7 +58,7 @@ def crc16(data: bytes) -> bytes:
 
 
 def old_sealed(frame: bytes) -> bytes:
-    """An older frame with its checksum."""
+    """Append the checksum of an older frame."""
     return frame + (sum(frame) & 0xFFFF).to_bytes(4, "big")
 
 
@@ -110,7 +110,7 @@ class JkProtocol(PolledProtocol):
         self._overheard_s = -math.inf
 
     def next_output(self, now_s: float) -> bytes:
-        """The question, unless another asks and its answers are heard."""
+        """Return the query, unless another master polls and its responses are received."""
         return b"" if now_s - self._overheard_s < LISTEN_S else super().next_output(now_s)
 
     def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
@@ -203,6 +203,7 @@ DEVICE = Device(
     "jk",
     lambda sign, address: JkProtocol(current_sign=sign, address=address),
     Resolution(115_200, "charge_positive", 1.0, 0.01, 0.01, 0.7),
+    has_binary_frames=True,
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. One board showed nothing below 0.7 A
 (github.com/syssi/esphome-jk-bms, issue 243)."""

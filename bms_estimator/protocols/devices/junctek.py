@@ -55,7 +55,7 @@ class JunctekProtocol(ReadingProtocol):
         self._asked_s = -math.inf
 
     def next_output(self, now_s: float) -> bytes:
-        """The question, once a second."""
+        """Return the query, once a second."""
         if now_s - self._asked_s < ASK_S:
             return b""
         self._asked_s = now_s
@@ -77,7 +77,7 @@ class JunctekProtocol(ReadingProtocol):
             self._rest = b""
 
     def _of(self, line: bytes, counted: bool) -> Reading | None:
-        """What a line says; None where it is no answer with values. Half a line at the start is no fault."""
+        """Parse a line; None if it is not a response with values. A partial first line is not counted as a fault."""
         at = line.rfind(b":")
         if not line or line[at:].startswith(
             (b":R", b":W", b":w", b":r00=", b":r51=")

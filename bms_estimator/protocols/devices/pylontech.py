@@ -98,7 +98,7 @@ class PylontechProtocol(ReadingProtocol):
             self._count_fault("length_errors", "bytes come, but no prompt of a Pylontech console: it has 115200 baud")
 
     def _of(self, arrival_s: float, answer: str) -> Reading | None:
-        """What the answer to ``pwr`` says; that to ``bat`` is kept for the next."""
+        """Parse the response to ``pwr``; store that to ``bat`` for the next one."""
         lines = [line.split() for line in re.split(r"[\r\n]+", answer) if line.strip()]
         header = next((n for n, line in enumerate(lines) if line[:2] in (["Power", "Volt"], ["Battery", "Volt"])), None)
         if header is None:
@@ -121,7 +121,7 @@ class PylontechProtocol(ReadingProtocol):
             return None
 
     def _keep_cells(self, arrival_s: float, answer: str, rows: Sequence[Sequence[str]]) -> None:
-        """Raises ValueError or LookupError: A row cannot be read."""
+        """Store the cell voltages of a response; raises ValueError or LookupError if a row cannot be parsed."""
         echo = ECHO.search(answer)
         battery = int(echo[1]) if echo else 1
         if not 1 <= battery <= BATTERIES or len(rows) > CELLS:
@@ -151,7 +151,7 @@ class PylontechProtocol(ReadingProtocol):
 
 
 def _whole(text: str) -> int:
-    """A whole number of the table.
+    """Parse an integer of the table.
 
     Raises:
         ValueError: It is none.

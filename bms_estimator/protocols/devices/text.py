@@ -102,14 +102,14 @@ class TextProtocol(DeviceProtocol):
         return block
 
     def _times(self, arrival_s: float, readings: Sequence[Reading]) -> list[float]:
-        """Times of samples that came together [s]."""
+        """Return times of samples that arrived together [s]."""
         before_s, self._last_s = (arrival_s if math.isnan(self._last_s) else self._last_s), arrival_s
         steps = np.arange(1, len(readings) + 1) / len(readings)
         arrivals = (before_s + (arrival_s - before_s) * steps).tolist()
         return [self._clock.sample_time(at_s, reading.time_s) for at_s, reading in zip(arrivals, readings, strict=True)]
 
     def _end_line(self, line: bytes) -> Reading | None:
-        """What a line says. Half a line at the start is no fault."""
+        """Parse a line. A partial first line is not counted as a fault."""
         counted, self._in_step = self._in_step, True
         if self._overlong:  # the end of it
             self._overlong = False

@@ -63,7 +63,7 @@ class VeDirectProtocol(ReadingProtocol):
             self._count_fault("length_errors", "bytes come that are no VE.Direct text: it has 19200 baud, 8N1")
 
     def _of(self, head: bytes) -> Reading | None:
-        """What a whole block says; None of history, and of a device that is no battery monitor."""
+        """Parse a whole block; None for history and for a device other than a battery monitor."""
         text = head.decode("ascii", "replace")
         fields = dict(line.split("\t", 1) for line in text.split("\r\n") if "\t" in line)
         if "V" not in fields:

@@ -21,7 +21,7 @@ _US = 1e-6
 
 @njit(cache=True)
 def forget_clock(d: Record) -> None:
-    """The board's clock begins anew."""
+    """Reset the estimate of the board's clock."""
     d.clock_windows = 0
 
 

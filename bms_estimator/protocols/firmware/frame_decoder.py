@@ -154,7 +154,7 @@ class FrameDecoder:
         return None
 
     def serial_number_in(self, data: bytes) -> str | None:
-        """Serial number of the last hello that ends in ``data``, which is not fed; empty of a board that has none."""
+        """Return the serial number of the last hello in ``data`` without feeding it; empty if the board has none."""
         state, found = self._state[0], None
         begun = state["buffer"][: state["length"]].tobytes()
         for frame in (begun + data).split(DELIMITER)[:-1]:

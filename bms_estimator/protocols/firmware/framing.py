@@ -196,7 +196,7 @@ def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
 
 @njit(cache=True)
 def take_hello(d: Record, s: Record) -> None:
-    """The board's scaling; and whether the board was reset, or is another one."""
+    """Store the board's scaling, and detect a reset or another board."""
     p = d.packet
     boot_id, serial = read_unsigned(p, 6, 2), read_unsigned(p, 8, 4)
     anew = boot_id != d.boot_id or serial != d.serial
@@ -265,7 +265,7 @@ def follow_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool:
 
 @njit(cache=True)
 def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
-    """The board counts anew: go on by arrival, and by no less than ``least_s``."""
+    """Restart the board's clock: continue by arrival time, advancing by at least ``least_s``."""
     d.origin_s = d.time_s + max(arrival_s - d.arrival_s, least_s)
     d.time_s = d.origin_s
     d.elapsed_us = 0

@@ -84,12 +84,12 @@ class ProtocolError(ValueError):
 
 
 def seal(packet: bytes) -> bytes:
-    """The frame of a packet without its CRC."""
+    """Return the frame of a packet; the CRC is appended here."""
     return bytes(cobs.encode(packet + struct.pack("<H", binascii.crc_hqx(packet, 0xFFFF)))) + DELIMITER
 
 
 def unseal(frame: bytes) -> bytes:
-    """The packet of a frame, without its CRC; the frame with or without its delimiter.
+    """Return the packet of a frame, without its CRC; the delimiter is optional.
 
     Raises:
         ProtocolError: It is not COBS, too short, or its CRC is wrong.

@@ -153,7 +153,7 @@ class BoardProtocol(DeviceProtocol):
         return self._told
 
     def _wanted(self) -> tuple[bytes, float]:
-        """What the board has still to be told, and after how long again [s]."""
+        """Return the command that the board still needs, and its retry interval [s]."""
         hello = self._decoder.hello
         if hello is None:
             return _HELLO if self._decoder.heard_at > self._unheard_at else b"", ASK_AGAIN_S
@@ -164,7 +164,7 @@ class BoardProtocol(DeviceProtocol):
         return b"", ASK_AGAIN_S
 
     def _follow(self, told: _Told) -> None:
-        """What came since may be the answer to a command, or the hello after it."""
+        """Match received data to a pending command: its acknowledgment, or the hello after it."""
         for ack in self._decoder.take_acks():
             if ack.command != unseal(told.frame)[1]:
                 continue

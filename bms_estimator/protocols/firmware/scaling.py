@@ -73,13 +73,13 @@ def take_ntc(s: Record, total: float, count: float, board_us: int) -> None:
 
 @njit(cache=True)
 def forget_readings(s: Record) -> None:
-    """Reference and temperature begin anew: the board was reset, or is another one."""
+    """Reset reference and temperature after a reset or another board."""
     s.bandgap_mean = s.bandgap_weight = s.ntc_mean = s.ntc_weight = 0.0
 
 
 @njit(cache=True)
 def reference(s: Record) -> float:
-    """The converter's full range [V]; NaN before the bandgap was measured."""
+    """Return the converter's full range [V]; NaN before the bandgap was measured."""
     if s.bandgap_mean <= 0.0:
         return math.nan
     return s.bandgap_v * s.full_scale / s.bandgap_mean

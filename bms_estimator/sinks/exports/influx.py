@@ -204,7 +204,7 @@ def _basic(settings: InfluxSettings) -> dict[str, str]:
 
 
 def _secret(key: str, path: Path) -> str:
-    """The one line of a file.
+    """Read the single line of a file.
 
     Raises:
         UserError: It cannot be read, or is no line of text.
@@ -249,7 +249,7 @@ def _post(settings: InfluxSettings, body: str) -> None:
 
 
 def _answer(error: urllib.error.HTTPError) -> bytes:
-    """The first of what it says; nothing where that does not come."""
+    """Return the start of the server's response; empty without one."""
     try:
         with error:
             return error.read(MOST_SHOWN * 4)
@@ -258,5 +258,5 @@ def _answer(error: urllib.error.HTTPError) -> bytes:
 
 
 def _shown(answer: bytes) -> str:
-    """What of an answer goes to the log."""
+    """Return the part of a response to log."""
     return "".join(c for c in answer.decode(errors="replace") if c.isprintable())[:MOST_SHOWN]

@@ -10,7 +10,7 @@ STATE, ALARM = "bms_state", "bms_alarm"
 
 
 def lines(before: Snapshot | None, snapshot: Snapshot) -> list[str]:
-    """The state, where there is one, and the alarms that have changed; times are in milliseconds.
+    """Return the state, if there is one, and the changed alarms as lines; times in milliseconds.
 
     Args:
         before: The snapshot before; None of the first.

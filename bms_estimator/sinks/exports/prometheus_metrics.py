@@ -94,7 +94,7 @@ def _fields(device: str, report: Estimate | Health, model: type[Estimate | Healt
 
 
 def _places(device: str, name: str, said: str, values: Iterable[float | None]) -> Metric:
-    """A list, its places numbered from 1."""
+    """Yield the metrics of a list, numbered from 1."""
     full, factor = named(f"{OWN_NAMES[name]}_{name.rsplit('_', 1)[-1]}")
     metric = GaugeMetricFamily(full, said, labels=["device", OWN_NAMES[name]])
     for number, value in enumerate(values, start=1):
@@ -135,7 +135,7 @@ def _watched(device: str, snapshot: Snapshot) -> Metric:
 
 
 def named(field: str) -> tuple[str, float]:
-    """A field's metric without ``_total``, and what its value is multiplied with."""
+    """Return a field's metric name without ``_total``, and its scale factor."""
     if field in RATIOS:
         return f"bms_{field}_ratio", 1.0
     stem, _, last = field.rpartition("_")

@@ -43,7 +43,7 @@ class DiscoveryInputs(NamedTuple):
 
 
 def check_names(settings: HomeAssistantSettings) -> None:
-    """Raises UserError: There is no such entity."""
+    """Check the entity names of the settings; raises UserError for an unknown entity."""
     unknown = sorted(set(settings.names) - NAMED)
     if unknown:
         raise UserError(
@@ -52,7 +52,7 @@ def check_names(settings: HomeAssistantSettings) -> None:
 
 
 def device_id(device: str) -> str:
-    """The device's name among all of Home Assistant's."""
+    """Return the device's identifier in Home Assistant."""
     return f"bms_{device}"
 
 
@@ -64,7 +64,7 @@ def discovery_topic(settings: HomeAssistantSettings, device: str) -> str:
 def discovery(
     settings: HomeAssistantSettings, described: DiscoveryInputs, root: str, sample_period_s: float
 ) -> dict[str, Any]:
-    """The discovery message.
+    """Return the discovery message.
 
     Args:
         settings: How the pack is to stand there.
@@ -111,7 +111,7 @@ def discovery(
 
 
 def _removed(described: DiscoveryInputs) -> dict[str, dict[str, str]]:
-    """What it may know from before: by its platform alone it goes, what is left out stays."""
+    """Return components that an earlier configuration may have had; a component with only a platform is removed."""
     platforms = {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
     platforms |= {name: made("")["platform"] for name, made in _COMMANDS.items() if name not in described.commands}
     return {key: {"platform": platform} for key, platform in platforms.items()}
@@ -156,7 +156,7 @@ def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
 
 
 def _sign(root: str, positive: str) -> dict[str, str]:
-    """What it calls positive is its only attribute."""
+    """Return the attribute that says which sign of the current is positive."""
     template = f"{{{{ {{'positive': '{positive}'}} | tojson }}}}"
     return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
 
@@ -178,7 +178,7 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
 
 
 def _set_soc(root: str) -> dict[str, Any]:
-    """It shows what was set last: to show the SOC, too, would make a row more for each change of it."""
+    """Return the control that sets the SOC. It shows the last set value, because the live SOC would add a row per change."""
     return {
         "platform": "number",
         "name": "Set state of charge",

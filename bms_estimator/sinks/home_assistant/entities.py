@@ -40,7 +40,7 @@ class Entity(NamedTuple):
 
 
 def _raw(name: str, unit: str | None, decimals: int, device_class: str | None = None) -> Entity:
-    """Internal value of the observer."""
+    """Return the entity of an internal value of the observer."""
     return Entity(name, unit, decimals, 10.0**-decimals, device_class, enabled=False)
 
 
@@ -126,7 +126,7 @@ def cell_key(number: int) -> str:
 
 
 def entities(info: Info, cells: int) -> dict[str, Entity]:
-    """The numbers of a pack by their keys; ``cells`` of it are measured."""
+    """Return the numeric entities of a pack by key; ``cells`` of its cells are measured."""
     shown = FUEL_CELL if info.capacity_ah is None else BATTERY
     if not cells:
         return shown

@@ -33,7 +33,7 @@ class EntityStates(NamedTuple):
 def values_to_publish(
     shown: EntityStates, snapshot: Snapshot, described: DiscoveryInputs, now_s: float, *, sign: float = 1.0
 ) -> EntityStates:
-    """What to tell of the values; ``shown`` itself where nothing is to be told.
+    """Return the values to publish; ``shown`` itself if nothing changed enough.
 
     Args:
         shown: What was told last.
@@ -63,7 +63,7 @@ def values_to_publish(
 
 
 def _rounded(snapshot: Snapshot, shows: Mapping[str, Entity], sign: float) -> dict[str, float | None]:
-    """The value of each entity; None where there is none."""
+    """Return the rounded value of each entity; None without a value."""
     values, rounded = _values(snapshot), dict[str, float | None]()
     for key, entity in shows.items():
         value = values.get(key)

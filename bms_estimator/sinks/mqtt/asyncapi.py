@@ -46,7 +46,7 @@ RESPONSE = {
 
 
 def document(base_topic: str) -> Document:
-    """The document.
+    """Return the AsyncAPI document.
 
     Args:
         base_topic: First part of all topics.
@@ -113,7 +113,7 @@ def _schemas() -> Document:
 
 
 def _arguments(name: str) -> Document:
-    """What a request may say."""
+    """Return the arguments of a request."""
     own = ARGUMENTS.get(name, {})
     return {
         "type": "object",

@@ -46,7 +46,7 @@ class AvailabilityMonitor:
         self._corrected_s = -math.inf
 
     def begin(self) -> None:
-        """A new connection, to a broker that may hold nothing: all is said anew."""
+        """Publish both availabilities again over a new connection, because the broker may hold nothing."""
         self._echoed.clear()
         self._forged = False
 
@@ -55,7 +55,7 @@ class AvailabilityMonitor:
         self._forged = False
 
     def on_message(self, topic: str, payload: bytes) -> None:
-        """An availability has come: given back, or somebody else's."""
+        """Handle a received availability: our own echo, or another client's."""
         right = {own.topic: own.payload for own in self._own()}
         if right.get(topic, payload) == payload:
             self._echoed.set()

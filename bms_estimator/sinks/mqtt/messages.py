@@ -68,21 +68,21 @@ class MessageBuilder:
         self._schema = _schema()  # takes milliseconds, and here nothing waits yet
 
     def birth_messages(self) -> list[Message]:
-        """What a broker is told first."""
+        """Return the first messages of a connection."""
         removed = [self._retained(f"alarm/{name}", b"") for name in self._unwatched]
         return [self._retained(AVAILABILITY, b"online"), self._retained("schema", self._schema), *removed]
 
     def offline_messages(self) -> list[Message]:
-        """What it is told last; the last of these is the will, too."""
+        """Return the last messages of a connection; the very last is also the will."""
         return [self._retained(SENSOR_AVAILABILITY, b"offline"), self._retained(AVAILABILITY, b"offline")]
 
     def availability(self, sent: PublishedState) -> list[Message]:
-        """What the two availabilities hold, unless somebody else writes there."""
+        """Return both availabilities, which another client may have overwritten."""
         sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
         return [self._retained(AVAILABILITY, b"online"), *sensor]
 
     def must_deliver(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
-        """What a snapshot brings that must reach the broker, late if need be: each has its own time.
+        """Return the messages of a snapshot that must reach the broker, late if necessary; each has its own time.
 
         Args:
             before: The snapshot before this one; None of the first.
@@ -94,7 +94,7 @@ class MessageBuilder:
     def live_messages(
         self, sent: PublishedState, snapshot: Snapshot, now_s: float
     ) -> tuple[list[Message], PublishedState]:
-        """What a snapshot brings that the broker has not got yet, beside what is ``must_deliver``.
+        """Return the other messages of a snapshot whose content the broker does not have yet.
 
         Args:
             sent: What it got.
@@ -160,7 +160,7 @@ class MessageBuilder:
 
 @cache
 def _schema() -> bytes:
-    """The same for all packs."""
+    """Return the schema, which is equal for all packs."""
     return _json(schema())
 
 

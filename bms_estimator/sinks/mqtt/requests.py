@@ -66,7 +66,7 @@ class RequestDispatcher:
         return tuple(command for command in COMMANDS if command in self._allowed)
 
     async def handle(self, name: str, payload: bytes) -> bytes | None:
-        """The response to one request: JSON of status, data, error, transaction.
+        """Respond to one request: JSON of status, data, error, transaction.
 
         Returns:
             None where no response is due: to a name that does not exist, and beyond the rate.
@@ -142,7 +142,7 @@ class RateLimiter:
 
 
 def number(arguments: Mapping[str, Any], name: str, low: float, high: float) -> float:
-    """The number ``name`` of a request's arguments.
+    """Return the number ``name`` of a request's arguments.
 
     Raises:
         UserError: It is missing, no number, or outside ``low``..``high``.
@@ -159,7 +159,7 @@ def _response(status: str, data: Mapping[str, Any] | None, error: str | None, tr
 
 
 def _arguments(payload: bytes) -> Mapping[str, Any]:
-    """A request's payload: a JSON object of finite numbers, or nothing.
+    """Parse a request's payload: a JSON object of finite numbers, or empty.
 
     Raises:
         UserError: It is something else, or too long.
@@ -178,7 +178,7 @@ def _arguments(payload: bytes) -> Mapping[str, Any]:
 
 
 def _finite(token: str) -> float:
-    """A number of a request; Python's JSON knows NaN, and takes 1e999 for infinity.
+    """Parse a number of a request; Python's JSON accepts NaN, and reads 1e999 as infinity.
 
     Raises:
         UserError: It is not finite.
@@ -190,7 +190,7 @@ def _finite(token: str) -> float:
 
 
 def _transaction(arguments: Mapping[str, Any]) -> str | int | None:
-    """What the response repeats, so that who asked knows it again.
+    """Return the transaction, which the response repeats so that the client can match it.
 
     Raises:
         UserError: It is neither a string nor an integer.

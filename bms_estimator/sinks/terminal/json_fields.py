@@ -22,15 +22,15 @@ class JsonFields:
         return bool(self._of)
 
     def number(self, name: str) -> float | None:
-        """A number; None where there is none."""
+        """Return a number; None if there is none."""
         return _number(self._of.get(name))
 
     def count(self, name: str) -> int:
-        """A whole number; 0 where there is none."""
+        """Return an integer; 0 if there is none."""
         return int(self.number(name) or 0)
 
     def text(self, name: str) -> str:
-        """A text without what would control a terminal; empty where there is none."""
+        """Return a text without terminal control characters; empty if there is none."""
         return _text(self._of.get(name))
 
     def flag(self, name: str) -> bool:
@@ -42,15 +42,15 @@ class JsonFields:
         return name in self._of and self._of[name] is None
 
     def fields(self, name: str) -> "JsonFields":
-        """An object."""
+        """Return an object."""
         return JsonFields(self._of.get(name))
 
     def texts(self, name: str) -> list[str]:
-        """A list of texts."""
+        """Return a list of texts."""
         return [_text(item) for item in self._list(name) if isinstance(item, str)]
 
     def numbers(self, name: str) -> list[float | None]:
-        """A list of numbers, some of which may be missing."""
+        """Return a list of numbers, some of which may be missing."""
         return [_number(item) for item in self._list(name)]
 
     def names(self) -> Iterator[str]:

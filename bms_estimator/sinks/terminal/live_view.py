@@ -131,7 +131,7 @@ class LiveView:
             curves.current_a.append(current_a)
 
     def _scene_now(self) -> ScreenState:
-        """A copy: the drawing thread must not see what changes."""
+        """Return a copy, because the drawing thread must not see changes."""
         now_s, lost = self._wall(), self._lost()
         packs = [
             PackView(name, dict(device.topics), max(device.heard_s.values()), now_s, lost)
@@ -164,7 +164,7 @@ class LiveView:
             self._error = error
 
     def _draw_screens(self) -> None:
-        """The newest scene, at most one each ``REDRAW_S``; the last one stays on the terminal."""
+        """Draw the newest scene at most once each ``REDRAW_S``; the last one stays on the terminal."""
         scene: ScreenState | None = None
         with Live(
             console=self._console, auto_refresh=False, screen=True, redirect_stdout=False, redirect_stderr=False
@@ -180,7 +180,7 @@ class LiveView:
             self._console.file.write(text + "\n")
 
     def _taken(self, waiting: deque[T]) -> Iterable[T]:
-        """What waits, until all is closed and nothing waits any more."""
+        """Yield the waiting items until the queue is closed and empty."""
         ended = False
         while not ended:
             self._due.wait()

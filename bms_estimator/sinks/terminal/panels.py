@@ -72,7 +72,7 @@ class Screen:
 
 
 def _blocks(scene: ScreenState, width: int, *, wide: bool) -> list[LayoutBlock]:
-    """The parts of the screen from top to bottom, each with its rank."""
+    """Return the parts of the screen from top to bottom, each with its rank."""
     hint = LayoutBlock(2, Text(scene.hint, style="cyan"))
     packs = [LayoutBlock(1, _packs(scene))] if len(scene.packs) > 1 else []
     if not scene.device:
@@ -121,7 +121,7 @@ def _shown(blocks: Sequence[LayoutBlock]) -> list[LayoutBlock]:
 
 
 def _charge(scene: ScreenState, cells: int) -> list[LayoutBlock]:
-    """What a battery holds."""
+    """Return the charge of a battery."""
     state = scene.state
     return [
         LayoutBlock(0, _soc(state, scene.true_soc)),
@@ -131,7 +131,7 @@ def _charge(scene: ScreenState, cells: int) -> list[LayoutBlock]:
 
 
 def sparkline(values: Sequence[float], cells: int) -> str:
-    """The last ``cells`` values as blocks from their lowest to their highest."""
+    """Draw the last ``cells`` values as blocks from their minimum to their maximum."""
     shown = values[-cells:]
     if not shown:
         return ""
@@ -176,7 +176,7 @@ def _header(scene: ScreenState, *, wide: bool) -> RenderableType:
 
 
 def _soc(state: JsonFields, true_soc: float | None) -> FlowLayout:
-    """The estimate with its band; beside it the truth, where it is known."""
+    """Return the estimate with its band, and the ground truth beside it where known."""
     soc = state.number("soc")
     texts = [
         Text.assemble(("SOC ", "dim"), (f"{_number(soc, '.2%')}{band_text(state, '%')}", "bold"), (" (2 std)", "dim"))
@@ -189,7 +189,7 @@ def _soc(state: JsonFields, true_soc: float | None) -> FlowLayout:
 
 
 def _bar(state: JsonFields, true_soc: float | None, cells: int) -> Text:
-    """Filled to the SOC, its band hatched, a tick where the truth is."""
+    """Draw a bar filled to the SOC, with a hatched band and a tick at the ground truth."""
     soc, band = state.number("soc") or 0.0, BAND_STDS * (state.number("soc_std") or 0.0)
     colour = "green" if soc > LOW_SOC else "yellow"
 
@@ -206,7 +206,7 @@ def _bar(state: JsonFields, true_soc: float | None, cells: int) -> Text:
 
 
 def _left(state: JsonFields) -> FlowLayout:
-    """What is left, and how long it lasts."""
+    """Return the remaining charge and time."""
     empty_s, full_s = state.number("time_to_empty_s"), state.number("time_to_full_s")
     lasts = "empty in - : no load"
     if empty_s is not None:
@@ -258,7 +258,7 @@ def _elements(elements: JsonFields) -> Table:
 
 
 def _alarms(alarms: Sequence[JsonFields]) -> FlowLayout:
-    """Raised and unwatched alarms, the critical first."""
+    """Return raised and unmonitored alarms, the critical ones first."""
     worst = sorted(alarms, key=lambda alarm: alarm.text("severity") != "critical")
     texts = [
         Text(
@@ -272,12 +272,12 @@ def _alarms(alarms: Sequence[JsonFields]) -> FlowLayout:
 
 
 def _unwatched(alarm: JsonFields) -> str:
-    """An alarm without a text: it cannot be watched."""
+    """Return True for an alarm without a text, which cannot be monitored."""
     return f"{alarm.text('name')} cannot be raised: {alarm.text('unwatched_reason')}"
 
 
 def _health(health: JsonFields, parameters: JsonFields) -> FlowLayout:
-    """What is wrong, in full; else how worn the pack is."""
+    """Return all faults; without any the pack's state of health."""
     message = health.text("sensor_message")
     wrong = [Text(message, style="bold red")] if message else []
     wrong += [Text(f"suspected: {suspect}", style="bold yellow") for suspect in health.texts("suspects")]
@@ -307,13 +307,13 @@ def _cells(state: JsonFields) -> FlowLayout:
 
 
 def _cell(state: JsonFields, name: str) -> str:
-    """A cell's number in brackets, where it is known."""
+    """Return a cell's number in brackets, if known."""
     number = state.number(name)
     return "" if number is None else f" (cell {number:.0f})"
 
 
 def _energy(state: JsonFields) -> FlowLayout:
-    """What went in and out since counting began."""
+    """Return energy in and out since counting began."""
     out_kwh, in_kwh, cycles = (state.number(key) for key in ("energy_out_kwh", "energy_in_kwh", "equivalent_cycles"))
     if out_kwh is None or in_kwh is None:
         return FlowLayout()
@@ -326,7 +326,7 @@ def _energy(state: JsonFields) -> FlowLayout:
 
 
 def _observer(state: JsonFields) -> FlowLayout:
-    """The thesis's observer: where its model stays stable, its gain, and whether it tracks."""
+    """Return the thesis's observer: stability margin, gain, lock."""
     margin = state.number("stability_margin")
     narrow = margin is not None and margin < NARROW_MARGIN
     return FlowLayout(
@@ -348,7 +348,7 @@ def _gain(state: JsonFields) -> Text:
 
 
 def _link(state: JsonFields, health: JsonFields) -> FlowLayout:
-    """The line and the service; faults are red."""
+    """Return the state of line and service; faults are red."""
     line, samples = health.fields("line"), health.fields("samples")
     dropped = sum(samples.count(name) for name in samples.names() if name.startswith("dropped_"))
     counts = {

@@ -61,7 +61,7 @@ class TerminalSink:
         self._view.show()
 
     def _said(self, snapshot: Snapshot) -> list[Message]:
-        """What a broker would get."""
+        """Return the messages that a broker would get."""
         greeting: list[Message] = []
         if self._messages is None:
             self._messages = MessageBuilder(BASE_TOPIC, snapshot.info.device)

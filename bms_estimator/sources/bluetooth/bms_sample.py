@@ -9,7 +9,7 @@ from bms_estimator.protocols.base.reading import Reading
 
 
 def reading_of(sample: Mapping[str, Any]) -> Reading | None:
-    """What a ``BMSSample`` of aiobmsble says, charge positive as it is there; None where it tells no voltage or no current."""
+    """Return the reading of aiobmsble's ``BMSSample``, positive on charge; None without voltage or current."""
     voltage_v, current_a = _number(sample.get("voltage")), _number(sample.get("current"))
     if math.isnan(voltage_v) or math.isnan(current_a):
         return None

@@ -99,7 +99,7 @@ class BleBringer(LineProducer):
         )
 
     async def _find(self) -> tuple[BLEDevice, type[BaseBMS]]:
-        """The BMS, and what speaks to its kind.
+        """Find the BMS and the driver of its kind.
 
         Raises:
             NothingComesError: It does not advertise, or nobody knows its kind.

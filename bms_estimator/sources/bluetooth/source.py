@@ -12,7 +12,7 @@ NEEDED_PYTHON = 0x030C0000
 
 
 def bringer(settings: Settings) -> LineProducer:
-    """What ``[source]`` asks for.
+    """Make the line producer of ``[source]``.
 
     Raises:
         UserError: This Python is too old, or aiobmsble knows no such BMS.

@@ -26,7 +26,7 @@ class CurveColumns(NamedTuple):
 
 
 def read_curve(path: Path) -> CurveColumns | None:
-    """The curve in a CSV file (.gz) with columns soc (0..1), ocv_v [V] and perhaps hysteresis_v [V].
+    """Read the curve in a CSV file (.gz) with columns soc (0..1), ocv_v [V] and optional hysteresis_v [V].
 
     Returns:
         None when the file is no CSV or has no such columns.
@@ -39,7 +39,7 @@ def read_curve(path: Path) -> CurveColumns | None:
 
 
 def read_polarisation(path: Path) -> Floats | None:
-    """The polarisation curve in a CSV file (.gz) with columns current_a [A], voltage_v [V] and perhaps temperature_c [C].
+    """Read the polarization curve in a CSV file (.gz) with columns current_a [A], voltage_v [V] and optional temperature_c [C].
 
     Returns:
         Those columns, shape (n, 3), a missing temperature as NaN. None when the file is no CSV, has no such columns, or has

@@ -76,14 +76,14 @@ _VERSIONED, _HEADER = TypeAdapter(_Versioned), TypeAdapter(CaptureHeader)
 
 
 def header_of(sensor: SensorSettings, source: PolledSource | None = None) -> CaptureHeader:
-    """What a capture of this board's line says of it, or of lines that another source has brought."""
+    """Return the header of a capture of this board's line, or of another source's lines."""
     if source is not None:
         return CaptureHeader(sensor.protocol, source.described, 0, sensor.current_sign)
     return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign, address=sensor.address)
 
 
 def sensor_of(path: Path) -> SensorSettings:
-    """The board whose line was recorded in ``path``, as far as decoding needs it.
+    """Return the board settings of the capture ``path`` that decoding needs.
 
     Raises:
         UserError: As ``read_header``, or this program does not know the board's protocol.
@@ -171,7 +171,7 @@ class CaptureWriter:
                 self._descriptor = -1
 
     def __enter__(self) -> Self:
-        """The writer."""
+        """Return the writer."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -276,7 +276,7 @@ def _read_header(path: Path, file: IO[bytes]) -> CaptureHeader:
 
 
 def _checked_header(path: Path, text: bytes) -> CaptureHeader:
-    """The header whose JSON is ``text``.
+    """Parse and check a header's JSON.
 
     Raises:
         UserError: It is none, or one of a later version; the message names the file and what is wrong.

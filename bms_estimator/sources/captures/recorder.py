@@ -79,7 +79,7 @@ class CaptureRecorder:
         self._waiting.put((arrival_s, data))
 
     def __enter__(self) -> Self:
-        """The recording."""
+        """Return the recorder."""
         return self
 
     def __exit__(self, *_: object) -> None:

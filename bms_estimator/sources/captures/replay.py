@@ -203,7 +203,7 @@ def _elapsed(time_s: NDArray[np.float64], last_s: float) -> NDArray[np.float64]:
 def open_capture(
     path: Path, sensor: SensorSettings | None = None, *, current_sign: CurrentSign | None = None
 ) -> Capture:
-    """A capture: a table by the end of its name, else a raw capture by its first bytes.
+    """Open a capture: a table by its file name extension, else a raw capture by its first bytes.
 
     Args:
         path: The file.

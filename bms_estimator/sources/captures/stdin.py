@@ -39,7 +39,7 @@ def standard_input() -> Iterator[Path]:
 
 
 def _ending(path: Path) -> str:
-    """The end of a name that has ``path`` read for what it is."""
+    """Return the file name extension that selects the reader of ``path``."""
     with path.open("rb") as file:
         first = file.read(len(MAGIC))
     if first.startswith(PARQUET):

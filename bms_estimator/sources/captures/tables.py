@@ -62,7 +62,7 @@ class ColumnTable(Protocol):
         """Names of the columns."""
 
     def __getitem__(self, name: str, /) -> ArrayLike:
-        """A column."""
+        """Return a column."""
 
 
 class _Columns(NamedTuple):
@@ -131,7 +131,7 @@ class CsvTable:
             raise UserError(f"{self._path}: no samples after the header in line {line}")
 
     def _values(self, lines: Sequence[str], first_line: int, columns: _Columns, width: int) -> NDArray[np.float64]:
-        """The wanted columns of some lines, shape (rows, columns)."""
+        """Return the wanted columns of some lines, shape (rows, columns)."""
         if not any(_is_data(line) for line in lines):
             return np.empty((0, len(columns.indices)))
         try:
@@ -154,7 +154,7 @@ class CsvTable:
         return np.array(rows)
 
     def _number(self, cell: str, line: int, column: str) -> float:
-        """An empty cell, or a word for it, is a missing value: NaN."""
+        """Parse a cell of a table; an empty cell, or a word for it, is NaN."""
         try:
             return measured(cell) if cell.strip() else np.nan
         except ValueError:
@@ -227,7 +227,7 @@ def table_reader(path: Path, sign: Sign) -> CsvTable | ParquetTable | None:
 
 
 def samples_of(table: ColumnTable, sign: Sign) -> SampleBlock:
-    """The samples of a table in memory.
+    """Return the samples of a table in memory.
 
     Raises:
         UserError: A column is missing, or is not of numbers.
@@ -237,7 +237,7 @@ def samples_of(table: ColumnTable, sign: Sign) -> SampleBlock:
 
 
 def _numeric(name: str, column: ArrayLike) -> NDArray[np.float64]:
-    """A column of a table in memory; None in it is a missing value: NaN.
+    """Return a numeric column of a table in memory; None becomes NaN.
 
     Raises:
         UserError: There are not numbers in it.
@@ -286,7 +286,7 @@ def _wanted(spelling: ColumnNaming) -> str:
 
 
 def _block(values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns: _Columns) -> tuple[SampleBlock, int]:
-    """Samples from columns of values in the order of ``columns``, and how many temperatures were none."""
+    """Return samples of columns in the order of ``columns``, and the number of implausible temperatures."""
     block = np.zeros(len(values[0]), dtype=SAMPLE)
     block["time_s"] = values[0]
     block["current_a"] = columns.discharge_sign * values[1]

@@ -99,7 +99,7 @@ class CanBringer(LineProducer):
             deliver(error)
 
     def _open(self) -> can.BusABC:
-        """Raises: NothingComesError: It cannot be opened."""
+        """Open the bus; raises SourceUnavailableError if that fails."""
         settings = self._settings
         further: dict[str, Any] = {**settings.options}
         if settings.bitrate is not None:
@@ -120,7 +120,7 @@ class CanBringer(LineProducer):
             raise SourceUnavailableError(f"cannot be opened: {error}") from error
 
     def _next(self, bus: can.BusABC) -> can.Message | None:
-        """The next frame, if one comes soon.
+        """Return the next frame if it comes soon.
 
         Raises:
             NothingComesError: The bus is lost.
@@ -145,7 +145,7 @@ class CanBringer(LineProducer):
             deliver(line)
 
     def _line(self, message: can.Message) -> bytes | None:
-        """What is whole with this frame."""
+        """Return the line of a sample that this frame completes."""
         data = bytes(message.data)
         reading = self._map.feed(time.monotonic(), message.arbitration_id, message.is_extended_id, data)
         return reading and sample_json_line(
@@ -154,7 +154,7 @@ class CanBringer(LineProducer):
 
 
 def bringer(settings: Settings) -> CanBringer:
-    """What ``[source]`` asks for.
+    """Make the line producer of ``[source]``.
 
     Raises:
         UserError: As ``CanBringer``.

@@ -36,7 +36,7 @@ class FrameId(NamedTuple):
 
 
 def bits_of(signal: Signal, data: bytes) -> int | None:
-    """The whole number that lies in ``data`` where ``signal`` says; None where the frame is too short."""
+    """Extract the integer of ``signal`` from ``data``; None if the frame is too short."""
     size = 8 * len(data)
     if signal.byte_order == "little":
         shift = signal.start_bit
@@ -172,7 +172,7 @@ class CanMap:
         )
 
     def _get(self, quantity: str, now_s: float, number: int = 0, kept_s: float = KEPT_S) -> float:
-        """The newest value; NaN where there is none, or an old one."""
+        """Return the newest value; NaN if there is none or it is too old."""
         came_s, value = self._newest.get((quantity, number), (-math.inf, math.nan))
         return value if now_s - came_s <= kept_s else math.nan
 
@@ -188,7 +188,7 @@ def _signals(settings: CanSource) -> Iterator[tuple[Key, Signal]]:
 
 
 def _load(path: Path) -> Database:
-    """The file that names the signals.
+    """Load the file that defines the signals.
 
     Raises:
         UserError: It cannot be read.
@@ -205,7 +205,7 @@ def _load(path: Path) -> Database:
 
 
 def _message(quantity: str, signal: str, database: Database) -> Message:
-    """The one that holds a signal.
+    """Return the message that contains a signal.
 
     Raises:
         UserError: None does, or several do.

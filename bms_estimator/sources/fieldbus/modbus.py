@@ -96,7 +96,7 @@ class ModbusBringer(LineProducer):
             client.close()
 
     async def _connect(self, client: Client) -> None:
-        """Raises: NothingComesError: It cannot be reached."""
+        """Connect to the device; raises SourceUnavailableError if that fails."""
         what = "no connection" if self._settings.port is None else "the port cannot be opened"
         try:
             if not await client.connect():
@@ -105,7 +105,7 @@ class ModbusBringer(LineProducer):
             raise SourceUnavailableError(f"{what}: {error}") from None
 
     def _line(self, words: Mapping[tuple[Table, int], int]) -> bytes | None:
-        """What the registers say; None where it is not voltage and current."""
+        """Return the line of a sample; None without voltage and current."""
         reading = reading_of(self._values, words)
         if reading is None:
             self._counters["not_measured"] += 1
@@ -117,7 +117,7 @@ class ModbusBringer(LineProducer):
         )
 
     async def _read(self, client: Client) -> Mapping[tuple[Table, int], int]:
-        """What all registers hold that are wanted.
+        """Read all wanted registers.
 
         Raises:
             NothingComesError: No answer, or none with voltage and current.
@@ -137,7 +137,7 @@ class ModbusBringer(LineProducer):
         return words
 
     def _instead(self, request: Request, error: _RefusedError) -> Sequence[Request]:
-        """What is asked for in place of a request that was refused.
+        """Return the requests to send instead of one that was refused.
 
         Raises:
             NothingComesError: There is no reading without it.
@@ -159,7 +159,7 @@ class ModbusBringer(LineProducer):
             log.warning("left out", source=self.name, what=request.described, reason=str(error))
 
     async def _ask(self, client: Client, request: Request) -> Sequence[int]:
-        """Raises: NothingComesError: No answer. _RefusedError: An exception came."""
+        """Send a request; raises SourceUnavailableError without a response, _RefusedError for an exception response."""
         read = client.read_input_registers if request.table == "input" else client.read_holding_registers
         try:
             answer = await read(request.address, count=request.words, device_id=self._settings.unit)
@@ -196,6 +196,6 @@ def _client(settings: ModbusSource) -> Client:
 
 
 def bringer(settings: Settings) -> ModbusBringer:
-    """What ``[source]`` asks for."""
+    """Make the line producer of ``[source]``."""
     assert isinstance(settings.source, ModbusSource)  # noqa: S101 - as KINDS has it
     return ModbusBringer(settings.source)

@@ -52,7 +52,7 @@ class Request(NamedTuple):
 
 
 def values_of(settings: ModbusSource) -> tuple[Value, ...]:
-    """What the device is asked for."""
+    """Return the values to read from the device."""
     named = {"voltage": settings.voltage, "current": settings.current, "temperature": settings.temperature}
     values = [Value(quantity, register) for quantity, register in named.items() if register is not None]
     if settings.cells is not None:
@@ -61,7 +61,7 @@ def values_of(settings: ModbusSource) -> tuple[Value, ...]:
 
 
 def plan(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
-    """The requests that bring ``values``: as few as their tables, ``gap`` and ``MOST_WORDS`` allow."""
+    """Return the requests that read ``values``: as few as their tables, ``gap`` and ``MOST_WORDS`` allow."""
     requests: list[Request] = []
     for value in sorted(values, key=lambda value: (value.register.table, value.register.address)):
         register, end = value.register, value.register.address + value.register.words
@@ -77,7 +77,7 @@ def plan(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...
 
 
 def split(request: Request) -> tuple[Request, ...]:
-    """The same by quantity and without gaps: which of them a device refuses then shows itself. One that cannot be split is returned."""
+    """Split a request by quantity and without gaps, to show which part a device refuses; return one that cannot be split."""
     quantities = dict.fromkeys(value.quantity for value in request.values)
     return tuple(
         part
@@ -87,7 +87,7 @@ def split(request: Request) -> tuple[Request, ...]:
 
 
 def decode(register: Register, words: Words) -> float:
-    """The value in V, A or degC; NaN where there is none: it was not read, is ``absent``, or a NaN itself."""
+    """Return the value in V, A or C; NaN if it was not read, is ``absent``, or is itself NaN."""
     addresses = range(register.address, register.address + register.words)
     if any((register.table, address) not in words for address in addresses):
         return math.nan
@@ -101,7 +101,7 @@ def decode(register: Register, words: Words) -> float:
 
 
 def reading_of(values: Sequence[Value], words: Words) -> Reading | None:
-    """What the registers say, the current as the device counts it; None where they tell no voltage or no current."""
+    """Return the reading of the registers with the device's sign of current; None without voltage or current."""
     found: dict[str, list[float]] = {}
     for quantity, register in values:
         found.setdefault(quantity, []).append(decode(register, words))

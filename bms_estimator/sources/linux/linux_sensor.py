@@ -66,7 +66,7 @@ class LinuxSensor(LineProducer):
         return self._fault
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
-        """A line each interval.
+        """Yield a line each interval.
 
         Raises:
             NothingComesError, OSError: The chip or a file of it is not there, or its bus hangs.
@@ -83,7 +83,7 @@ class LinuxSensor(LineProducer):
             await asyncio.sleep(due_s - loop.time())
 
     async def _read(self, call: Callable[[], T]) -> T:
-        """What a call says that may wait for the bus."""
+        """Run a call that may wait for the bus; return its result."""
         if self._left is not None:
             await self._wait(self._left)
             self._left = None
@@ -97,7 +97,7 @@ class LinuxSensor(LineProducer):
         return future.result()
 
     async def _wait(self, future: asyncio.Future[T]) -> None:
-        """Raises: NothingComesError: The bus hangs."""
+        """Wait for the bus; raises SourceUnavailableError if it hangs."""
         done, _ = await asyncio.wait({future}, timeout=self._hung_s)
         if not done:
             raise SourceUnavailableError(f"the bus has not answered for {self._hung_s:g} s")
@@ -111,7 +111,7 @@ class LinuxSensor(LineProducer):
         return _Chip(voltage, current, temperature, amperes, told.interval_s or self._own_interval_s())
 
     def _amperes(self, current: Channel) -> float:
-        """What the shunt makes of one unit of the channel.
+        """Return amperes per unit of the channel, by the shunt.
 
         Raises:
             NothingComesError: The settings do not say, or the driver does not.
@@ -185,7 +185,7 @@ class LinuxSensor(LineProducer):
 
 
 def bringer(settings: Settings) -> LinuxSensor:
-    """What ``[source]`` asks for."""
+    """Make the line producer of ``[source]``."""
     assert isinstance(settings.source, LinuxSource)  # noqa: S101 - as KINDS has it
     return LinuxSensor(settings.source)
 

@@ -35,7 +35,7 @@ class Channel(NamedTuple):
         return next((kind for word, kind in words.items() if name.startswith(word)), "")
 
     def read(self) -> float:
-        """The value now [V, A, degC].
+        """Return the present value [V, A, C].
 
         Raises:
             OSError: It cannot be read now.
@@ -49,7 +49,7 @@ class Channel(NamedTuple):
 
 
 def read_number(path: Path) -> float:
-    """The number in a file of sysfs.
+    """Read the number in a sysfs file.
 
     Raises:
         OSError: It cannot be read now.
@@ -89,7 +89,7 @@ def find_chip(chip: str, root: Path = SYS) -> Path:
 
 
 def find_channel(name: str, chip: str, root: Path = SYS) -> Channel:
-    """A channel.
+    """Find a channel.
 
     Args:
         name: As ``LinuxSource.voltage``: a file or iio channel of the chip, ``other_chip/name``, or a path.
@@ -132,7 +132,7 @@ def _is_iio(path: Path) -> bool:
 
 
 def _beside(channel: Path, part: str) -> Path:
-    """A file of an iio channel; channels of one kind may share a scale: ``in_voltage_scale`` for ``in_voltage0_raw``."""
+    """Return a file of an iio channel; channels of one kind may share it: ``in_voltage_scale`` for ``in_voltage0_raw``."""
     own = channel.with_name(f"{channel.name}_{part}")
     if part == "raw" or own.exists():
         return own

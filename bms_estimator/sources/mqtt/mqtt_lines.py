@@ -93,7 +93,7 @@ class MqttReports(LineProducer):
             raise SourceUnavailableError(str(error)) from None
 
     async def _lines(self, connection: Connection) -> AsyncGenerator[bytes, None]:
-        """Raises ``BrokerConnectionError`` when the connection is lost."""
+        """Yield the lines of a connection; raises ``BrokerConnectionError`` when it is lost."""
         receiving: asyncio.Future[ReceivedMessage] | None = None
         asked_s = -float("inf")
         try:
@@ -144,7 +144,7 @@ class MqttReports(LineProducer):
 
 
 def bringer(settings: Settings) -> MqttReports:
-    """What ``[source]`` asks for.
+    """Make the line producer of ``[source]``.
 
     Raises:
         UserError: There is no broker, or what opens its door cannot be used.

@@ -31,12 +31,12 @@ class MissingError(InvalidValueError):
 
 
 def cell_pattern(text: str) -> re.Pattern[str]:
-    """What matches a topic, or a key, with ``{cell}`` in it: the cell's number is its only group."""
+    """Return the pattern of a topic or key with ``{cell}``; the cell's number is its only group."""
     return re.compile(r"0*([0-9]{1,3})".join(map(re.escape, CELL.split(text))))
 
 
 def read_value(payload: bytes, place: ValueLocation, path: str) -> float:
-    """The quantity [SI].
+    """Read the quantity in SI units.
 
     Raises:
         NoNumberError: It is not there, or no finite number.
@@ -91,7 +91,7 @@ def _parsed(payload: bytes, path: str) -> Any:
 
 
 def _found(value: Any, path: str) -> Any:
-    """What a path leads to.
+    """Return the value at a path.
 
     Raises:
         MissingError: It leads nowhere.

@@ -130,7 +130,7 @@ class SampleAssembler:
         self._counters["publisher_errors"] += conflict
 
     def line(self, now_s: float) -> bytes:
-        """The sample that is complete now; nothing where none is."""
+        """Return the line of a complete sample; None without one."""
         if not self._new or (len(self._new) < len(NEEDED) and (self.wait_s(now_s) or 0.0) > 0.0):
             return b""
         self._new.clear()
@@ -183,14 +183,14 @@ class SampleAssembler:
         return True
 
     def _miss(self, name: str) -> None:
-        """A sample lacks one of the two."""
+        """Count a sample that lacks voltage or current."""
         self._counters["stale"] += 1
         if name in self._told:
             topics = ", ".join(self._topics_of(name))
             self._faults.setdefault(name, f"{name}: nothing on {topics} for {self._settings.max_age_s:g} s")
 
     def _value(self, name: str, now_s: float, most_s: float) -> float | None:
-        """What is not older than so long."""
+        """Return a value unless it is older than ``most_s``."""
         told = self._told.get(name)
         return told.value if told and now_s - told.at_s <= most_s else None
 
@@ -205,7 +205,7 @@ class SampleAssembler:
 
 
 def _filter(topic: str) -> str:
-    """What to subscribe to for a topic with ``{cell}`` in it."""
+    """Return the topic filter of a topic with ``{cell}``."""
     return "/".join("+" if "{cell}" in level else level for level in topic.split("/"))
 
 

@@ -56,7 +56,7 @@ class BoardCheck:
         return self._told or self._known.get("serial", "")
 
     def opened(self) -> None:
-        """The port was opened anew."""
+        """Reset after the port was opened again."""
         self.pending_protocol = self._make() if self.serial else None
         self._refused = False
         self._drop(self._held)
@@ -77,7 +77,7 @@ class BoardCheck:
             self._looking = False
 
     def accept(self, read: Chunk, decoder: DeviceProtocol) -> Sequence[Chunk]:
-        """The reads that ``decoder``, which hears the pack's board, may be fed now.
+        """Return the chunks that ``decoder``, which knows the pack's board, may be fed now.
 
         Raises:
             OtherBoardError: Neither this one nor those after it, until the port is opened anew.
@@ -102,7 +102,7 @@ class BoardCheck:
         return held
 
     def remember_board(self, board: Mapping[str, str], now_s: float) -> None:
-        """Samples of ``board`` are taken: it is the pack's from now on. What has changed is said, and remembered.
+        """Accept samples of ``board`` as the pack's from now on; log and store what changed.
 
         Args:
             board: What it says of itself.
@@ -130,7 +130,7 @@ class BoardCheck:
             log.info("this is the pack's board from now on", **self._known)
 
     def _remember(self, now_s: float) -> None:
-        """A disk that hangs holds up nothing; one that failed, or lost the file, is tried again while samples come."""
+        """Store the board without blocking on a hung disk; retry a failed write while samples come."""
         if self._memory is None or self._keeping or now_s - self._tried_s < RETRY_S:
             return
         self._keeping, self._tried_s = True, now_s

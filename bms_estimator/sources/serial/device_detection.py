@@ -50,7 +50,7 @@ class DetectedDevice:
     """In series, where they are told."""
 
     def __str__(self) -> str:
-        """What it is, and how it is spoken to unless it is a board at the firmware's own rate."""
+        """Describe the device, and how to reach it unless it is a board at the firmware's own rate."""
         usual = self.baud == BAUD and self.protocol in ("binary", "text")
         return self.described if usual else f"{self.described}; protocol {self.protocol}, {self.baud} baud"
 
@@ -126,7 +126,7 @@ def _ask_in_turns(line: "serial.Serial", decoders: Mapping[str, DeviceProtocol],
 
 
 def _described(decoder: DeviceProtocol) -> tuple[str, int | None]:
-    """What it is, and its cells."""
+    """Return the device's description and its number of cells."""
     return decoder.description or "", decoder.cells.shape[1] or None
 
 
@@ -146,7 +146,7 @@ class BoardClient:
         self._board, self._text = BoardProtocol(), TextProtocol()
 
     def __enter__(self) -> Self:
-        """The board."""
+        """Return the board client."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -154,7 +154,7 @@ class BoardClient:
         self._line.close()
 
     def hello(self) -> Hello:
-        """What the board says of itself, after the last command.
+        """Return the board's hello after the last command.
 
         Raises:
             UserError: No board answers; the message says what is there instead.
@@ -193,7 +193,7 @@ class BoardClient:
     def _ask(
         self, decoders: Sequence[DeviceProtocol], answer: Callable[[], Answer | None], patience_s: float | None = None
     ) -> Answer:
-        """The answer.
+        """Wait for a response.
 
         Raises:
             UserError: There is none.

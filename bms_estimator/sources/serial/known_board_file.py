@@ -40,7 +40,7 @@ class KnownBoardFile:
         return f"bms-estimator board --folder {self.path.parent} --accept"
 
     def load(self) -> Mapping[str, str]:
-        """What was kept last; empty where nothing was, or nothing that can be used, which is logged."""
+        """Load the stored board; empty if there is none or it is not valid, which is logged."""
         try:
             return _checked(json.loads(read_private(self.path, LONGEST_FILE)))
         except FileNotFoundError:
@@ -72,7 +72,7 @@ class KnownBoardFile:
 
 
 def _checked(found: object) -> Mapping[str, str]:
-    """What a file held.
+    """Check the content of a file.
 
     Raises:
         ValueError: It is no board.

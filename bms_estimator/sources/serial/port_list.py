@@ -61,7 +61,7 @@ def stable_names() -> list[Path]:
 
 
 def resolve_port(port: str) -> str:
-    """The device path of ``port``, which may be ``auto``.
+    """Return the device path of ``port``, which may be ``auto``.
 
     Raises:
         NoPortError: No board is there, or with ``auto`` more than one.

@@ -95,7 +95,7 @@ class SerialPort:
         return path
 
     def confirm(self) -> None:
-        """What is on the line is what was looked for: when it is lost it is looked for at once."""
+        """Mark the device on the line as the wanted one: when it is lost, search for it at once."""
         self._retry_s = self._first_retry_s
 
     def close(self) -> None:
@@ -110,7 +110,7 @@ class SerialPort:
         self._reads.put_nowait(None)
 
     async def read(self) -> Chunk | None:
-        """What came next; without bytes where the port was opened, None at the end."""
+        """Return the next chunk; an empty chunk after the port was opened, None at the end."""
         return await self._reads.get()
 
     def send(self, data: bytes) -> None:
@@ -123,7 +123,7 @@ class SerialPort:
             log.warning("not sent", reason=str(error))
 
     def _read(self, descriptor: int) -> None:
-        """The descriptor has bytes, or has died."""
+        """Read from a descriptor that has bytes or has failed."""
         arrival_s = self.now_s
         try:
             data = os.read(descriptor, READ_BYTES)

@@ -163,7 +163,7 @@ class SerialSource:
             self._task.result()
 
     def _admit(self, read: Chunk) -> Sequence[Chunk]:
-        """The reads that are decoded now."""
+        """Return the chunks to decode now."""
         if not read[1]:
             self._openings += 1
             self._decoder.on_port_opened()
@@ -176,7 +176,7 @@ class SerialSource:
             return ()
 
     def _leave(self, message: str) -> None:
-        """What is on the port is not taken: look elsewhere."""
+        """Reject the device on the port and search elsewhere."""
         self._say(message)
         self._refused = True
         self._where.skip_port(self._path, WRONG_PORT_RETRY_S)

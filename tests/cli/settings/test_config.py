@@ -117,7 +117,7 @@ def test_init_leaves_an_existing_file_as_it_is(pack, capsys):
             '[influx]\nurl = "localhost:8086"\n',
             ["influx.url = 'localhost:8086': is not of the form", "http://host:port"],
         ),
-        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "'binary', 'text'"]),
+        ('[sensor]\nprotocol = "x"\n', ["sensor.protocol = 'x'", "must be one of binary, "]),
         ('[sensor]\nbaud = "fast"\n', ["sensor.baud = 'fast'", "number, without quotes"]),
         ("[observer]\nlambda = -1\n", ["observer.lambda = -1", "greater than 0"]),
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),
