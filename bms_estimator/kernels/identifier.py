@@ -45,9 +45,9 @@ from bms_estimator.numba_cache import njit
 FIT_EVERY_S = 120.0
 """One element is fitted this often, each in its turn [s of samples]."""
 LEAST_BINS = 3
-"""Three parameters of an element need so many bins of SOC."""
+"""Minimum number of SOC bins for the three parameters of an element."""
 MIN_EXCITATION_C = 0.05
-"""A load of so much, RMS over 10 min, tells of the resistances [C]."""
+"""Minimum load that excites the resistances, RMS over 10 min [C]."""
 
 
 @njit(cache=True)

@@ -20,7 +20,7 @@ Mirror = NDArray[np.int32]
 """Shape (words of a record,): which word each is likely to equal, an earlier one; -1: 0."""
 WORD_BYTES, WORD_BITS = 8, 64
 _WORDS = "f8", "i8", "u8"
-"""What a word may be."""
+"""Data types of a word."""
 
 
 @lru_cache(maxsize=64)

@@ -22,7 +22,7 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 MAX_SOC_STD_AFTER_GAP = 0.3
-"""How far the SOC may have gone while nobody measured, at most, std."""
+"""Maximum std of the SOC after an unmeasured gap."""
 
 
 @njit(cache=True)

@@ -28,11 +28,11 @@ PARTING_S = 1.0
 NO_DELAY = (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 """Small messages go at once."""
 HEAD_BYTES = 16
-"""What a published message has beside topic and payload, at most."""
+"""Maximum overhead of a published message beside topic and payload [bytes]."""
 SOCKET_BROKE = "failed to receive on socket: "
-"""How paho's line of an error of the socket begins."""
+"""Beginning of paho's log line about a socket error."""
 TLS_ALERT = "[SSL: "
-"""How the text of an error begins that TLS itself has a name for: the broker told us what it does not like."""
+"""Beginning of the text of a TLS error that has a name, such as an alert sent by the broker."""
 
 log = structlog.get_logger(__name__)
 
@@ -56,10 +56,10 @@ class Timeouts(NamedTuple):
     """How long silence is borne."""
 
     connected_s: float = 10.0
-    """Name server, TCP, TLS and the broker's answer together may take so long [s]."""
+    """Timeout of name resolution, TCP, TLS and the broker's CONNACK together [s]."""
     keepalive_s: int = 10
-    """After so long a silence the broker is asked for a sign of life, for which it has as long again. One that lost us
-    without a word publishes the will after one and a half times this [s]."""
+    """MQTT keepalive interval [s]. The broker has as long again to answer a ping. It publishes the will of a silently
+    lost client after 1.5 intervals."""
     acknowledged_s: float = 15.0
     """A broker that lives but takes longer for a message is lost; NATS takes 10 s to find a new leader [s]."""
 

@@ -33,7 +33,8 @@ class ConnectOptions(NamedTuple):
     """How each connection of a client begins."""
 
     identifier: str
-    """The same at each: the broker ends an older one that it still holds, and its will comes first."""
+    """Client identifier, equal for all connections, so that the broker ends an older one first and publishes its will
+    before."""
     will: Message | None
     """None of who only reads."""
     on_message_lost: Callable[[str, str], None]
@@ -41,7 +42,7 @@ class ConnectOptions(NamedTuple):
     most_waiting: int = MOST_WAITING
     """Messages that wait to be read; more are lost."""
     most_bytes: int = MOST_BYTES
-    """Of a message; longer ones are kept back by an MQTT 5 broker, and thrown away else."""
+    """Maximum size of a received message [bytes]. An MQTT 5 broker withholds longer ones; else they are dropped here."""
 
 
 class Connection(Protocol):

@@ -20,8 +20,8 @@ class DeliveryStats:
     trouble: str | None = None
     """Why the last one was lost, or a broker could not be reached."""
     refused_topics: list[str] = field(default_factory=list)
-    """What the broker denies, as far as it can be told."""
+    """Topics that the broker denies, as far as it reports them."""
     corrections: int = 0
-    """Times somebody else wrote an availability of ours and was put right."""
+    """Availability messages of other clients that were corrected."""
     requests: Counter[str] = field(default_factory=Counter)
     """By what became of them."""

@@ -3,7 +3,7 @@
 from paho.mqtt.reasoncodes import ReasonCode
 
 UNSUPPORTED_VERSION = 132
-"""Of a broker that does not know MQTT 5."""
+"""CONNACK code of a broker without MQTT 5."""
 
 _NOT_ALLOWED = (
     "name or password wrong, or not allowed; see mqtt.username, mqtt.password_file and the broker's access list"
@@ -28,7 +28,7 @@ FINAL = {
     149,  # too large
     153,  # payload format invalid
 }
-"""What makes a broker refuse a message however often it comes; all else (busy, quota, unspecified) may pass."""
+"""Reason codes that will not change with a retry; all others (busy, quota, unspecified) may be temporary."""
 
 
 def is_final(reason: ReasonCode) -> bool:

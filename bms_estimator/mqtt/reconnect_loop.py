@@ -14,7 +14,7 @@ from bms_estimator.process.backoff import FIRST_DELAY_S, Backoff
 MIN_CONNECTION_S = 10.0
 """A connection that ends sooner is taken as an attempt that failed [s]."""
 LOG_S = 600.0
-"""The same reason is logged no more often than this [s]."""
+"""Minimum interval between two log lines with equal reason [s]."""
 
 log = structlog.get_logger(__name__)
 

@@ -26,7 +26,7 @@ REASONS = {"too_long": f"longer than {MOST_BYTES} bytes", "overflow": "faster th
 LOG_S = 60.0
 """Minimum time between two log lines on dropped messages [s]."""
 CLOSING_S = 3.0
-"""How long parting from the broker may take [s]."""
+"""Timeout of a disconnect from the broker [s]."""
 
 
 log = structlog.get_logger(__name__)

@@ -35,7 +35,7 @@ class DeviceMessage(NamedTuple):
     topic: str
     """Below the device's, such as ``state`` or ``alarm/soc_low``."""
     payload: Any
-    """Parsed JSON; text where it is none; None: the topic was emptied."""
+    """Parsed JSON; text if it is not JSON; None if the topic was cleared."""
 
 
 @dataclass
@@ -47,7 +47,7 @@ class DeviceTopics:
     heard_s: dict[str, float] = field(default_factory=dict)
     """By topic when that came, seconds since 1970."""
     sizes: dict[str, int] = field(default_factory=dict)
-    """Of the payloads [bytes]."""
+    """Sizes of the payloads [bytes]."""
     alarms: set[str] = field(default_factory=set)
     """Topics of the alarms that are raised."""
     last_s: float = 0.0

@@ -13,7 +13,7 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 TIMESYNCD = Path("/run/systemd/timesync/synchronized")
 """There once systemd-timesyncd has set the clock since the machine was started."""
 TIME_ERROR = 5
-"""What adjtimex(2) returns while nothing sets the wall clock."""
+"""Return value of adjtimex(2) while nothing sets the wall clock."""
 TIMEX_BYTES = 512
 """More than a ``struct timex`` has anywhere."""
 

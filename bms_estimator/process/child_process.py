@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 PR_SET_PDEATHSIG = 1
-"""Of linux/prctl.h."""
+"""Option number from linux/prctl.h."""
 
 
 def ends_with_us() -> Callable[[], None] | None:

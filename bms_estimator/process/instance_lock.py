@@ -16,7 +16,7 @@ from bms_estimator.model.errors import UserError
 
 ROOT = 0
 ATTEMPTS, PAUSE_S = 20, 0.01
-"""So often is tried to take a name that is held and does not listen, and how long between [s]."""
+"""Number of attempts to take a name that is held but not listening, and the delay between them [s]."""
 _CREDENTIALS = struct.Struct("3i")
 """``struct ucred``: process, user, group."""
 

@@ -6,9 +6,9 @@ import threading
 import time
 
 WAITING_LINES = 1000
-"""So many wait for who reads; what comes then is lost, and counted."""
+"""Maximum number of log lines waiting for the reader; further lines are lost and counted."""
 END_S = 1.0
-"""So long the end of the process waits for who reads [s]."""
+"""Time that the process waits at its end for the reader [s]."""
 STDERR = 2
 
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 CREDENTIALS = Path("/run/credentials")
-"""Where systemd keeps the credentials of all units."""
+"""Folder in which systemd keeps the credentials of all units."""
 
 
 class SystemdNotifier:

@@ -5,7 +5,7 @@ from collections.abc import Coroutine
 from typing import Any
 
 AGAIN_S = 0.1
-"""A task that goes on is cancelled once more after so long [s]."""
+"""Interval at which a task that ignores cancellation is cancelled again [s]."""
 
 
 async def end(*tasks: asyncio.Future[Any]) -> None:

@@ -22,7 +22,7 @@ from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
 LOOK_S = 1.0
 """Often enough for a line of the log [s]."""
 SILENT_PERIODS = 3.0
-"""Without a sample for so many of the periods at which they are expected something is at fault."""
+"""Number of expected sample periods without a sample that counts as a fault."""
 
 log = structlog.get_logger(__name__)
 

@@ -17,7 +17,7 @@ class SourceHealth(NamedTuple):
     block_age_s: float
     """Since the bytes of the block that came last were read [s]."""
     queued_reads: int
-    """Reads of the line that nobody has taken yet."""
+    """Chunks of the serial port that are waiting to be decoded."""
 
 
 class ReadTap(Protocol):

@@ -19,26 +19,24 @@ from bms_estimator.store.migrations import MIGRATIONS, NewerVersionError, OtherT
 HANG_S = 10.0
 """A disk that has not answered by then is taken to hang [s]."""
 ENDING_S = 5.0
-"""How long all of what is written at the end may take [s]."""
+"""Timeout of all writes during shutdown [s]."""
 RETRY_S = 10.0
 """A disk that failed is tried again no more often than this [s]."""
 SYNC_S = 30.0
-"""The first transaction after so long waits for the platter; those between reach the system at once, the platter when it likes [s].
-
-So much is lost with the power while transactions go on: where none follows, nothing syncs those before.
-"""
+"""Minimum interval between two fsyncs [s]. Commits in between are only handed to the OS. A power failure loses
+everything since the last fsync, which happens only with a commit."""
 LOCKED_S = 5.0
-"""How long somebody else may hold the file [s]."""
+"""Time that another process may lock the file [s]."""
 LOG_BYTES = 4 << 20
-"""To so much the write-ahead log is cut back."""
+"""Maximum size of the write-ahead log [bytes]."""
 FREE_PAGES = 1024
-"""Of 4 KiB; so many that are free are kept for what comes."""
+"""Number of free pages of 4 KiB that are kept for later rows."""
 TRIMMED_PAGES = 4096
-"""So many after one transaction: those that are not the file's last are moved."""
+"""Maximum number of pages moved to shrink the file after one transaction."""
 UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT)
-"""What SQLite says of a damaged file, at any time."""
+"""SQLite errors of a damaged file, at any time."""
 UNUSABLE_AT_OPEN = (*UNUSABLE, sqlite3.SQLITE_ERROR)
-"""The same while tables are looked for and made: they are others than we make."""
+"""SQLite errors of an unusable file while tables are checked and created: its tables are not ours."""
 
 Result = TypeVar("Result")
 

@@ -18,7 +18,7 @@ from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoc
 
 MINUTES_A_DAY = 1440
 WAITING_MINUTES = 2 * MINUTES_A_DAY
-"""So many rows wait in memory for a disk that cannot be written."""
+"""Maximum number of rows in memory while the disk cannot be written."""
 WAITING_EVENTS = 1000
 MOST_EVENTS = 50_000
 """In the database: a line that comes and goes each second must not fill the disk."""

@@ -33,7 +33,7 @@ MIGRATIONS = (
     """,
     "CREATE TABLE history_mark (run TEXT NOT NULL, number INTEGER NOT NULL);",
 )
-"""What makes version n + 1 of version n; never changed once released, only added to."""
+"""Statements that migrate version n to version n + 1; a released one is never changed."""
 
 
 class NewerVersionError(Exception):

@@ -11,7 +11,7 @@ MINUTE_S = 60
 LONGEST_S = 30.0
 """Between two publications; longer may be a gap, over which no charge is counted [s]."""
 GAP_RATIO = 3.0
-"""It is one where it is so many times as long as the time before: a slow source makes none. As between samples."""
+"""An interval counts as a gap if it is this many times as long as the one before, so that a slow source has none."""
 
 
 class Minute(NamedTuple):
@@ -37,7 +37,7 @@ class Minute(NamedTuple):
     energy_out_wh: float
     energy_in_wh: float
     seen_s: float
-    """So much of it was measured."""
+    """Measured part of the minute [s]."""
     publications: int
 
 

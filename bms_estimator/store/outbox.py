@@ -15,9 +15,9 @@ from bms_estimator.store.outbox_queue import PAGE, Queue
 from bms_estimator.store.outbox_table import OutboxTransaction, Outcome, read_backlog
 
 FLUSH_S = 1.0
-"""How often what waits is written while the broker is away [s]."""
+"""Interval at which waiting messages are written to disk while the broker is away [s]."""
 BEHIND = 3
-"""A connected broker that has not acknowledged a message after so many of these times is behind."""
+"""Number of these intervals without an acknowledgment after which a connected broker counts as behind."""
 
 __all__ = ["Outbox", "QueuedMessage"]
 

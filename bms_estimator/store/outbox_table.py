@@ -59,17 +59,17 @@ class OutboxTransaction:
 
     offset: int
     first: int
-    """Of what is on disk alone."""
+    """First number that is only on disk."""
     end: int
     """One after its last."""
     gaps: list[tuple[int, int]]
-    """What is to be removed: from each number to before the other."""
+    """Ranges to remove: from each number up to but excluding the second one."""
     rows: list[QueuedMessage]
     """To be written; what is there already is replaced."""
     page: int
-    """So many of the oldest that are on disk alone are read."""
+    """Maximum number of the oldest messages that are read from disk."""
     recount: bool
-    """Whether to look what is on disk alone, first of all."""
+    """True to count the messages that are only on disk, first of all."""
 
     def __bool__(self) -> bool:
         """Whether there is something to do."""

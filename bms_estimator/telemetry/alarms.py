@@ -35,7 +35,7 @@ INPUTS = "inputs"
 SILENCE = "silence"
 """Key of the saved reason why no samples came."""
 SHARE_S = 1.0
-"""Lost and unusable samples are set against the good ones of so long at least [s]."""
+"""Minimum time over which lost and unusable samples are compared with good ones [s]."""
 
 
 class SampleCounts(NamedTuple):

@@ -32,7 +32,7 @@ OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
 CONFIGURED = "configured value: no data has identified it"
 LEARNED = "learned by the observer's law, which knows no error of it"
 VALID_FIT_STD = 0.5
-"""The same for a1..a15: amplitudes and exponents show only where the SOC was swept."""
+"""Maximum relative std of a valid a1..a15: amplitudes and exponents show only where the SOC was swept."""
 VALID_CAPACITY_STD = 0.02
 VALID_OFFSET = 0.5
 """An offset is identified when its standard deviation is below this part of the first one."""

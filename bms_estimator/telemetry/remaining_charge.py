@@ -11,7 +11,7 @@ from bms_estimator.estimator.identified_parameters import present_resistance, re
 from bms_estimator.kernels.cell_model import chen_mora
 
 LONGEST_H = 1000.0
-"""A load that would take longer to empty the pack is none, and a charge that would take longer to fill it."""
+"""Longest published time to empty or full [h]; a smaller load or charge counts as none."""
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,11 @@ from collections import deque
 from bms_estimator.model.payloads import Estimate
 
 WATCHED_S = 30.0
-"""So long current and voltage must have kept still [s]."""
+"""Time for which current and voltage must have been constant [s]."""
 MOST_CURRENT = 0.04
-"""Of the largest current that the cell file allows: what a sensor's offset may be; more is a load."""
+"""Maximum current at rest, as a fraction of the cell file's largest current: the offset of a sensor."""
 MOST_STEPS = 2.0
-"""Of the voltage's resolution: between the means of two publish windows noise makes less."""
+"""Maximum change between the means of two publish windows, in steps of the voltage's resolution."""
 
 
 class RestDetector:

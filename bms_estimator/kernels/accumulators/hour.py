@@ -45,7 +45,7 @@ HOUR_SUMS = np.dtype(
 )
 """All zero: nothing came yet."""
 OF_HOUR = tuple(HOUR_SUMS.names or ())[(HOUR_SUMS.names or ()).index("samples") :]
-"""What begins anew with each hour."""
+"""Fields that restart with each hour."""
 
 
 @njit(cache=True)

@@ -6,12 +6,13 @@ SLOW_S = 2.0
 """Between samples further apart the current is more than their straight line [s]."""
 
 GAP_RATIO = 3.0
-"""A step this many times as long as the one before may be a gap: slow sampling is none."""
+"""A step is a gap only if it is at least this many times as long as the one before, so that slow sampling does not
+count as gaps."""
 
 UNMEASURED_S = 60.0
-"""Over a longer step nobody measured the current [s], unless the source has slower samples: then over ``PERIODS`` of them."""
+"""Longest step over which the current counts as measured [s]; for slower sources ``PERIODS`` of their periods."""
 PERIODS = 2.5
-"""A regular source may be late by so much, or lose a sample [periods]."""
+"""Longest regular step [periods]: a regular source may be late, or lose a sample."""
 LONGEST_FLOW_S = 3600.0
 """A current is not taken to have flowed for longer without a sample: one wrong time stamp must not empty a cell [s]."""
 

@@ -29,19 +29,19 @@ NAMES = (
     "limiting_current_a",
     "internal_current_a",
 )
-"""What is learned, as ln of the value over that of the file: r, A, a, C, B, i_L, i_n."""
+"""Identified parameters, as ln of the value over that of the file: r, A, a, C, B, i_L, i_n."""
 
 R, TAFEL, ACTIVATION, C_DL, B, LIMIT, INTERNAL = range(len(NAMES))
 E = len(NAMES)
 """Places in ``given``: those of the parameters, then E."""
 CELLS, TEMPERATURE, HYDROGEN, OXYGEN = range(1 + len(NAMES), 5 + len(NAMES))
-"""Places in what the file gives, shape (16,): the parameters from 1 on, then cells in series, temperature where nobody
-measures it [C], partial pressures [atm]."""
+"""Indices into the constants, shape (16,): the file's parameters from 1 on, then cells in series, temperature without
+a sensor [C], partial pressures [atm]."""
 BARRIER_V = 0.948
 """Energy that the reaction at the cathode must be given, over its transferred charge: a at 0 K, of one cell, as A ln i_0
 with i_0 after Arrhenius has it: xi_1 of Mann et al. (2000) [V]."""
 MEMBRANE_K = 1268.0
-"""Of the membrane's conductivity, e^(-1268 / T): Springer et al. (1991) [K]."""
+"""Temperature coefficient of the membrane's conductivity, e^(-1268 / T): Springer et al. (1991) [K]."""
 LEAST_REST = 0.02
 """1 - I / i_L is no less: beyond 98 % of the limiting current the loss stays, for there is no steady state [1]."""
 

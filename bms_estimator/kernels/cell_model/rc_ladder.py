@@ -19,8 +19,8 @@ RESISTANCES = 1 + BRANCHES
 WEAK_J, STRONG_J = 12e3, 45e3
 """Activation energies of the two parts of each resistance [J/mol]: of the electrolyte, and of reaction and diffusion."""
 HYSTERESIS_J = 8e3
-"""How hysteresis grows in the cold [J/mol]: between C/30 curves of an LFP cell lay, without what its ladder drops, 1.2 and 1.7
-times as much at 5 and -15 C as at 25 C."""
+"""Activation energy of the hysteresis [J/mol]: the hysteresis between C/30 curves of an LFP cell, without the drop of
+its RC network, was 1.2 and 1.7 times as large at 5 and -15 C as at 25 C."""
 GAS_J = 8.314462618
 """[J/(mol K)]"""
 REFERENCE_C = 25.0
@@ -32,7 +32,8 @@ WEAK_SHARE = (0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57)
 """Part of each resistance that grows as ``WEAK_J``, where captures of one temperature cannot tell: that of an 18650 NCA cell from
 -10 to 33 C, mean over SOC 0.3 to 1; of an LFP cell from -15 to 25 C 0.8, 1, 0.9, 0.75, 0.7, 0.6, 0.6."""
 WEAK_LEFT_SOC, WEAK_LEFT = (0.0, 0.1, 0.2, 0.3, 0.45), (0.45, 0.5, 0.8, 0.9, 1.0)
-"""What of it is left towards empty: at SOC 0.2 and 0.1 0.73 and 0.14 in that cell, 0.97 and 0.92 in the LFP one."""
+"""Fraction of the weak part that is left near empty, over SOC: at SOC 0.2 and 0.1 it was 0.73 and 0.14 in that cell,
+0.97 and 0.92 in the LFP cell."""
 
 TREND = 3
 """The branch whose current tells whether the cell is charged or discharged: that of 120 s."""

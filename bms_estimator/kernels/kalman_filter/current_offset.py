@@ -13,12 +13,12 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 REST_C, REST_S = 0.01, 60.0
-"""Less than this, second by second, for so long is a rest [C, s] ..."""
+"""Maximum current, second by second [C], and minimum duration [s] of a rest."""
 ZERO_C = 0.002
-"""... and shows no current when its mean is below this [C]."""
+"""Maximum mean current of a rest at which the current counts as zero [C]."""
 FORGOTTEN = 4.0
-"""The offset is not learned again before its variance has grown to so many times what a rest leaves: a rest in an hour errs
-as that of now does."""
+"""Growth of the offset's variance since a rest after which the next rest updates it again. Successive rests have a
+common error."""
 
 
 @njit(cache=True)

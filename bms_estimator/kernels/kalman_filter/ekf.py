@@ -29,20 +29,19 @@ from bms_estimator.numba_cache import njit
 NARROWEST, WIDEST = 0.02, 0.3
 """The OCV's slope is that of the secant over one std of SOC, between these."""
 LEAST_SLOPE_V = 0.02
-"""Of one cell [V]; a plateau would let the filter go anywhere."""
+"""Minimum slope of the OCV of one cell [V per unit SOC]; on a flat plateau the filter would diverge."""
 HUBER = 2.0
-"""An innovation of more than so many of its std counts as one of so many."""
+"""Limit of an innovation in std; a larger one counts as this much (Huber)."""
 MINUTE_S, TEN_MINUTES_S = 60.0, 600.0
 """Over which a mean innovation shows an error that stays."""
 INFLATION_OVER = 5.0, 3.0
-"""It is averaged over so many times as long."""
+"""Averaging time of the inflation, in multiples of its own time constant."""
 NEAR, MOST_TIMES = 0.01, 8
-"""An update is linearised about where it brings the SOC, to how well it is known then, until it comes so near that; so often
-at most."""
+"""Convergence limit in SOC and maximum number of iterations, as an update is linearized again about its result."""
 LOWEST, HIGHEST = -0.05, 1.05
-"""Where the SOC of a filter may be."""
+"""Limits of a filter's SOC."""
 MOST_STDS = 3.0
-"""Resistances are within so many of their first std."""
+"""Limit of ln of the resistances in multiples of their initial std."""
 LEAST_LN_Q, MOST_LN_Q = math.log(0.5), math.log(1.3)
 """Limits of the learned over the declared capacity: age takes up to half of it, no make holds much more than it declares."""
 HOLD_NOTHING, HOLD_CAPACITY, HOLD_CELL, HOLD_CELL_AND_CURVE = range(4)

@@ -24,7 +24,7 @@ LEARNED_VARIANCE = 0.5**2
 MODEL_ERROR = 0.02
 """An element is no closer to (2.5)-(2.9) than this, relative."""
 PRIOR_ERROR = 0.7
-"""How far the configured function, brought to the level of the visited bins, may be off in others, relative."""
+"""Relative error of the configured function in SOC bins that were not visited, after scaling to the visited ones."""
 EXPONENT_MIN, EXPONENT_MAX = 0.5, 300.0
 SEARCH_POINTS = 24
 REFINEMENTS = 12

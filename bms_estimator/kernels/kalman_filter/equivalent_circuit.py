@@ -26,12 +26,12 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
-"""Of ``value`` and ``ln_variance``."""
+"""Indices into ``value`` and ``ln_variance``."""
 SHORT_S = 60.0
 """Between the time constants of the ladder that are published as R_ts C_ts and as R_tl C_tl [s]."""
 SHORT = sum(tau_s < SHORT_S for tau_s in TAU_S)
 SHAPE_STD = 0.03
-"""How far the series resistance of the file, scaled to the cell, may be off at one SOC and temperature."""
+"""Relative std of the file's series resistance, scaled to the cell, at one SOC and temperature."""
 LONGEST_S = 2.0
 """Samples further apart show no step of the current [s]."""
 KNOWN = 0.5

@@ -14,14 +14,15 @@ FAST_S = 10.0
 VISIBLE_V = 0.003
 """A change of the overpotential of one cell that shows fully [V]."""
 DOUBT_S = 5.0
-"""A voltage is not believed from so long on [s] in which it cannot be the same."""
+"""Duration of an impossibly constant voltage after which it is no longer used [s]."""
 FROZEN_S = 60.0
-"""What cannot be for so long is not [s]: that the current is the same ..."""
+"""Duration of an impossibly constant input after which it is reported as frozen [s]."""
 SWING_V, RESOLVED = 0.02, 3.0
-"""... where the voltage of one cell changes by so much [V], that the voltage is where what the current drops is visible, ..."""
+"""Change of the voltage of one cell that proves a constant current frozen [V], and minimum ratio of a change to the
+voltage's resolution."""
 HELD_V, LOAD_C = 0.01, 0.1
-"""... or where the open-circuit voltage of one cell has moved by so much [V]. Below a discharge of this [C] only sudden changes count:
-chargers hold a voltage. All are more than ``RESOLVED`` steps of the voltage's resolution."""
+"""Change of the OCV of one cell that proves a constant voltage frozen [V]. Below this discharge current [C] only
+sudden changes count, because chargers hold a voltage."""
 UNCOUNTED = 0.1
 """Charge that goes wrong while the voltage tells nothing, relative."""
 OUTLIERS_S = 3600.0

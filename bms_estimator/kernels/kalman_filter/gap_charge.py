@@ -10,16 +10,16 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 LOAD_S = 600.0
-"""The present load is judged over so long; it goes on for about as long [s]."""
+"""Averaging time of the present load, and expected duration of that load in a gap [s]."""
 USUAL_S = 6.0 * 3600.0
-"""What a load is when it has changed is judged over so long [s]."""
+"""Averaging time of the usual load, which follows the present one in a long gap [s]."""
 BETWEEN = 0.2
 """Variance of the mean current about that line, over the square of the change: 1/12 where the load stays for much longer than
 from one sample to the next, 0.10 and 0.18 with levels of 20 s each 10 s and each 60 s, 1/4 where it is another each time."""
 SAME_STEPS = 1.5
-"""A current that is shown within so many steps of the one before is the same."""
+"""Maximum difference between two reported currents that count as equal, in steps of the resolution."""
 IDLE_C = 0.1
-"""Std of a current that nobody measured is no less, whatever was seen [C]."""
+"""Minimum std of an unmeasured current [C]."""
 
 
 @njit(cache=True)

@@ -66,28 +66,28 @@ REACH_STDS = 2.25
 OVERLAP = 0.62
 """Std of a hypothesis over the distance to the next."""
 BEYOND_STD = 0.03
-"""How far outside 0..1 a told SOC may mean, std."""
+"""Std of an SOC set outside 0..1."""
 LEAST_STD = 0.005
-"""What full and empty are of a cell is known no better, std of SOC."""
+"""Minimum std of the SOC: full and empty of a cell are not defined better."""
 UNKNOWN_FULL = 0.03
 """Std of the SOC, over that of ln R, of a cell that was not measured: another make is full elsewhere on the curve."""
 HYST_STD = 0.7
 """Std of the first hysteresis."""
 KNOWN_S = 1800.0
-"""What was before switch-on is forgotten in so long [s]."""
+"""Time constant in which the unknown history before switch-on fades [s]."""
 REOPEN_STDS = 4.0
-"""A model that would have to be wrong by so many std is not: the SOC is ..."""
+"""Bias in std beyond which the SOC is initialized again: such a model error is less likely than a wrong SOC."""
 STRAINED_STDS = 2.0
-"""Beyond so many of them a hypothesis loses weight: as its biases follow what they see, its innovations are small, whatever the
-biases have become."""
+"""Bias in std beyond which a hypothesis loses weight. Its biases absorb its errors, so that its innovations alone
+would look small."""
 REOPEN_STD = 0.2
-"""... by as much as at switch-on."""
+"""Std of the SOC after such an initialization, as at switch-on."""
 USER_SOC_STD = 0.03
-"""An SOC that is told is known to this std, ..."""
+"""Std of an SOC set by the user, if it is right."""
 WRONG_USER_SOC_STD = 0.12
-"""... or it is wrong, by as much as this, ..."""
+"""Std of an SOC set by the user, if it is wrong."""
 LN_RIGHT = 3.0
-"""... which is less likely by so much, in ln: one in ten in all."""
+"""Log-odds that an SOC set by the user is right; all wrong hypotheses together have one chance in ten."""
 
 
 @njit(cache=True)

@@ -28,13 +28,14 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.numba_cache import njit
 
 GATE_STDS = 6.0
-"""A sample further from its prediction than so many std of the innovation is a glitch, ..."""
+"""Limit of the innovation gate in std: a sample beyond it is a glitch."""
 GATE_SAMPLES, GATE_S = 5, 5.0
-"""... unless so many in a row, for so long [s], say the same: then the cell has changed."""
+"""Number of successive samples beyond the gate, and their minimum duration [s], after which they are accepted because
+the cell has changed."""
 SNAPSHOT_S = 60.0
-"""The state is kept as the last good one so often [s]."""
+"""Interval at which the last good state is stored [s]."""
 LOST_STD = 0.05
-"""How far the SOC may have gone from the last good one, std."""
+"""Std of the SOC after a return to the last good state."""
 LOST_AT_MOST = 0.4
 """No SOC is less certain than this, std."""
 SIGN_S = 300.0
@@ -42,21 +43,22 @@ SIGN_S = 300.0
 LEAST_EVIDENCE = 0.1
 """Share of that memory which must be filled."""
 CLIP = 5.0
-"""A change of voltage counts up to so many times what the resistances explain: not a glitch to zero."""
+"""Limit of a voltage change, in multiples of what the resistances explain, so that a glitch to zero does not
+dominate."""
 MANY_OUTLIERS, FEW_OUTLIERS = 5.0, 1.0
 OFFSET_STDS, CAPACITY_STDS = 4.0, 2.0
-"""Offset and capacity are suspicious beyond so many of their first std, ..."""
+"""Limits of offset and capacity, in multiples of their initial std, beyond which they are suspicious."""
 PRESENT_STDS = 3.0
-"""... and of their present one."""
+"""Minimum deviation of a suspicious offset or capacity in multiples of its present std."""
 TAKEN_BACK = 0.7
 """A suspicion stands until its measure is below this part of its limit."""
 WRONG_V, WRONG_S = 0.12, 1800.0
-"""No curve of the cell's own chemistry is so far off, of one cell [V], over so long [s]."""
+"""Bias of one cell [V] and duration [s] that no OCV of the cell's own chemistry explains."""
 SEARCHES_S = 5.0 * 3600.0
 """Memory of searches for the SOC: time after time only a wrong OCV explains them [s]."""
 MANY_SEARCHES = 4.0
 UNKNOWN_K = 5.0
-"""So far outside the temperatures of the cell file nothing is known of it [K]."""
+"""Distance from the temperatures of the cell file beyond which the model has no data [K]."""
 
 SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT = (int(bit) for bit in InputFault)
 UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT

@@ -38,9 +38,9 @@ FLOOR_C = 0.1
 INDEPENDENT_S = 30.0
 """A sample after a longer pause tells no more [s]."""
 UNSENSED_R_STD = 0.25
-"""Std of ln of the resistances where nobody measures the temperature: 10 K either way."""
+"""Std of ln of the resistances without a temperature sensor: 10 K in both directions."""
 WARMED_R_STD = 0.015
-"""The same for each kelvin by which it makes itself warmer: half of them may be wrong [1/K]."""
+"""Increase of that std for each kelvin of modeled self-heating [1/K]: half of the heating may be wrong."""
 AGED_SOC = 400.0
 """Charge over which the curve of a cell becomes another with age: 200 full cycles [SOC]."""
 HYST_LEFT = 0.17
@@ -52,7 +52,7 @@ STEEP_V = 1.0
 USUAL_LN_R = 0.25
 """Up to this ln of the resistances over those of the file, the error of the model does not grow with them."""
 OUTSIDE_K = 30.0
-"""So far outside the temperatures of the cell file, errors are twice as large [K]."""
+"""Distance from the temperatures of the cell file at which the model's errors double [K]."""
 
 
 @njit(cache=True)

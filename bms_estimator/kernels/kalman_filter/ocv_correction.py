@@ -19,7 +19,7 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 ALIKE_SOC = 0.6
-"""Errors of a curve go together over so much [SOC]: makes of one chemistry differ in what is cut off of the electrodes."""
+"""Correlation length of the OCV's error [SOC]: cells of one chemistry differ in the used range of the electrodes."""
 NEIGHBOURS = math.exp(-1.0 / (NODES - 1) / ALIKE_SOC)
 """Correlation of two nodes beside each other, before anything is learned."""
 

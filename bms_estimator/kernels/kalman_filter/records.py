@@ -49,7 +49,7 @@ class Noise:
     """B: the same from a shift of resistances and of the OCV's last fall along SOC, at 25 C; it grows with ``WEAK_J``."""
     slow_s: float = 3600.0
     fast_s: float = 45.0
-    """B: half of its variance each changes within so long [s]."""
+    """B: time constant of the fast bias, in which half of its variance changes [s]."""
     x_relative: float = 0.05
     """Q: current in the branches, relative to the current."""
     charge_error: float = 0.002
@@ -57,17 +57,17 @@ class Noise:
     r_std: float = 0.1
     """Resistances: std of their logarithm, where the cell file says nothing."""
     unsensed_s: float = 3600.0
-    """Where no temperature is told, resistances follow an unknown one with this time constant [s]."""
+    """Time constant with which resistances follow an unknown temperature without a sensor [s]."""
     offset_c: float = 0.007
     """Offset of the current sensor, std [C] ..."""
     offset_s: float = 10.0 * 86400.0
-    """... and the time in which it becomes another [s]."""
+    """Time in which the offset drifts by its initial std [s]."""
     zero_std_c: float = 0.001
     """Offset of a sensor that has shown no current at rest, std [C]."""
     capacity_std: float = 0.08
     """Capacity, relative std, ..."""
     aged_soc: float = 1000.0
-    """... and the charge in which it becomes another with age: 500 full cycles [SOC]."""
+    """Charge throughput in which the capacity changes by its initial std with age: 500 full cycles [SOC]."""
     cell_spread: float = 0.1
     """Cells in series: by how much of the charge drawn the emptiest lies below their mean, std of SOC. One that is smaller by a
     fifth is within two of it."""
@@ -76,11 +76,11 @@ class Noise:
     load_c: float = 1.2
     """Load before switch-on, unknown: its std [C] ..."""
     load_mean_c: float = 0.3
-    """... its mean ..."""
+    """Mean of the unknown load before switch-on [C]."""
     load_level_c: float = 0.35
-    """... the std of that, constant for hours, ..."""
+    """Std of the part of that load that stays constant for hours [C]."""
     load_s: float = 20.0
-    """... and for how long it stays the same [s]."""
+    """Correlation time of the varying part of that load [s]."""
     half_likelihood_exponent: float = 0.17
     """Power of the likelihood, halved, by which hypotheses are weighted: successive errors are not independent."""
     min_innovation_scale: float = 0.25
@@ -147,7 +147,7 @@ STEP = np.dtype(
     ],
     align=True,
 )
-"""The last step of the current, and what such steps have told of R_s."""
+"""Last step of the current, and R_s as learned from such steps."""
 
 EKF_STATE = np.dtype(
     [

@@ -18,11 +18,11 @@ from bms_estimator.numba_cache import njit
 
 UNHELD, HELD, STEPPED = range(3)
 LEAST_C = 0.2
-"""A step is a change of the current by so much between two samples [C]."""
+"""Minimum change of the current between two samples that counts as a step [C]."""
 HELD_SHARE = 0.1
 """A current is held that changes by no more than this part of the (least) step."""
 STEP_STD = 0.05
-"""Of ln of the resistance that one step shows: kinetics, and how far the time of a sample is off."""
+"""Std of ln of the resistance that one step shows, by kinetics and by timing errors of samples."""
 FAST_STD = 0.5
 """Relative std of what the branches change by within the step."""
 SHAPE_STD = 0.3

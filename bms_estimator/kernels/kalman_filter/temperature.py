@@ -23,21 +23,22 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 TEMPERATURE_S = 10.0
-"""A temperature sensor's noise is averaged over so long [s]."""
+"""Averaging time of a temperature sensor's noise [s]."""
 
 FASTEST_K_S = 0.1
 """No cell warms or cools faster [K/s], ..."""
 
 SETTLED_S = 60.0
-"""... once a minute has shown that the first sample was right: some sensors begin with 85 C."""
+"""Delay until the rate limit of the temperature applies [s]: some sensors begin with 85 C."""
 
 COLDEST_C, HOTTEST_C = -60.0, 120.0
-"""Where a cell's temperature may be [C]."""
+"""Range of a cell's plausible temperatures [C]."""
 
 HEAT_J = 22.0
 """Heat that warms 1 Ah of a cell by a kelvin [J/(K Ah)] ..."""
 COOLS_S = 600.0
-"""... and the time constant in which it cools in still air [s]: an LG M50 at C/2 and 1C takes 22 and 24, 650 and 570."""
+"""Time constant of a cell's cooling in still air [s]: for an LG M50 at C/2 and 1C the fits of heat capacity and time
+constant give 22 and 24 J/K per Ah, 650 and 570 s."""
 WARMEST_C = 80.0
 """No cell that is used gets warmer [C]: a current that is no truth would leave it hot for an hour."""
 

@@ -11,9 +11,9 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 NAMES = ("r_s", "r_ts", "tau_ts", "r_tl", "tau_tl")
-"""What is learned, in the order of theta."""
+"""Identified elements, in the order of theta."""
 E_O = 5
-"""Of ``given``: E_o [V]; before it the file's elements in the order of ``NAMES`` [ohm, s]."""
+"""Index of E_o [V] in ``given``; before it are the file's elements in the order of ``NAMES`` [ohm, s]."""
 
 
 @njit(cache=True)

@@ -22,7 +22,7 @@ class Model(IntEnum):
 _CHEN_MORA = int(Model.CHEN_MORA)
 _FUEL_CELL = int(Model.FUEL_CELL)
 NAMES = {Model.CHEN_MORA: chen_mora_sensitivity.NAMES, Model.FUEL_CELL: fuel_cell.NAMES}
-"""What is learned of each, in the order of theta."""
+"""Identified parameters of each model, in the order of theta."""
 
 
 @njit(cache=True)

@@ -3,9 +3,9 @@
 import numpy as np
 
 LEARNABLE = 8
-"""So many parameters a model may have learned."""
+"""Maximum number of identified parameters of a model."""
 CONSTANTS = 16
-"""So many numbers the file of a model may give; Chen & Mora: a1..a15 at their index."""
+"""Maximum number of constants from a model's file; Chen & Mora: a1..a15 at their index."""
 
 LEARNING_SETTINGS = np.dtype(
     [

@@ -3,14 +3,14 @@
 import math
 
 EARLY_S = 5.0
-"""So much earlier than its own time says no sample comes; one that does tells that the clock was set [s]."""
+"""Maximum time by which a sample may precede its own timestamp [s]; more shows that the clock was set."""
 STUCK_S = 10.0
-"""A time that stays the same for so long, while samples come, tells nothing [s]."""
+"""Duration for which a device time may stay constant while samples come; after it the device time is ignored [s]."""
 SLOWEST = 0.01
 """No device's clock is slower than the host's by more than this, relative."""
 LAG_S, LAG_STEPS = 60.0, 3
-"""A clock that has fallen behind so far, by so many steps that were each below half of what passed, is slow: samples that
-waited would have come at once [s]."""
+"""Lag [s] and number of successive slow steps, each below half of the elapsed time, after which a clock counts as
+slow. Samples that merely waited would arrive together."""
 
 
 class DeviceClock:

@@ -31,7 +31,7 @@ class DeviceProtocol(ABC):
     cells: CellBlock = NO_CELLS
     """Beside the samples that ``feed`` or ``feed_reads`` returned last."""
     probing: bool = False
-    """Set where nobody knows who is there: ``next_output`` then sends only what changes nothing in any device."""
+    """True while the device is unknown; ``next_output`` then sends only queries that change nothing in any device."""
 
     @property
     @abstractmethod

@@ -11,18 +11,19 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
 PACE_S = 1.0
-"""A round of questions begins so often [s]: as dbus-serialbattery asks them."""
+"""Poll interval [s], as in dbus-serialbattery."""
 GAP_S = 0.22
-"""Between two questions: the longest answer, 48 cells of a Daly at 9600 baud, takes so long on the line [s]."""
+"""Interval between two queries [s]: the longest response, 48 cells of a Daly at 9600 baud, takes this long on the
+line."""
 UNANSWERED_ROUNDS = 3
-"""After so many the other way of asking is tried, where there is one."""
+"""Number of unanswered poll cycles after which the next query variant is tried."""
 NOISE_BYTES = 64
-"""So much without a frame is no single glitch."""
+"""Number of bytes without a frame that counts as a fault and not as a single glitch."""
 LONGEST_START = 4
 """No frame begins with more bytes that are always the same."""
 FAULTS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs")
 FRESH_S = 3.0
-"""What came in an answer of its own, and is older, stands beside no sample [s]."""
+"""Values from a separate response are attached to a sample only if they are newer than this [s]."""
 
 
 class ParseResult(Enum):

@@ -33,7 +33,7 @@ REGISTER_BYTES: Mapping[int, int] = {
     0xB7: 15,
     0xBA: 24,
 }
-"""Of each register but the cells', which tells its own length."""
+"""Length of each register but that of the cells, which contains its own length [bytes]."""
 CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOFTWARE, VERSION = 0x79, 0x81, 0x82, 0x83, 0x84, 0xB7, 0xC0
 ABSENT_C = 140
 """The end of an older frame's scale, -40 degC: what a probe that is not there reads."""
@@ -44,7 +44,7 @@ REALTIME, KINDS = 0x02, (0x01, 0x02, 0x03)
 MODBUS_WRITE, REALTIME_REGISTER = 0x10, 0x1620
 ABSENT_DECI_C = -2000
 LISTEN_S = 10.0
-"""While frames come that were not asked for, another master asks, every 6 s; nothing is asked for so long after them [s]."""
+"""Time without queries after unsolicited frames [s]: another master polls every 6 s."""
 
 
 def crc16(data: bytes) -> bytes:

@@ -19,7 +19,7 @@ ADDRESS = 1
 """As it is delivered."""
 ASK = b":R50=%d,2,1,\r\n" % ADDRESS
 ASK_S = 1.0
-"""It is asked so often [s]."""
+"""Poll interval [s]."""
 LINE_BYTES = 256
 VOLTAGE, CURRENT, TEMPERATURE, DIRECTION = 0, 1, 6, 9
 """Places of the values."""

@@ -16,9 +16,9 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol, RecentCellVoltages
 
 ROUND_S = 2.0
-"""It is asked for all batteries so often [s]; then for the cells of one of them."""
+"""Interval between queries of all batteries [s]; the cells of one battery are queried in between."""
 ANSWER_S = 5.0
-"""Without an answer for so long it is asked again [s]."""
+"""Timeout of a response [s]; then the query is repeated."""
 ANSWER_BYTES = 16384
 """No answer is longer: 16 rows of less than 200 bytes."""
 PROMPT = re.compile(rb"pylon\w*>")

@@ -24,7 +24,7 @@ from bms_estimator.protocols.base.reading import Reading, read_line
 LINE_BYTES = 4096
 """A longer line is noise: 400 cells of seven characters fit."""
 SHOWN_BYTES = 60
-"""So much of a line that says nothing is shown."""
+"""Maximum number of characters of an invalid line that are shown."""
 
 
 class TextProtocol(DeviceProtocol):

@@ -24,11 +24,11 @@ from bms_estimator.protocols.firmware.messages import (
 from bms_estimator.protocols.firmware.scaling import SCALING, reference
 
 DEAF_BYTES = 512
-"""So many bytes without one whole frame, and the line itself is at fault: eight of the longest frames."""
+"""Number of bytes without a whole frame that shows a fault of the line: eight times the longest frame."""
 MOST_CLOCK_PPM = 20_000.0
 """No resonator is so far off: the host slept meanwhile, or the board is a simulated one in a hurry [1e-6]."""
 HELLO_FRAME_BYTES = HELLO_BYTES + 1
-"""Of a hello in COBS, without its delimiter."""
+"""Length of a COBS-encoded hello without its delimiter [bytes]."""
 _MESSAGES = 8
 
 
@@ -66,8 +66,8 @@ class FrameCounters:
     """Temperatures that no pack has: handed on as not measured."""
     resets: int = 0
     clock_jumps: int = 0
-    """Samples that came long before their time stamp, so long after the one before as neither arrival nor the samples between
-    say, or after a gap that does not fit the samples lost in it: from then on the board's clock counts anew, by arrival."""
+    """Times that the board's clock was restarted by arrival: a sample came long before its timestamp, or its
+    timestamp advanced by more than arrival, sequence numbers or a gap explain."""
 
     def as_dict(self) -> dict[str, int]:
         """By name."""

@@ -86,21 +86,22 @@ DECODER = np.dtype(
 _MASK = MODULUS - 1
 _HALF = MODULUS >> 1
 EARLY_S = 2.0
-"""A sample that came so much before the others would have the board's clock wrong [s]."""
+"""Time by which a sample must precede the others to show that the board's clock is wrong [s]."""
 HASTE_S = 0.3
-"""So much more than host and samples say may pass by the board's clock from one sample to the next [s]."""
+"""Time by which the board's clock may advance beyond arrival and sequence numbers from one sample to the next [s]."""
 SLOWEST = 0.01
 """No board's clock is slower than the host's by more than this, relative."""
 _REORDER_WINDOW = 64  # a sample further behind comes from a board that counts anew
 _MOST_APART = 0.1  # sequence and clock of one board, relative; beyond this it is another, or has another rate
 LONGEST_DOUBT_S = 5.0
-"""So long samples wait for the hello that tells whose they are; where none comes they are taken as before [s]."""
+"""Maximum time for which samples wait for the hello that identifies their board [s]; then they are accepted as
+before."""
 _US = 1e-6
 _WRAP_S = MODULUS * _US
 
 _OVERRUN = int(BoardStatus.OVERRUN)
 _SATURATED_OR_OVERRUN = int(BoardStatus.VOLTAGE_SATURATED | BoardStatus.CURRENT_SATURATED | BoardStatus.OVERRUN)
-"""The same bits on the line and in SampleStatus."""
+"""Status bits that are equal in frames and in SampleStatus."""
 _AUX_IS_NTC = int(BoardStatus.AUX_IS_NTC)
 _RESET = int(SampleStatus.RESET)
 _GAP = int(SampleStatus.GAP)

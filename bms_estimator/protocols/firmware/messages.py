@@ -18,7 +18,7 @@ PROTOCOL_VERSION = 1
 BAUD = 500_000
 RATE_HZ = range(1, 1001)
 LEAST_BANDGAP_V, MOST_BANDGAP_V = 1.0, 1.2
-"""What the internal reference of an ATmega328P may be, by its data sheet [V]."""
+"""Range of the internal reference of an ATmega328P by its data sheet [V]."""
 LEAST_DIVIDER, MOST_DIVIDER = 1.0, 100.0
 LEAST_VOLTS_PER_AMPERE, MOST_VOLTS_PER_AMPERE = 0.001, 2.0
 DELIMITER = b"\0"
@@ -157,7 +157,7 @@ def set_ratiometric_command(ratiometric: int) -> bytes:
 
 
 RELAY_KEEP, RELAY_LOW, RELAY_HIGH = range(3)
-"""What becomes of the level when the host is silent."""
+"""Fallback level of the relay when the host is silent."""
 MOST_SILENT_S = 3600
 
 

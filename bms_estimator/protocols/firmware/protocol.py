@@ -23,7 +23,7 @@ from bms_estimator.protocols.firmware.messages import (
 )
 
 ASK_AGAIN_S = 0.5
-"""What the board has not answered for so long is asked again [s]."""
+"""Retry interval of an unanswered command [s]."""
 _HELLO = hello_command()
 
 

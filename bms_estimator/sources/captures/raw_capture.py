@@ -69,7 +69,7 @@ class CaptureHeader:
     """Wall clock at the first byte, ISO 8601 UTC; set by the writer when empty."""
     version: int = VERSION
     address: int | None = None
-    """Of several packs on the line, the one that was taken."""
+    """Address of the recorded pack, if the line had several."""
 
 
 _VERSIONED, _HEADER = TypeAdapter(_Versioned), TypeAdapter(CaptureHeader)

@@ -15,10 +15,10 @@ from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWri
 SYNC_S = 5.0
 """The disk has all but the last seconds, even when the power fails [s]."""
 WAITING_READS = 1 << 16
-"""So many reads wait for the disk: a minute at a thousand samples a second."""
+"""Maximum number of chunks waiting for the disk: a minute at a thousand samples a second."""
 
 END_S = 5.0
-"""So long the end waits for the disk to take more of what waits [s]."""
+"""Time that the recorder waits at its end for the disk to accept waiting chunks [s]."""
 
 log = structlog.get_logger(__name__)
 

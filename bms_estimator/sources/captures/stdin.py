@@ -13,9 +13,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.raw_capture import MAGIC
 
 NAME = "stdin"
-"""What messages call it."""
+"""Name used in messages."""
 GZIP, PARQUET = b"\x1f\x8b", b"PAR1"
-"""How such files begin."""
+"""First bytes of such files."""
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from bms_estimator.model.sample import LEAST_C, MOST_C, SAMPLE, CurrentSign, Sam
 
 BLOCK_ROWS = 65_536
 SHOWN = 40
-"""Of what is no number so many characters are told."""
+"""Maximum number of characters of an invalid number that are shown."""
 
 
 class ColumnNaming(NamedTuple):
@@ -32,7 +32,7 @@ class ColumnNaming(NamedTuple):
     voltage_v: str
     temperature_c: str
     current_sign: CurrentSign | None
-    """What it calls positive; None: that is not laid down."""
+    """Direction that the columns call positive; None if they do not define it."""
 
 
 SPELLINGS = (
@@ -48,7 +48,7 @@ class Sign(NamedTuple):
     given: CurrentSign | None = None
     """Said of this very table: holds whatever its columns are called."""
     otherwise: CurrentSign = "discharge_positive"
-    """Where neither ``given`` nor the names of the columns tell."""
+    """Direction if neither ``given`` nor the column names define it."""
 
     def of(self, spelling: ColumnNaming) -> float:
         """Factor that makes discharge positive."""
@@ -69,7 +69,7 @@ class _Columns(NamedTuple):
     """Where a table keeps what a sample needs."""
 
     indices: tuple[int, ...]
-    """Of time, current, voltage, and temperature where there is one."""
+    """Column indices of time, current, voltage, and temperature if there is one."""
     names: tuple[str, ...]
     discharge_sign: float
 

@@ -18,11 +18,11 @@ from bms_estimator.sources.fieldbus.can_signals import CanMap
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 LISTEN_S = 0.2
-"""So often the thread looks whether it is to end [s]."""
+"""Interval at which the thread checks for its end [s]."""
 CLOSE_S = 5.0
-"""An adapter may take so long to be opened or closed [s]; then it is left alone."""
+"""Timeout for opening or closing an adapter [s]; then it is abandoned."""
 BUS_OFF = 0x40
-"""Of the identifier of an error frame: CAN_ERR_BUSOFF of linux/can/error.h."""
+"""Bit in the identifier of an error frame: CAN_ERR_BUSOFF of linux/can/error.h."""
 
 Deliver = Callable[[bytes | Exception], None]
 

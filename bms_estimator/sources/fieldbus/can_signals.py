@@ -15,14 +15,14 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.can_source import CanSource, Signal
 
 DECIMALS = 5
-"""Of V, A and degC: 5234 times 0.01 is 52.34."""
+"""Decimals of V, A and C: 5234 times 0.01 is 52.34."""
 KEPT_S = 30.0
-"""What came longer ago than this is no part of a reading [s]: batteries send temperatures and cells every few seconds."""
+"""Maximum age of a value in a reading [s]: batteries send temperatures and cells every few seconds."""
 APART_PERIODS = 3.0
-"""Voltage and current that came further apart than so many periods belong to two loads."""
+"""Maximum distance between voltage and current of one reading, in periods."""
 
 SHOWN = 20
-"""So many names of a DBC file are shown."""
+"""Maximum number of names of a DBC file that are shown."""
 
 
 class FrameId(NamedTuple):
@@ -60,7 +60,7 @@ class _Frame:
 
     signals: list[tuple[Key, Signal]] = field(default_factory=list)
     message: Message | None = None
-    """Of the DBC file, where one of the signals is named."""
+    """Message of the DBC file, if one of the signals is named."""
 
     def values(self, data: bytes) -> Iterator[tuple[Key, float | None]]:
         """In V, A or degC; NaN where one is absent, None where ``data`` is too short; not those of another multiplexer value."""

@@ -9,14 +9,14 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.modbus_source import MOST_WORDS, ModbusSource, Register
 
 GAP_WORDS = 8
-"""So many registers that nobody wants are read along, so that what lies around them is of one moment."""
+"""Maximum number of unwanted registers in one request, so that the values around them are read at the same moment."""
 
 DECIMALS = 5
-"""Of V, A and degC: finer than any register, and 259 times 0.01 is 2.59."""
+"""Decimals of V, A and C: finer than any register, and 259 times 0.01 is 2.59."""
 
 Table = Literal["holding", "input"]
 Words = Mapping[tuple[Table, int], int]
-"""What the registers hold, by table and address."""
+"""Contents of the registers by table and address."""
 
 _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
 
@@ -41,7 +41,7 @@ class Request(NamedTuple):
     address: int
     words: int
     values: tuple[Value, ...]
-    """What lies within, by address."""
+    """Values in the request, by address."""
 
     @property
     def described(self) -> str:

@@ -14,11 +14,11 @@ from bms_estimator.sources.line_source import SILENT_PERIODS, LineProducer, Sour
 from bms_estimator.sources.linux.sysfs import SYS, Channel, JunkError, find_channel, find_chip, read_number
 
 LEAST_INTERVAL_S = 0.1
-"""Chips update as often as each 2 ms, which nobody needs [s]."""
+"""Minimum interval between two readings [s]; chips update as often as each 2 ms."""
 HUNG_S = 5.0
 """A second is long for a bus, but not for a machine that swaps [s]."""
 GONE = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
-"""What is said of a chip that was taken away, or whose driver was."""
+"""Errors of a chip, or its driver, that was removed."""
 
 T = TypeVar("T")
 

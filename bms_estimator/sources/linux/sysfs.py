@@ -25,7 +25,7 @@ class Channel(NamedTuple):
     """One value of a chip."""
 
     path: Path
-    """Of a hwmon file; of an iio channel without what follows its name."""
+    """Path of a hwmon file; for an iio channel its prefix."""
 
     @property
     def kind(self) -> str:

@@ -24,7 +24,7 @@ from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 MOST_WAITING = 2000
 """Messages that wait to be read: a broker hands out at once all that it has kept of a wildcard."""
 MOST_BYTES = 65_536
-"""Nobody tells more of a battery at once."""
+"""Maximum size of a battery's message [bytes]."""
 
 log = structlog.get_logger(__name__)
 

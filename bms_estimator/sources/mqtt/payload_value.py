@@ -11,7 +11,7 @@ from bms_estimator.model.decimal_text import number
 from bms_estimator.settings.mqtt_source import ValueLocation
 
 SHOWN = 40
-"""So much of what is no number is shown."""
+"""Maximum number of characters of an invalid number that are shown."""
 MOST_CELLS = 400
 """A path or topic may name no cell beyond."""
 CELL = re.compile(r"\{cell\}")

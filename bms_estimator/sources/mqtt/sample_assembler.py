@@ -21,7 +21,7 @@ class _TopicBinding(NamedTuple):
     path: str
     topic: str
     pattern: re.Pattern[str]
-    """Of the topic; with a group where it holds the number of a cell."""
+    """Pattern of the topic; with a group for the cell's number, if it has one."""
 
 
 class _TimestampedValue(NamedTuple):

@@ -15,10 +15,10 @@ from bms_estimator.sources.serial.known_board_file import NO_BOARD, REMEMBERED, 
 from bms_estimator.sources.source import Chunk
 
 MAX_PENDING_READS = 4096
-"""So many reads are kept for a board that has not told its serial number yet: seconds at any rate."""
+"""Maximum number of chunks stored for a board without a serial number yet: seconds at any rate."""
 
 RETRY_S = 60.0
-"""So often is looked whether the disk has the board, and it is written where it has not [s]."""
+"""Interval at which a board that could not be stored is written again [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -45,10 +45,10 @@ class BoardCheck:
         self._nameless = self._looking = self._keeping = self._failed = self._refused = False
         self._tried_s = -math.inf
         self.pending_protocol: DeviceProtocol | None = None
-        """What hears a board that is not known yet."""
+        """Decoder of a board that is not known yet."""
         self._held = deque[Chunk]()
         self.unadmitted_bytes = 0
-        """Of boards that were refused, of ports lost before their board was known, and of reads that found no room."""
+        """Bytes of refused boards, of ports lost before their board was known, and of chunks beyond the limit."""
 
     @property
     def serial(self) -> str:

@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 BOOT_TIMEOUT_S = 3.0
 """A board that was reset by the opening of its port spends two seconds in its boot loader [s]."""
 PROTOCOL_TIMEOUT_S = 1.5
-"""So much longer takes a baud rate for each protocol that is tried at it, in turns with the others [s]."""
+"""Time added to a baud rate for each protocol that is tried at it in turn [s]."""
 QUERY_INTERVAL_S = 0.3
 """For an answer before another protocol's question goes out [s]."""
 READ_S = 0.1
-"""A read waits so long [s]."""
+"""Timeout of a read [s]."""
 READ_BYTES = 4096
 REFERENCE_RATE_HZ = 100
 """The firmware's own: the bandgap is measured in every second sample, or in each without an NTC."""
 REFERENCE_SAMPLES = 300
-"""Of them the noise of the bandgap's mean is 0.03 %."""
+"""Number of bandgap readings: the noise of their mean is 0.03 %."""
 REFERENCE_S = 10.0
-"""So long may they take [s]."""
+"""Timeout of these readings [s]."""
 
 Answer = TypeVar("Answer")
 
@@ -47,7 +47,7 @@ class DetectedDevice:
     described: str
     """For people."""
     cells: int | None = None
-    """In series, where they are told."""
+    """Cells in series, if reported."""
 
     def __str__(self) -> str:
         """Describe the device, and how to reach it unless it is a board at the firmware's own rate."""

@@ -10,12 +10,12 @@ import structlog
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 
 REMEMBERED = ("serial", "divider", "volts_per_ampere", "bandgap_v")
-"""Of what a board says of itself."""
+"""Stored fields of a board's hello."""
 NO_BOARD: Mapping[str, str] = dict.fromkeys(REMEMBERED, "")
-"""What stands in the file once another board is to be accepted."""
+"""Content of the file once another board is to be accepted."""
 _SERIAL = re.compile(r"([0-9a-f]{8})?")
 LONGEST_FILE = 4096
-"""A longer file is none of ours [bytes]."""
+"""Maximum size of the file [bytes]."""
 
 log = structlog.get_logger(__name__)
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from bms_estimator.sources.serial.port_list import NoPortError, board_ports, resolve_port
 
 WRONG_PORT_RETRY_S = 60.0
-"""A port with another board is not opened again for so long while there are others: opening may reset who is there [s]."""
+"""Time until a port with another board is opened again while there are other ports [s]: opening may reset a device."""
 BUSY_PORT_RETRY_S = 1.0
-"""One that cannot be opened is tried again after so long: who held it may have looked for a board, too [s]."""
+"""Time until a port that could not be opened is tried again [s]: another search may have held it."""
 
 
 class PortDiscovery:

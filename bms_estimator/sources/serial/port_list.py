@@ -14,7 +14,7 @@ from serial.tools.list_ports_common import ListPortInfo
 BY_ID = Path("/dev/serial/by-id")
 
 WRITE_S = 1.0
-"""A device that takes nothing for so long is given up; a serial line takes the longest question in a tenth [s]."""
+"""Timeout of a write [s]; a serial line takes the longest query in a tenth of it."""
 
 ANY_PRODUCT = range(0x10000)
 BRIDGE_CHIPS: Mapping[int, Collection[int]] = {
@@ -31,7 +31,7 @@ NO_BOARD = re.compile(
     r"|aeotec|cc(1352|26\d\d)|efr32",
     re.IGNORECASE,
 )
-"""What radio sticks say of themselves, which have the same chips."""
+"""USB descriptions of radio sticks with the same chips as boards."""
 
 
 class NoPortError(Exception):

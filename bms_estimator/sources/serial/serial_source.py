@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     import serial
 
 TALK_S = 0.25
-"""So often is sent what is due [s]."""
+"""Interval at which due bytes are sent [s]."""
 TALKS = 4
-"""After so many is looked whether samples come."""
+"""Number of these intervals between two checks that samples come."""
 SILENT_S = 3.0
-"""Without a frame for so long the line is at fault [s], ..."""
+"""Time without a frame that counts as a fault of the line [s]."""
 SILENT_PERIODS = 3.0
-"""... and of a slower device for so many of its periods."""
+"""Number of sample periods without a frame that counts as a fault, for slower devices."""
 ANSWER_S = 4.0
 """A board measures for a second before it answers a command [s]."""
 
